@@ -1,12 +1,11 @@
-"""What a budget buys, and how a training comes to it: held-out PSNR at several budgets, and against time within each.
+"""Held-out PSNR of trainings with several time budgets, and its course within each training.
 
     python benchmarks/anytime.py photos-scene lego_400 -o anytime
     python benchmarks/anytime.py desk -o desk --budgets 15,60 --seeds 0,1 --clock processor --threads 1
 
-A second is one of the clock, on a machine that does nothing else, or one of processor time, which other programs
-disturb less; both stand still while held-out pixels are rendered. Every budget is a training of its own: what one does
-with its beginning depends on when it ends. Prints a table, writes OUT.csv and, with the course of each training,
-OUT-curve.csv.
+Seconds are of wall-clock time, on an otherwise idle machine, or of processor time, which other programs disturb less;
+both clocks pause while held-out pixels are rendered. Each budget needs its own training, as schedules depend on when it
+ends. Prints a table, writes OUT.csv and, with the course of each training, OUT-curve.csv.
 """
 
 import csv
@@ -28,14 +27,14 @@ from nerfcli.fit.fitting import Fitting
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.held_out_pixels import PIXELS
 
-# Where in its budget a training is looked at.
+# Fractions of the budget at which PSNR is measured.
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 
 
 @dataclass(frozen=True)
 class Moment:
-    """Where a training stood: its share of the budget, seconds, steps and samples so far, PSNR of held-out pixels."""
+    """A moment of a training: fraction of the budget, seconds, steps and samples so far, PSNR of held-out pixels."""
 
     share: float
     seconds: float
@@ -46,8 +45,11 @@ class Moment:
 
 @dataclass(frozen=True)
 class Line:
-    """One training. PSNR and SSIM are means over whole photos; `dip_db` is what the best moment was better by than the
-    last one, over the same held-out pixels."""
+    """One training.
+
+    PSNR and SSIM are means over whole photos. `dip_db` is the best moment's PSNR minus the last one's, on the same
+    held-out pixels.
+    """
 
     scene: str
     budget_s: float
@@ -62,7 +64,7 @@ class Line:
 
 
 def fit(capture: Capture, settings: TrainSettings, *, budget: float, clock: str) -> tuple[Fitting, list[Moment]]:
-    """Train for `budget` seconds of a clock."""
+    """Train for `budget` seconds of a clock, and measure PSNR at every fraction of `SHARES`."""
     fitting = Fitting(capture.pool, capture.extent.marching, contraction=capture.extent.contraction, settings=settings)
     now, used, samples, curve = CLOCKS[clock], 0.0, 0, []
     due = list(SHARES)
@@ -78,7 +80,7 @@ def fit(capture: Capture, settings: TrainSettings, *, budget: float, clock: str)
 
 
 def measure(capture: Capture, *, budget: float, seed: int, clock: str, threads: int) -> tuple[Line, list[Moment]]:
-    """Train, and look at all of every held-out photo."""
+    """Train, and evaluate every held-out photo in full."""
     settings = TrainSettings(budget_seconds=budget, seed=seed, threads=threads)
     fitting, curve = fit(capture, settings, budget=budget, clock=clock)
     photos = [HeldOutPhoto(photo.frame, photo.pixels, photo.used) for photo in capture.test_photos]
@@ -100,7 +102,7 @@ def measure(capture: Capture, *, budget: float, seed: int, clock: str, threads: 
 
 
 def print_table(lines: list[Line], clock: str, threads: int) -> None:
-    """A line per training."""
+    """Print one line per training."""
     table = Table(title=f"seconds of {clock} time, {threads} threads")
     names = ("scene", "budget s", "seed", "PSNR dB", "SSIM", "steps", "M samples", "MB", "dip at the end dB")
     for name in names:

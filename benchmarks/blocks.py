@@ -1,10 +1,10 @@
-"""Blocks against one table of as many bytes: a loop of 192 m through the town of `town_capture.py`.
+"""Blocks compared with one table of the same total size, on a loop of 192 m through the town of `town_capture.py`.
 
     python benchmarks/blocks.py -o blocks --rows 17 --steps 1500
 
 Writes the capture (154 photos of 240x180, with true poses, and points with the photos that see them), trains four
-blocks, and one field of four times as many rows per table on as many samples. Prints PSNR of held-out pixels by the
-block whose ground they show, and of those near a border; writes OUT/table.csv.
+blocks, and one field with four times as many rows per table on as many samples. Prints PSNR of held-out pixels for each
+block, by the ground that they show, and for pixels near a border; writes OUT/table.csv.
 """
 
 import csv
@@ -38,14 +38,14 @@ from nerfcli.workflows.blocks import train_blocks
 from nerfcli.workflows.train import train_scene
 
 SIZE, FOCAL_PX = (240, 180), 168.0
-# The second loop of the walk, around four blocks of houses; every second photo.
+# Every second photo of the second loop of the walk, around four blocks of houses.
 PHOTOS = range(151, 459, 2)
 POINTS_PER_PHOTO = 80
 BLOCKS, BORDER_METRES, PIXELS_PER_PHOTO = 4, 2.0, 2000
 
 
 def write_town(folder: Path, *, seed: int = 0) -> None:
-    """Write images/ and sparse/0, a COLMAP model of the true poses, true points and who sees them."""
+    """Write images/ and sparse/0, a COLMAP model of the true poses, true points and their observations."""
     rng, (width, height) = np.random.default_rng(seed), SIZE
     camera = Camera("PINHOLE", width, height, (FOCAL_PX, FOCAL_PX, width / 2, height / 2))
     poses = walk(max(PHOTOS) + 1)[list(PHOTOS)]

@@ -1,15 +1,16 @@
-"""Cameras that are wrong by a known amount: how near training brings them, what that gains, and what it costs.
+"""Refinement of cameras that are wrong by a known amount: remaining errors, gain in held-out PSNR, and time.
 
     python benchmarks/component_scenes.py scenes --only poses-balls --only focal-balls --only alpha
     python benchmarks/cameras.py scenes -o cameras
     python benchmarks/cameras.py scenes -o long --only poses-balls --steps 1500 --seeds 2
 
-Each scene is trained as it is, with cameras that learn, and with the true cameras, with the same steps and seeds.
-Errors of poses are root mean squares over the training photos against the truth: turns and moves as they are, moves as
-shares of the cameras' distance from their middle. "picture" is how far what stands at the middle of the scene is from
-its place in the pictures: raw, and after the similarity that makes it least, which no photo can tell. Held-out PSNR is
-that of whole photos, at their true poses and at those that this similarity takes these to ("mapped"); and of the right
-halves, raw and with the pose aligned on the left half (`nerfcli evaluate --align pose`). Seconds are of the processor.
+Each scene is trained with the given cameras, with refined and with true cameras, with the same steps and seeds. Pose
+errors are root mean squares over the training photos against the truth, without alignment; translations are in per cent
+of the cameras' mean distance from their centre. "picture" is the reprojection error of points at the middle of the
+scene: raw, and after the similarity that minimizes it, which no photo can determine. Held-out PSNR is given for whole
+photos, at their true poses and at these poses mapped into the refined frame by that similarity ("mapped"); and for the
+right halves, raw and with the pose aligned on the left half (`nerfcli evaluate --align pose`). Seconds are processor
+time.
 """
 
 import csv
@@ -41,7 +42,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.loop import Progress, train
 
-# Scene, downscale, and what is to learn. The last four need nothing: what is lost on them is the price.
+# Scene, downscale, and what is refined. The last four need no refinement: their loss in PSNR is its cost.
 CASES = (
     ("poses-balls", 1, "poses"),
     ("moves-balls", 1, "poses"),
@@ -79,7 +80,7 @@ class Trained:
 
 
 def with_truth(capture: Scene, folder: Path) -> Scene:
-    """The scene with the cameras that its photos were made with."""
+    """Return the scene with the true cameras of its photos."""
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     poses, params = truth.get("world_from_cam", {}), truth.get("params")
     frames = tuple(
@@ -94,21 +95,21 @@ def with_truth(capture: Scene, folder: Path) -> Scene:
 
 
 class Pictures:
-    """Where the true cameras see what stands at the middle of the scene."""
+    """Projections of points at the middle of the scene into the true cameras."""
 
     def __init__(self, true: Sequence[Frame]):
         self.truth = np.array([frame.world_from_cam for frame in true])
         self._cameras = [frame.camera for frame in true]
         centres, ahead = self.truth[:, :3, 3], self.truth[:, :3, 2]
         self.reach = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
-        # The point that all optical axes pass nearest to.
+        # The point nearest to all optical axes, in least squares.
         away = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
         self._middle = np.linalg.lstsq(away.sum(0), (away @ centres[:, :, None])[..., 0].sum(0), rcond=None)[0]
         offsets = np.random.default_rng(0).uniform(-1, 1, (MIDDLE_POINTS, 3))
         self._points = self._middle + MIDDLE_SHARE * self.reach * offsets
 
     def off(self, poses: np.ndarray) -> np.ndarray:
-        """(N, 2) pixels that the points are from their places in the pictures of cameras with these poses (P, 4, 4)."""
+        """Return the reprojection errors (N, 2) in pixels of the points in cameras with these poses (P, 4, 4)."""
         places = [
             camera.project(apply(inverse(a), self._points))[0] - camera.project(apply(inverse(b), self._points))[0]
             for camera, a, b in zip(self._cameras, poses, self.truth, strict=True)
@@ -116,7 +117,7 @@ class Pictures:
         return np.concatenate(places)
 
     def alignment(self, poses: np.ndarray) -> Similarity:
-        """What takes poses to where the points are nearest to their places."""
+        """Return the similarity of poses that minimizes the squared reprojection errors of the points."""
         found = Similarity.identity()
         for _ in range(ALIGNMENT_ROUNDS):
             now = self.off(found.apply_pose(poses)).ravel()
@@ -128,7 +129,7 @@ class Pictures:
         return found
 
     def _small(self, change: np.ndarray) -> Similarity:
-        """A turn, a move and a growth about the middle."""
+        """Return a similarity from a rotation vector, a translation over `reach` and a log scale, about the middle."""
         turn, scale = rotation_from_vector(change[:3]), float(np.exp(change[6]))
         return Similarity(scale, turn, self._middle + self.reach * change[3:6] - scale * turn @ self._middle)
 
@@ -158,14 +159,14 @@ def fit(given: Scene, truth: Scene, choice: str, *, seed: int, steps: int, downs
         run, capture = Path(folder), truth if choice == "true" else given
         train(capture, run, settings, resume=False, notify=lambda text: None, on_progress=clock)
         model, cameras = load_model(run / FIELD, "cpu"), read_cameras(run)
-        held_out = [  # while the run is there: it says where the photos are from where it is
+        held_out = [  # while the run exists: its photo paths are relative to it
             HeldOutPhoto(photo.frame, photo.pixels, photo.used)
             for photo in load_photos(cameras.test, factor=downscale, threads=1)
         ]
     pictures = Pictures(truth.train_frames)
     found = np.array([frame.world_from_cam for frame in cameras.train])
     alignment = pictures.alignment(found)
-    there = [  # a held-out camera, as it stands to the refined ones
+    there = [  # held-out cameras, mapped into the frame of the refined ones
         replace(h, frame=replace(h.frame, world_from_cam=alignment.inverse().apply_pose(h.frame.world_from_cam)))
         for h in held_out
     ]
@@ -192,7 +193,7 @@ def fit(given: Scene, truth: Scene, choice: str, *, seed: int, steps: int, downs
 
 
 def print_table(trained: list[Trained]) -> None:
-    """A line per scene and choice: means over the seeds."""
+    """Print one line per scene and choice, with means over the seeds."""
     table = Table(title=f"{trained[0].steps} steps")
     heads = (
         "scene",

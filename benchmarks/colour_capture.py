@@ -36,12 +36,12 @@ MATRICES = np.array(
 CONTRASTS = (1.0, 1.2, 0.85)
 VIGNETTING = ((0.0, 0.0), (-0.3, -0.1), (-0.1, -0.2))
 MIDDLE = 0.18
-# Standard deviation of the logarithms of gains: of all channels of a photo, and of each.
+# Standard deviations of log gains: of the part common to a photo's channels, and of each channel's own.
 GAIN, WHITE_BALANCE = 0.25, 0.08
 
 
 def developed(light: Array, truth: dict[str, Any]) -> Array:
-    """Return linear light (H, W, 3) as a photo of this truth has it, not clipped."""
+    """Return linear light (H, W, 3) developed with a photo's parameters, not clipped."""
     height, width = light.shape[:2]
     y, x = np.mgrid[:height, :width] + 0.5
     squared = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / ((width / 2) ** 2 + (height / 2) ** 2)
@@ -51,7 +51,7 @@ def developed(light: Array, truth: dict[str, Any]) -> Array:
 
 
 def truths(count: int, *, effects: tuple[str, ...], seed: int = 0) -> list[dict[str, Any]]:
-    """Return what each of the photos is developed with; effects that are left out are none."""
+    """Return each photo's parameters; effects that are left out are neutral."""
     rng = np.random.default_rng(seed)
     gains = rng.normal(0.0, GAIN, (count, 1)) + rng.normal(0.0, WHITE_BALANCE, (count, 3))
     return [
@@ -71,9 +71,9 @@ def write(source: Path, out: Path, *, effects: tuple[str, ...], reduction: int) 
 
     Args:
         source: a folder like sample_scenes/desk.
-        out: where to.
+        out: the folder to write into.
         effects: some of `EFFECTS`.
-        reduction: of the photos' sides.
+        reduction: factor by which the photos' sides are reduced.
     """
     known = json.loads((source / "truth" / "cameras.json").read_text())
     (focal, x, y, k1, k2), names = known["camera"]["params"], sorted(image["name"] for image in known["images"])
@@ -87,7 +87,7 @@ def write(source: Path, out: Path, *, effects: tuple[str, ...], reduction: int) 
         curved = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
         levels = np.round(255 * curved.clip(0, 1)).astype(np.uint8)
         Image.fromarray(levels).save(out / "images" / f"{Path(name).stem}.png")
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])  # to the axes of OpenGL, as the format has them
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])  # to the OpenGL axes of the format
     frames = [
         {"file_path": f"images/{Path(name).stem}.png", "transform_matrix": (poses[name] @ flip).tolist()}
         for name in names

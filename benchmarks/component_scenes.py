@@ -1,11 +1,11 @@
-"""Scenes that need one component each, made from sample_scenes: known truth, the same bytes for the same seed.
+"""Scenes that each need one component, made from sample_scenes with known truth, reproducible from a seed.
 
     python benchmarks/component_scenes.py scenes
     python benchmarks/component_scenes.py scenes --only exposure --only poses --seed 3
 
-Each is a scene of its own, OUT/NAME (COLMAP model and scene.json), in OUT/NAME/truth.json what was done to it. Held-out
-photos keep the exposure, the poses and the lens of the truth, so that a gain on them is a gain of the field. Needs
-nothing but nerfcli; `--only` may be given again, the seed moves every random choice.
+Each scene is a folder OUT/NAME (COLMAP model and scene.json); OUT/NAME/truth.json records how it was changed. Held-out
+photos keep the true exposure, poses and lens, so that a gain on them is a gain of the field. Needs only nerfcli;
+`--only` may be repeated, and the seed determines every random choice.
 """
 
 import importlib.util
@@ -31,13 +31,13 @@ from nerfcli.media.images import downscale, read_image
 
 SAMPLES = Path(__file__).parent.parent / "sample_scenes"
 DESK_DOWNSCALE = 2
-# What the photos of `scales` are smaller by, and how much finer the patterns are.
+# Reduction factors of the photos of `scales`, and how much finer its patterns are.
 SCALES, FINER = (1, 4), 4.0
-# Of the views of the balls.
+# Views of the balls.
 VIEWS, WIDTH, HEIGHT, SUBPIXELS, REACH, FOV_X = 48, 160, 120, 3, 4.4, 0.8
 EXPOSURE_SPREAD, WHITE_BALANCE_SPREAD = 0.3, 0.06
 POSE_NOISE_DEG = 0.5
-# Per axis, of the cameras' mean distance from their middle.
+# Standard deviation per axis, as a fraction of the cameras' mean distance from their centre.
 MOVE_NOISE = 0.0087
 FOCAL_ERROR = 0.02
 FEW_VIEWS = 6
@@ -46,7 +46,7 @@ POINTS_PER_VIEW, POINT_NOISE_PX = 250, 0.4
 
 @dataclass(frozen=True)
 class View:
-    """A photo that is going to be written: camera, pose, pixels uint8 (H, W, 3 or 4), whether held out, a mask."""
+    """A photo to be written: camera, pose, pixels uint8 (H, W, 3 or 4), whether it is held out, a mask."""
 
     name: str
     camera: Camera
@@ -58,12 +58,12 @@ class View:
 
 
 def linear(levels: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB in [0, 1]."""
+    """Return the linear light of sRGB levels in [0, 1]."""
     return np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
 
 
 def srgb(light: np.ndarray) -> np.ndarray:
-    """sRGB of linear light, clipped to [0, 1] as a camera does."""
+    """Return the sRGB levels of linear light, clipped to [0, 1] as in a camera."""
     light = np.clip(light, 0.0, 1.0)
     return np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
 
@@ -76,7 +76,7 @@ def to_8_bit(levels: np.ndarray) -> np.ndarray:
 
 
 def desk_views() -> list[View]:
-    """The photos of the desk at half size, with the cameras that they were rendered with."""
+    """Return the photos of the desk at half size, with their true cameras."""
     known = json.loads((SAMPLES / "desk" / "truth" / "cameras.json").read_text(encoding="utf-8"))
     whole = Camera.from_json(known["camera"])
     camera = whole.resized(whole.width // DESK_DOWNSCALE, whole.height // DESK_DOWNSCALE)
@@ -94,7 +94,7 @@ def desk_views() -> list[View]:
 
 
 def log_gains(views: list[View], generator: np.random.Generator) -> np.ndarray:
-    """(views, 3) logarithms of gains in linear light; their mean over the training photos is 0."""
+    """Return log gains (views, 3) in linear light, with a mean of 0 over the training photos."""
     common = np.clip(generator.normal(0.0, EXPOSURE_SPREAD, (len(views), 1)), -0.6, 0.6)
     gains = common + generator.normal(0.0, WHITE_BALANCE_SPREAD, (len(views), 3))
     return gains - gains[[not view.test for view in views]].mean(axis=0)
@@ -106,7 +106,7 @@ def exposed(view: View, gain: np.ndarray) -> np.ndarray:
 
 
 def exposure(views: list[View], generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
-    """Exposure and white balance drift from photo to photo, and no EXIF tells; held-out photos have the mean."""
+    """Vary exposure and white balance of the training photos, without EXIF; held-out photos have the mean."""
     gains = log_gains(views, generator)
     changed = [
         view if view.test else replace(view, pixels=exposed(view, gain))
@@ -116,7 +116,7 @@ def exposure(views: list[View], generator: np.random.Generator) -> tuple[list[Vi
 
 
 def exposure_exif(views: list[View], generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
-    """Exposure drifts, that of held-out photos too, and EXIF tells the shutter times."""
+    """Vary the exposure of all photos, including held-out ones, with shutter times in EXIF."""
     gains = log_gains(views, generator).mean(axis=1, keepdims=True)
     changed = [
         replace(view, pixels=exposed(view, gain), exposure_seconds=math.exp(gain[0]) / 60)
@@ -126,7 +126,7 @@ def exposure_exif(views: list[View], generator: np.random.Generator) -> tuple[li
 
 
 def poses(views: list[View], generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
-    """Training photos are turned by half a degree about a random axis through their centres."""
+    """Rotate the training cameras by half a degree about random axes through their centres."""
     changed, angles = [], {}
     for view in views:
         axis = generator.normal(size=3)
@@ -141,7 +141,7 @@ def poses(views: list[View], generator: np.random.Generator) -> tuple[list[View]
 
 
 def moves(views: list[View], generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
-    """The centres of the training photos are wrong by 0.87 % of their distance from their middle, along each axis."""
+    """Move the training cameras along each axis by normal noise of 0.87 % of their mean distance from their centre."""
     centres = np.array([view.world_from_cam[:3, 3] for view in views if not view.test])
     reach = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
     changed, moved = [], {}
@@ -157,7 +157,7 @@ def moves(views: list[View], generator: np.random.Generator) -> tuple[list[View]
 
 
 def focal(views: list[View], generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
-    """The focal length of the training photos is 2 % too long."""
+    """Make the focal length of the training photos 2 % too long."""
     camera = views[0].camera
     wrong = replace(camera, params=(camera.params[0] * (1 + FOCAL_ERROR), *camera.params[1:]))
     return [view if view.test else replace(view, camera=wrong) for view in views], {"params": list(camera.params)}
@@ -167,7 +167,7 @@ def focal(views: list[View], generator: np.random.Generator) -> tuple[list[View]
 
 
 def ball_tracer() -> ModuleType:
-    """The script that made sample_scenes/spheres: what stands where, hit by rays in closed form."""
+    """Load the script that made sample_scenes/spheres: its objects, and their closed-form ray tracing."""
     spec = importlib.util.spec_from_file_location("make_spheres", SAMPLES / "make_spheres.py")
     assert spec is not None
     assert spec.loader is not None
@@ -177,7 +177,7 @@ def ball_tracer() -> ModuleType:
 
 
 def ball_pose(index: int, count: int) -> np.ndarray:
-    """world_from_cam (4, 4), OpenCV axes: evenly spread over a band of a sphere."""
+    """Return one of `count` poses spread evenly over a band of a sphere: world_from_cam (4, 4), OpenCV axes."""
     azimuth, height = index * math.pi * (3 - math.sqrt(5)), 0.12 + 0.72 * (index + 0.5) / count
     ring = math.sqrt(1 - height**2)
     backward = np.array((ring * math.cos(azimuth), ring * math.sin(azimuth), height))
@@ -193,12 +193,12 @@ def ball_camera() -> Camera:
     return Camera("SIMPLE_PINHOLE", WIDTH, HEIGHT, (0.5 * WIDTH / math.tan(0.5 * FOV_X), WIDTH / 2, HEIGHT / 2))
 
 
-# What a ray of no hit sees, and what a surface reflects, by directions (..., 3) in the world or in the camera.
+# Light (..., 3) from infinity by directions (..., 3), in world or camera axes.
 Light = Callable[[np.ndarray], np.ndarray]
 
 
 def room_light(directions: np.ndarray) -> np.ndarray:
-    """(..., 3): three soft lamps in fixed directions."""
+    """Return the light (..., 3) of three soft lamps in fixed directions."""
     lamps = np.array([[0.6, 0.2, 0.77], [-0.7, 0.5, 0.5], [0.1, -0.8, 0.6]])
     lamps /= np.linalg.norm(lamps, axis=1, keepdims=True)
     shades = np.array([[1.0, 0.95, 0.85], [0.7, 0.85, 1.0], [0.9, 1.0, 0.8]])
@@ -206,7 +206,7 @@ def room_light(directions: np.ndarray) -> np.ndarray:
 
 
 def surroundings(directions: np.ndarray) -> np.ndarray:
-    """(..., 3) sRGB of what is infinitely far: a sky, a horizon, hills and clouds."""
+    """Return the sRGB (..., 3) of a background at infinity: a sky, a horizon, hills and clouds."""
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     around = np.arctan2(y, x)
     hills = 0.08 * np.sin(3 * around) + 0.05 * np.sin(7 * around + 1)
@@ -226,13 +226,13 @@ def ball_views(
     views: int = VIEWS,
     finer: float = 1.0,
 ) -> list[View]:
-    """Views of the balls, every 8th held out: RGBA; or in front of something far, fixed to the world or the camera.
+    """Return views of the balls, every 8th held out: RGBA, or RGB in front of a background at infinity.
 
     Args:
-        behind, moving_behind: what is infinitely far by directions in the world, or by directions in the camera.
-        gloss: how much of `room_light` the surfaces reflect.
-        views: how many.
-        finer: how much finer the patterns are than those of sample_scenes/spheres.
+        behind, moving_behind: the background by directions in the world, or by directions in the camera.
+        gloss: fraction of `room_light` that the surfaces reflect.
+        views: number of views.
+        finer: factor by which the patterns are finer than those of sample_scenes/spheres.
     """
     tracer, camera, made = ball_tracer(), ball_camera(), []
     balls = tuple(replace(ball, frequency=finer * ball.frequency) for ball in tracer.BALLS)
@@ -262,7 +262,7 @@ def ball_views(
 
 
 def surface_normals(tracer: ModuleType, points: np.ndarray) -> np.ndarray:
-    """(N, 3) outward normals at points on the surfaces."""
+    """Return outward normals (N, 3) at points on the surfaces."""
     best, normals = np.full(len(points), np.inf), np.zeros_like(points)
     for ball in tracer.BALLS:
         local = (points - np.array(ball.centre)) / ball.radius
@@ -278,13 +278,15 @@ def surface_normals(tracer: ModuleType, points: np.ndarray) -> np.ndarray:
 
 
 def alpha() -> list[View]:
-    """A matt object in RGBA: colours depend on the point alone, and behind it is nothing."""
+    """Return RGBA views of a matt object: colours depend only on the point, and nothing is behind it."""
     return ball_views()
 
 
 def scales() -> list[View]:
-    """The object with fine patterns in photos of two sizes in turn, among the held-out ones, too, as from near and from
-    four times as far away: what is some pixels wide in one is less than a pixel in the other."""
+    """Return views of finer patterns at full and quarter size in turn, among training and held-out photos alike.
+
+    The small photos look as from four times as far: details of a few pixels become smaller than a pixel.
+    """
     views = ball_views(finer=FINER)
     places = {view.name: i for held in (False, True) for i, view in enumerate(v for v in views if v.test == held)}
     changed = []
@@ -296,25 +298,27 @@ def scales() -> list[View]:
 
 
 def glossy() -> list[View]:
-    """The same object, polished: lamps wander over it with the view."""
+    """Return the same object with a polish: reflections of lamps move over it with the view."""
     return ball_views(gloss=0.7)
 
 
 def unbounded() -> list[View]:
-    """The object in front of what is infinitely far: colours behind it depend on the direction alone."""
+    """Return the object in front of a background at infinity, whose colours depend only on the direction."""
     return ball_views(behind=surroundings)
 
 
 def turntable() -> list[View]:
-    """The object turns in front of a camera that stands still: what is behind it contradicts the poses. With masks,
-    whose black is empty space; held-out photos are RGBA."""
+    """Return the object turning in front of a fixed camera, so that the background contradicts the poses.
+
+    With masks, whose black is empty space; held-out photos are RGBA.
+    """
     clean = ball_views()
     views = ball_views(moving_behind=surroundings)
     return [a if a.test else b for a, b in zip(clean, views, strict=True)]
 
 
 def few() -> list[View]:
-    """Six photos to learn from, with points and where they were seen, as structure from motion gives them."""
+    """Return six training photos and the held-out ones; `make` adds points and observations, as after SfM."""
     views = ball_views(behind=surroundings)
     kept = set(np.linspace(0, len(views) - 1, FEW_VIEWS).round().astype(int).tolist())
     chosen = [replace(view, test=index not in kept) for index, view in enumerate(views) if index in kept or view.test]
@@ -322,7 +326,7 @@ def few() -> list[View]:
 
 
 def ball_points(views: list[View], generator: np.random.Generator) -> tuple[np.ndarray, Observations]:
-    """Points on the surfaces that the training views see, and where they see them, with noise."""
+    """Return surface points seen by the training views, and their noisy observations."""
     tracer, points = ball_tracer(), []
     training = [view for view in views if not view.test]
     for view in training:
@@ -358,7 +362,7 @@ CHANGES: dict[str, Change] = {
     "poses": poses,
     "focal": focal,
 }
-# The scenes: views, and what is done to them.
+# The scenes: a function that makes the views, and the change applied to them.
 MAKERS: dict[str, tuple[Callable[[], list[View]], Change | None]] = {
     "desk": (desk_views, None),
     **{name: (desk_views, change) for name, change in CHANGES.items()},
@@ -375,9 +379,9 @@ MAKERS: dict[str, tuple[Callable[[], list[View]], Change | None]] = {
 
 
 def write_photo(view: View, path: Path) -> None:
-    """JPEG or PNG by the name's ending, with the exposure time in EXIF where it is known."""
+    """Write a JPEG or PNG, by the name's suffix, with the exposure time in EXIF if known."""
     exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 1  # Pillow leaves out what has no entry of its own in a PNG
+    exif[ExifTags.Base.Orientation] = 1  # without a top-level entry, Pillow writes no EXIF into a PNG
     if view.exposure_seconds is not None:
         camera = exif.get_ifd(ExifTags.IFD.Exif)
         camera[ExifTags.Base.ExposureTime] = view.exposure_seconds

@@ -1,11 +1,11 @@
-"""What each component gains on the scene that needs it, and costs: the same seeds and steps with and without.
+"""Gain and cost of each component on the scene that needs it, with and without it at the same seeds and steps.
 
     python benchmarks/component_scenes.py scenes
     python benchmarks/components.py scenes -o components
     python benchmarks/components.py scenes -o exposure --only exposure --steps 600
 
-Held-out PSNR is the mean over whole photos, as `nerfcli evaluate` has it. Seconds are processor time of the training
-alone, so that other work on the machine counts little. Prints a table and writes OUT.csv.
+Held-out PSNR is the mean over whole photos, as in `nerfcli evaluate`. Seconds are processor time of the training only,
+so that other work on the machine hardly matters. Prints a table and writes OUT.csv.
 """
 
 import csv
@@ -31,7 +31,7 @@ from nerfcli.runs.files import FIELD
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.loop import Progress, train
 
-# Scene, downscale, and what is compared: the first is what it is compared with. "-name" is --without.
+# Scene, downscale, and the choices to compare, the baseline first. "-name" is --without.
 CASES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("exposure-balls", 1, ("", "exposure")),
     ("exposure-exif-balls", 1, ("", "exposure=exif", "exposure")),
@@ -47,7 +47,7 @@ CASES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
 
 @dataclass(frozen=True)
 class Trained:
-    """One training and its held-out numbers."""
+    """One training and its held-out metrics."""
 
     scene: str
     components: str
@@ -99,7 +99,7 @@ def fit(folder: Path, choice: str, *, seed: int, steps: int, downscale: int, sam
 
 
 def print_table(trained: list[Trained]) -> None:
-    """A line per scene and choice: means over the seeds, and gains over the first choice, seed by seed."""
+    """Print one line per scene and choice: means over the seeds, and gains over the first choice at equal seeds."""
     table = Table(title=f"{trained[0].steps} steps")
     for name in ("scene", "components", "PSNR dB", "gain dB", "spread of it", "SSIM", "CPU s", "seeds"):
         table.add_column(name, justify="left" if name in ("scene", "components") else "right")

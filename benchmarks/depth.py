@@ -1,4 +1,4 @@
-"""The error of every meaning of depth against a true or a measured depth, on two captures.
+"""The error of every depth convention against true or measured depth, on two captures.
 
     python benchmarks/depth.py desk -o desk-depth
     python benchmarks/depth.py redkitchen path/to/redkitchen -o kitchen-depth
@@ -6,9 +6,9 @@
 
 desk: sample_scenes/desk with its true cameras, against the true z of its held-out photos. redkitchen: a hand-held RGB-D
 video with poses (7-Scenes; images/, depth/ in millimetres with 0 for none, pose/ camera to world), against its sensor,
-seen by its depth camera. One number, from camera positions, brings the unit to metres; with the capture's own poses it
-is 1. A folder OUT gets the scene, the run, OUT.csv and one picture per held-out view: photo, true z, conditional z,
-error. `--scene SCENE` takes the poses of `nerfcli poses`, `--run RUN` a run that is there already.
+in the view of its depth camera. A scale from the camera positions converts units to metres; with the capture's own
+poses it is 1. The folder OUT gets the scene, the run, a CSV and one picture per held-out view: photo, true z,
+conditional z, error. `--scene SCENE` uses the poses of `nerfcli poses`, `--run RUN` an existing run.
 """
 
 import csv
@@ -41,19 +41,19 @@ from nerfcli.runs.files import FIELD
 
 DEPTHS = (*CONVENTIONS, "quantile:0.05", "quantile:0.95")
 SHARES = (0.5, 0.05, 0.95)
-# Every second pixel of every second row is looked at: neighbours tell the same.
+# Every second pixel of every second row is measured, as neighbours are nearly equal.
 STRIDE = 2
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk"
-# Of a Kinect: the focal length of its colour camera, and where it stands in the axes of its depth camera, in metres.
+# Kinect: focal length of the colour camera, and its pose in the axes of the depth camera, in metres.
 COLOUR_FOCAL_PX = 525.0
 DEPTH_FROM_COLOUR = np.array([[1.0, 0, 0, 0.025], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-# From the axes of OpenCV to those of OpenGL, which transforms.json has.
+# From the axes of OpenCV to those of OpenGL, as in transforms.json.
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Of one depth over all held-out views, in metres and shares."""
+    """Errors of one depth over all held-out views, in metres and as fractions."""
 
     depth: str
     coverage: float
@@ -65,7 +65,7 @@ class Errors:
 
 
 def desk_scene(folder: Path) -> None:
-    """transforms.json of the desk's true cameras."""
+    """Write transforms.json with the desk's true cameras."""
     truth = json.loads((DESK / "truth" / "cameras.json").read_text(encoding="utf-8"))
     f, cx, cy, k1, k2 = truth["camera"]["params"]
     lens = {"fl_x": f, "fl_y": f, "cx": cx, "cy": cy, "k1": k1, "k2": k2, "p1": 0.0, "p2": 0.0}
@@ -74,13 +74,13 @@ def desk_scene(folder: Path) -> None:
 
 
 def kitchen_scene(folder: Path, capture: Path) -> None:
-    """transforms.json of the video's colour camera.
+    """Write transforms.json with the video's colour camera.
 
-    The capture's poses and its lens (585 px) are those of the depth camera, and the pictures are not registered: with
-    them, matches between colour pictures lie 1.9 px (median) off their epipolar lines, with `COLOUR_FOCAL_PX` 1.1 px.
-    Points triangulated from these matches are 21 cm (median) off the sensor's depth with the former, 12 cm with the
-    latter, too near by 4 cm: no field that is trained on these poses can be expected to do better by much. Those of
-    `nerfcli poses` (`--scene`) have no such limit.
+    The capture's poses and lens (585 px) are those of the depth camera, to which the colour pictures are not
+    registered: with them, matches between colour pictures are 1.9 px (median) off their epipolar lines, with
+    `COLOUR_FOCAL_PX` 1.1 px. Points triangulated from these matches are 21 cm (median) off the sensor's depth with the
+    former, 12 cm with the latter and 4 cm too near: a field trained on these poses cannot be expected to do much
+    better. The poses of `nerfcli poses` (`--scene`) have no such limit.
     """
     cx, cy = np.loadtxt(capture / "camera-intrinsics.txt")[:2, 2]
     lens = {"fl_x": COLOUR_FOCAL_PX, "fl_y": COLOUR_FOCAL_PX, "cx": cx, "cy": cy}
@@ -97,23 +97,23 @@ def _write_scene(folder: Path, lens: dict[str, object], poses: dict[Path, np.nda
 
 
 def desk_truth(frame: Frame) -> np.ndarray:
-    """True z (600, 800) in metres."""
+    """Return the true z (600, 800) in metres."""
     return tifffile.imread(DESK / "truth" / "depth" / f"{Path(frame.name).stem}.tiff").astype(np.float64)
 
 
 def kitchen_pose(name: str, capture: Path) -> np.ndarray:
-    """World from colour camera (4, 4) as it comes with the capture, in metres."""
+    """Return world_from_cam (4, 4) of the colour camera, from the capture's pose, in metres."""
     return np.loadtxt(capture / "pose" / f"{Path(name).stem}.txt") @ DEPTH_FROM_COLOUR
 
 
 def kitchen_metres(frames: Sequence[Frame], capture: Path) -> float:
-    """Metres per unit of the frames: the scale of the similarity that brings their positions to the capture's."""
+    """Return metres per unit: the scale of the similarity that aligns the frames' centres with the capture's."""
     centres = np.array([frame.world_from_cam[:3, 3] for frame in frames])
     return align(centres, np.array([kitchen_pose(frame.name, capture)[:3, 3] for frame in frames])).scale
 
 
 def kitchen_depth_view(frame: Frame, capture: Path, *, metres: float = 1.0) -> Frame:
-    """What the depth camera sees when the colour camera takes a photo, where a unit is so many metres."""
+    """Return the depth camera's frame for a photo of the colour camera, with `metres` per unit."""
     matrix = np.loadtxt(capture / "camera-intrinsics.txt")
     camera = Camera("PINHOLE", 640, 480, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
     colour_from_depth = np.linalg.inv(DEPTH_FROM_COLOUR)
@@ -122,14 +122,14 @@ def kitchen_depth_view(frame: Frame, capture: Path, *, metres: float = 1.0) -> F
 
 
 def kitchen_truth(frame: Frame, capture: Path) -> np.ndarray:
-    """Measured z (480, 640) in metres; NaN where the sensor has none."""
+    """Return the measured z (480, 640) in metres; NaN where the sensor has none."""
     levels = cv2.imread(str(capture / "depth" / f"{Path(frame.name).stem}.png"), cv2.IMREAD_UNCHANGED)
     assert levels is not None
     return np.where((levels > 0) & (levels < 65535), levels / 1000.0, np.nan)
 
 
 def depths(model: Model, frame: Frame, *, min_opacity: float) -> dict[str, np.ndarray]:
-    """Every depth along z (H / STRIDE, W / STRIDE) at the centres of every few pixels, from one rendering."""
+    """Render every depth along z once, at the centres of every `STRIDE`-th pixel: (H / STRIDE, W / STRIDE) each."""
     width, height = frame.camera.width, frame.camera.height
     pixels = np.arange(width * height).reshape(height, width)[::STRIDE, ::STRIDE]
     rays = pixel_rays(
@@ -154,7 +154,7 @@ def depths(model: Model, frame: Frame, *, min_opacity: float) -> dict[str, np.nd
 
 
 def measure(maps: list[dict[str, np.ndarray]], truths: list[np.ndarray]) -> list[Errors]:
-    """Errors of every depth over all pixels of the views whose truth is known."""
+    """Return the errors of every depth over all pixels of the views with known truth."""
     rows = []
     known = np.isfinite(np.stack(truths))
     truth = np.stack(truths)
@@ -178,7 +178,7 @@ def measure(maps: list[dict[str, np.ndarray]], truths: list[np.ndarray]) -> list
 
 
 def draw(photo: Path, depth: np.ndarray, truth: np.ndarray, path: Path) -> None:
-    """Photo, true z, conditional z, their difference to +-10 cm (blue too near, red too far), side by side."""
+    """Draw photo, true z, conditional z and its error within +-10 cm (blue too near, red too far), side by side."""
     height, width = truth.shape
     lo, hi = np.nanpercentile(truth, (1, 99))
 

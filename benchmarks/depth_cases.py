@@ -1,10 +1,9 @@
-"""The error of every depth of a ray against 60 decimal digits, on rays that are hard for rounding.
+"""The error of every depth of a ray against 60-digit answers, on rays that are prone to rounding errors.
 
     python benchmarks/depth_cases.py -o depth_cases.csv
 
-Columns: the definition in plain torch in float64 and in float32, and the compiled kernel (float32 in and out). The same
-float32 inputs go into all of them. An error is relative to the value; "same" is no error at all, "undefined" that the
-value is NaN and has to be.
+Columns: the definition in plain torch in float64 and in float32, and the compiled kernel (float32 in and out). All get
+the same float32 inputs. Errors are relative to the value; 0 also where the value is NaN as it should be.
 """
 
 import csv
@@ -32,12 +31,12 @@ ROWS = ("opacity", "transmittance", *DEPTHS, "spread")
 
 
 def single(ray: Ray) -> list[list[float]]:
-    """Densities, starts and ends as float32 holds them."""
+    """Return densities, starts and ends rounded to float32."""
     return [torch.tensor(v, dtype=torch.float32).tolist() for v in (ray.density, ray.starts, ray.ends)]
 
 
 def computed(case: Ray, backend: str) -> dict[str, float]:
-    """Every row by one of the implementations."""
+    """Return every row, computed by one of the implementations."""
     dtype = torch.float64 if backend == "float64" else torch.float32
     module = numba_cpu if backend == "compiled" else depth
     density, starts, ends = (torch.tensor(values, dtype=dtype) for values in single(case))
@@ -56,7 +55,7 @@ def computed(case: Ray, backend: str) -> dict[str, float]:
 
 
 def answers_of(ray: Ray) -> dict[str, float]:
-    """Every row by its definition."""
+    """Return every row by its definition, from 60-digit answers."""
     wanted = {name: found.value for name, found in exact_depths.light_ends(ray).depths.items()}
     mean = wanted["conditional"]
     wanted["moment"] = 0.0 if math.isnan(mean) else mean * wanted["opacity"]
@@ -64,7 +63,10 @@ def answers_of(ray: Ray) -> dict[str, float]:
 
 
 def error(value: float, wanted: float) -> float:
-    """Relative error; infinite where only one of the two is defined. Below float32's range only 0 is asked for."""
+    """Return the relative error; infinite if only one value is NaN.
+
+    If the wanted value is below float32's normal range, the error is 0 for a value that is too, else infinite.
+    """
     if math.isnan(value) or math.isnan(wanted):
         return 0.0 if math.isnan(value) and math.isnan(wanted) else math.inf
     if abs(wanted) < torch.finfo(torch.float32).tiny:

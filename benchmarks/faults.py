@@ -1,14 +1,14 @@
-"""What damage does: random corruptions of scene, run and image files.
+"""Effects of damaged files: random corruptions of scene, run and image files.
 
     python benchmarks/faults.py corruptions --count 500 -o corruptions.csv
-    python benchmarks/faults.py corruptions --first 16 --count 1      one case again, alone
+    python benchmarks/faults.py corruptions --first 16 --count 1      repeat a single case
 
-Every corruption damages one file of a small capture or of its run; one command is run on it, in a child process.
-Verdicts: `refused` (exit codes 3, 4 or 5, two lines), `same` (the result is that of the whole files), `other input`
-(the damage is in a file that has no checksum, a JPEG or a COLMAP model say, and reads as another picture or another
-number; what comes out belongs to it); bad ones: `traceback`, `crash`, `hang`, `wrong`, and `lost` where a file of the
-user's has changed. A crash is told with its signal, the last lines of stderr and whether the kernel ran out of memory.
-What is bad is tried again in a fresh process, and its capture is kept beside the CSV.
+Each case damages one file of a small capture or of its run, and runs one command on it in a child process. Verdicts:
+`refused` (exit codes 3, 4 or 5, one error), `same` (the result is that of the intact files), `other input` (a file
+without a checksum, such as a JPEG or a COLMAP model, reads as another picture or number, and the result is that of this
+input); bad ones: `traceback`, `crash`, `hang`, `wrong`, and `lost` if a file of the user has changed. A crash is
+reported with its signal, the last lines of stderr and the number of out-of-memory kills. Bad cases are repeated in a
+fresh process, and their captures are kept beside the CSV.
 """
 
 import csv
@@ -39,7 +39,8 @@ TRAIN = ("--steps", "6", "--threads", "1", "--quiet")
 RENDER = ("--cameras", "test", "--max-size", "24", "--threads", "1", "--quiet", "--depth-format", "npy")
 CPU_SECONDS_PER_CASE, MOST_SECONDS_PER_CASE, LOOK_EVERY_SECONDS = 60, 1800, 20
 BAD = ("traceback", "crash", "hang", "wrong", "lost")
-# What other programs write, or have always written without a checksum: a changed number in them is another number.
+# Files of a run in which damage must be noticed. Any other file, by other programs or without a checksum, may read as
+# different but valid input.
 OURS = ("field.safetensors", "state.safetensors", "config.json", "cameras.json")
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -47,7 +48,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 @dataclass(frozen=True)
 class Case:
-    """One damage and what came of it."""
+    """One case of damage and its outcome."""
 
     number: int
     file: str
@@ -60,14 +61,14 @@ class Case:
 
 
 def nerfcli(*arguments: object, timeout: float | None = None) -> subprocess.CompletedProcess[str]:
-    """The command in a process of its own."""
+    """Run a nerfcli command in a separate process."""
     command = [sys.executable, "-m", "nerfcli", *map(str, arguments)]
     environment = {**os.environ, "GOMP_SPINCOUNT": "1000"}
     return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=timeout)
 
 
 def make_capture(place: Path) -> None:
-    """`place`/photos with 8 JPEGs, `place`/blender, `place`/scene (scene.json and a COLMAP model), and `place`/run."""
+    """Write `place`/photos with 8 JPEGs, `place`/blender, `place`/scene (scene.json, COLMAP model), and `place`/run."""
     blender, photos = place / "blender", place / "photos"
     photos.mkdir(parents=True)
     listed = json.loads((SPHERES / "transforms_train.json").read_text())
@@ -101,7 +102,7 @@ def make_capture(place: Path) -> None:
 
 
 def damaged(data: bytes, others: list[bytes], draw: random.Random) -> tuple[str, bytes | None]:
-    """One of seven damages in words, and what is left of a file; None where the file is gone."""
+    """Return a random kind of damage and the damaged content; None if the file is to be deleted."""
     kind = draw.choice(("bit", "bits", "cut", "zeros", "noise", "empty", "deleted", "swapped"))
     if kind == "deleted":
         return kind, None
@@ -112,7 +113,7 @@ def damaged(data: bytes, others: list[bytes], draw: random.Random) -> tuple[str,
     if kind == "cut":
         return kind, data[: draw.randrange(len(data))]
     content = bytearray(data)
-    # Half of the hits go to the beginning, where the structure of most files stands.
+    # Half of the damage is done at the beginning, where most files have their structure.
     at = draw.randrange(min(200, len(content))) if draw.random() < 0.5 else draw.randrange(len(content))
     if kind in ("bit", "bits"):
         for place in [at, *(draw.randrange(len(content)) for _ in range(9))][: 1 if kind == "bit" else 10]:
@@ -124,13 +125,13 @@ def damaged(data: bytes, others: list[bytes], draw: random.Random) -> tuple[str,
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Of every file below a folder."""
+    """Return the digest of every file below a folder, by relative path."""
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {str(path.relative_to(folder)): hashlib.blake2b(path.read_bytes()).hexdigest() for path in files}
 
 
 def commands_for(file: str, draw: random.Random) -> tuple[str, ...]:
-    """A command that reads a file of the capture, with its arguments below the capture's folder."""
+    """Return a random command that reads a file of the capture, with arguments relative to the capture's folder."""
     if file.startswith("run/"):
         return draw.choice(
             (
@@ -153,7 +154,7 @@ def commands_for(file: str, draw: random.Random) -> tuple[str, ...]:
 
 
 def outcome(folder: Path, command: tuple[str, ...], text: str) -> str:
-    """What a command that succeeded says: a hash of the numbers, without times and places."""
+    """Return a hash of the results of a successful command, without times and paths."""
     from nerfcli.field.checkpoint import load_tensors
     from nerfcli.media.images import read_image
 
@@ -211,7 +212,7 @@ def serve() -> None:
 
 
 class Child:
-    """A process that runs commands until one of them is its end."""
+    """A child process that runs commands, and is restarted when one of them crashes or hangs."""
 
     def __init__(self, log: Path) -> None:
         self.log = log
@@ -233,7 +234,8 @@ class Child:
 
         began, kills_before = self._cpu_seconds(), out_of_memory_kills()
 
-        # Processor time: a busy machine is no endless loop. What waits for ever takes none; it has a wall clock.
+        # Limit processor time, so that a busy machine does not look like an endless loop, and wall-clock time for
+        # processes that wait forever.
         def give_up(signum: int, frame: object) -> None:
             if self._cpu_seconds() - began > CPU_SECONDS_PER_CASE or time.monotonic() > latest:
                 raise TimeoutError
@@ -253,13 +255,13 @@ class Child:
         return self._again("crash", told=f"out-of-memory kills meanwhile: {out_of_memory_kills() - kills_before}")
 
     def _cpu_seconds(self) -> float:
-        """Of the process and of those of its children that have ended."""
+        """Return the processor time of the process and of its children that have ended."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
         return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
     def _again(self, why: str, told: str = "") -> dict[str, Any]:
         if why == "crash":
-            with suppress(subprocess.TimeoutExpired):  # it ends by itself: its own signal is what counts
+            with suppress(subprocess.TimeoutExpired):  # let it end by itself, to see its own signal
                 self.process.wait(30)
         self.process.kill()
         code = self.process.wait()
@@ -274,7 +276,7 @@ class Child:
 
 
 def out_of_memory_kills() -> int:
-    """How often the kernel has killed for want of memory since it started; 0 where it does not say."""
+    """Return the number of out-of-memory kills since the kernel started; 0 if it does not report them."""
     try:
         lines = Path("/proc/vmstat").read_text().splitlines()
     except OSError:
@@ -283,7 +285,7 @@ def out_of_memory_kills() -> int:
 
 
 def corruption_cases(numbers: range, seed: int, place: Path, keep: Path) -> Iterator[Case]:
-    """Damage one file at a time, run one command, look at what is left."""
+    """Damage one file at a time, run one command, and judge the outcome."""
     whole, broken = place / "whole", place / "case"
     make_capture(whole)
     files = [path for path in sorted(digests(whole)) if not path.endswith((".lock", "poses_report.json"))]
@@ -309,7 +311,7 @@ def corruption_cases(numbers: range, seed: int, place: Path, keep: Path) -> Iter
         return verdict_of(answer, expected[command], file), answer
 
     for number in numbers:
-        draw = random.Random(f"{seed} {number}")  # so that each can be had alone
+        draw = random.Random(f"{seed} {number}")  # so that each case can be repeated alone
         kind = draw.choice(kinds)
         file = draw.choice([name for name in files if kind_of(name) == kind])
         command = commands_for(file, draw)
@@ -340,19 +342,19 @@ def corruption_cases(numbers: range, seed: int, place: Path, keep: Path) -> Iter
 
 
 def kind_of(file: str) -> str:
-    """Files of one kind are hit as often as those of another, however many there are."""
+    """Return the kind of a file. Each kind is damaged equally often, however many files it has."""
     return file.rsplit("/", 1)[0] + "/*" + Path(file).suffix if file.endswith((".jpg", ".png")) else file
 
 
 def is_kept(name: str, command: tuple[str, ...]) -> bool:
-    """Whether a command has to leave a file as it is."""
+    """Return whether a command must leave a file unchanged."""
     if name.startswith("run/"):
         return command[0] in ("info", "render") or (command[0] == "evaluate" and "metrics" not in name)
     return True
 
 
 def verdict_of(answer: dict[str, Any], expected: str, file: str) -> str:
-    """What to think of an answer."""
+    """Return the verdict on an answer of the child process."""
     if "verdict" in answer:
         return answer["verdict"]
     if answer["raised"] or answer["code"] == 1:
@@ -395,7 +397,7 @@ def corruptions(
 
 
 def show(table: Counter[tuple[str, str]]) -> None:
-    """Commands in rows, verdicts in columns."""
+    """Print a table of counts, with verdicts in columns."""
     verdicts = sorted({verdict for _, verdict in table})
     typer.echo(f"{'':32s}" + "".join(f"{verdict:>13s}" for verdict in verdicts))
     for row in sorted({row for row, _ in table}):

@@ -3,8 +3,8 @@
     python benchmarks/gpu.py --capture sample_scenes/spheres -o gpu-results
     python benchmarks/gpu.py --capture sample_scenes/spheres -o /tmp/dry --dry
 
-What has been measured is kept in OUT/results.json; a call with the same OUT goes on from there. OUT/table.md shows it.
-`--dry` runs everything to its end without a GPU: the kernels in Triton's interpreter, at sizes that mean nothing.
+Results are kept in OUT/results.json, and a call with the same OUT continues from there; OUT/table.md shows them.
+`--dry` runs everything without a GPU: the kernels run in Triton's interpreter, at sizes too small to be meaningful.
 """
 
 import json
@@ -43,7 +43,7 @@ VIEWS = (
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured."""
+    """Sizes and repetitions of the measurements."""
 
     samples: tuple[int, ...]
     log2_rows: tuple[int, ...]
@@ -59,7 +59,7 @@ TINY = Sizes((48,), (6,), (96,), (5,), 6, 1, 1)
 
 
 class Results:
-    """Measurements by name, on disk after each."""
+    """Measurements by name, written to disk after each one."""
 
     def __init__(self, folder: Path, seconds: float):
         folder.mkdir(parents=True, exist_ok=True)
@@ -68,7 +68,7 @@ class Results:
         self.values: dict[str, Any] = json.loads(self._path.read_text()) if self._path.is_file() else {}
 
     def measure(self, name: str, function: Callable[[], Any], *, needs: float = 0.0) -> None:
-        """Keep what a function returns, unless it is there already or the time is over."""
+        """Store the result of a function, unless it is there already or no time is left."""
         if name in self.values:
             return
         if time.monotonic() + needs > self._until:
@@ -76,14 +76,14 @@ class Results:
             return
         try:
             self.values[name] = function()
-        except Exception as error:  # the rest is worth knowing all the same
+        except Exception as error:  # the other measurements are still useful
             self.values[name] = {"error": f"{type(error).__name__}: {error}"}
         print(f"{name}: {self.values[name]}", flush=True)
         self._path.write_text(json.dumps(self.values, indent=1))
 
 
 def timed(function: Callable[[], Any], device: Any, repeats: int) -> float:
-    """Median seconds of a call, by the device's clock."""
+    """Return the median seconds of a call, by the device's clock."""
     import torch
 
     if device.type != "cuda":
@@ -104,7 +104,7 @@ def timed(function: Callable[[], Any], device: Any, repeats: int) -> float:
 
 
 def correct(dry: bool) -> str:
-    """Run the tests of the kernels; the last line of their output."""
+    """Run the tests of the kernels; raise an error with the end of their output if one fails."""
     only = ["-k", "adam_rows"] if dry else []
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "tests/triton_kernels.py", *only]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
@@ -114,7 +114,7 @@ def correct(dry: bool) -> str:
 
 
 def stages(samples: int, log2_rows: int, device: Any, repeats: int) -> dict[str, float]:
-    """Nanoseconds per sample of every kernel, for 32 samples a ray."""
+    """Return nanoseconds per sample of every kernel, with 32 samples per ray."""
     import torch
 
     from nerfcli.kernels.interface import HashGrid, March, Rays
@@ -184,7 +184,7 @@ def stages(samples: int, log2_rows: int, device: Any, repeats: int) -> dict[str,
 
 
 def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[Any, Any]:
-    """A fresh training by the GPU kernels, and the frame that it is in."""
+    """Return a fresh training with the GPU kernels, and the similarity to its training frame."""
     from nerfcli import scene
     from nerfcli.fit.extent import choose_extent
     from nerfcli.fit.fitting import Fitting
@@ -215,7 +215,7 @@ def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[
 
 
 def same_losses(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
-    """How far the losses of the first six steps are from those in plain torch, relatively; float16 makes about 1e-4.
+    """Return relative differences of the losses of six steps from those in plain torch; float16 causes about 1e-4.
 
     Raises:
         RuntimeError: more than 1e-2.
@@ -239,7 +239,7 @@ def same_losses(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
 
 
 def whole_step(capture: Path, device: Any, batch: int, sizes: Sizes) -> dict[str, float]:
-    """Millions of samples per second of whole steps, with their quartiles, after some training."""
+    """Return millions of samples per second of whole steps, with quartiles, after some training."""
     import torch
 
     fitting, _ = fitting_of(capture, device, batch, sizes.log2_rows[min(1, len(sizes.log2_rows) - 1)])
@@ -257,9 +257,10 @@ def whole_step(capture: Path, device: Any, batch: int, sizes: Sizes) -> dict[str
 
 
 def launches(capture: Path, device: Any, sizes: Sizes) -> dict[str, int]:
-    """Kernels that a step starts, nerfcli's and torch's, and how often the host waits for the device.
+    """Count the kernels of nerfcli and of torch that a step launches, and the host's waits for the device.
 
-    Torch's are those of the forward pass and the optimiser on a GPU, where gradients are computed in another thread.
+    On a GPU, only torch's kernels of the forward pass and the optimiser are counted, as gradients are computed in
+    another thread.
     """
     import warnings
 
@@ -290,7 +291,7 @@ def launches(capture: Path, device: Any, sizes: Sizes) -> dict[str, int]:
             fitting.advance(0.6)
     finally:
         launch.variant_of = original
-    ignored = (*VIEWS, "set_", "copy_") if device.type == "cpu" else VIEWS  # those are the interpreter's
+    ignored = (*VIEWS, "set_", "copy_") if device.type == "cpu" else VIEWS  # the interpreter causes these
     of_torch = sum(count for name, count in operations.items() if name not in ignored)
     found = {"kernels of nerfcli": ours.total(), "operations of torch": of_torch}
     if device.type == "cpu":
@@ -304,7 +305,7 @@ def launches(capture: Path, device: Any, sizes: Sizes) -> dict[str, int]:
 
 
 def quality(capture: Path, device: str, seconds: int, folder: Path, *, dry: bool) -> dict[str, float]:
-    """Held-out PSNR after a training of so many seconds."""
+    """Return held-out PSNR after a training of `seconds`."""
     import nerfcli
     from nerfcli.runs.settings import TrainSettings, sizes_for
 
@@ -320,7 +321,7 @@ def quality(capture: Path, device: str, seconds: int, folder: Path, *, dry: bool
 
 
 def pictures(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
-    """Pictures per second at 800x800 after a short training."""
+    """Return square pictures per second (800x800 at full size) after a short training."""
     from nerfcli import scene
     from nerfcli.cameras.camera import Camera
     from nerfcli.render.model import Model
@@ -341,7 +342,7 @@ def pictures(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
 
 
 def table(values: dict[str, Any]) -> str:
-    """The measurements as a table in Markdown."""
+    """Return the measurements as a Markdown table."""
     lines = ["| what | result |", "|---|---|"]
     for name, value in values.items():
         if isinstance(value, dict):
@@ -370,7 +371,7 @@ def main(
 
     sizes, where = (TINY, torch.device("cpu")) if dry else (FULL, torch.device(device))
     if not dry:
-        if (why_not := kernels.why_not_triton(where)) is not None:
+        if (why_not := kernels.triton_unavailable_reason(where)) is not None:
             raise typer.BadParameter(f"the GPU kernels do not run on {device}: {why_not}", param_hint="--device")
         kernels.prepare(print, device)
     results = Results(output, 60 * minutes)

@@ -1,11 +1,11 @@
-"""Speed and error of every compiled kernel, beside the plain-torch reference in the same run.
+"""Speed and error of every compiled kernel, compared with the plain-torch reference in the same run.
 
     python benchmarks/kernels.py -o kernels.csv
     python benchmarks/kernels.py --sizes 131072 --log2-rows 17,19 --threads 1
 
-A line per kernel, direction, size, table and thread count: nanoseconds per sample (median and quartiles), how many
-times faster than the reference, and the largest error against the reference in float64, relative to the largest value.
-Rays of 32 samples, in order, as training has them. Let nothing else run meanwhile.
+One line per kernel, direction, size, table and thread count: nanoseconds per sample (median and quartiles), speed-up
+over the reference, and the largest error against the reference in float64, relative to the largest value. Rays have 32
+samples in order, as in training. Run nothing else meanwhile.
 """
 
 import csv
@@ -53,9 +53,9 @@ class Operation:
 
     Args:
         name: of the kernel.
-        fast, exact: take the inputs, give the outputs.
+        fast, exact: map the inputs to the outputs.
         inputs: differentiable, float32; `exact` also takes them in float64.
-        has_backward: whether the kernel gives gradients.
+        has_backward: whether the kernel has gradients.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Operation:
 
 
 def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
-    """Every kernel on `samples` samples along random straight rays through the unit cube."""
+    """Yield every kernel on `samples` samples along random straight rays through the unit cube."""
     generator = torch.Generator().manual_seed(0)
     torch.manual_seed(0)
     rays = -(-samples // SAMPLES_PER_RAY)
@@ -81,7 +81,7 @@ def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
         "hash_encode",
         (table,),
         lambda t: (numba_cpu.hash_encode(points, t, resolutions),),
-        # float64 takes the coordinates as float32 scales them: at 1024 cells these alone cost 4 digits
+        # also in float64, coordinates are scaled in float32: at 1024 cells that rounding alone costs 4 digits
         lambda t: (reference.hash_encode(points, t, resolutions).to(t.dtype),),
     )
     encoded = reference.hash_encode(points, table, resolutions)
@@ -107,7 +107,7 @@ def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
     occupied = torch.ones(64, 64, 64, dtype=torch.bool)
 
     def follow(module: Any, table: Tensor) -> tuple[Tensor, ...]:
-        """Density and features; nothing is dense enough to end a ray. The jitter of 0 keeps all 32 steps of a ray."""
+        """Return density and features, too thin to end a ray; a jitter of 0 keeps all 32 steps of each ray."""
         o, d, e, *layers = (x.to(table.dtype) for x in (origins, axis, edges, *weights))
         out = module.visible_samples(
             Rays(o, d, torch.zeros_like(o[:, 0])),
@@ -145,7 +145,7 @@ def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
     rows[3] = rows[3].square()
 
     def step(module: Any, dtype: torch.dtype) -> tuple[Tensor, ...]:
-        """One step of Adam on as many rows as there are samples, each touched; with the time to copy the arrays."""
+        """Take a step of Adam on `samples` rows with gradients; the time includes copying the arrays."""
         arrays = [x.to(dtype, copy=True) for x in rows]
         module.adam_rows(*arrays, step=3, rate=0.01, betas=(0.9, 0.99), eps=1e-15)
         return arrays[0], arrays[2], arrays[3]
@@ -160,7 +160,7 @@ def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
 
 
 def median_seconds(action: Callable[[], object]) -> tuple[float, float, float]:
-    """Median and quartiles of the time that `action` takes, after one call that is not counted."""
+    """Return median and quartiles of the seconds that `action` takes, after a call that does not count."""
     action()
     times: list[float] = []
     until = time.perf_counter() + SECONDS_EACH
@@ -173,7 +173,7 @@ def median_seconds(action: Callable[[], object]) -> tuple[float, float, float]:
 
 
 def relative_error(actual: tuple[Tensor, ...], exact: tuple[Tensor, ...]) -> float:
-    """The largest difference, relative to the largest value of its tensor."""
+    """Return the largest difference, relative to the largest value of its tensor."""
     worst = 0.0
     for a, b in zip(actual, exact, strict=True):
         scale = b.abs().max().item()
@@ -182,7 +182,7 @@ def relative_error(actual: tuple[Tensor, ...], exact: tuple[Tensor, ...]) -> flo
 
 
 def measure(operation: Operation, samples: int, log2_rows: int, threads: int) -> Iterator[Measurement]:
-    """Forward and backward of one kernel."""
+    """Measure the forward and backward passes of one kernel."""
 
     def leaves(dtype: torch.dtype) -> tuple[Tensor, ...]:
         return tuple(x.to(dtype, copy=True).requires_grad_(operation.has_backward) for x in operation.inputs)
@@ -215,7 +215,7 @@ def measure(operation: Operation, samples: int, log2_rows: int, threads: int) ->
 
 
 def numbers(text: str) -> list[int]:
-    """A comma-separated list."""
+    """Parse a comma-separated list."""
     return [int(part) for part in text.split(",")]
 
 

@@ -1,12 +1,12 @@
-"""What a kill does: poses, train and render, killed at random moments of their work, again and again.
+"""Effects of kills: poses, train and render, killed repeatedly at random moments.
 
     python benchmarks/kills.py --count 20 -o kills.csv
 
-SIGKILL comes at a random moment after the first file has appeared; every second time it waits for a file that is just
-being written. The same command is given again (train with --resume where a state is there) and killed again. One that
-comes to its end is compared with a command that nobody disturbed, file by file, and the next begins from nothing. After
-the last kill one is left alone and compared, too. Captures are small, and training saves a checkpoint several times a
-second instead of every 30, so that kills meet it.
+SIGKILL is sent at a random moment after the first file has appeared; every second time it also waits until a file is
+being written. The same command is then run and killed again (train with --resume if there is a state). If it completes,
+its result is compared file by file with that of an undisturbed command, and the next one starts from scratch. After the
+last kill, the command is left to complete and is compared, too. Captures are small, and training saves a checkpoint
+every 0.3 s instead of every 30 s, so that kills hit that as well.
 """
 
 import csv
@@ -34,12 +34,12 @@ nerfcli.train.loop.CHECKPOINT_SECONDS = {CHECKPOINT_SECONDS}
 from nerfcli.cli import main
 main()
 """
-# Beside these, results hold times of day and durations.
+# Files to compare; the other files of these results contain times of day and durations.
 TOLD = {
     "poses": ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"),
     "train": ("field.safetensors", "cameras.json", "config.json"),
 }
-WRITING = (".partial-", "-journal", "-wal")  # in the names of files; the last two are SQLite's
+WRITING = (".partial-", "-journal", "-wal")  # parts of file names; the last two are of SQLite
 LOOK_EVERY_SECONDS = 0.002
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -47,7 +47,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 @dataclass(frozen=True)
 class Given:
-    """A command without its output folder, and what it must not touch."""
+    """A command without its output folder, and the inputs that it must not change."""
 
     name: str
     words: tuple[object, ...]
@@ -55,8 +55,11 @@ class Given:
 
 
 def commands(place: Path, run: Path | None) -> list[Given]:
-    """Poses of 12 small photos of the desk, 200 steps on spheres, 60 small pictures of those or of a copy of `run`; and
-    the captures for them."""
+    """Write the captures and return the commands.
+
+    These are: poses of 12 small photos of the desk; 200 steps on spheres; 60 small pictures of a run on spheres, or of
+    a copy of `run`.
+    """
     make_capture(place / "capture")
     photos, capture = place / "photos", place / "capture"
     photos.mkdir()
@@ -77,7 +80,7 @@ def commands(place: Path, run: Path | None) -> list[Given]:
 
 
 def started(given: Given, output: Path) -> subprocess.Popen[str]:
-    """The command in a process of its own; it goes on where there is something to go on from."""
+    """Start the command in a separate process; a training resumes if there is a state."""
     words = [*given.words, "-o", output, "--threads", "1", "--quiet"]
     if given.name == "train" and (output / "state.safetensors").exists():
         words.append("--resume")
@@ -87,7 +90,7 @@ def started(given: Given, output: Path) -> subprocess.Popen[str]:
 
 
 def files_around(output: Path) -> set[str]:
-    """Everything in the output folder and in hidden ones beside it."""
+    """Return all files in the output folder and beside it."""
     found = set[str]()
     for folder, _, files in os.walk(output.parent):
         found.update(os.path.join(folder, file) for file in files)
@@ -95,7 +98,7 @@ def files_around(output: Path) -> set[str]:
 
 
 def undisturbed(given: Given, output: Path) -> tuple[float, float]:
-    """Run a command to its end: seconds until it had begun to write, and in all.
+    """Run a command to its end; return the seconds until it began to write, and in total.
 
     Raises:
         SystemExit: it fails.
@@ -112,10 +115,10 @@ def undisturbed(given: Given, output: Path) -> tuple[float, float]:
 
 
 def killed(process: subprocess.Popen[str], output: Path, *, after: float, writing: bool) -> str:
-    """Kill a process after some seconds or, `writing`, as soon as a file is being written then.
+    """Kill a process after some seconds or, if `writing`, as soon as a file is being written after that.
 
     Returns:
-        "done" where it came to its end before, else what was going on: "writing" or "working".
+        "done" if it completed before, "exit CODE: ..." if it failed, else what it was doing: "writing" or "working".
     """
     end = time.monotonic() + after
     while process.poll() is None:
@@ -132,7 +135,7 @@ def killed(process: subprocess.Popen[str], output: Path, *, after: float, writin
 
 
 def differing(name: str, whole: Path, part: Path) -> list[str]:
-    """The files that are not the same in two results, or missing, times and places of runs aside."""
+    """Return the files that differ between two results or are missing, and leftovers of unfinished writing."""
     one, other = digests(whole), digests(part)
     names = TOLD.get(name) or sorted(one.keys() | other.keys())
     leftovers = [file for file in other if "partial" in file or "unfinished" in file]

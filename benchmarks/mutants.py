@@ -1,10 +1,10 @@
-"""Whether the tests notice a broken kernel: every operation is broken on purpose, one place at a time.
+"""Mutation testing: do the tests notice operations that are broken on purpose, one place at a time?
 
     python benchmarks/mutants.py -o mutants.csv [--only compositing]
 
 A mutant is one text of one file replaced by another (a sign, an index, a factor, a missing clamp) in a copy of the
-program; the tests of that file run against it until the first fails. It is killed if one fails, survives if none does.
-What survives needs a test, or a reason why no test can tell. The lists of mutants stand in `mutant_list.py`,
+program; the tests of that file run against it until the first fails. The mutant is killed if one fails, else it
+survives. A survivor needs a test, or a reason why no test can detect it. The lists of mutants are in `mutant_list.py`,
 `mutant_list_training.py` and `mutant_list_triton.py`.
 """
 
@@ -38,14 +38,14 @@ from rich.table import Table
 ROOT = Path(__file__).parent.parent
 # A broken loop may never end.
 SECONDS = 900.0
-# pytest's exit codes for an error of its own, wrong usage, and no tests.
+# pytest's exit codes for an internal error, wrong usage, and no tests.
 _NOT_RUN = (3, 4, 5)
 
 
 def tree_with(mutant: Mutant, group: Group, folder: Path) -> Path:
-    """A copy of the program with the mutant in it, beside the tests as they are."""
+    """Return a copy of the program that contains the mutant, with links to the unchanged tests."""
     tree = folder / "tree"
-    shutil.copytree(ROOT / "nerfcli", tree / "nerfcli")  # with the compiled kernels, and the times they are known by
+    shutil.copytree(ROOT / "nerfcli", tree / "nerfcli")  # with the compiled kernels, known by their timestamps
     for name in ("tests", "sample_scenes", "benchmarks", "pyproject.toml"):
         (tree / name).symlink_to(ROOT / name)
     path = tree / "nerfcli" / group.file
@@ -60,7 +60,7 @@ def tree_with(mutant: Mutant, group: Group, folder: Path) -> Path:
 
 
 def run_tests(tree: Path, group: Group, log: Path) -> None:
-    """In a process of its own: the tests until the first that fails; its exit code says whether one did."""
+    """Run the tests until the first failure, in this child process, and exit with pytest's code."""
     os.setpgid(0, 0)
     os.chdir(tree)
     sys.path[:0] = [str(tree), str(tree / "tests")]
@@ -75,22 +75,22 @@ def run_tests(tree: Path, group: Group, log: Path) -> None:
 
 
 def keep_machine_code(kernels: Path) -> None:
-    """Vouch for what is compiled: what the mutant is in has been taken away, and the rest is not compiled each time."""
+    """Mark the copied machine code as current (that of the mutant is deleted), so that it is not compiled again."""
     spec = importlib.util.spec_from_file_location("machine_code", kernels / "machine_code.py")
     assert spec is not None
     assert spec.loader is not None
     machine_code = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(machine_code)  # by itself: the package would discard all at once
+    spec.loader.exec_module(machine_code)  # without its package, which would discard all compiled code
     machine_code.note_sources(machine_code.sources(), kernels / "__pycache__")
 
 
 def verdict_of(mutant: Mutant, group: Group) -> tuple[str, float]:
-    """Which test killed it, or that none did, and the seconds that it took."""
+    """Return which test killed the mutant, or that it survived, and the seconds that this took."""
     with tempfile.TemporaryDirectory(prefix="mutant-") as temporary:
         folder = Path(temporary)
         tree = tree_with(mutant, group, folder)
         began = time.perf_counter()
-        # Forked, so that torch and what stands above need not be loaded each time; nothing of the program is yet.
+        # Forked, so that torch and the other imports above are loaded only once; nothing of the program is loaded yet.
         process = multiprocessing.get_context("fork").Process(target=run_tests, args=(tree, group, folder / "log"))
         process.start()
         process.join(SECONDS)

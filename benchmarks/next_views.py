@@ -1,13 +1,13 @@
-"""What the views that `nerfcli doctor RUN` suggests gain, in surface and in dB, beside random ones.
+"""Gain of the views that `nerfcli doctor RUN` suggests, in surface seen and in dB, compared with random views.
 
     python benchmarks/next_views.py desk -o next-views-desk
     python benchmarks/next_views.py path/to/fox -o next-views-fox --downscale 8
 
-Photos are sorted by their direction from the middle; a third of them, side by side, is withheld. Every fourth of these
-measures, the others are candidates. A field is trained on the rest, four candidates are chosen by the rule of `doctor`,
-or at random, and a field is trained with them. Held-out PSNR is the mean over the photos that measure. The surface is
-what any photo sees, by a field that is trained on all photos but a few; counted is what two of those used see.
-Everything that is there already is kept; writes OUT/table.csv.
+Photos are sorted by their direction from the middle, and a contiguous third is withheld. Every fourth of these is a
+test photo, the others are candidates. A field is trained on the rest; four candidates are chosen by the rule of
+`doctor` or at random; and a field is trained with them added. Held-out PSNR is the mean over the test photos. The
+surface consists of the points that any photo sees, by the depths of a field trained on all photos but a few; the table
+has the fraction of it that at least two of the photos in use see. Existing runs are kept; writes OUT/table.csv.
 """
 
 import csv
@@ -52,7 +52,7 @@ def around(frames: Sequence[Frame]) -> list[Frame]:
 
 
 def suggested(run: Run, candidates: Sequence[Frame]) -> list[str]:
-    """Return the names of the candidates that `doctor` would choose from, best first."""
+    """Return the names of the candidates that `doctor` would suggest, best first."""
     model = run.model()
     photos = photo_depths(run, model, on_progress=lambda share: None, notify=print)
     views = depth_maps(model, candidates, max_size=CANDIDATE_PX)
@@ -65,7 +65,7 @@ def suggested(run: Run, candidates: Sequence[Frame]) -> list[str]:
 
 
 def surface_of(run: Run, frames: Sequence[Frame]) -> dict[str, np.ndarray]:
-    """Return which points (N,) of the surface each photo sees, by name, by the depths of one field."""
+    """Return for each photo, by name, which points (N,) of the surface it sees, by the depths of one field."""
     model = run.model()
     views = depth_maps(model, frames, max_size=CANDIDATE_PX)
     low, high = np.array(scene_box(model, frames)).reshape(2, 3)
@@ -74,12 +74,12 @@ def surface_of(run: Run, frames: Sequence[Frame]) -> dict[str, np.ndarray]:
 
 
 def seen_twice(surface: dict[str, np.ndarray], without: Sequence[str]) -> float:
-    """Return which part of the surface two photos or more see, without some."""
+    """Return the fraction of the surface that at least two photos see, not counting the photos in `without`."""
     return float((np.sum([seen for name, seen in surface.items() if name not in without], axis=0) >= 2).mean())
 
 
 def field_of(capture: Path, folder: Path, held_out: Sequence[str], settings: TrainSettings) -> Run:
-    """Train on all photos but those held out, or return the run that is there."""
+    """Train on all photos but those held out, or return the existing run."""
     names = folder.with_suffix(".txt")
     names.parent.mkdir(parents=True, exist_ok=True)
     names.write_text("\n".join(held_out), encoding="utf-8")

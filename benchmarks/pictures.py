@@ -49,7 +49,7 @@ def _picture(folder: Path, quality: Quality = Quality()) -> RenderedPicture:
 
 
 def _seconds(folder: Path, threads: int, repeats: int) -> str:
-    """Median and range of the seconds of the first held-out view."""
+    """Return median and range of the seconds for the first held-out view."""
     torch.set_num_threads(threads)
     run = Run(folder)
     model = run.model()

@@ -1,18 +1,18 @@
-"""Structure from motion on captures whose poses are known: seconds against error, for each quality.
+"""Structure from motion on captures with known poses: time and error, for each quality.
 
     python benchmarks/poses.py captures/fox captures/dtu24 -o poses
     python benchmarks/poses.py captures/redkitchen/handheld_video.mp4 captures/banana -o poses --qualities default
 
-A capture is a folder with photos in images/, or a video. Its truth is read from what stands beside them:
-transforms.json, cameras_sphere.npz (projection matrices, as IDR and NeuS have them), or pose/ with a camera-to-world
-matrix per frame. Without truth only the counts are printed. Calls `nerfcli poses`, so that what is measured is what
-users get; scenes are kept in OUT-scenes/, and not made again. Writes OUT.csv and prints a table.
+A capture is a folder with photos in images/, or a video. Its truth is read from a file or folder beside them:
+transforms.json, cameras_sphere.npz (projection matrices, as in IDR and NeuS), or pose/ with a camera-to-world matrix
+per frame. Without truth only the counts are printed. Calls `nerfcli poses`, to measure what users get; existing scenes
+in OUT-scenes/ are reused. Writes OUT.csv and prints a table.
 
 How to read it: ATE is the RMS distance of camera centres from the true ones after the best similarity, over the RMS
-distance of the true ones from their mean. Rotations are compared after the same similarity; "own axes" is the rotation
-that all cameras share about their own axes, and what is left without it: a principal point that truth and result place
-differently turns all cameras alike, and projects the same. AUC is over all pairs of photos, of the larger of the
-errors of their relative rotation and of their baseline's direction; a photo that is not placed counts as wrong.
+distance of the true ones from their mean. Rotations are compared after the same similarity. "own axes" is the rotation
+error that all cameras have in common in their own axes, plus the remaining error: a different principal point in truth
+and result rotates all cameras alike, with the same projections. AUC is over all pairs of photos, for the larger of the
+errors of relative rotation and of baseline direction; a photo that is not placed counts as wrong.
 """
 
 import csv
@@ -40,7 +40,7 @@ from nerfcli.errors import TOO_FEW_PHOTOS
 from nerfcli.media.images import image_size, list_images
 
 NAN = float("nan")
-# Frames of a video between two given poses get one by interpolation, if these are no farther apart.
+# Frames of a video between two known poses at most this far apart get an interpolated pose.
 MOST_FRAMES_BETWEEN = 10
 
 
@@ -54,7 +54,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How far poses are from the truth: see the module's text. NaN where fewer than three photos have both."""
+    """Errors of poses: see the module's docstring. NaN if fewer than three photos have both poses."""
 
     compared: int = 0
     ate: float = NAN
@@ -86,11 +86,11 @@ class Row:
 
 
 def compare_poses(truth: Sequence[np.ndarray], found: Sequence[np.ndarray], *, missing: int = 0) -> Accuracy:
-    """How far poses are from the truth.
+    """Return the errors of poses.
 
     Args:
-        truth, found: world_from_cam (4, 4) of the same photos, each in a world of its own.
-        missing: photos that have a truth and were not found.
+        truth, found: world_from_cam (4, 4) of the same photos; the two worlds differ by a similarity.
+        missing: number of photos with a true pose that were not placed.
     """
     if len(truth) < 3:
         return Accuracy(compared=len(truth))
@@ -119,12 +119,12 @@ def compare_poses(truth: Sequence[np.ndarray], found: Sequence[np.ndarray], *, m
 
 
 def area_under_curve(errors: np.ndarray, limit: float) -> float:
-    """Mean over all thresholds from 0 to `limit` of the share of errors below the threshold; 1 if all are 0."""
+    """Return the mean, over thresholds from 0 to `limit`, of the fraction of errors below; 1 if all errors are 0."""
     return float(np.mean(np.clip(1 - errors / limit, 0, 1)))
 
 
 def _relative_errors(t: np.ndarray, f: np.ndarray) -> np.ndarray:
-    """Degrees, per pair: the larger of the errors of relative rotation and of the baseline's direction."""
+    """Return for each pair, in degrees, the larger of the errors of relative rotation and baseline direction."""
     one, other = np.triu_indices(len(t), 1)
 
     def relative(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,7 +142,7 @@ def _pairs(count: int) -> int:
 
 
 def read_truth(capture: Path, photos: Path) -> Truth:
-    """What is known of the photos in the folder `photos` of a capture; nothing where nothing is."""
+    """Return the known poses of the photos in the folder `photos` of a capture; empty if there are none."""
     home = capture if capture.is_dir() else capture.parent
     names = [path.name for path in list_images(photos)]
     if (home / "pose").is_dir():
@@ -157,7 +157,7 @@ def read_truth(capture: Path, photos: Path) -> Truth:
 
 
 def _truth_of_projections(path: Path, photos: Path, names: Sequence[str]) -> Truth:
-    """From world_mat_i = K [R | t] of the i-th photo, in pixels of a picture whose centre is about K's."""
+    """Read poses from world_mat_i = K [R | t] of photo i, in pixels of a picture centred near K's principal point."""
     matrices, poses, focals = np.load(path), {}, {}
     for index, name in enumerate(names):
         k, rotation = rq(matrices[f"world_mat_{index}"][:3, :3])
@@ -168,14 +168,14 @@ def _truth_of_projections(path: Path, photos: Path, names: Sequence[str]) -> Tru
             rotation, translation = -rotation, -translation
         poses[name] = rigid.inverse(rigid.from_parts(rotation, translation))
         k = k / k[2, 2]
-        # The pictures may have been made smaller by a whole factor since they were calibrated.
+        # The pictures may have been reduced by an integer factor since calibration.
         factor = round(2 * k[0, 2] / image_size(photos / name)[0])
         focals[name] = float(k[0, 0] + k[1, 1]) / 2 / factor
     return Truth(poses, focals)
 
 
 def _truth_of_matrices(folder: Path, photos: Path, names: Sequence[str]) -> Truth:
-    """From a 4 x 4 camera-to-world matrix per numbered frame; frames in between by splines through those."""
+    """Read a 4 x 4 camera-to-world matrix per numbered frame; interpolate frames in between by splines."""
     given = {int(path.stem.split("-")[-1]): np.loadtxt(path) for path in sorted(folder.glob("*.txt"))}
     numbers = np.array(sorted(given))
     rotations = rigid.nearest_rotation(np.array([given[n][:3, :3] for n in numbers]))
@@ -193,7 +193,7 @@ def _truth_of_matrices(folder: Path, photos: Path, names: Sequence[str]) -> Trut
 
 
 def measure(capture: Path, quality: str, folder: Path, *, seed: int, threads: int) -> Row:
-    """Find the poses of a capture, unless they are there already, and compare them with its truth."""
+    """Find the poses of a capture, unless they exist already, and compare them with its truth."""
     name = capture.stem if capture.is_file() else capture.name
     target = folder / f"{name}-{quality}"
     source = capture if capture.is_file() or not (capture / "images").is_dir() else capture / "images"
@@ -230,7 +230,7 @@ def measure(capture: Path, quality: str, folder: Path, *, seed: int, threads: in
 
 
 def print_table(rows: Sequence[Row]) -> None:
-    """A line per capture and quality."""
+    """Print one line per capture and quality."""
     table = Table(title="nerfcli poses against known poses")
     for name in ("capture", "quality", "extract s", "match s", "map s", "total s", "placed", "ATE", "rotation deg"):
         table.add_column(name, justify="left" if name in ("capture", "quality") else "right")

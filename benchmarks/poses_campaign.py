@@ -1,9 +1,9 @@
-"""Structure from motion on a list of captures, as a stranger runs it: `nerfcli poses PHOTOS`, defaults, one row each.
+"""Structure from motion on a list of captures, as a new user runs it: `nerfcli poses PHOTOS` with defaults.
 
     python benchmarks/poses_campaign.py captures.toml -o before
     python benchmarks/poses_campaign.py captures.toml -o after --only fountain --limit 900
 
-The list is TOML, a table per capture; paths are relative to the list's folder:
+The list is a TOML file with a table per capture; paths are relative to the list's folder:
 
     [fountain]
     photos = "fountain-P11/images"             # a folder or a video
@@ -12,17 +12,17 @@ The list is TOML, a table per capture; paths are relative to the list's folder:
 
 Truth is any of: a COLMAP model, transforms.json or another file that `nerfcli convert` reads; a folder of .camera
 files (Strecha's multi-view evaluation); a file of P matrices "name K R t" (Middlebury's *_par.txt); a folder with a
-3 x 4 matrix per photo named PHOTO_P.txt. Cameras of truth are resized to the photos' size.
+3 x 4 matrix per photo named PHOTO_P.txt. True cameras are resized to the photos' size.
 
 Scenes, the output of each command (NAME.log) and its row (NAME.json) are kept in the folder OUT, and a capture that has
-a row is not run again. Writes OUT.csv and prints a table. The interpreter runs `-m nerfcli` from wherever PYTHONPATH
-points, so that two versions are compared by two calls.
+a row is not run again. Writes OUT.csv and prints a table. The command is `-m nerfcli` as found by PYTHONPATH, so that
+two versions can be compared by two calls.
 
-How to read it: CPU seconds are those of the command and its children, which differ little on a machine that others use
-too. ATE and rotations are as in poses.py; where centres are nearly on a line or in a clump, the similarity leaves the
-rotations loose, and "rel. deg", the median error of the rotation between two photos, says more. The lens error is how
-far pixels move when the true lens is replaced by the one found, over a grid of the photo, after the rotation that makes
-them agree best: RMS, and the largest.
+How to read it: CPU seconds are those of the command and its children, and vary little on a shared machine. ATE and
+rotations are as in poses.py. If centres are nearly collinear or clumped, the similarity does not fix the rotations, and
+"rel. deg", the median error of the rotation between two photos, is more informative. The lens error is the distance by
+which pixels move when the lens found replaces the true one, over a grid of the photo and after the best-fitting
+rotation: RMS, and the largest.
 """
 
 import csv
@@ -55,14 +55,14 @@ from nerfcli.convert.formats import Given
 from nerfcli.errors import UserError
 from nerfcli.media.images import image_size, list_images
 
-# After SIGTERM the command may save its work for so many seconds.
+# Seconds that the command may take to save its work after SIGTERM.
 GRACE_S = 30
 GRID = 24
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A row of the list, with absolute paths."""
+    """A capture of the list, with absolute paths."""
 
     name: str
     photos: Path
@@ -72,7 +72,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class View:
-    """What is known of a photo: its pose, (4, 4) world_from_cam, and its lens, if that is of the photo as it is."""
+    """The truth of a photo: world_from_cam (4, 4), and its camera if that applies to the photo's pixels."""
 
     camera: Camera | None
     world_from_cam: np.ndarray
@@ -80,7 +80,7 @@ class View:
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one capture. exit_code is -1 where the limit of time ended the command."""
+    """The results of one capture. exit_code is -1 if the time limit ended the command."""
 
     capture: str
     photos: int
@@ -104,7 +104,7 @@ class Row:
 
 
 def read_list(path: Path) -> list[Capture]:
-    """The captures of a list."""
+    """Return the captures of a list."""
     content = tomllib.loads(path.read_text(encoding="utf-8"))
     home = path.resolve().parent
     return [
@@ -119,7 +119,7 @@ def read_list(path: Path) -> list[Capture]:
 
 
 def read_truth(path: Path, photos: Mapping[str, tuple[int, int]]) -> dict[str, View]:
-    """Known cameras by the photos' names, resized to the photos' sizes (width, height)."""
+    """Return the true cameras by photo name, resized to the photos' sizes (width, height)."""
     if path.is_dir() and any(path.glob("*.camera")):
         views = _strecha(path)
     elif path.is_dir() and any(path.glob("*_P.txt")):
@@ -141,7 +141,7 @@ def _resized(view: View, size: tuple[int, int]) -> View:
 
 
 def _strecha(folder: Path) -> dict[str, View]:
-    """NAME.camera: K (3 rows), three zeros, world_from_cam's rotation (3 rows), the centre, width and height."""
+    """Read NAME.camera: K (3 rows), three zeros, world_from_cam's rotation (3 rows), the centre, width and height."""
     views = {}
     for path in sorted(folder.glob("*.camera")):
         numbers = np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64)
@@ -152,7 +152,7 @@ def _strecha(folder: Path) -> dict[str, View]:
 
 
 def _middlebury(path: Path, photos: Mapping[str, tuple[int, int]]) -> dict[str, View]:
-    """A line per photo: its name, K, cam_from_world's rotation and translation."""
+    """Read a line per photo: its name, K, cam_from_world's rotation and translation."""
     views = {}
     for line in path.read_text(encoding="utf-8").splitlines()[1:]:
         name, *words = line.split()
@@ -165,7 +165,7 @@ def _middlebury(path: Path, photos: Mapping[str, tuple[int, int]]) -> dict[str, 
 
 
 def _projections(folder: Path, photos: Mapping[str, tuple[int, int]]) -> dict[str, View]:
-    """PHOTO_P.txt: K [R | t] up to scale, perhaps after a line CONTOUR; a suffix of PHOTO may be left out."""
+    """Read PHOTO_P.txt: K [R | t] up to scale, perhaps after a line CONTOUR; PHOTO may lack its suffix."""
     views = {}
     for name, size in photos.items():
         path = next(folder.glob(f"{Path(name).stem.split('.')[0]}_P.txt"), None)
@@ -183,13 +183,13 @@ def _projections(folder: Path, photos: Mapping[str, tuple[int, int]]) -> dict[st
 
 
 def _pinhole_view(k: np.ndarray, rotation: np.ndarray, translation: np.ndarray, *, size: tuple[int, int]) -> View:
-    # These write the centre of the first pixel as 0, we as 0.5.
+    # In these formats the centre of the first pixel is 0; here it is 0.5.
     camera = Camera("PINHOLE", *size, (k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5))
     return View(camera, rigid.inverse(rigid.from_parts(rigid.nearest_rotation(rotation), translation)))
 
 
 def lens_error(true: Camera, found: Camera) -> tuple[float, float]:
-    """Pixels (RMS, largest) between two lenses of one photo, after the rotation that makes them agree best."""
+    """Return the distance in pixels (RMS, largest) between two lenses of one photo, after the best-fitting rotation."""
     axes = [(np.arange(GRID) + 0.5) * length / GRID for length in (true.width, true.height)]
     pixels = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     (seen, valid), (other, other_valid) = true.bearings(pixels), found.bearings(pixels)
@@ -203,7 +203,7 @@ def lens_error(true: Camera, found: Camera) -> tuple[float, float]:
 
 
 def relative_rotation_deg(truth: Sequence[np.ndarray], found: Sequence[np.ndarray]) -> float:
-    """The median over all pairs of photos of the error of the rotation between them."""
+    """Return the median error, over all pairs of photos, of the rotation between them."""
     one, other = np.triu_indices(len(truth), 1)
 
     def between(poses: Sequence[np.ndarray]) -> Rotation:
@@ -214,7 +214,7 @@ def relative_rotation_deg(truth: Sequence[np.ndarray], found: Sequence[np.ndarra
 
 
 def run(capture: Capture, folder: Path, *, limit_s: float) -> tuple[int, float, float]:
-    """Call `nerfcli poses` into folder/NAME: exit code (-1: stopped), seconds, CPU seconds."""
+    """Call `nerfcli poses` into folder/NAME; return exit code (-1: stopped), seconds and CPU seconds."""
     command = [sys.executable, "-P", "-m", "nerfcli", "poses", str(capture.photos), "-o", str(folder / capture.name)]
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     with (folder / f"{capture.name}.log").open("w", encoding="utf-8") as log:
@@ -240,13 +240,13 @@ def run(capture: Capture, folder: Path, *, limit_s: float) -> tuple[int, float, 
 
 
 def measure(capture: Capture, folder: Path, *, limit_s: float) -> Row:
-    """Run a capture and compare what it gave with what is known of it."""
+    """Run a capture and compare its result with its truth."""
     code, seconds, cpu = run(capture, folder, limit_s=limit_s)
     return judge(capture, folder, exit_code=code, seconds=seconds, cpu_seconds=cpu)
 
 
 def judge(capture: Capture, folder: Path, *, exit_code: int, seconds: float, cpu_seconds: float) -> Row:
-    """The row of a capture whose command has ended."""
+    """Return the row of a capture whose command has ended."""
     sizes = _photo_sizes(capture)
     shapes = sorted({f"{width}x{height}" for width, height in sizes.values()})
     target = folder / capture.name
@@ -311,26 +311,26 @@ def _photo_sizes(capture: Capture) -> dict[str, tuple[int, int]]:
     for path in list_images(capture.photos):
         try:
             sizes[path.name] = image_size(path)
-        except (UserError, OSError):  # the command has said so
+        except (UserError, OSError):  # the command reports it
             continue
     return sizes
 
 
 def _report(target: Path) -> dict[str, Any]:
-    """poses_report.json, which a refusal leaves too; nothing where the command did not get so far."""
+    """Return poses_report.json, which is also written on refusal; empty if the command ended before writing it."""
     path = target / "poses_report.json"
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def _error_text(log: Path) -> str:
-    """The error and its hint, as the command printed them; the last lines where there is none."""
+    """Return the error and its hint, as the command printed them, or the last lines if there is none."""
     lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     first = next((number for number, line in enumerate(lines) if line.startswith("Error")), max(len(lines) - 2, 0))
     return " ".join(lines[first:])[:600]
 
 
 def print_table(rows: Iterable[Row]) -> None:
-    """A line per capture."""
+    """Print one line per capture."""
     table = Table(title="nerfcli poses, capture by capture")
     names = (
         "capture",
@@ -366,7 +366,7 @@ def _text(value: float, form: str) -> str:
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """All numbers of all rows."""
+    """Write all numbers of all rows."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [field.name for field in fields(Row)])
         writer.writeheader()

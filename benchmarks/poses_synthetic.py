@@ -1,11 +1,11 @@
-"""Poses against synthetic truth: features and matches of known cameras, from the mapper to the verdict.
+"""Poses from features and matches of known synthetic cameras, from the mapper to the verdict.
 
     python benchmarks/poses_synthetic.py
     python benchmarks/poses_synthetic.py --seeds 3 -o poses_synthetic.csv
 
-A pair's error is the larger of the errors of its relative rotation and of its baseline's direction; a pair with a photo
-that was not placed has none small enough. AUC is the area under the share of pairs below an error, up to a bound, as a
-percentage of the largest possible. Captures that nobody can solve must be refused, with the reason.
+A pair's error is the larger of the errors of its relative rotation and of its baseline's direction, infinite if one of
+its photos was not placed. AUC is the area under the cumulative fraction of pairs by error, up to a bound, as a
+percentage of the largest possible. Captures that cannot be solved must be refused, with the reason.
 """
 
 import csv
@@ -34,9 +34,10 @@ USUAL = Noise()
 
 @dataclass(frozen=True)
 class Capture:
-    """Views of a scene, how noisy their features are, which pairs are compared.
+    """Views of a scene, the noise of their features, and the pairs to compare.
 
-    refused: what must be said of it. missing: how many of the photos, the last ones, show nothing that others do.
+    refused: words that the verdict must contain; None if the capture must be accepted. missing: number of photos, at
+    the end, that show nothing that others do.
     """
 
     views: list[View]
@@ -68,7 +69,7 @@ class Result:
 
 
 def captures(seed: int) -> dict[str, Capture]:
-    """By name. Some can be solved, and some only recognised."""
+    """Return the captures by name. Some can be solved; some can only be recognised as unsolvable."""
     ball = synthetic.boulder(1500, seed=seed)
     far = (40.0, 0.0, 0.0)
     apart = synthetic.together(ball, synthetic.boulder(1500, seed=seed + 1, centre=far))
@@ -151,7 +152,7 @@ def solve(name: str, capture: Capture, *, seed: int) -> Result:
 
 
 def pair_errors_deg(model: pycolmap.Reconstruction, views: list[View]) -> np.ndarray:
-    """The pose error of every pair of views, infinite where one was not placed."""
+    """Return the pose error of every pair of views; infinite if one of them was not placed."""
     placed = set(model.reg_image_ids())
     errors = []
     for i, j in combinations(range(len(views)), 2):
@@ -169,7 +170,7 @@ def pair_errors_deg(model: pycolmap.Reconstruction, views: list[View]) -> np.nda
 
 
 def worst_focal_percent(model: pycolmap.Reconstruction, views: list[View]) -> float:
-    """The largest error of a focal length; NaN where no photo's lens has the projection that it truly has."""
+    """Return the largest error of a focal length, over photos whose lens has the true kind of projection; else NaN."""
     errors = []
     for image_id in model.reg_image_ids():
         camera, lens = model.camera(model.image(image_id).camera_id), views[image_id - 1].lens
@@ -179,7 +180,7 @@ def worst_focal_percent(model: pycolmap.Reconstruction, views: list[View]) -> fl
 
 
 def auc(errors: np.ndarray, bound: float) -> float:
-    """Area under the cumulative share of errors up to a bound, per cent: the mean of 1 - error / bound, at least 0."""
+    """Return the area under the cumulative fraction of errors to a bound in per cent: mean of max(1 - e / bound, 0)."""
     return float(100 * np.maximum(1 - errors / bound, 0).mean())
 
 

@@ -75,7 +75,7 @@ def nerfstudio(picture: np.ndarray, photo: np.ndarray) -> tuple[float, float]:
 
 
 def nerfstudio_inside(picture: np.ndarray, photo: np.ndarray) -> tuple[float, float]:
-    """The same with data range 1, and windows inside the picture only."""
+    """PSNR and SSIM like `nerfstudio`, but with data range 1 and only windows inside the picture."""
     rgb, image = _tensors(picture, photo)
     full: Any = torchmetrics_ssim(image, rgb, data_range=1.0, return_full_image=True)[1]
     inside = full[..., BORDER:-BORDER, BORDER:-BORDER]
@@ -87,7 +87,7 @@ def _tensors(*pictures: np.ndarray) -> list[torch.Tensor]:
     return [torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)).permute(2, 0, 1)[None] for p in floats]
 
 
-# Name, function, whether of unrounded pictures, and whether its definition is ours.
+# Name, function, whether it takes unrounded pictures, and whether its definition is the same as ours.
 DEFINITIONS: tuple[tuple[str, Pair, bool, bool], ...] = (
     ("nerfbaselines", nerfbaselines, False, True),
     ("scikit-image", scikit_image, False, True),
@@ -97,7 +97,7 @@ DEFINITIONS: tuple[tuple[str, Pair, bool, bool], ...] = (
 
 
 def compare(run: Path) -> list[dict[str, Any]]:
-    """Per definition: our mean, theirs, and the largest difference of a single photo."""
+    """Return for each definition our mean, the recomputed mean, and the largest difference for a single photo."""
     folder = run / "predictions"
     info = json.loads((folder / "info.json").read_text())
     metrics = json.loads((run / "metrics.json").read_text())
@@ -139,7 +139,7 @@ def compare(run: Path) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Print the table, write it, and say whether all is within bounds."""
+    """Print and write the table; exit with 1 if a difference exceeds its bound."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("-o", "--output", type=Path)

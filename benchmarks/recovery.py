@@ -1,11 +1,11 @@
-"""How much of what the right component brings `--model auto` recovers, in the same total time, on scenes that need one.
+"""Gain of `--model auto` compared with that of the right component, in the same total time, on scenes that need one.
 
     python benchmarks/recovery.py -o recovery
     python benchmarks/recovery.py -o recovery --budget 200s --only poses --seeds 3
 
 Three trainings of each scene (see component_scenes.py): the default model, `auto` with its search in the budget, and
 the right component forced. Prints a table of held-out PSNR and writes OUT.csv, a line per training as soon as it is
-done; lines that are there already are not computed again. Speed is a part of the result: nothing else should run.
+done; existing lines are not computed again. Speed affects the results: run nothing else meanwhile.
 """
 
 import csv
@@ -27,7 +27,7 @@ MODELS = ("default", "auto", "right")
 
 
 def training(name: str, seed: int, model: str, budget: str) -> dict[str, object]:
-    """One line of the table."""
+    """Train once and return a line of the table."""
     options = ["--model", "auto" if model == "auto" else "default"]
     if model == "right":
         options += [word for key, value in NEEDED[name].items() for word in ("--with", f"{key}={value}")]
@@ -51,7 +51,7 @@ def training(name: str, seed: int, model: str, budget: str) -> dict[str, object]
 
 
 def print_table(lines: list[dict[str, str]], budget: str) -> None:
-    """A line per scene: means over the seeds that have all three trainings."""
+    """Print one line per scene: means over the seeds that have all three trainings."""
     table = Table(title=f"held-out PSNR in dB after {budget}, search included")
     for column in ("scene", "needs", "seeds", *MODELS, "auto - right", "kept by auto"):
         table.add_column(column)

@@ -1,10 +1,10 @@
-"""Storage, computation, quality: the three kinds of fields at equal bytes and equal processor time.
+"""Storage, computation and quality of the three kinds of fields, at equal bytes and equal processor time.
 
     python benchmarks/representations.py photos-scene lego_400 -o representations
     python benchmarks/representations.py desk -o desk --seconds 30 --megabytes 1,4
 
-Each field is trained until it has used so many seconds of processor time, which other programs on the machine disturb
-less than the clock; then pixels of held-out photos, the same for all, are rendered. Writes OUT.csv, prints a table.
+Each field is trained for a fixed processor time, which other programs on the machine disturb less than wall-clock time;
+then the same pixels of held-out photos are rendered. Writes OUT.csv and prints a table.
 """
 
 import csv
@@ -31,13 +31,13 @@ from nerfcli.render.model import Model
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.train.held_out_pixels import HeldoutPixels
 
-# A step of a network of megabytes takes longer than the whole budget with the samples of a hash grid's.
+# Samples per step of a network: with those of a hash grid, one step of a network of megabytes exceeds the budget.
 NETWORK_SAMPLES = 2**13
 
 
 @dataclass(frozen=True)
 class Line:
-    """One training: what it was given, what it cost, what came of it."""
+    """One training: its inputs, costs and results."""
 
     scene: str
     kind: str
@@ -57,7 +57,7 @@ class Line:
 
 
 class Capture:
-    """The photos of a scene, ready to be trained on many times."""
+    """The photos of a scene, prepared for many trainings."""
 
     def __init__(self, folder: Path, *, pixels: int, threads: int):
         capture = scene.load(folder)
@@ -72,17 +72,17 @@ class Capture:
         self.pool = PixelPool(photos, self.similarity, torch.device("cpu"))
         self.test_photos = load_photos(capture.test_frames, factor=factor, threads=threads)
         self.heldout = HeldoutPixels(self.test_photos, self.similarity, torch.device("cpu"))
-        # A network of megabytes takes seconds for what a grid renders in milliseconds.
+        # Fewer pixels: a network of megabytes takes seconds to render what takes a grid milliseconds.
         for name in ("origins", "directions", "colours", "cones", "photos"):
             setattr(self.heldout, name, getattr(self.heldout, name)[:pixels])
         self.background = (1.0, 1.0, 1.0) if self.pool.has_alpha else (0.0, 0.0, 0.0)
 
     def psnr(self, model: Model) -> float:
-        """On the held-out pixels, whose photos are all exposed alike."""
+        """Return PSNR on the held-out pixels, taking all photos as equally exposed."""
         return self.heldout.psnr(model, log_gains=np.zeros((len(self.test_photos), 3)))
 
     def model(self, fitting: Fitting) -> Model:
-        """What the training of `fitting` has come to."""
+        """Return the current model of a training."""
         return Model(
             fitting.field, fitting.cells.coarse, self.extent.marching, self.background, self.similarity, "arbitrary"
         )
@@ -131,7 +131,7 @@ def measure(capture: Capture, kind: str, *, megabytes: float, seconds: float, th
 
 
 def print_table(lines: list[Line], seconds: float, threads: int) -> None:
-    """A line per training."""
+    """Print one line per training, and the mean PSNR of each kind."""
     table = Table(title=f"{seconds:g} s of processor time on each of {threads} threads")
     names = ("scene", "field", "MB", "training MB", "ops", "B", "steps", "M samples", "CPU us", "PSNR dB", "us a ray")
     for name in names:

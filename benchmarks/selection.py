@@ -1,11 +1,11 @@
-"""Which components `--model auto` picks on scenes that need one each: how often the right one, and how often others.
+"""Components that `--model auto` picks on scenes that each need one: how often the right one, how often others.
 
     python benchmarks/selection.py -o selection
     python benchmarks/selection.py -o selection --only glossy --seeds 3
 
-Every seed is a scene of its own (see component_scenes.py) and another training. Counted in steps, so that other work on
-the machine changes nothing. Prints a table and writes OUT.csv, a line per scene and seed as soon as it is known; lines
-that are there already are not computed again.
+Every seed gives another scene (see component_scenes.py) and another training. Budgets are in steps, so that other work
+on the machine changes nothing. Prints a table and writes OUT.csv, a line per scene and seed as soon as it is known;
+existing lines are not computed again.
 """
 
 import csv
@@ -26,8 +26,8 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.search.selection import SEARCH_SHARE
 from nerfcli.train.preparation import prepare
 
-# What each scene needs, beside what every model has; and what may be left out of it. Points are needed where photos
-# share any, and are told apart.
+# Components that each scene needs beyond the default. Points help wherever photos share any, and are counted
+# separately; the view may be left out, except in `NEEDS_VIEW`.
 NEEDED: dict[str, dict[str, object]] = {
     "exposure-balls": {"exposure": "learned"},
     "exposure-exif-balls": {"exposure": "exif"},
@@ -45,7 +45,7 @@ COLUMNS = ["scene", "seed", "picked", "points", "view", "right", "cpu_seconds", 
 
 
 def search(name: str, seed: int, steps: int) -> dict[str, object]:
-    """What the scene of a seed decides on."""
+    """Search components on the scene of a seed and return a line of the table."""
     with tempfile.TemporaryDirectory() as folder:
         make(name, Path(folder) / name, seed)
         settings = TrainSettings(
@@ -79,7 +79,7 @@ def search(name: str, seed: int, steps: int) -> dict[str, object]:
 
 
 def print_table(lines: list[dict[str, str]]) -> None:
-    """A line per scene."""
+    """Print one line per scene."""
     table = Table(title="picked by --model auto")
     for column in ("scene", "needs", "right", "points", "view kept", "picked", "CPU s"):
         table.add_column(column)

@@ -3,9 +3,9 @@
     python benchmarks/step.py photos-scene
     python benchmarks/step.py lego_400 --warm-up 60
 
-The field is trained for a while first, as the work of a step depends on what rays meet; then steps of the final size
-are timed, every way in turn. Samples are those that are trained on: what is skipped or stands behind surfaces does not
-count. Let nothing else run meanwhile.
+The field is first trained for a while, as the work of a step depends on the density along rays; then steps of the final
+size are timed for each path in turn. Only samples that are trained on count, not those that are skipped or hidden
+behind surfaces. Run nothing else meanwhile.
 """
 
 import statistics
@@ -27,7 +27,7 @@ from nerfcli.runs.settings import TrainSettings, automatic_downscale
 
 
 def trained(folder: Path, seconds: float, threads: int) -> Fitting:
-    """A field that has been trained for some seconds."""
+    """Return a training that has run for some seconds."""
     capture = scene.load(folder)
     first = capture.train_frames[0].camera
     factor = automatic_downscale(first.width, first.height)
@@ -46,7 +46,7 @@ def trained(folder: Path, seconds: float, threads: int) -> Fitting:
 
 
 def samples_per_second(fitting: Fitting, steps: int) -> list[float]:
-    """Speed of single steps at the end of the budget."""
+    """Return the speed of single steps at the end of the budget."""
     speeds = []
     for _ in range(steps):
         began = time.perf_counter()

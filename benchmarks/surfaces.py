@@ -4,10 +4,11 @@
     python benchmarks/surfaces.py kitchen-run --sensor path/to/redkitchen --voxel-size 0.02
 
 RUN was trained in metres: on the desk with its true cameras (`sample_scenes/desk/truth`), or on the scene that
-`benchmarks/depth.py redkitchen` writes. The truth is what the desk's six true depth maps, or every tenth of the
-sensor's, show inside the box. Of a mesh only what one of these views could see counts: up to 5 cm behind its depth.
-Three surfaces with the same voxels: signed distances of median depths, as `nerfcli export --to mesh` has them; the same
-of conditional depths; and a threshold on the density, the one of several with the best F-score at 1 cm.
+`benchmarks/depth.py redkitchen` writes. The true surface consists of the points of the desk's six true depth maps, or
+of every tenth depth map of the sensor, inside the box. Of a mesh, only points up to 5 cm behind the depth of one of
+these views count. Three surfaces are compared with the same voxels: from signed distances of median depths, as in
+`nerfcli export --to mesh`; from those of conditional depths; and from a density threshold, the one of several with the
+best F-score at 1 cm.
 """
 
 import json
@@ -41,7 +42,7 @@ SENSOR_EVERY = 10
 
 
 def desk_views() -> tuple[Camera, list[tuple[np.ndarray, np.ndarray]]]:
-    """The camera of the desk, and pose and true z of six photos."""
+    """Return the camera of the desk, and pose and true z of six photos."""
     known = json.loads((DESK / "cameras.json").read_text(encoding="utf-8"))
     depths = {image["name"]: DESK / "depth" / f"{Path(image['name']).stem}.tiff" for image in known["images"]}
     images = [image for image in known["images"] if depths[image["name"]].exists()]
@@ -50,7 +51,7 @@ def desk_views() -> tuple[Camera, list[tuple[np.ndarray, np.ndarray]]]:
 
 
 def sensor_views(capture: Path) -> tuple[Camera, list[tuple[np.ndarray, np.ndarray]]]:
-    """The depth camera of an RGB-D video (pose/, depth/ in millimetres), and pose and measured z of some frames."""
+    """Return the depth camera of an RGB-D video (pose/, depth/ in mm), and pose and measured z of some frames."""
     matrix = np.loadtxt(capture / "camera-intrinsics.txt")
     camera = Camera("PINHOLE", 640, 480, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
     views = []
@@ -90,7 +91,7 @@ class Truth:
         return np.asarray(((points >= self.low) & (points <= self.high)).all(axis=1))
 
     def could_see(self, points: np.ndarray) -> np.ndarray:
-        """(N,) whether a view shows a point, or would if it stood 5 cm nearer."""
+        """Return which points (N,) a view shows, or would show if they were up to 5 cm nearer."""
         seen = np.zeros(len(points), dtype=bool)
         for pose, depth in self.views:
             local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -101,7 +102,7 @@ class Truth:
         return seen
 
     def compare(self, mesh: Mesh) -> dict[str, float]:
-        """Accuracy and completeness (mean distances, mm) and F-scores."""
+        """Return accuracy and completeness (mean distances, mm) and F-scores of a mesh."""
         points = samples_of(mesh)
         points = points[self._inside(points)]
         points = points[self.could_see(points)]
@@ -118,7 +119,7 @@ class Truth:
 
 
 def samples_of(mesh: Mesh) -> np.ndarray:
-    """Points (N, 3) evenly spread over the area of a mesh."""
+    """Return random points (N, 3), uniform over the area of a mesh."""
     rng = np.random.default_rng(0)
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

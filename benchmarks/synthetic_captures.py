@@ -1,7 +1,7 @@
 """Captures without pictures: features and matches of known cameras, in the database that pycolmap maps from.
 
-What an extractor and a matcher would have found in a scene is drawn at random: noise on every feature, features that
-have no partner, matches that are wrong. Everything from the verification of the matches on is real.
+The results of an extractor and a matcher are simulated: noise on every feature, features without a partner, wrong
+matches. Everything from the verification of the matches on is real.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from nerfcli.poses.input.settings import FULL_SIZE
 
 Array = NDArray[np.float64]
 
-# What is farther away is too small to have features.
+# Points farther away are too small to have features.
 _FARTHEST = 15.0
 
 
@@ -38,14 +38,17 @@ LONG = Lens("SIMPLE_RADIAL", 900, 1200, (1600.0, 450.0, 600.0, 0.02))
 PHONE = Lens("RADIAL", 1000, 750, (820.0, 510.0, 369.0, 0.12, -0.25))
 FISHEYE = Lens("OPENCV_FISHEYE", 1000, 1000, (320.0, 320.0, 500.0, 500.0, 0.03, -0.01, 0.004, -0.001), "OPENCV_FISHEYE")
 
-# The same lens, of which nothing is known: as photos without EXIF are.
+# The same lens, but unknown, as for photos without EXIF.
 UNKNOWN_FISHEYE = replace(FISHEYE, start_model="SIMPLE_RADIAL")
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What there is to see. points (n, 3); normals (n, 3): a point is seen from its front only; looks: (n,) points
-    of the same number look alike, and a matcher may take one for the other."""
+    """The points of a scene.
+
+    points (n, 3); normals (n, 3): a point is seen only from its front; looks (n,): points with the same number look
+    alike, and a matcher may confuse them.
+    """
 
     points: Array
     normals: Array
@@ -61,13 +64,13 @@ class View:
 
     @property
     def centre(self) -> Array:
-        """Where it was taken."""
+        """Centre of the camera in the world."""
         return -self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3]
 
 
 @dataclass(frozen=True)
 class Noise:
-    """features_px: standard deviation. outliers: share of wrong matches. missed: share of matches not found."""
+    """features_px: standard deviation. outliers: fraction of wrong matches. missed: fraction of matches not found."""
 
     features_px: float = 0.5
     outliers: float = 0.1
@@ -75,7 +78,7 @@ class Noise:
 
 
 def boulder(count: int, *, seed: int, centre: Sequence[float] = (0.0, 0.0, 0.0)) -> Scene:
-    """A bumpy ball of radius about 1."""
+    """Return a bumpy ball of radius about 1."""
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -84,7 +87,7 @@ def boulder(count: int, *, seed: int, centre: Sequence[float] = (0.0, 0.0, 0.0))
 
 
 def twofold(count: int, *, seed: int) -> Scene:
-    """A boulder whose back looks like its front: each point has its like on the other side of the z axis."""
+    """Return a boulder whose back looks like its front: each point has a look-alike across the z axis."""
     half = boulder(count // 2, seed=seed)
     turn = np.diag([-1.0, -1.0, 1.0])
     return Scene(
@@ -95,7 +98,7 @@ def twofold(count: int, *, seed: int) -> Scene:
 
 
 def room(count: int, *, seed: int) -> Scene:
-    """The inside of a box of 8 x 8 x 4."""
+    """Return the inside of a box of 8 x 8 x 4."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, size=(count, 3))
     wall, side = rng.integers(0, 3, count), rng.choice([-1.0, 1.0], count)
@@ -106,7 +109,7 @@ def room(count: int, *, seed: int) -> Scene:
 
 
 def wall(count: int, *, seed: int, size: float = 6.0, depth: float = 0.0) -> Scene:
-    """A square that faces +z, with points up to `depth` before it; of depth 0 it is a plane."""
+    """Return a square facing +z, with points up to `depth` in front of it; a plane for depth 0."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, size=(count, 3)) * [size / 2, size / 2, 0.0]
     points[:, 2] = rng.uniform(0, depth, count)
@@ -114,7 +117,7 @@ def wall(count: int, *, seed: int, size: float = 6.0, depth: float = 0.0) -> Sce
 
 
 def courtyard(count: int, *, seed: int, radius: float = 9.0) -> Scene:
-    """The inside of a round wall of height 4 that is uneven by a metre."""
+    """Return the inside of a round wall of height 4 with a roughness of 1."""
     rng = np.random.default_rng(seed)
     angles = rng.uniform(0, 2 * np.pi, count)
     outward = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
@@ -123,7 +126,7 @@ def courtyard(count: int, *, seed: int, radius: float = 9.0) -> Scene:
 
 
 def together(one: Scene, other: Scene) -> Scene:
-    """Both; nothing of the one looks like anything of the other."""
+    """Return both scenes together; no point of one looks like a point of the other."""
     return Scene(
         np.vstack([one.points, other.points]),
         np.vstack([one.normals, other.normals]),
@@ -132,7 +135,7 @@ def together(one: Scene, other: Scene) -> Scene:
 
 
 def looking_at(centre: Array, target: Array) -> Array:
-    """Pose (3, 4) of a camera at `centre` that looks at `target`, z being up."""
+    """Return the pose (3, 4) of a camera at `centre` that looks at `target`, with z up."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -149,7 +152,7 @@ def ring(
     turn_deg: float = 360,
     at: Sequence[float] = (),
 ) -> list[View]:
-    """Photos around the origin (or `at`) that look at it, the lenses in turn, from uneven heights and distances."""
+    """Return photos around the origin (or `at`) looking at it, from varied heights and distances, lenses in turn."""
     rng = np.random.default_rng(seed)
     middle = np.asarray(at) if at else np.zeros(3)
     views = []
@@ -162,7 +165,7 @@ def ring(
 
 
 def dome(count: int, lens: Lens, *, seed: int, radius: float = 4.2, span_deg: float = 60) -> list[View]:
-    """Photos from one side of the origin, in rows that span so much of the sphere to both sides, as a robot takes."""
+    """Return photos from one side of the origin, in rows that span `span_deg` to both sides, as a robot takes them."""
     rng = np.random.default_rng(seed)
     side = int(np.ceil(np.sqrt(count)))
     views = []
@@ -178,7 +181,7 @@ def dome(count: int, lens: Lens, *, seed: int, radius: float = 4.2, span_deg: fl
 
 
 def panorama(count: int, lens: Lens, *, turn_deg: float = 300) -> list[View]:
-    """Photos from one place, the camera only being turned."""
+    """Return photos from one place, by a camera that only rotates."""
     angles = np.radians(turn_deg) * np.arange(count) / count
     centre = np.array([0.3, -0.2, 0.1])
     return [
@@ -187,16 +190,16 @@ def panorama(count: int, lens: Lens, *, turn_deg: float = 300) -> list[View]:
 
 
 def walk(count: int, lens: Lens, *, radius: float = 5.0) -> list[View]:
-    """A walk round a circle, looking outward: the last photos see what the first ones saw."""
+    """Return a walk around a circle, looking outward: the last photos see what the first ones saw."""
     angles = 2 * np.pi * np.arange(count) / count
     directions = np.column_stack([np.cos(angles), np.sin(angles), 0.1 * np.sin(3 * angles)])
     return [View(lens, looking_at(radius * d, (radius + 1) * d)) for d in directions]
 
 
 def above(count: int, lens: Lens, *, seed: int, height: float = 5.0, tilt: float = 0.0) -> list[View]:
-    """Photos towards -z from a grid at about one height, as of a drone.
+    """Return photos towards -z from a grid at about one height, as from a drone.
 
-    tilt: how far the point looked at is from the one below the camera, as a share of the height.
+    tilt: largest distance per axis between the target and the point below the camera, as a fraction of the height.
     """
     rng = np.random.default_rng(seed)
     side = int(np.ceil(np.sqrt(count)))
@@ -205,13 +208,13 @@ def above(count: int, lens: Lens, *, seed: int, height: float = 5.0, tilt: float
         x, y = (index // side, index % side) - np.full(2, (side - 1) / 2)
         centre = np.array([x, y, height * rng.uniform(0.98, 1.02)])
         aim = rng.normal(scale=0.01, size=2) + tilt * rng.uniform(-1, 1, size=2)
-        # A hair off the vertical, where "up" would be undefined.
+        # Slightly off the vertical, where "up" would be undefined.
         views.append(View(lens, looking_at(centre, centre + height * np.array([*aim, -1.0]))))
     return views
 
 
 def each_its_own(views: Sequence[View], *, seed: int) -> list[View]:
-    """The same photos, each by a camera of its own, of another focal length."""
+    """Return the same photos, each by a separate camera with a different focal length."""
     rng = np.random.default_rng(seed)
     return [
         replace(view, lens=replace(view.lens, params=(view.lens.params[0] * factor, *view.lens.params[1:])))
@@ -220,12 +223,12 @@ def each_its_own(views: Sequence[View], *, seed: int) -> list[View]:
 
 
 def turned_away(views: Sequence[View]) -> list[View]:
-    """From the same places, looking the other way."""
+    """Return photos from the same places, looking the other way."""
     return [View(view.lens, looking_at(view.centre, view.centre - view.cam_from_world[2, :3])) for view in views]
 
 
 def seen(view: View, scene: Scene) -> tuple[NDArray[np.int64], Array]:
-    """Numbers of the points that a view sees from their front, and their pixels (n, 2)."""
+    """Return the indices of the points that a view sees from their front, and their pixels (n, 2)."""
     camera = _camera(view.lens, 1)
     towards = view.centre - scene.points
     distances = np.linalg.norm(towards, axis=1)
@@ -247,10 +250,10 @@ def write_database(
     pairs: Callable[[int, int], bool] = lambda i, j: True,
     threads: int = 1,
 ) -> None:
-    """Features and verified matches of the views; photo i is called 0000i.jpg, image id i + 1.
+    """Write features and verified matches of the views; photo i is called 0000i.jpg, with image id i + 1.
 
-    Lenses become one camera each, with the focal length unknown. Of the pairs only those are compared for which `pairs`
-    is true. Look-alike points that two photos see are matched as if they were the same.
+    Each lens becomes one camera, with unknown focal length unless it is a fisheye. Only pairs for which `pairs` is true
+    are compared. Look-alike points that two photos see are matched as if they were the same.
     """
     rng = np.random.default_rng(seed)
     lenses = list(dict.fromkeys(view.lens for view in views))
@@ -259,7 +262,7 @@ def write_database(
             start = pycolmap.Camera.create_from_model_name(
                 number + 1, lens.start_model, 1.2 * max(lens.width, lens.height), lens.width, lens.height
             )
-            if "FISHEYE" in lens.start_model:  # as a user would say who knows the lens
+            if "FISHEYE" in lens.start_model:  # as given by a user who knows the lens
                 start.params = [*lens.params[:4], *[0.0] * (len(start.params) - 4)]
                 start.has_prior_focal_length = True
             write_camera(database, start)
@@ -283,7 +286,7 @@ def write_database(
 
 
 def write_camera(database: pycolmap.Database, camera: pycolmap.Camera) -> None:
-    """A camera and its rig under the camera's own id."""
+    """Write a camera and its rig under the camera's id."""
     camera_id = database.write_camera(camera, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=camera_id)
     rig.add_ref_sensor(camera.sensor_id)
@@ -293,7 +296,7 @@ def write_camera(database: pycolmap.Database, camera: pycolmap.Camera) -> None:
 def write_image(
     database: pycolmap.Database, number: int, camera_id: int, *, keypoints: Array, looks: NDArray[np.int64]
 ) -> None:
-    """Photo `number` and its features, which look like the points `looks` (-1: like nothing)."""
+    """Write photo `number` and its features, with the appearance of `looks` (-1: like no point)."""
     image = pycolmap.Image(name=photo_name(number), camera_id=camera_id, image_id=number + 1)
     database.write_image(image, use_image_id=True)
     frame = pycolmap.Frame(frame_id=number + 1, rig_id=camera_id)
@@ -305,7 +308,10 @@ def write_image(
 
 
 def _appearance(looks: NDArray[np.int64], *, seed: int) -> NDArray[np.uint8]:
-    """Descriptors (n, 128) as pycolmap's: of length 512; 0.35 apart for one look, 0.85 for two, if the length is 1."""
+    """Return descriptors (n, 128) of norm 512, as in pycolmap.
+
+    Scaled to norm 1, those of the same look are 0.35 apart, others 0.85.
+    """
     rng = np.random.default_rng([seed, 1])
     known = np.abs(np.random.default_rng(0).normal(size=(looks.max(initial=-1) + 1, 128)))
     found = np.abs(rng.normal(size=(len(looks), 128)))
@@ -315,7 +321,7 @@ def _appearance(looks: NDArray[np.int64], *, seed: int) -> NDArray[np.uint8]:
 
 
 def synthetic_job(folder: Path, views: Sequence[View], *, seed: int) -> Job:
-    """The job of mapping from folder/database.db. There are no photos: all features and matches are sought already."""
+    """Return the job of mapping from folder/database.db, without photos: all features and matches exist already."""
     work = folder / "work"
     (work / "photos").mkdir(parents=True)
     names = tuple(photo_name(number) for number in range(len(views)))
@@ -347,7 +353,7 @@ def synthetic_job(folder: Path, views: Sequence[View], *, seed: int) -> Job:
 
 
 def true_model(views: Sequence[View]) -> pycolmap.Reconstruction:
-    """The true cameras and poses, with the image ids and names of `write_database`; no points."""
+    """Return the true cameras and poses, with the image ids and names of `write_database`, and no points."""
     model = pycolmap.Reconstruction()
     lenses = list(dict.fromkeys(view.lens for view in views))
     for number, lens in enumerate(lenses):
@@ -361,10 +367,10 @@ def true_model(views: Sequence[View]) -> pycolmap.Reconstruction:
 def observed_model(
     views: Sequence[View], scene: Scene, *, noise_px: float, seed: int, shiny: float = 0.0, slide: float = 0.05
 ) -> pycolmap.Reconstruction:
-    """The true cameras, poses and points, and where each view sees the points, with noise.
+    """Return the true cameras, poses and points, with noisy observations in each view.
 
-    shiny: share of the points that are highlights: they slide along the surface as the view moves, each in a direction
-    of its own, by about `slide` of the scene's unit from the middle to the side.
+    shiny: fraction of the points that are highlights. They slide along the surface as the view moves, each in its own
+    direction, by about `slide` scene units from the middle to the side.
     """
     rng = np.random.default_rng(seed)
     model = true_model(views)
@@ -397,9 +403,10 @@ def observed_model(
 
 
 def bent(model: pycolmap.Reconstruction, first: int) -> pycolmap.Reconstruction:
-    """The photos from `first` on and half of the points turned by 40 degrees about an axis outside the scene.
+    """Return the model with the images from id `first` on, and the points they mostly see, turned by 40 degrees.
 
-    All residuals within either half stay as they are; observations across are deleted, as a mapper would.
+    The axis is outside the scene. Residuals within either part do not change; observations across the parts are
+    deleted, as by a mapper.
     """
     wrong = pycolmap.Reconstruction(model)
     angle = np.radians(40)
@@ -422,7 +429,7 @@ def bent(model: pycolmap.Reconstruction, first: int) -> pycolmap.Reconstruction:
 
 
 def photo_name(number: int) -> str:
-    """As the worker numbers photos."""
+    """Return the name that the worker gives a photo."""
     return f"{number:05d}.jpg"
 
 
@@ -435,7 +442,7 @@ def _camera(lens: Lens, camera_id: int) -> pycolmap.Camera:
 def _features(
     points: NDArray[np.int64], pixels: Array, lens: Lens, scene: Scene, *, noise: Noise, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.int64], dict[int, int]]:
-    """Keypoints in random order, clutter among them, the look of each (-1: none), and the keypoint of each look."""
+    """Return shuffled keypoints including clutter, the look of each (-1: none), and the keypoint of each look."""
     noisy = pixels + rng.normal(scale=noise.features_px, size=pixels.shape)
     clutter = rng.uniform(0, [lens.width, lens.height], size=(len(points) // 4 + 10, 2))
     looks = np.concatenate([scene.looks[points], np.full(len(clutter), -1)])

@@ -1,11 +1,11 @@
-"""Reconstructions of computed scans: kinds of fields at equal time, numbers of views, seeds of the noise.
+"""Reconstructions of computed scans, by kind of field (at equal time), number of views and seed of the noise.
 
     python benchmarks/tomography.py ct_tooth/line_integrals_f32.npy -o tooth --views 60,30,15 --seeds 3
     python benchmarks/tomography.py sample_scenes/phantom -o phantom --views 40,20,10 --fields voxels,hash
 
-SCAN is any input of `convert` that names its true volume. Line integrals get counting noise of --photons, another one
-for each seed; counts stay what they are. Of the training views every n-th is fitted; the held-out views are always the
-same. Everything else is left to `train`. Writes OUT.csv, prints a table; the runs stay in the folder OUT.
+SCAN is any input of `convert` that names its true volume. Line integrals get counting noise of --photons, different for
+each seed; counts stay unchanged. Every n-th training view is fitted; the held-out views are always the same. All other
+settings are the defaults of `train`. Writes OUT.csv and prints a table; the runs stay in the folder OUT.
 """
 
 import csv
@@ -30,7 +30,7 @@ from nerfcli.workflows.tomography_scores import evaluate_scan
 
 @dataclass(frozen=True)
 class Line:
-    """One reconstruction; the baselines get no time."""
+    """One reconstruction; times are 0 for the baselines."""
 
     method: str
     views: int
@@ -47,7 +47,7 @@ class Line:
 
 
 def with_noise(scan: Scan, photons: float, seed: int) -> Scan:
-    """Transmissions as counted photons; counts as they are."""
+    """Return line integrals as noisy transmissions of `photons`; other scans are returned unchanged."""
     if scan.kind != "line_integral":
         return scan
     counts = np.random.default_rng(seed).poisson(photons * np.exp(-scan.values.astype(np.float64)))
@@ -56,7 +56,7 @@ def with_noise(scan: Scan, photons: float, seed: int) -> Scan:
 
 
 def thinned(scan: Scan, views: int) -> Scan:
-    """The scan with every n-th of its training views, and all held-out ones."""
+    """Return the scan with every n-th of its training views, and all held-out ones."""
     training = scan.training_views
     chosen = training[:: max(1, len(training) // views)][:views]
     index = np.sort(np.concatenate([chosen, np.array(scan.held_out, dtype=int)]))
@@ -124,7 +124,7 @@ def main(
 
 
 def print_table(lines: list[Line]) -> None:
-    """Mean and standard deviation over seeds."""
+    """Print means and standard deviations over seeds."""
     table = Table("method", "views", "seeds", "volume dB", "SSIM", "held-out dB", "chi-square", "s", "CPU s")
     for method, views in dict.fromkeys((line.method, line.views) for line in lines):
         own = [line for line in lines if (line.method, line.views) == (method, views)]

@@ -26,10 +26,10 @@ Array = NDArray[np.float64]
 # Metres: from crossing to crossing, and the streets' width.
 _PITCH, _STREET = 24.0, 8.0
 _EYE, _FARTHEST = 1.6, 150.0
-# From crossing to crossing, each loop ends where it began; then the next one.
+# Moves from crossing to crossing. Each loop ends where it began, then the next one starts.
 _LOOPS = ("RULD", "RRUULLDD", "UURRDDLL", "RRRUUULLLDDD")
 _MOVES = {"R": (1.0, 0.0), "L": (-1.0, 0.0), "U": (0.0, 1.0), "D": (0.0, -1.0)}
-# Corners are cut by so many metres.
+# Metres by which corners are cut.
 _CORNER = 4.0
 _SUPERSAMPLED = 2
 
@@ -46,7 +46,7 @@ def walk(count: int, *, step: float = 0.6) -> Array:
     ahead = np.stack([np.interp(along + 0.5, lengths, path[:, axis]) for axis in (0, 1)], axis=1)
     heading = np.arctan2(*(ahead - places).T[::-1]) + np.radians(20) * np.sin(along / 7)
     pitch = np.radians(4) * np.sin(along / 11)
-    # Another way along the same street is not the same to the centimetre.
+    # A second pass along the same street does not follow exactly the same line.
     side = 0.5 * np.sin(along / 17)
     poses = np.tile(np.eye(4), (count, 1, 1))
     for pose, (x, y), angle, up, off, where in zip(poses, places, heading, pitch, side, along, strict=True):
@@ -86,7 +86,7 @@ def write(folder: Path, *, count: int, size: tuple[int, int], shuffled: bool = F
 
 
 def _rounded(corners: Array) -> Array:
-    """A path along corners that goes around each of them in an arc."""
+    """Return a path along corners that rounds each of them with an arc."""
     path = [corners[:1]]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
         start, end = (corner + _CORNER / _PITCH * (other - corner) for other in (before, after))
@@ -108,7 +108,7 @@ def _rendered(world_from_cam: Array, width: int, height: int, focal_px: float) -
                 picture[row, column] = 200
                 continue
             place = origin + distance * direction
-            # A pixel's size on what it sees; walls seen at a flat angle get a little more than they can show.
+            # Size of a pixel on the surface; at grazing angles, walls get slightly more detail than pixels resolve.
             pixel = distance / focal_px
             face = wall % 5
             u = place[1] if face in (1, 2) else place[0]
@@ -122,7 +122,7 @@ def _rendered(world_from_cam: Array, width: int, height: int, focal_px: float) -
 
 @njit
 def hit(origin: Array, direction: Array) -> tuple[float, int]:
-    """Distance, in lengths of `direction`, to what a ray hits first, and its number; -1 for the sky.
+    """Return the distance to the first hit of a ray, in lengths of `direction`, and its number; -1 for the sky.
 
     Number % 5 is the face: 0 the ground, 1 and 2 walls across x, 3 and 4 walls across y.
     """
@@ -160,7 +160,7 @@ def hit(origin: Array, direction: Array) -> tuple[float, int]:
 
 @njit
 def _texture(wall: int, u: float, v: float, pixel: float) -> float:
-    """Smooth noise of many sizes and rectangles with sharp edges, none of it smaller than two pixels."""
+    """Return smooth noise of many sizes and sharp-edged rectangles, without details smaller than two pixels."""
     grey = 120.0
     size = 4.0
     for octave in range(8):
@@ -184,7 +184,7 @@ def _texture(wall: int, u: float, v: float, pixel: float) -> float:
 
 @njit
 def _random(wall: int, kind: int, i: int, j: int) -> float:
-    """A number in 0...1 that is always the same for the same arguments."""
+    """Return a pseudo-random number in 0...1 that depends only on the arguments."""
     mixed = np.uint64(wall * 73856093 ^ kind * 19349663 ^ (i + 100000) * 83492791 ^ (j + 100000) * 2654435761)
     mixed ^= mixed >> np.uint64(33)
     mixed *= np.uint64(0xFF51AFD7ED558CCD)

@@ -3,10 +3,9 @@
     python benchmarks/training.py photos-scene lego_400 -o budgets --budgets 15,60,300,1800 --models auto
     python benchmarks/training.py fox fern banana -o models --budgets 100 --seeds 0,1,2 --threads 1
 
-Every budget is a training of its own, for each scene, model and seed; the search of `auto` is part of its budget. Calls
-`nerfcli train` and `nerfcli evaluate`, so that what is measured is what users get, peak memory included. Prints a table
-and writes OUT.csv, a line per training as soon as it is done; lines that are there already are not computed again. Let
-nothing else run meanwhile.
+There is a separate training for each budget, scene, model and seed; the search of `auto` is part of its budget. Calls
+`nerfcli train` and `nerfcli evaluate`, to measure what users get, peak memory included. Prints a table and writes
+OUT.csv, a line per training as soon as it is done; existing lines are not computed again. Run nothing else meanwhile.
 """
 
 import csv
@@ -27,10 +26,10 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Training:
-    """One training, and what `evaluate` said of it over whole held-out photos.
+    """One training, and its results of `evaluate` over whole held-out photos.
 
-    `dip_db` is what the best quarter of it was better by than the end, over some held-out pixels; `kept` is what the
-    search put into the model or left out.
+    `dip_db` is the best logged PSNR of some held-out pixels minus the last one; `kept` lists the changes that the
+    search kept.
     """
 
     scene: str
@@ -49,7 +48,7 @@ class Training:
 
 
 def nerfcli(*arguments: str) -> str:
-    """Standard output of a command; its progress goes where ours goes."""
+    """Run a command and return its standard output; its stderr is shown."""
     command = [sys.executable, "-m", "nerfcli", *arguments]
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
@@ -89,7 +88,7 @@ def mean(trainings: Iterable[Training], name: str) -> float:
 
 
 def print_tables(trainings: list[Training]) -> None:
-    """A line per scene, budget and model: means over the seeds; and the gains of auto where both were trained."""
+    """Print means over seeds per scene, budget and model, and the gains of auto where both models were trained."""
     table = Table(title="held-out photos")
     for name in (
         "scene",
@@ -164,7 +163,7 @@ def main(
 
 
 def typed(line: dict[str, str]) -> Training:
-    """A line of OUT.csv."""
+    """Return the training of a line of OUT.csv."""
     return Training(**{field.name: field.type(line[field.name]) for field in fields(Training)})  # type: ignore[operator]
 
 

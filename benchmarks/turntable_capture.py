@@ -21,7 +21,7 @@ from PIL import Image
 Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
-# The centres (x, y) of the boxes on the disc, their sizes (x, y, z), and how they are turned.
+# Centres (x, y) of the boxes on the disc, their sizes (x, y, z), and their rotation in radians.
 _BOXES = (
     ((0.0, 0.0), (0.7, 0.5, 0.9), 0.3),
     ((0.55, 0.3), (0.3, 0.3, 0.5), 0.9),
@@ -34,8 +34,11 @@ _TEXTURE_PX = 256
 
 @dataclass(frozen=True)
 class Turntable:
-    """A capture. photos (n, height, width, 3) uint8; masks (n, height, width) bool, the object; poses (n, 4, 4), object
-    from camera, OpenCV axes; focal_px of all photos, the principal point being in the middle."""
+    """A capture.
+
+    photos (n, height, width, 3) uint8; masks (n, height, width) bool, true on the object; object_from_cam (n, 4, 4),
+    OpenCV axes; focal_px of all photos, with the principal point in the middle.
+    """
 
     photos: NDArray[np.uint8]
     masks: NDArray[np.bool_]
@@ -54,15 +57,15 @@ def turntable(
     supersampled: int = 2,
     seed: int = 0,
 ) -> Turntable:
-    """Photos of the object in equal steps of its turn.
+    """Return photos of the object in equal steps of its rotation.
 
     Args:
         count: of photos.
         size: (width, height).
-        heights: from so many places of the camera, one after the other, each a part of the photos and a whole turn.
-        turn_deg: of a whole turn.
+        heights: number of camera positions, one after the other, each with a part of the photos over a whole turn.
+        turn_deg: angle of a whole turn.
         texture: contrast of the room, 0...1: at 0 it is grey.
-        shift_px: standard deviation of what the camera is shaken by between photos.
+        shift_px: standard deviation of the shift of the background by camera shake between photos.
         supersampled: rays per pixel, in each direction.
         seed: of textures and noise.
     """
@@ -96,7 +99,7 @@ def turntable(
 
 
 def write(capture: Turntable, folder: Path, *, stem: str = "turn") -> None:
-    """images/, masks/ and transforms.json, which is in NeRF's axes: y up, looking along -z."""
+    """Write images/, masks/ and transforms.json, which is in NeRF's axes: y up, looking along -z."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     (folder / "masks").mkdir(exist_ok=True)
     height, width = capture.masks.shape[1:]
@@ -117,7 +120,7 @@ def write(capture: Turntable, folder: Path, *, stem: str = "turn") -> None:
 def _render(
     object_from_cam: Array, textures: list[Picture], focal_px: float, size: tuple[int, int]
 ) -> tuple[Picture, Picture]:
-    """The object before black, (height, width, 3), and where it is, (height, width) 0 or 1."""
+    """Return the object on black, (height, width, 3), and its coverage, (height, width) 0 or 1."""
     width, height = size
     columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     local = np.stack([(columns - width / 2) / focal_px, (rows - height / 2) / focal_px, np.ones_like(rows)], axis=-1)
@@ -155,8 +158,10 @@ def _add_disc(origin: Picture, directions: Picture, texture: Picture, nearest: P
 def _add_box(
     origin: Picture, directions: Picture, half: Picture, faces: list[Picture], nearest: Picture, colour: Picture
 ) -> None:
-    """Draw an axis-aligned box around 0 where it is nearer; opposite faces have the same texture, one of them upside
-    down and darker."""
+    """Draw an axis-aligned box around 0 where it is nearer.
+
+    Opposite faces have the same texture, one of them upside down and darker.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-half - origin) / directions, (half - origin) / directions
     entering, leaving = np.minimum(one, other), np.maximum(one, other)
@@ -174,10 +179,10 @@ def _add_box(
 
 
 def _looked_up(texture: Picture, places: Picture) -> Picture:
-    """Colours (n, 3) at places (n, 2) in 0...1."""
+    """Return the colours (n, 3) of a texture at places (n, 2) in 0...1."""
     across, down = (places * np.array(texture.shape[1::-1], dtype=np.float32)).astype(np.float32).T.reshape(2, -1, 1)
     found = np.empty((len(places), 3), dtype=np.float32)
-    for start in range(0, len(places), 30_000):  # remap's pictures have less than 32768 rows
+    for start in range(0, len(places), 30_000):  # remap is limited to fewer than 32768 rows
         rows = slice(start, start + 30_000)
         looked_up = cv2.remap(texture, across[rows], down[rows], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         found[rows] = looked_up.reshape(-1, 3)
@@ -185,7 +190,7 @@ def _looked_up(texture: Picture, places: Picture) -> Picture:
 
 
 def _texture(rng: np.random.Generator, width: int, height: int) -> Picture:
-    """Noise of many sizes, and rectangles, (height, width, 3) in 0...255."""
+    """Return noise of many sizes with rectangles, (height, width, 3) in 0...255."""
     picture = np.zeros((height, width, 3), dtype=np.float32)
     for cells in (4, 10, 24, 60):
         coarse = rng.uniform(-1, 1, size=(cells, cells, 3)).astype(np.float32)
@@ -198,7 +203,7 @@ def _texture(rng: np.random.Generator, width: int, height: int) -> Picture:
 
 
 def _looking_at(centre: Array, target: Array) -> Array:
-    """world_from_cam (4, 4), OpenCV axes, z being up in the world."""
+    """Return world_from_cam (4, 4) in OpenCV axes, with z up in the world."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)

@@ -41,7 +41,7 @@ from nerfcli.workflows.train import train_scene, was_interrupted
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-# Scenes and the sectors of their rings; steps of a training, and by what their photos are smaller.
+# Scenes and the sectors of their rings; steps of a training, and the downscale of the desk's photos.
 REPLICATES = {"spheres": (0, 1, 2, 3), "desk": (0, 1, 2, 3), "blocks-1": (0, 2), "blocks-2": (0, 2)}
 STEPS, DESK_STEPS, DESK_DOWNSCALE = 400, 800, 4
 KINDS = ("seeds", "photos", "prior", "field")
@@ -52,10 +52,10 @@ CONTROLS = (
     *("coverage", "parallax", "true coverage", "opacity", "gradient", "distance", "random", "another replicate"),
     *("Laplace", "combined", "combined, free"),
 )
-# What is combined: with the spread, and what costs no further training.
+# Predictors to combine: with the spread, and those that need no further training.
 COMBINED = {"combined": ("spread", "coverage", "parallax"), "combined, free": ("coverage", "parallax", "opacity")}
 
-# By kind, all numbers of each replicate.
+# All numbers of each replicate, by kind.
 Numbers = dict[str, list[dict[str, float | str]]]
 
 app = typer.Typer(help=__doc__, add_completion=False)
@@ -74,13 +74,13 @@ class Replicate:
         return f"{self.scene}-sector-{self.sector}"
 
     def settings(self, longer: int) -> TrainSettings:
-        """Of every training: the default components, one thread, `longer` times the usual number of steps."""
+        """Return the settings of every training: default components, one thread, `longer` times the usual steps."""
         steps, downscale = (DESK_STEPS, DESK_DOWNSCALE) if self.scene == "desk" else (STEPS, 1)
         return TrainSettings(budget_seconds=None, steps=longer * steps, downscale=downscale, threads=1)
 
 
 def replicates() -> list[Replicate]:
-    """All of them; the first sectors of all scenes first."""
+    """Return all replicates, in the order of their sectors: the first sector of every scene comes first."""
     pairs = [(place, scene, sector) for scene, of in REPLICATES.items() for place, sector in enumerate(of)]
     return [Replicate(scene, sector) for _, scene, sector in sorted(pairs, key=lambda pair: pair[0])]
 
@@ -117,17 +117,17 @@ def train_kind(one: Replicate, kind: str, output: Path, *, members: int, longer:
 def keep_distances(
     folder: Path, kind: str, capture: Path, views: list[Frame], *, first: TrainSettings, members: int
 ) -> None:
-    """Train the fields of a kind that are missing, and keep the distances that they show in views: FOLDER/KIND.npz.
+    """Train the missing fields of a kind, and keep the distances that they render in views: FOLDER/KIND.npz.
 
-    Fields are deleted afterwards. FOLDER/held_out.txt lists the photos that are withheld.
+    Fields are deleted afterwards. FOLDER/held_out.txt lists the withheld photos.
 
     Args:
         folder: of the replicate.
-        kind: "deployed", which is one field of these settings, or one of `KINDS`.
+        kind: "deployed", a single field with the settings `first`, or one of `KINDS`.
         capture: to train on.
         views: in which depth is compared.
         first: settings of the deployed field.
-        members: of the kind.
+        members: number of fields of the kind.
     """
     kept, holdout, columns, seconds = folder / f"{kind}.npz", str(folder / "held_out.txt"), [], 0.0
     if kept.exists():
@@ -159,13 +159,13 @@ def keep_distances(
 
 
 def depth_of(picture: RenderedPicture) -> np.ndarray:
-    """(H, W) depth of a picture that was rendered with it."""
+    """Return the depth (H, W) of a picture that was rendered with depth."""
     assert picture.depth is not None
     return picture.depth
 
 
 def deployed_maps(model: Model, run: Run, views: list[Frame], colours: list[np.ndarray]) -> dict[str, np.ndarray]:
-    """Coverage and parallax by the field's own depth, and the length of the picture's gradient, of all pixels."""
+    """Return coverage and parallax by the field's own depth, and the picture's gradient norm, of all pixels."""
     photos = depth_maps(model, run.cameras.train)
     request, found = DepthRequest("median", "ray"), []
     for view, rgb in zip(views, colours, strict=True):
@@ -182,7 +182,7 @@ def deployed_maps(model: Model, run: Run, views: list[Frame], colours: list[np.n
 
 @dataclass(frozen=True)
 class Pixels:
-    """Of a replicate and a kind, the pixels in which the deployed field and all members have a depth.
+    """The pixels of a replicate and a kind in which the deployed field and all members have a depth.
 
     Args:
         members: (M, P) distances.
@@ -190,7 +190,7 @@ class Pixels:
         stratum: (P,) index in `STRATA`.
         views: (P,) number of the view.
         uncertainty: (P,) by name; larger is less certain.
-        abstained: of the pixels where something is, the part without a depth, in each stratum.
+        abstained: in each stratum, the fraction of the pixels with a true surface that lack a depth.
     """
 
     members: np.ndarray
@@ -206,7 +206,7 @@ class Pixels:
         return self.uncertainty["spread"]
 
     def only(self, name: str) -> "Pixels":
-        """Those of one stratum."""
+        """Return the pixels of one stratum."""
         rows = self.stratum == STRATA.index(name)
         uncertainty = {key: values[rows] for key, values in self.uncertainty.items()}
         return replace(
@@ -221,7 +221,7 @@ class Pixels:
 
 
 def read_pixels(folder: Path, kind: str, members: int = MEMBERS) -> Pixels:
-    """Read what `train_kind` kept; the first `members` alone."""
+    """Read the results of `train_kind`, for the first `members` only."""
     true = TruePixels(**np.load(folder / "truth.npz"))
     maps, deployed = np.load(folder / "maps.npz"), np.load(folder / "deployed.npz")["distances"][0]
     distances = np.load(folder / f"{kind}.npz")["distances"][:members]
@@ -256,7 +256,7 @@ def read_pixels(folder: Path, kind: str, members: int = MEMBERS) -> Pixels:
 
 
 def measures(pixels: Pixels) -> dict[str, float]:
-    """All numbers of a replicate and a kind."""
+    """Return all numbers of a replicate and a kind."""
     found: dict[str, float] = {"pixels": len(pixels.true), "mean error": float(pixels.error.mean())}
     for name, values in pixels.uncertainty.items():
         found[f"AUSE {name}"] = statistics.ause(pixels.error, values)
@@ -289,7 +289,7 @@ def measures(pixels: Pixels) -> dict[str, float]:
 
 
 def widened(one: Replicate, pixels: Pixels, replicates: list[Replicate], every: list[Pixels]) -> dict[str, float | str]:
-    """Held parts of 90 % intervals that hold 90 % in stratum D of the other scenes, by one factor for all pixels."""
+    """Return the coverage of 90 % intervals, widened by the factor that gives 90 % in stratum D of the other scenes."""
     others = [of.only("D") for other, of in zip(replicates, every, strict=True) if other.scene != one.scene]
     if not others:
         return {}
@@ -307,9 +307,9 @@ def widened(one: Replicate, pixels: Pixels, replicates: list[Replicate], every: 
 def combined(
     one: Replicate, pixels: Pixels, replicates: list[Replicate], every: list[Pixels], names: Sequence[str]
 ) -> np.ndarray:
-    """Return the sum of the ranks of some predictors that comes nearest to the rank of the error in the other scenes.
+    """Return the linear combination of the predictors' ranks that best fits the rank of the error in the other scenes.
 
-    Ranks are those inside a replicate, from 0 to 1; replicates count equally in the least squares.
+    Ranks are within a replicate, from 0 to 1; replicates have equal weights in the least squares.
     """
 
     def rows(of: Pixels) -> np.ndarray:
@@ -323,7 +323,7 @@ def combined(
 
 
 def trained(output: Path, kind: str) -> list[Replicate]:
-    """The replicates whose members of a kind are there."""
+    """Return the replicates that have results of a kind."""
     return [one for one in replicates() if (output / one.name / f"{kind}.npz").exists()]
 
 
@@ -356,18 +356,18 @@ def judge(output: Out) -> None:
 
 
 def column(rows: list[dict[str, float | str]], name: str) -> np.ndarray:
-    """One number of all replicates; NaN where there is none."""
+    """Return one number of all replicates; NaN where it is missing."""
     return np.array([row.get(name, np.nan) for row in rows], dtype=float)
 
 
 def mean_of(values: np.ndarray) -> float:
-    """The mean of what is not NaN; NaN where nothing is."""
+    """Return the mean of the finite values; NaN if there are none."""
     there = values[np.isfinite(values)]
     return float(there.mean()) if len(there) else float("nan")
 
 
 def summaries(table: Numbers) -> dict[str, statistics.Summary]:
-    """What decides over each kind."""
+    """Return the numbers that decide the verdict on each kind."""
     differences = {kind: column(rows, "AUSE spread") - column(rows, "AUSE coverage") for kind, rows in table.items()}
     adjusted = statistics.holm({kind: statistics.sign_flip(values) for kind, values in differences.items()})
     return {
@@ -424,7 +424,7 @@ def print_tables(table: Numbers, found: dict[str, statistics.Summary]) -> None:
 
 
 def print_by_members(output: Path) -> None:
-    """Print what fewer of the same members would have given, means over replicates."""
+    """Print the results with fewer of the same members, as means over replicates."""
     counts = range(2, MEMBERS + 1)
     shown = Table("first members", *(f"{count}: v U0, AUSE / mean error" for count in counts))
     for kind in KINDS:

@@ -2,8 +2,8 @@
 
     python benchmarks/uncertainty_kitchen.py path/to/redkitchen -o uncertainty-kitchen
 
-A quarter of the photos, those that look into one sector of the room, is withheld, and every 8th of the others. What
-photos saw is decided by the sensor: its depth in a training photo is that of the point to 5 cm.
+A quarter of the photos, those that look into one sector of the room, is withheld, and every 8th of the others. A
+training photo counts as seeing a point if the sensor's depth in it agrees with the point within 5 cm.
 """
 
 import math
@@ -41,7 +41,7 @@ def withheld(frames: Sequence[Frame]) -> tuple[list[str], list[str]]:
 
 
 def sensor_sees(photo: Frame, points: np.ndarray, capture: Path) -> np.ndarray:
-    """Return which points (N, 3) the depth camera of a photo sees: its depth there is theirs to `SAME_METRES`."""
+    """Return which points (N, 3) the depth camera of a photo sees: its depth is theirs within `SAME_METRES`."""
     view = kitchen_depth_view(photo, capture)
     pose = view.world_from_cam
     local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -57,7 +57,7 @@ def sensor_sees(photo: Frame, points: np.ndarray, capture: Path) -> np.ndarray:
 def measured_pixels(
     capture: Path, test: Sequence[Frame], views: Sequence[Frame], training: Sequence[Frame]
 ) -> TruePixels:
-    """Return what the sensor says of the pixels of views; no distance where it has none."""
+    """Return the sensor's distances for the pixels of views (infinite where it has none), and who sees the points."""
     columns = []
     for frame, view in zip(test, views, strict=True):
         bearings, _ = view.camera.pixel_bearings()

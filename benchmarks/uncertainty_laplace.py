@@ -1,8 +1,8 @@
-"""Bayes' Rays' uncertainty of a field: the Laplace approximation of a grid that would deform its space.
+"""Bayes' Rays' uncertainty of a field: a Laplace approximation over a grid that deforms its space.
 
 Goli et al. 2024, arXiv:2309.03185, and its code: points x of the training rays become x + D(x), with one offset per
-vertex of a grid over the field's unit cube, interpolated. The Hessian of the squared colour error with respect to these
-offsets, at 0, is kept on its diagonal, and its inverse is the variance of each vertex. Nothing is trained again.
+vertex of a grid over the field's unit cube, interpolated. Only the diagonal of the Hessian of the squared colour error
+with respect to these offsets, at 0, is used; its inverse is the variance of each vertex. Nothing is trained again.
 
     python benchmarks/uncertainty_laplace.py -o uncertainty       # the folder of `uncertainty.py train`
 """
@@ -28,14 +28,14 @@ from nerfcli.render.rays import CENTRES, pixel_rays
 from nerfcli.render.tracing import TOLERANCE, deepest, uniform_cuts
 from nerfcli.workflows.train import train_scene, was_interrupted
 
-# Cells along each side of the deformation grid, and training rays that are looked at; they take 4,096,000 and 256.
+# Cells along each side of the deformation grid, number of training rays (theirs: 256 and 4,096,000), rays per batch.
 SIDE, RAYS, TOGETHER = 64, 2**15, 1024
-# Of the code: the prior, and the logarithm that light from nowhere counts as.
+# From their code: the prior, and the log10 deviation of light that passes all samples.
 PRIOR, LEAST = 1e-4, -3.0
 
 
 def corners_of(coordinates: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Return the numbers (8, N) of the vertices around places (N, 3) of the unit cube, and their weights (8, N)."""
+    """Return the indices (8, N) of the vertices around points (N, 3) of the unit cube, and their weights (8, N)."""
     places = coordinates.clamp(0.0, 1.0) * side
     low = places.floor().clamp_max(side - 1)
     share = places - low
@@ -49,7 +49,7 @@ def corners_of(coordinates: Tensor, side: int) -> tuple[Tensor, Tensor]:
 
 
 def marched(model: Model, origins: Tensor, directions: Tensor) -> tuple[HashGrid, Samples]:
-    """Return the field's grid and the samples that light gets to."""
+    """Return the field's grid and the visible samples of rays."""
     grid = model.field.medium()
     assert isinstance(grid, HashGrid)
     assert not grid.antialias
@@ -74,8 +74,9 @@ def colours(
 
 
 def squared_jacobians(model: Model, origins: Tensor, directions: Tensor, side: int) -> Tensor:
-    """Return, of each vertex of the grid, the sum over rays, channels and axes of the squared derivative of the colour
-    with respect to its offset: ((side + 1)^3,) float64.
+    """Return the squared derivatives of colours by the offset of each vertex, ((side + 1)^3,) float64.
+
+    They are summed over rays, channels and axes.
     """
     grid, samples = marched(model, origins, directions)
     offsets = torch.zeros_like(samples.coordinates).requires_grad_()
@@ -94,10 +95,10 @@ def squared_jacobians(model: Model, origins: Tensor, directions: Tensor, side: i
 
 @torch.no_grad()
 def logarithms(model: Model, origins: Tensor, directions: Tensor, variance: Tensor, side: int) -> Tensor:
-    """Return (R,) of rays: log10 of the standard deviation of the deformation, blended like their colours.
+    """Return for rays (R,) the log10 standard deviation of the deformation, composited like their colours.
 
     Args:
-        variance: ((side + 1)^3,) of the vertices. Between them it is the mean by squared weights.
+        variance: ((side + 1)^3,) of the vertices; between them, means are weighted by squared interpolation weights.
     """
     _, samples = marched(model, origins, directions)
     numbers, weights = corners_of(samples.coordinates, side)
@@ -108,7 +109,7 @@ def logarithms(model: Model, origins: Tensor, directions: Tensor, variance: Tens
 
 
 def rays_of(model: Model, frame: Frame, pixels: np.ndarray) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield origins and directions (N, 3) of some pixels, a part at a time."""
+    """Yield origins and directions (N, 3) of some pixels, in batches."""
     rays = pixel_rays(frame, model.training_from_scene, pixels=pixels, places=CENTRES, device=torch.device("cpu"))
     for directions in rays.directions.split(TOGETHER):
         yield rays.origin.expand_as(directions), directions

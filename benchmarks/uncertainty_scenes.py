@@ -1,7 +1,7 @@
-"""Captures with true geometry for `uncertainty.py`, and who sees what in them, from the geometry alone.
+"""Captures with true geometry for `uncertainty.py`, and which photos see which points, from the geometry alone.
 
-spheres and two more scenes of balls and blocks are met by rays in closed form; the desk is met by rays to its triangles
-(embreex, which only says which triangle: the distance to its plane is computed here in float64).
+Rays hit spheres and two more scenes of balls and blocks in closed form, and the triangles of the desk by embreex, which
+reports only the triangle: the distance to its plane is computed here in float64.
 """
 
 import importlib
@@ -28,11 +28,11 @@ from make_spheres import Ball, Box
 
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk"
 DESK_SEED = 20260
-# From the axes of OpenCV to those of OpenGL, which transforms.json has.
+# From the axes of OpenCV to those of OpenGL, as in transforms.json.
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-# A photo sees a point if its ray meets something no farther than this from it, at an incidence below that.
+# A photo sees a point if the first hit of its ray is within `SAME` of it, at an incidence below `STEEPEST_DEG`.
 SAME, STEEPEST_DEG = 0.002, 80.0
-# Degrees of the ring that are withheld, and every how many of the other photos.
+# Degrees of the ring that are withheld; every how many of the other photos are controls.
 SECTOR_DEG, CONTROL_EVERY = 120.0, 8
 # Longer side in pixels of the views in which depth is compared.
 VIEW_PX = 64
@@ -43,8 +43,9 @@ class Truth(Protocol):
     """The true surface of a scene."""
 
     def first_hit(self, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance (N,) and normal (N, 3), of either sign, of what rays (N, 3) of length 1 from a point (3,) meet
-        first; infinite and NaN where that is nothing.
+        """Return distance (N,) and normal (N, 3), of either sign, of the first hits of unit rays (N, 3) from (3,).
+
+        Infinite and NaN for rays that hit nothing.
         """
         ...
 
@@ -97,7 +98,7 @@ class Triangles:
 
 
 def blocks(seed: int) -> Solids:
-    """Blocks and balls on a slab, which hide one another."""
+    """Return blocks and balls on a slab, which occlude one another."""
     rng = np.random.default_rng(seed)
     things: list[Ball | Box] = [Box((0.0, 0.0, -0.37), (1.1, 1.1, 0.12), (0.5, 0.55, 0.6), 8.0)]
     for _ in range(5):
@@ -146,7 +147,7 @@ def write_capture(name: str, folder: Path) -> None:
 
 
 def withheld(frames: Sequence[Frame], *, sector: int) -> tuple[list[str], list[str]]:
-    """Return the names of the photos in a sector of the ring, 90 degrees on for each number, and of the controls."""
+    """Return the names of the photos in a sector of the ring, from 90 degrees times its number, and of the controls."""
     middle = np.mean([frame.centre for frame in frames], axis=0)
     inside, others = [], []
     for frame in frames:
@@ -171,7 +172,7 @@ def looks(frames: Sequence[Frame]) -> list[Frame]:
 
 @dataclass(frozen=True)
 class TruePixels:
-    """What is true in the pixels of some views, one after the other.
+    """The truth in the pixels of some views, one view after the other.
 
     Args:
         distance: (P,) along the ray, infinite where nothing is hit.
@@ -190,8 +191,9 @@ class TruePixels:
 
 
 def stratum_of(photos: np.ndarray, parallax_deg: np.ndarray, *, hit: np.ndarray) -> np.ndarray:
-    """Return the index in `STRATA` of each point: U0 no photo; U1 one, or less than 2 degrees between them; D three and
-    more, 10 degrees and more; W what is between.
+    """Return the index in `STRATA` of each point, by the photos that see it.
+
+    U0: none. U1: one, or less than 2 degrees between them. D: at least three, with at least 10 degrees. W: all others.
     """
     stratum = np.full(len(photos), STRATA.index("W"))
     stratum[(photos >= 3) & (parallax_deg >= 10.0)] = STRATA.index("D")
@@ -202,7 +204,7 @@ def stratum_of(photos: np.ndarray, parallax_deg: np.ndarray, *, hit: np.ndarray)
 
 
 def true_pixels(truth: Truth, views: Sequence[Frame], training: Sequence[Frame]) -> TruePixels:
-    """Look at the true surface through the pixels of views, and from the training photos at what is seen there."""
+    """Return the true distances in the pixels of views, and which training photos see the points there."""
     columns = []
     for view in views:
         bearings, _ = view.camera.pixel_bearings()
@@ -210,7 +212,7 @@ def true_pixels(truth: Truth, views: Sequence[Frame], training: Sequence[Frame])
         distance, normals = truth.first_hit(view.centre, rays)
         there = np.flatnonzero(np.isfinite(distance))
         points = view.centre + distance[there, None] * rays[there]
-        # On the side of the surface that this view sees: a photo on the other side of a thin sheet sees another one.
+        # The normal on the side that this view sees: a photo on the other side of a thin sheet does not see the point.
         towards = np.where((normals[there] * rays[there]).sum(axis=1) > 0, -1.0, 1.0)[:, None] * normals[there]
         seen = np.stack([sees(truth, photo, points, towards) for photo in training], axis=1)
         photos, parallax = np.zeros(len(rays), int), np.zeros(len(rays))

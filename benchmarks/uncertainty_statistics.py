@@ -1,6 +1,6 @@
-"""Statistics and verdicts of `uncertainty.py`, written down before any result was seen.
+"""Statistics and verdicts of `uncertainty.py`, fixed before any result was seen.
 
-Letters: M members, P pixels, s standard deviation between members (ddof 1), m their mean, z the true distance.
+Notation: M members, P pixels, s standard deviation between members (ddof 1), m their mean, z the true distance.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from scipy import stats
 
 RATIOS = np.linspace(0.0, 1.0, 100, endpoint=False)
 LEVELS = (0.5, 0.9)
-# Of U0, D and all pixels of a replicate; fewer pixels than this have no statistics.
+# Fewer pixels than this have no statistics, in a stratum or in all of a replicate.
 LEAST_PIXELS = 50
 NLL_FLOOR = 0.001
 WRONG = 0.05
@@ -19,7 +19,7 @@ YES, LABEL_ONLY, NO, UNDECIDED = "YES", "LABEL ONLY", "NO", "undecided"
 
 
 def sparsification(error: np.ndarray, uncertainty: np.ndarray, *, seed: int = 0) -> np.ndarray:
-    """Return the mean error (100,) of what is left when the most uncertain 0, 1, ..., 99 % are removed.
+    """Return the mean error (100,) of the remaining pixels when the most uncertain 0, 1, ..., 99 % are removed.
 
     Pixels of the same uncertainty are removed in random order.
     """
@@ -41,12 +41,12 @@ def ause(error: np.ndarray, uncertainty: np.ndarray) -> float:
 
 
 def aurg(error: np.ndarray, uncertainty: np.ndarray) -> float:
-    """Return the area between the mean error, as random removal leaves it, and the curve by the uncertainty."""
+    """Return the area between the mean error, as under random removal, and the curve by the uncertainty."""
     return float(np.trapezoid(error.mean() - sparsification(error, uncertainty), RATIOS))
 
 
 def ause_of_views(error: np.ndarray, uncertainty: np.ndarray, views: np.ndarray) -> float:
-    """Return AUSE as the code of Bayes' Rays has it: of each view, both curves divided by the larger maximum; the mean.
+    """Return AUSE as in the code of Bayes' Rays: the mean over views, with both curves divided by their maximum.
 
     Args:
         error, uncertainty: (P,).
@@ -63,9 +63,9 @@ def ause_of_views(error: np.ndarray, uncertainty: np.ndarray, views: np.ndarray)
 
 
 def variance_fraction(members: np.ndarray, true: np.ndarray) -> float:
-    """Return v = mean(s^2) / (mean(s^2) + mean((m - z)^2)), which part of the squared error members show.
+    """Return v = mean(s^2) / (mean(s^2) + mean((m - z)^2)), the fraction of the squared error that is variance.
 
-    Members that differ from the truth as they differ from one another have M / (2 M + 1), nearly a half.
+    If the truth is distributed like another member, v is M / (2 M + 1), nearly a half.
 
     Args:
         members: (M, P).
@@ -76,19 +76,19 @@ def variance_fraction(members: np.ndarray, true: np.ndarray) -> float:
 
 
 def in_reaches(members: np.ndarray, true: np.ndarray, *, level: float) -> np.ndarray:
-    """Return |m - z| / (t s sqrt(1 + 1/M)), t the quantile of Student's t with M - 1 degrees: up to 1 inside."""
+    """Return |m - z| / (t s sqrt(1 + 1/M)), at most 1 inside the interval; t: Student's quantile, M - 1 degrees."""
     count = len(members)
     reach = stats.t.ppf(0.5 * (1.0 + level), count - 1) * members.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / count)
     return np.abs(members.mean(axis=0) - true) / np.maximum(reach, np.finfo(float).tiny)
 
 
 def held_by_interval(members: np.ndarray, true: np.ndarray, *, level: float, widened: float = 1.0) -> float:
-    """Return which part of the truth is in m +- t s sqrt(1 + 1/M), or in an interval `widened` times as wide."""
+    """Return the fraction of true values in m +- t s sqrt(1 + 1/M), or in an interval `widened` times as wide."""
     return float((in_reaches(members, true, level=level) <= widened).mean())
 
 
 def log_likelihood_loss(members: np.ndarray, true: np.ndarray) -> float:
-    """Return the mean negative log likelihood of the truth under a normal of m and s, s of a millimetre at least."""
+    """Return the mean negative log likelihood of the truth under a normal of m and s, with s at least a millimetre."""
     spread = np.maximum(members.std(axis=0, ddof=1), NLL_FLOOR)
     return float(-stats.norm.logpdf(true, members.mean(axis=0), spread).mean())
 
@@ -102,7 +102,7 @@ def area_under_roc(values: np.ndarray, positive: np.ndarray) -> float:
 
 
 def ranks(values: np.ndarray) -> np.ndarray:
-    """Return the ranks of values from 0 to 1, ties in the middle of theirs."""
+    """Return the ranks of values, scaled to 0 to 1, with mean ranks for ties."""
     return (stats.rankdata(values) - 0.5) / len(values)
 
 
@@ -134,7 +134,7 @@ def mean_with_interval(values: np.ndarray) -> tuple[float, float, float]:
 
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
-    """Return p-values adjusted for their number. Source: Holm 1979, Scandinavian Journal of Statistics 6, 65-70."""
+    """Return p-values adjusted for multiple tests. Source: Holm 1979, Scandinavian Journal of Statistics 6, 65-70."""
     adjusted, largest = {}, 0.0
     for place, name in enumerate(sorted(p_values, key=lambda name: p_values[name])):
         largest = max(largest, min(1.0, (len(p_values) - place) * p_values[name]))
@@ -144,14 +144,14 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Summary:
-    """What decides over a kind of ensemble, over all replicates.
+    """The numbers that decide the verdict on a kind of ensemble, over all replicates.
 
     Args:
-        held: part of the truth in 90 % intervals in U0.
+        held: fraction of true values in 90 % intervals in U0.
         v_unseen, v_seen: `variance_fraction` in U0 and in D.
         correlation: Spearman's, of spread and error inside U0: mean and its interval.
         marks: area under the ROC of the spread, U0 against D.
-        p_of_ause: that AUSE is not below that of coverage, adjusted by `holm`.
+        p_of_ause: p-value of AUSE below that of coverage, adjusted by `holm`.
         ause_difference: mean of AUSE of the spread minus that of coverage.
     """
 
@@ -165,7 +165,7 @@ class Summary:
 
 
 def verdict(found: Summary) -> str:
-    """Return what a kind of ensemble is good for where no photo looked.
+    """Return the verdict on a kind of ensemble where no photo looked.
 
     YES, it measures the error: in U0 90 % intervals hold at least 80 %, v(U0) is within a factor 2 of v(D), the rank
     correlation in U0 is at least 0.3 with an interval above 0, and AUSE is below that of coverage (p < 0.05).
@@ -173,7 +173,7 @@ def verdict(found: Summary) -> str:
     correlation is not above 0, or v(U0) < 0.3.
     NO, it shows what repeated optimisation disagrees on: v(U0) < 0.1, or 90 % intervals hold less than 50 %, or AUSE is
     not below that of coverage.
-    Looked at in this order: what marks the unseen and fails a rule of NO is LABEL ONLY.
+    The rules apply in this order: a kind that marks the unseen and also meets a rule of NO is LABEL ONLY.
     """
     mean, low, _ = found.correlation
     if (
@@ -193,6 +193,6 @@ def verdict(found: Summary) -> str:
 
 
 def permuted(maps: Sequence[np.ndarray], index: int, *, seed: int = 0) -> np.ndarray:
-    """Return the uncertainty of the next replicate, drawn to the length of this one: it knows nothing of this one."""
+    """Return draws from the next replicate's uncertainty, as many as this one has pixels: an uninformed control."""
     other = maps[(index + 1) % len(maps)]
     return np.random.default_rng(seed).choice(other, len(maps[index]))

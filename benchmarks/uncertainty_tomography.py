@@ -1,13 +1,14 @@
-"""The question of `uncertainty.py` where the null space is known exactly: linear tomography of slices, in a minute.
+"""The question of `uncertainty.py` with an exactly known null space: linear tomography of slices, in a minute.
 
     python benchmarks/uncertainty_tomography.py -o tomography.csv
 
 Slices of the phantom of `sample_scenes/ellipsoids.py` on 32 x 32 pixels, parallel beam, 1 % noise: with 60 of 180
-degrees missing, and with a detector that sees the middle 60 % alone. A fit goes from its start to the least squares, so
-that what the data do not touch keeps its start. Members differ in their starts (seeds: white, 1e-4; prior: smooth, of 6
-pixels and the standard deviation of the slice) or in their views (photos: 80 %, from 0). U0 is the quarter of the
-pixels whose unit vectors lie most in the null space, D the quarter that lies least in it. The positive control draws
-slices from the Gaussian of the prior and members from its posterior: 90 % intervals have to hold 87 to 93 %.
+degrees missing, and with a detector that sees only the middle 60 %. A fit is the least-squares solution nearest to its
+start, so that components in the null space keep their start. Members differ in their starts (seeds: white noise of
+1e-4; prior: smooth over 6 pixels, with the standard deviation of the slice) or in their views (photos: 80 %, from 0).
+U0 is the quarter of the pixels whose unit vectors are most in the null space, D the quarter that is least in it. The
+positive control draws slices from the Gaussian of the prior and members from its posterior: 90 % intervals must hold 87
+to 93 %.
 """
 
 import csv
@@ -31,21 +32,21 @@ SIDE, VIEWS, NOISE, SMOOTH_PX = 32, 45, 0.01, 6.0
 HEIGHTS = (0.0, 1.5)
 MEMBERS, CONTROLS = 8, 40
 KINDS = ("seeds", "photos", "prior")
-# Singular values below this part of the largest count as 0: noise would be 50 times as large in what they give.
+# Singular values below this fraction of the largest count as 0, as they would amplify noise 50 times more.
 CUT = 0.02
 QUARTER = 0.25
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Lines of a scan: angles in degrees of its views, and the part of the width that the detector sees."""
+    """Lines of a scan: angles of its views in degrees, and the fraction of the width that the detector sees."""
 
     name: str
     angles_deg: np.ndarray
     width: float
 
     def matrix(self) -> np.ndarray:
-        """(lines, pixels): of points every half pixel along a line, bilinear weights times their distance."""
+        """Return (lines, pixels): bilinear weights of points every half pixel along each line, times their spacing."""
         offsets = (np.arange(SIDE) + 0.5) / SIDE * 2 - 1
         offsets = offsets[np.abs(offsets) < self.width]
         along = (np.arange(3 * SIDE) + 0.5) / (1.5 * SIDE) * 1.5 - 1.5
@@ -77,7 +78,7 @@ GEOMETRIES = (
 
 @dataclass(frozen=True)
 class Inverse:
-    """The least squares of a matrix, by its singular vectors above `CUT`.
+    """The least-squares inverse of a matrix, by its singular vectors above `CUT`.
 
     Args:
         back: (pixels, lines) pseudo-inverse.
@@ -96,7 +97,7 @@ class Inverse:
 
 
 def smooth_root() -> np.ndarray:
-    """A square root (pixels, pixels) of the covariance exp(-d^2 / (2 l^2)), l of `SMOOTH_PX`."""
+    """Return a square root (pixels, pixels) of the covariance exp(-d^2 / (2 l^2)), with l = `SMOOTH_PX`."""
     y, x = np.divmod(np.arange(SIDE**2), SIDE)
     squared = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
     values, vectors = np.linalg.eigh(np.exp(-squared / (2 * SMOOTH_PX**2)))
@@ -104,7 +105,7 @@ def smooth_root() -> np.ndarray:
 
 
 def slice_at(height: float) -> np.ndarray:
-    """(pixels,) attenuation of the phantom at a height, minus its mean, of standard deviation 1."""
+    """Return the attenuation (pixels,) of the phantom at a height, with mean 0 and standard deviation 1."""
     at = 9.0 * ((np.arange(SIDE) + 0.5) / SIDE * 2 - 1)
     points = np.stack(np.meshgrid(at, at, [height], indexing="xy"), axis=-1).reshape(-1, 3)
     values = attenuation_at(bean(), points)
@@ -112,7 +113,7 @@ def slice_at(height: float) -> np.ndarray:
 
 
 def fits(kind: str, matrix: np.ndarray, data: np.ndarray, root: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(MEMBERS, pixels) fits of a kind; views are equal numbers of rows of the matrix."""
+    """Return fits (MEMBERS, pixels) of a kind; each view has the same number of rows in the matrix."""
     whole, lines = Inverse.of(matrix), len(data) // VIEWS
     members = []
     for _ in range(MEMBERS):
@@ -128,7 +129,7 @@ def fits(kind: str, matrix: np.ndarray, data: np.ndarray, root: np.ndarray, rng:
 
 
 def cases() -> Iterator[dict[str, float | str]]:
-    """Numbers of each kind in each case; the deployed fit is one of the seeds."""
+    """Yield the numbers of each kind in each case; the deployed fit starts at 0."""
     root = smooth_root()
     for number, (geometry, height) in enumerate((g, h) for g in GEOMETRIES for h in HEIGHTS):
         matrix, true, rng = geometry.matrix(), slice_at(height), np.random.default_rng(number)
@@ -172,7 +173,7 @@ def cases() -> Iterator[dict[str, float | str]]:
 
 
 def positive_control(geometry: Geometry) -> float:
-    """Return which part of the truth 90 % intervals hold where truth and prior are the same Gaussian.
+    """Return the fraction of true values in 90 % intervals if truth and prior are the same Gaussian.
 
     A draw of the posterior is x + C A' (A C A' + s^2)^-1 (b + s e - A x), x from the prior, e white.
     Source: Papandreou and Yuille 2010, Gaussian sampling by local perturbations, section 2.

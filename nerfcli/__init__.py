@@ -1,12 +1,11 @@
 """nerfcli: from a folder of photos to a radiance field, its renders, depth maps and videos.
 
-What the commands do, for Python programs: `estimate_poses`, `train_scene`, `evaluate_run`, `render_run`, `export_run`;
-and `load_scene`, `load_run` for what these write. They are imported when they are first used, so that `import nerfcli`
-is quick.
+Python programs can call the commands as functions: `estimate_poses`, `train_scene`, `evaluate_run`, `render_run` and
+`export_run`; `load_scene` and `load_run` read their results. All are imported on first use: `import nerfcli` is fast.
 """
 
-# Before any module of this package can import pycolmap: its wheel exports zlib's functions, and where Python's zlib is
-# loaded after it, the first compression (a PNG, a TIFF, an npz) aborts the process.
+# Must come before any import of pycolmap: its wheel exports zlib's functions, and if Python's zlib is loaded after it,
+# the first compression (a PNG, a TIFF, an npz) aborts the process.
 import zlib  # noqa: F401
 
 __version__ = "0.1.0"
@@ -31,7 +30,7 @@ _MODULES = {
     "render_run": "nerfcli.workflows.render",
     "train_scene": "nerfcli.workflows.train",
 }
-# Where the name in the module is another one.
+# Functions that have a different name in their module.
 _NAMES = {"load_scene": "load"}
 
 

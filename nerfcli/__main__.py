@@ -1,6 +1,6 @@
-"""Entry point of the command `nerfcli`, and of `python -m nerfcli` where that is not on the path.
+"""Entry point of the command `nerfcli`, and of `python -m nerfcli` if the command is not on the path.
 
-Importing what a command needs takes longer than many commands: Ctrl-C meanwhile ends as it does later, in one line.
+Imports take longer than many commands; Ctrl-C during them ends with one line, as it does later.
 """
 
 import gc
@@ -8,8 +8,8 @@ import sys
 
 from nerfcli.errors import INTERRUPTED
 
-# Instead of 10. A full collection visits everything that torch and numba made while they were imported, and importing
-# them caused dozens, a quarter of its time; young garbage is collected as often as before.
+# Instead of 10. A full collection visits every object that the imports of torch and numba create, and with the default,
+# dozens of them took a quarter of the import time; young garbage is collected as often as before.
 _YOUNG_PER_FULL_COLLECTION = 100
 
 

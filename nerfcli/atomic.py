@@ -1,7 +1,7 @@
-"""Files and folders that appear whole or not at all.
+"""Files and folders that are written completely or not at all.
 
 Everything is written under a hidden name beside its destination and renamed when complete, so that a killed
-command or a full disk leaves nothing behind that a later one would take for a result.
+command or a full disk leaves nothing behind that a later command would take for a result.
 """
 
 import json
@@ -17,7 +17,7 @@ from typing import Any
 
 from nerfcli.errors import UserError
 
-# What a process that was killed leaves: half a result, or a whole one that it had just put aside.
+# Leftovers of a killed process: a partial result, or an old result that it had just moved aside.
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<kind>partial|old)-(?P<process>\d+)(\D.*)?", re.DOTALL)
 
 
@@ -26,7 +26,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """Provide a temporary path with the suffix of `path`; renamed to `path` on success, removed on any exception.
 
     Raises:
-        UserError: the folder cannot be made or written, or the disk is full.
+        UserError: the folder cannot be created or written, or the disk is full.
     """
     partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
     with _write_errors_explained(path):
@@ -35,15 +35,15 @@ def atomic_path(path: Path) -> Iterator[Path]:
             yield partial
             os.replace(partial, path)
         finally:
-            with suppress(OSError):  # the error that brought us here says more
+            with suppress(OSError):  # the original error is more informative
                 partial.unlink(missing_ok=True)
 
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Provide a temporary folder that takes the place of `path` on success and is removed on any exception.
+    """Provide a temporary folder that replaces `path` on success and is removed on any exception.
 
-    A folder that stands at `path` is replaced only in the last step; asking the user comes before.
+    A folder at `path` is replaced only in the last step; callers ask the user before.
 
     Raises:
         UserError: as for `atomic_path`.
@@ -82,8 +82,8 @@ def replace_folder(complete: Path, path: Path) -> None:
 
 
 def clear_leftovers(folder: Path) -> None:
-    """Remove what killed processes left in a folder: half results; and whole ones that they had put aside to replace
-    them, which are put back where their place is empty. What belongs to a process that lives is left alone."""
+    """Remove leftovers of killed processes in a folder: partial results, and old results moved aside, which are
+    restored if nothing has replaced them. Files of running processes are kept."""
     found = [match for match in map(_LEFTOVER.fullmatch, _names(folder)) if match and not _lives(int(match["process"]))]
     for match in found:
         path, place = folder / match.string, folder / match["name"]
@@ -99,25 +99,25 @@ def clear_leftovers(folder: Path) -> None:
 def _names(folder: Path) -> list[str]:
     try:
         return os.listdir(folder)
-    except OSError:  # there is none yet
+    except OSError:  # the folder does not exist yet
         return []
 
 
 def _lives(process: int) -> bool:
-    """Return whether there is a process with this number on this machine; True where one cannot ask."""
+    """Return True if a process with this number runs on this machine, or if that cannot be checked."""
     if sys.platform == "win32":
         return True
     try:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except (OSError, OverflowError):  # somebody else's
+    except (OSError, OverflowError):  # a process of another user
         return True
     return True
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write `content` as indented JSON, atomically. NaN and infinity are refused: JSON has no word for them."""
+    """Write `content` as indented JSON, atomically. NaN and infinity are refused, since JSON cannot hold them."""
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     with atomic_path(path) as partial:
         partial.write_text(text + "\n", encoding="utf-8")
@@ -128,11 +128,11 @@ def read_json(path: Path, *, needed: tuple[str, ...], hint: str) -> dict[str, An
 
     Args:
         path: the file.
-        needed: keys without which it is damaged.
-        hint: what to do if it is.
+        needed: required keys.
+        hint: advice for the error.
 
     Raises:
-        UserError: it cannot be read, is no JSON, or lacks a key.
+        UserError: it cannot be read, is not a JSON object, or lacks a key.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -144,10 +144,10 @@ def read_json(path: Path, *, needed: tuple[str, ...], hint: str) -> dict[str, An
 
 
 def refuse_read_only(path: Path) -> None:
-    """Refuse a place where nothing can be written, before the work rather than after it.
+    """Refuse a path that cannot be written, before the work rather than after it.
 
     Raises:
-        UserError: the nearest folder above `path` that exists may not be written.
+        UserError: the nearest existing folder above `path` is not writable.
     """
     home = next(folder for folder in path.absolute().parents if folder.exists())
     if not os.access(home, os.W_OK):
@@ -165,7 +165,7 @@ def cannot_write(path: Path, error: OSError) -> UserError:
 
 @contextmanager
 def _write_errors_explained(path: Path) -> Iterator[None]:
-    """Tell the user about errors of writing `path`; errors of reading something else meanwhile pass through."""
+    """Convert errors of writing `path` to UserError; errors about other files pass through."""
     try:
         yield
     except OSError as error:

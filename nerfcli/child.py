@@ -1,4 +1,4 @@
-"""Child processes that report in lines of JSON on stdout, and end when their parent does."""
+"""Child processes that report lines of JSON on stdout, and end when their parent ends."""
 
 import json
 import os
@@ -19,33 +19,33 @@ def spawn(
     """Start `python -m MODULE JOB` with its stderr in a log.
 
     Args:
-        module: of this program; it calls `take_stdout` first.
-        job: the argument.
+        module: a module of this package, which calls `take_stdout` first.
+        job: its argument.
         log: an open file.
-        threads: for OpenMP, where above 0.
-        descriptors: that the child inherits; none on Windows.
+        threads: OpenMP threads, if above 0.
+        descriptors: file descriptors for the child to inherit; ignored on Windows.
     """
     package_root = str(Path(nerfcli.__file__).parent.parent)
-    # An empty entry would mean the current folder, whose files must not pass for libraries.
+    # An empty entry would mean the current folder, whose files must not be imported.
     places = [package_root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
     if threads > 0:
         environment["OMP_NUM_THREADS"] = str(threads)
     return subprocess.Popen(
-        # -P: else a file numpy.py or a folder nerfcli where the user happens to be would be taken for ours.
+        # -P: otherwise a file numpy.py or a folder nerfcli in the user's current folder would be imported.
         [sys.executable, "-P", "-m", module, str(job)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=log,
         env=environment,
         pass_fds=() if sys.platform == "win32" else descriptors,
-        # Ctrl-C on a terminal goes to its whole process group; only the parent answers it, by ending the child.
+        # Ctrl-C reaches the whole process group of a terminal; only the parent handles it, and ends the child.
         start_new_session=True,
     )
 
 
 def messages(child: subprocess.Popen[bytes]) -> Generator[dict[str, Any], None, None]:
-    """Yield what the child reports until it ends; it is dead when the iterator is exhausted or closed."""
+    """Yield the messages of the child until it ends; closing the iterator kills the child."""
     try:
         assert child.stdout is not None
         for line in child.stdout:
@@ -57,14 +57,14 @@ def messages(child: subprocess.Popen[bytes]) -> Generator[dict[str, Any], None, 
 
 
 def take_stdout() -> Callable[[dict[str, Any]], None]:
-    """Return a function, in the child, that sends a message; nothing else writes to stdout from here on.
+    """Return, in the child, a function that sends a message; from now on nothing else writes to stdout.
 
-    The process ends at once when its stdin closes, which is what happens when the parent dies, however it dies.
+    The process ends at once when its stdin closes, which happens whenever the parent dies, even if it is killed.
     """
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to all processes of a command: the parent answers it
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to all processes of a command, but handled by the parent
 
     def send(message: dict[str, Any]) -> None:
         channel.write(json.dumps(message) + "\n")

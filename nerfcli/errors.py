@@ -14,8 +14,8 @@ class UserError(Exception):
     """A problem that the user can fix, reported in two lines.
 
     Args:
-        message: what is wrong, with the value and the file; no trailing full stop needed.
-        hint: what was expected and what to do about it.
+        message: the problem, with the value and the file; no trailing full stop needed.
+        hint: what was expected, and how to fix it.
         exit_code: the process's exit status, one of the constants of this module.
     """
 
@@ -27,6 +27,6 @@ class UserError(Exception):
 
 
 def reason_of(error: BaseException) -> str:
-    """Return one line for an exception: its type and the first line of its text."""
+    """Describe an exception in one line: its type and the first line of its text."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

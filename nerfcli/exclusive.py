@@ -1,4 +1,4 @@
-"""One process at a time: locks that a process which is killed lets go of."""
+"""File locks for one process at a time, released when the process ends or is killed."""
 
 import os
 import sys
@@ -12,17 +12,17 @@ from nerfcli.errors import UserError
 
 @contextmanager
 def exclusive(path: Path, holder: str) -> Iterator[int]:
-    """Hold the lock of a file, which is made if need be, with its folder.
+    """Hold the lock of a file, which is created with its folder if necessary.
 
     Args:
         path: the file; its content is unused.
-        holder: who holds it, for those that come too late: "nerfcli poses is at work on photos-scene".
+        holder: description of the holder for the error message: "nerfcli poses is at work on photos-scene".
 
     Yields:
-        The descriptor. A child process that inherits it holds the lock, too, until both have ended.
+        The descriptor. A child process that inherits it also holds the lock, until both have ended.
 
     Raises:
-        UserError: another process holds it, or the file cannot be made.
+        UserError: another process holds the lock, or the file cannot be created.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,12 +14,12 @@ class Finding:
 
     Args:
         check: its name.
-        verdict: good; look: it can be used, but expect less; bad: mend it before any long work.
-        summary: what was found, in words.
-        number: what was measured, None where that is no number.
-        threshold: what the number was held against, in words.
-        advice: what to do; empty where there is nothing to do.
-        photos: what to say of each photo concerned, by name, the worst first.
+        verdict: good; look: usable, but expect lower quality; bad: fix it before any long computation.
+        summary: the result, in words.
+        number: the measured value; None if it is not a number.
+        threshold: the criteria for the number, in words.
+        advice: what to do; empty if there is nothing to do.
+        photos: (name, remark) of each photo concerned, worst first.
     """
 
     check: str
@@ -32,22 +32,22 @@ class Finding:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The photos concerned."""
+        """Names of the photos concerned."""
         return tuple(name for name, _ in self.photos)
 
 
 def verdict_above(number: float, *, look: float, bad: float) -> str:
-    """Return the verdict on a number that should be small: look from one value on, bad from another."""
+    """Return the verdict on a number that should be small: look from `look` on, bad from `bad` on."""
     return BAD if number >= bad else LOOK if number >= look else GOOD
 
 
 def verdict_below(number: float, *, look: float, bad: float) -> str:
-    """Return the verdict on a number that should be large: look below one value, bad below another."""
+    """Return the verdict on a number that should be large: look below `look`, bad below `bad`."""
     return BAD if number < bad else LOOK if number < look else GOOD
 
 
 def worst(verdicts: Iterable[str]) -> str:
-    """Return the worst of the verdicts; good if there is none."""
+    """Return the worst of the verdicts; good if there are none."""
     return max(verdicts, key=VERDICTS.index, default=GOOD)
 
 

@@ -1,17 +1,17 @@
-"""Replace numbers that JSON has no word for."""
+"""Replace non-finite numbers, which JSON cannot hold."""
 
 import math
 from typing import Any
 
 
 def finite(content: Any) -> tuple[Any, dict[str, str]]:
-    """Copy plain content with None in place of every number that is not finite.
+    """Copy plain content, with None in place of every non-finite number.
 
     Args:
         content: dictionaries, lists, tuples and plain values. Tuples come back as lists.
 
     Returns:
-        The copy, and where a number was replaced, by its place: `{"lenses.0.gain": "inf"}`.
+        The copy, and the replaced numbers by their path: `{"lenses.0.gain": "inf"}`.
 
     Example:
         >>> finite({"gain": [1.0, float("inf")]})

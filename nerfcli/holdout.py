@@ -1,7 +1,7 @@
 """Held-out split: every n-th photo by name, a block of neighbours, or a list in a file.
 
-every:8       index 0, 8, 16, ... of the names in order: each has trained neighbours on both sides
-block:0.15    the middle 15 % of the names in order: a gap in the capture, whose inside has no neighbour
+every:8       index 0, 8, 16, ... of the sorted names: each has training neighbours on both sides
+block:0.15    the middle 15 % of the sorted names: a gap in the capture without training neighbours inside
 FILE          the names in a text file, one per line
 """
 
@@ -19,7 +19,7 @@ def check_holdout(text: str) -> str:
     """Return the rule, with the path of a file made absolute.
 
     Raises:
-        ValueError: it is none; the message says what was expected.
+        ValueError: the text is not a valid rule; the message says what was expected.
     """
     kind, _, value = text.partition(":")
     if kind == "every" and re.fullmatch(r"\d+", value) and int(value) >= 2:
@@ -39,11 +39,11 @@ def names_held_out(rule: str, names: Iterable[str], *, others: Iterable[str] = (
 
     Args:
         rule: see the module.
-        names: of the photos that can be held out.
-        others: names that a file may list, too, and that are passed over.
+        names: names of the photos that can be held out.
+        others: further names that a file may list, which are ignored.
 
     Raises:
-        UserError: a file lists a name that is not there, or nothing is left to train on or to measure on.
+        UserError: a file lists an unknown name, or no photos are left for training or for evaluation.
     """
     present = sorted(names)
     kind, _, value = rule.partition(":")
@@ -64,7 +64,7 @@ def names_held_out(rule: str, names: Iterable[str], *, others: Iterable[str] = (
 
 
 def _in_order(name: str) -> list[tuple[int, int, str]]:
-    """For sorting as the photos were taken: frame_9 before frame_10."""
+    """Return a sort key that compares numbers by value: frame_9 before frame_10."""
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.findall(r"\d+|\D+", name)]
 
 

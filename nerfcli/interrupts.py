@@ -1,7 +1,7 @@
-"""Ctrl-C and SIGTERM: both end a command in the same way, at the next moment at which what is saved is whole.
+"""Ctrl-C and SIGTERM: both end a command in the same way, at the next point where the saved state is complete.
 
-SIGTERM comes from `kill`, `timeout`, systemd and the schedulers of clusters. Some of them send it more than once, to a
-command alone and to its group: the first one counts. Who cannot wait has SIGKILL.
+SIGTERM comes from `kill`, `timeout`, systemd and cluster schedulers. Some of them send it more than once, to the
+command alone and to its group; only the first one counts. SIGKILL ends a command without waiting.
 """
 
 import _thread
@@ -12,19 +12,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-# Long enough to be out of the callback, short enough to go unnoticed.
+# Long enough for the callback to return, short enough to go unnoticed.
 _AGAIN_SECONDS = 0.05
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM came; what answers Ctrl-C answers this."""
+    """SIGTERM was received; code that handles Ctrl-C handles this, too."""
 
 
 def install_handlers() -> None:
-    """Make SIGTERM raise `Terminated`, unless the parent process ignores it; and lose no interrupt.
+    """Make SIGTERM raise `Terminated`, unless the parent process ignores it, and make sure that no interrupt is lost.
 
-    Python drops what is raised in a callback of C code or while an object is freed, numba's compiler for instance: what
-    was dropped is raised once more, elsewhere.
+    Python drops exceptions raised in a callback from C code (as in numba's compiler) or while an object is freed;
+    a dropped interrupt is raised again shortly afterwards.
     """
     if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminate)
@@ -34,7 +34,7 @@ def install_handlers() -> None:
 def restore_sigterm() -> None:
     """Restore Python's SIGTERM handler after a C++ library has replaced it.
 
-    Outside of the main thread, which alone may do this, nothing changes.
+    Only the main thread may set handlers; in other threads nothing changes.
     """
     handler = signal.getsignal(signal.SIGTERM)
     if handler is not None:
@@ -49,7 +49,7 @@ class Interrupts:
         self.came: type[KeyboardInterrupt] | None = None
 
     def note(self, signum: int, frame: FrameType | None) -> None:
-        """Remember the first; a Ctrl-C after it does not wait."""
+        """Record the first signal; a Ctrl-C after it is raised at once."""
         if signum == signal.SIGTERM:
             self.came = self.came or Terminated
         elif self.came is not None:
@@ -58,11 +58,11 @@ class Interrupts:
             self.came = KeyboardInterrupt
 
     def raise_if_pending(self) -> None:
-        """Raise the interrupt that arrived meanwhile.
+        """Raise the interrupt that arrived, if any.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C came.
-            Terminated: SIGTERM came.
+            KeyboardInterrupt: Ctrl-C arrived.
+            Terminated: SIGTERM arrived.
         """
         if self.came is not None:
             raise self.came
@@ -72,7 +72,7 @@ class Interrupts:
 def deferred_interrupts() -> Iterator[Interrupts]:
     """Defer Ctrl-C, and SIGTERM if `install_handlers` handles it, until `raise_if_pending`.
 
-    Outside of the main thread, to which signals do not come, nothing is held back.
+    In other threads than the main thread, which do not receive signals, nothing is deferred.
     """
     interrupts = Interrupts()
     try:
@@ -105,7 +105,7 @@ def _raise_again(dropped: "sys.UnraisableHookArgs") -> None:
         number = signal.SIGTERM
         signal.signal(number, _terminate)
     again = threading.Timer(_AGAIN_SECONDS, _send, [number])
-    again.daemon = True  # the command may end before
+    again.daemon = True  # the command may end first
     again.start()
 
 
@@ -115,4 +115,4 @@ def _send(number: signal.Signals) -> None:
         return
     main = threading.main_thread().ident
     assert main is not None
-    signal.pthread_kill(main, number)  # which ends a wait, too
+    signal.pthread_kill(main, number)  # also ends a blocking wait

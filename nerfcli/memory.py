@@ -1,7 +1,7 @@
 """Memory of the machine and of processes.
 
-What counts is what is resident. A limit on the address space (RLIMIT_AS) would be simpler, but it counts what is merely
-reserved: the libraries, the stacks and heaps of threads, gigabytes that never become memory.
+Only resident memory counts. A limit on the address space (RLIMIT_AS) would be simpler, but it includes memory that is
+merely reserved: libraries, thread stacks and heaps, gigabytes that are never used.
 """
 
 import ctypes
@@ -10,17 +10,18 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
-# Of what the machine, or the container, has. The rest is for its other processes and for the cache of files.
+# Fraction of the memory of the machine or container; the rest is for other processes and the file cache.
 _DEFAULT_SHARE = 0.8
 _CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-# Parameters of glibc's mallopt; memory that is always returned: arrays of this size, and more than this left over.
+# Parameters of glibc's mallopt, and thresholds: arrays of this size, and free memory beyond this, are always returned.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 _RETURNED_ARRAY, _RETURNED_REST = 2**30, 2**31 - 1
 
 
 def default_memory_limit(device: str = "cpu") -> int | None:
-    """Return four fifths of the memory of the machine or container, in bytes; None if unknown, and for a GPU, where all
-    that is free may be used.
+    """Return four fifths of the memory of the machine or container, in bytes.
+
+    None if unknown, and for a GPU, whose free memory may all be used.
     """
     if device != "cpu":
         return None
@@ -37,7 +38,7 @@ def default_memory_limit(device: str = "cpu") -> int | None:
 
 
 def resident_bytes(pid: int) -> int:
-    """Resident memory of a process, 0 if it has ended or the system has no word for it."""
+    """Return the resident memory of a process in bytes; 0 if it has ended or the system does not report it."""
     try:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE")
@@ -46,7 +47,7 @@ def resident_bytes(pid: int) -> int:
 
 
 def _resident_by_ps(pid: int) -> int:
-    """Ask `ps`, on systems without /proc."""
+    """Read resident memory from `ps`, on systems without /proc."""
     try:
         text = subprocess.run(["ps", "-o", "rss=", "-p", str(pid)], capture_output=True, text=True, check=False).stdout
     except OSError:
@@ -55,13 +56,13 @@ def _resident_by_ps(pid: int) -> int:
 
 
 def keep_freed_memory() -> bool:
-    """Keep the memory of freed arrays for the next ones, in one heap for all threads, instead of returning it.
+    """Keep the memory of freed arrays for later ones, in one heap for all threads, instead of returning it.
 
-    A training step allocates what the last one freed. The system would clear each page of it again, for up to 14 ms
-    of CPU time in a step of 62 ms on two threads. Call it before libraries start threads: heaps that exist stay.
+    A training step allocates what the last one freed. Otherwise the system would clear each page again, for up to 14 ms
+    of CPU time in a step of 62 ms on two threads. Call it before libraries start threads: existing heaps remain.
 
     Returns:
-        False where the C library is not glibc; nothing changes then.
+        False if the C library is not glibc; then nothing changes.
     """
     mallopt = _glibc_function("mallopt")
     if mallopt is None:
@@ -73,14 +74,14 @@ def keep_freed_memory() -> bool:
 
 
 def return_freed_memory() -> None:
-    """Return to the system what `keep_freed_memory` has kept, after work that needed much of it."""
+    """Return the memory that `keep_freed_memory` has kept to the system, after work that needed a lot of it."""
     if (trim := _glibc_function("malloc_trim")) is not None:
         trim(0)
 
 
 def _glibc_function(name: str) -> Callable[..., int] | None:
-    """Find a function of the C library; None on Windows, and where the library lacks it."""
+    """Find a function of the C library; None on Windows, and if the library lacks it."""
     try:
         return getattr(ctypes.CDLL(None), name, None)
-    except TypeError:  # Windows takes no None
+    except TypeError:  # Windows does not accept None
         return None

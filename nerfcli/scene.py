@@ -1,7 +1,7 @@
-"""A scene: the photos of a capture with their cameras, read from whichever format its folder is in.
+"""A scene: the photos of a capture with their cameras, read from any supported format.
 
-`load` finds the format; `save` writes nerfcli's own scene.json beside a COLMAP model. The world frame of a scene is the
-one of its files: it is never rotated, moved or scaled here.
+`load` detects the format; `save` writes nerfcli's own scene.json beside a COLMAP model. The world frame of a scene is
+that of its files: it is never rotated, moved or scaled here.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ from nerfcli.media.masks import find_mask
 MODEL_FOLDER = "sparse/0"
 
 
-# Every how many photos, in the order of their names, one is held out.
+# By default, one of this many photos in the order of their names is held out.
 HELD_OUT_EVERY = 8
 
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -45,16 +45,16 @@ class Scene:
     Args:
         root: the folder that was loaded.
         kind: "nerfcli", "colmap", "transforms", "blender" or "llff".
-        frames: all views whose photo is on disk.
+        frames: all views whose photos are on disk.
         test_names: names of the held-out frames.
-        points: (N, 3) points of the surface in the world frame, float64; N is 0 where the format has none.
-        missing: names of images that the capture lists and that are not on disk.
-        unit: of length: "arbitrary" or "metre".
-        depth_bounds: (frames, 2) nearest and farthest z per frame, in scene units, where the format has them.
-        unit_source: how a metre is known; None where the unit is arbitrary, or unknown.
-        rescaled: for how many photos the intrinsics were given for another size, see `Capture.rescaled`.
-        history: how cameras and points were found: the provenance of `save`, or {"from": the format}.
-        holdout: the rule that chose the held-out frames; None where the capture itself says, or is split as usual.
+        points: (N, 3) surface points in the world frame, float64; N is 0 if the format has none.
+        missing: names of listed images that are not on disk.
+        unit: unit of length: "arbitrary" or "metre".
+        depth_bounds: (frames, 2) nearest and farthest z per frame, in scene units, if the format has them.
+        unit_source: source of the metric scale; None if the unit is arbitrary, or the source is unknown.
+        rescaled: number of photos whose intrinsics were given for another size, see `Capture.rescaled`.
+        history: origin of cameras and points: the provenance of `save`, or {"from": the format}.
+        holdout: the rule that chose the held-out frames; None for the split of the capture, or the default split.
     """
 
     root: Path
@@ -72,7 +72,7 @@ class Scene:
 
     @property
     def train_frames(self) -> tuple[Frame, ...]:
-        """The frames to learn from, in order."""
+        """The training frames, in order."""
         return tuple(frame for frame in self.frames if frame.name not in self.test_names)
 
     @property
@@ -86,8 +86,8 @@ def with_fraction_of_photos(scene: Scene, fraction: float, *, seed: int) -> Scen
 
     Args:
         scene: the whole scene.
-        fraction: in (0, 1]; one photo is left at least.
-        seed: of the draw.
+        fraction: in (0, 1]; at least one photo is kept.
+        seed: seed of the draw.
     """
     names = [frame.name for frame in scene.train_frames]
     left_out = len(names) - max(1, round(fraction * len(names)))
@@ -100,18 +100,18 @@ def with_fraction_of_photos(scene: Scene, fraction: float, *, seed: int) -> Scen
 
 
 def is_scene(path: Path) -> bool:
-    """Return whether a folder contains the files of a scene, well-formed or not."""
+    """Return True if a folder contains the files of a scene, well-formed or not."""
     files = (SCENE_FILE, *_FOREIGN_FILES)
     return any((path / name).is_file() for name in files) or model_folder(path) is not None
 
 
 def model_folder(path: Path) -> Path | None:
-    """Return the folder of the COLMAP model in a scene's folder; None where there is none."""
+    """Return the folder of the COLMAP model in a scene's folder; None if there is none."""
     return next((path / name for name in _MODEL_FOLDERS if is_model(path / name)), None)
 
 
 def load(path: str | Path, *, holdout: str | None = None) -> Scene:
-    """Load the scene in a folder, whatever its format; a scene.json or transforms.json itself may be named too.
+    """Load the scene in a folder of any supported format; or from the path of a scene.json or transforms.json.
 
     Example:
         >>> import nerfcli
@@ -120,10 +120,10 @@ def load(path: str | Path, *, holdout: str | None = None) -> Scene:
 
     Args:
         path: the folder, or the file.
-        holdout: the rule by which photos are held out, see `holdout`, instead of what the capture says.
+        holdout: rule for the held-out photos, see `holdout`, instead of the split of the capture.
 
     Raises:
-        UserError: there is no scene, its files are malformed or do not fit the photos, or the rule does not.
+        UserError: there is no scene, its files are malformed or do not fit the photos, or the rule does not fit.
     """
     scene = _load(Path(path))
     if holdout is None:
@@ -146,18 +146,17 @@ def save(
     """Write scene.json beside the COLMAP model in scene_dir/sparse/0, and fix the held-out split.
 
     Args:
-        scene_dir: holds sparse/0, whose cameras refer to upright photos (EXIF orientation applied).
-        image_folder: the photos; stored relative to the scene folder, so that the two can move together.
+        scene_dir: contains sparse/0, whose cameras refer to upright photos (EXIF orientation applied).
+        image_folder: the photos; stored relative to the scene folder, so that both can be moved together.
         provenance: plain values: versions, command, settings.
-        unit: "arbitrary" or "metre"; unit_source says how a metre is known.
-        masks: a folder with a mask for each photo that has one, named as `media.masks.find_mask` says; or the mask of
-            each of these photos by its name.
-        split: by name, "train", "test", "val", or None for a photo that is not to be used; every 8th is held out if
-            this is not given.
-        depth_bounds: nearest and farthest z by name, in scene units, where they are known without points.
+        unit: "arbitrary" or "metre".
+        unit_source: source of the metric scale.
+        masks: a folder of masks, named as in `media.masks.find_mask`; or masks by the name of the photo.
+        split: "train", "test", "val" or None (unused) by the name of the photo; by default every 8th is held out.
+        depth_bounds: nearest and farthest z by name, in scene units, if they are known without points.
 
     Raises:
-        UserError: the model is not readable or scene.json cannot be written.
+        UserError: the model cannot be read, or scene.json cannot be written.
     """
     if unit not in UNITS:
         raise ValueError(f"unit must be one of {UNITS}, got {unit!r}")
@@ -193,15 +192,15 @@ def save(
 
 
 def default_split(names: Iterable[str]) -> frozenset[str]:
-    """Return the held-out names: sorted, every 8th, from the first on."""
+    """Return the held-out names: every 8th of the sorted names, including the first."""
     return frozenset(sorted(names)[::HELD_OUT_EVERY])
 
 
 def fingerprint(scene: Scene) -> str:
-    """SHA-256 over names, cameras, poses and split: the same on every machine that reads the same capture.
+    """Compute a SHA-256 of names, cameras, poses and split: the same on every machine that reads the same capture.
 
     Numbers enter with nine digits after the point (positions after division by the power of ten that bounds them), so
-    that the last bits, in which linear algebra libraries differ, do not.
+    that differences between linear algebra libraries in the last bits do not matter.
     """
     reach = max((float(np.abs(frame.centre).max()) for frame in scene.frames), default=0.0)
     size = 10.0 ** math.ceil(math.log10(reach)) if reach > 0 else 1.0
@@ -244,13 +243,13 @@ def _load(path: Path) -> Scene:
 
 
 def _scene(root: Path, capture: Capture) -> Scene:
-    """Return the scene of a capture in a foreign format, with its own split where it fixes one."""
+    """Return the scene of a capture in a foreign format, with the capture's split if it has one."""
     splits = {frame.split for frame in capture.frames}
     frames = capture.frames
     if "test" in splits or "val" in splits:
         held_out = "test" if "test" in splits else "val"
         test_names = frozenset(frame.name for frame in frames if frame.split == held_out)
-        # Views that the capture keeps for another purpose are neither learned from nor measured on.
+        # Views of other splits are used neither for training nor for evaluation.
         kept = [index for index, frame in enumerate(frames) if frame.split in ("train", held_out)]
     else:
         test_names = default_split(frame.name for frame in frames)
@@ -306,13 +305,13 @@ def _measure(path: Path) -> tuple[int, int, int]:
 
 
 def _measure_upright(path: Path) -> tuple[int, int, int]:
-    """For models whose cameras refer to the upright photos, as those of nerfcli poses do: nothing is left to turn."""
+    """Measure photos for models whose cameras refer to upright photos, as those of nerfcli poses do: no rotation."""
     return (*image_size(path), 1)
 
 
 def _image_folder(root: Path, model_dir: Path, model: ColmapModel) -> Path:
-    """Return where the photos of a COLMAP project are: the folder beside the model, or beside the folders that it
-    stands in, that holds most of the names; these may begin with the name of such a folder themselves."""
+    """Return the folder of a COLMAP project's photos: the one that contains most of the names, among the image folders
+    in `root`, the model's folder and its parents, and these folders themselves if names include the image folder."""
     homes = list(dict.fromkeys([root, model_dir, *model_dir.resolve().parents[:3]]))
     folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
     if not folders:
@@ -325,7 +324,7 @@ def _image_folder(root: Path, model_dir: Path, model: ColmapModel) -> Path:
 
 
 def _relative(path: Path, start: Path) -> str:
-    """Return a path as seen from a folder, with forward slashes; absolute where there is none (another drive)."""
+    """Return a path relative to a folder, with forward slashes; absolute if that is impossible (another drive)."""
     try:
         return Path(os.path.relpath(path.resolve(), start.resolve())).as_posix()
     except ValueError:
@@ -336,7 +335,7 @@ def refuse_without_training_photos(scene: Scene) -> None:
     """Refuse a scene that holds out every photo.
 
     Raises:
-        UserError: there is no training photo.
+        UserError: no training photo is left.
     """
     if not scene.train_frames:
         raise UserError(
@@ -346,7 +345,7 @@ def refuse_without_training_photos(scene: Scene) -> None:
 
 
 def photo_folder(path: Path) -> Path | None:
-    """Return the folder that contains photos: `path`, or its folder `images`; None if neither does."""
+    """Return the folder that contains photos: `path` or its subfolder `images`; None if neither does."""
     return next((folder for folder in (path, path / "images") if folder.is_dir() and list_images(folder)), None)
 
 

@@ -1,4 +1,4 @@
-"""JSON files with a digest of their content: a digit that changes on a disk would be another camera."""
+"""JSON files with a digest of their content, so that corruption on a disk cannot silently change a camera."""
 
 import hashlib
 import json
@@ -11,7 +11,7 @@ SEAL = "blake2b"
 
 
 def digest(value: Any) -> str:
-    """Hash plain values: equal for equal values, in every process and on every machine."""
+    """Hash plain values; equal values have equal digests in every process and on every machine."""
     return hashlib.blake2b(json.dumps(value, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
@@ -25,11 +25,11 @@ def write_sealed(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_sealed(path: Path) -> dict[str, Any]:
-    """Return what `write_sealed` wrote; a file without a digest is taken as it is.
+    """Read an object that `write_sealed` wrote; a file without a digest is accepted unchecked.
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no JSON object, or its content is not what was written.
+        ValueError: it is not a JSON object, or its content has changed.
     """
     content = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(content, dict):

@@ -16,17 +16,17 @@ SECONDS = 180.0
 
 
 def find_browser() -> str | None:
-    """The browser's program; None where there is none."""
+    """Return the path of the browser's program, or None if there is none."""
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
 class Browser:
-    """One page in a browser of its own.
+    """One page in its own browser process.
 
     Args:
         folder: for its profile.
         width, height: of the window.
-        flags: more of the browser's options.
+        flags: additional command-line options of the browser.
     """
 
     def __init__(self, folder: Path, *, width: int = 480, height: int = 360, flags: tuple[str, ...] = ()):
@@ -40,7 +40,7 @@ class Browser:
         )
 
         def descriptors() -> None:
-            # By way of others: the pipe may have just these numbers.
+            # Duplicated first, as the pipes themselves may already be descriptors 3 and 4.
             reads, writes = os.dup(to_browser), os.dup(from_browser)
             os.dup2(reads, 3)
             os.dup2(writes, 4)
@@ -73,7 +73,7 @@ class Browser:
         os.close(self._read)
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """A command of the DevTools protocol, and its answer."""
+        """Send a command of the DevTools protocol and return its answer."""
         self._number += 1
         message: dict[str, Any] = {"id": self._number, "method": method, "params": parameters}
         if self._session is not None:
@@ -97,23 +97,23 @@ class Browser:
         return json.loads(message)
 
     def open(self, page: Path, fragment: str = "") -> None:
-        """Load a page from the disk and wait until it has begun or said why not."""
+        """Load a page from disk and wait until it has started or reported why it cannot."""
         self.visit(page.resolve().as_uri() + fragment)
 
     def visit(self, url: str) -> None:
-        """Load a page by its address, as `open`."""
+        """Load a page by its URL and wait, like `open`."""
         self.send("Page.navigate", url="about:blank")
         self.send("Page.navigate", url=url)
         self.wait("document.body && document.body.dataset.state")
 
     def run(self, script: str) -> Any:
-        """The value of an expression in the page."""
+        """Return the value of an expression in the page."""
         answer = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
     def wait(self, script: str, *, seconds: float = SECONDS) -> Any:
-        """Wait until an expression is true; its value."""
+        """Wait until an expression is truthy and return its value."""
         end = time.monotonic() + seconds
         while not (value := self.run(script)):
             assert time.monotonic() < end, f"waited {seconds:g} s for {script}; {self.errors}"
@@ -121,7 +121,7 @@ class Browser:
         return value
 
     def key(self, key: str, *, seconds: float = 0.0) -> None:
-        """Press a key, for so long."""
+        """Press a key, and hold it for `seconds`."""
         text = {"text": key} if len(key) == 1 else {}
         self.send("Input.dispatchKeyEvent", type="keyDown", key=key, **text)
         time.sleep(seconds)
@@ -142,5 +142,5 @@ class Browser:
         self.send(mouse, type="mouseReleased", x=end[0], y=end[1], button="left", clickCount=1)
 
     def screenshot(self, path: Path) -> None:
-        """A PNG of the window."""
+        """Write a PNG of the window."""
         path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))

@@ -1,4 +1,4 @@
-"""Small captures with known truth, of every camera model, for the tests of capture formats; and what equality means."""
+"""Small captures of every camera model with known truth, and comparisons of captures, for tests of capture formats."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -43,10 +43,10 @@ CAMERAS = {
 
 
 def ring(*cameras: Camera, num_frames: int = 6, num_points: int = 40, seed: int = 0) -> Capture:
-    """Cameras around a cloud of coloured points near the origin, with all that a COLMAP model holds.
+    """Return frames around a cloud of coloured points near the origin, with everything that a COLMAP model holds.
 
-    Frames take turns with the cameras. Every point that a frame sees is observed where it projects, and each frame has
-    two features without a point. Names have spaces and letters beyond ASCII.
+    Frames cycle through the cameras. Every point that a frame sees is observed at its projection, and each frame has
+    two features without a point. Names contain spaces and non-ASCII letters.
     """
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.7, 0.7, size=(num_points, 3))
@@ -67,14 +67,14 @@ def ring(*cameras: Camera, num_frames: int = 6, num_points: int = 40, seed: int 
 
 
 def with_photos(capture: Capture, folder: Path) -> Capture:
-    """The capture with its images said to be in a folder, under the frames' names."""
+    """Return the capture with image paths in a folder, named like the frames."""
     return replace(capture, frames=tuple(replace(frame, image=folder / frame.name) for frame in capture.frames))
 
 
 def reprojection_px(truth: Capture, other: Capture) -> float:
-    """The largest distance in pixels between where two captures' frames see the points of the first one.
+    """Return the largest distance in pixels between two captures' projections of the first one's points.
 
-    Frames are compared in their order; pictures of another size are compared in pixels of the first capture's.
+    Frames are compared in order, at the picture sizes of the first capture.
     """
     assert len(truth.frames) == len(other.frames)
     worst = 0.0
@@ -89,7 +89,7 @@ def reprojection_px(truth: Capture, other: Capture) -> float:
 
 
 def assert_same(capture: Capture, other: Capture, *, pose_tolerance: float = 0.0) -> None:
-    """All parts of two captures agree exactly, poses to a tolerance."""
+    """Assert that all parts of two captures agree exactly, and poses within a tolerance."""
     assert len(capture.frames) == len(other.frames)
     for frame, again in zip(capture.frames, other.frames, strict=True):
         assert (again.name, again.camera, again.split) == (frame.name, frame.camera, frame.split)

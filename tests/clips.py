@@ -1,4 +1,4 @@
-"""Small videos with known content, for the tests of video input: made by the ffmpeg that reads them."""
+"""Small videos with known content for tests of video input, encoded by the ffmpeg that also reads them."""
 
 import subprocess
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ def ffmpeg(*arguments: str, raw: bytes = b"") -> None:
 
 
 def encode(path: Path, frames: Sequence[np.ndarray], *, codec: Sequence[str] = LOSSLESS, fps: int = 30) -> Path:
-    """A video of uint8 (height, width, 3) frames."""
+    """Write a video of uint8 (height, width, 3) frames and return its path."""
     height, width = frames[0].shape[:2]
     source = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-framerate", str(fps), "-i", "-")
     ffmpeg(*source, *codec, f"file:{path}", raw=b"".join(np.ascontiguousarray(frame).tobytes() for frame in frames))
@@ -27,7 +27,7 @@ def encode(path: Path, frames: Sequence[np.ndarray], *, codec: Sequence[str] = L
 
 
 def wallpaper(*, height: int = 240, width: int = 900, seed: int = 0) -> np.ndarray:
-    """A picture with detail at every place and scale, to move a camera over."""
+    """Return a picture with detail everywhere and at every scale, to move a camera over."""
     rng = np.random.default_rng(seed)
     layers = [
         cv2.resize(rng.uniform(0, 255, (max(2, height // size), max(2, width // size), 3)), (width, height))
@@ -39,7 +39,7 @@ def wallpaper(*, height: int = 240, width: int = 900, seed: int = 0) -> np.ndarr
 def pan(
     offsets: Sequence[float], *, height: int = 120, width: int = 160, blurred: Sequence[int] = ()
 ) -> list[np.ndarray]:
-    """Frames of a camera that looks at the wallpaper from `offsets` on; some blurred by motion to the side."""
+    """Return views of the wallpaper shifted by `offsets` pixels; those in `blurred` have sideways motion blur."""
     paper = wallpaper()
     frames = []
     for number, offset in enumerate(offsets):

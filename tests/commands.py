@@ -1,4 +1,4 @@
-"""Commands in this process or in one of their own, and what they said and left."""
+"""Run commands in this process or a separate one, and inspect their output and files."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from nerfcli import cli
 
-# Each call of the runner would build all commands again, which takes as long as most of them do to refuse an input.
+# Otherwise each call of the runner would rebuild all commands, which takes as long as most refusals of an input.
 typer.testing._get_command = cache(typer.testing._get_command)  # pyright: ignore[reportPrivateUsage, reportPrivateImportUsage]
 
 
@@ -23,7 +23,7 @@ def nerfcli(*arguments: str | Path, stdin: str | None = None) -> Result:
 
 
 def error_of(result: Result) -> tuple[str, str]:
-    """Error and hint of a failed command, which are all that it said besides notes."""
+    """Return the error and the hint of a failed command, after checking that stderr has exactly one of each."""
     lines = [line for line in result.stderr.splitlines() if line.startswith(("Error:", "Hint:"))]
     assert len(lines) == 2, result.stderr
     assert "Traceback" not in result.stderr
@@ -31,12 +31,12 @@ def error_of(result: Result) -> tuple[str, str]:
 
 
 def listing(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder with its content, hidden ones too."""
+    """Return the content of every file below a folder, including hidden ones, by relative path."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def started(*arguments: str | Path) -> subprocess.Popen[str]:
-    """The command as a terminal starts it; a suite that runs in the background hands on that Ctrl-C is ignored."""
+    """Start a command that reacts to Ctrl-C as in a terminal, even if a suite in the background ignores SIGINT."""
     program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
     program += "from nerfcli.cli import main; main()"
     command = [sys.executable, "-c", program, *map(str, arguments)]

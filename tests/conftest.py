@@ -1,4 +1,4 @@
-"""Shared fixtures, the trained run that several files look at, and the one table of tolerances."""
+"""Shared fixtures, the trained run that several test files use, and the table of tolerances."""
 
 import fcntl
 import json
@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-# Threads of two test processes on two cores must not spin while they wait; to be said before torch is imported.
+# Threads of two test processes on two cores must not spin while they wait. Must be set before torch is imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import pytest
@@ -28,16 +28,16 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.train import held_out_pixels
 from nerfcli.train.loop import train
 
-# Relative tolerance of a chain of some dozen operations, per dtype. A looser one in a test carries its reason.
+# Relative tolerance of a chain of about a dozen operations, per dtype. A test with a looser one states its reason.
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 5e-6}
 
 # Five balls and a box with known geometry: 21 views to train on, 3 held out, 96 x 72 RGBA.
 SPHERES = Path(__file__).parent.parent / "sample_scenes" / "spheres"
 
 
-# Machines may be slow, and the first example of a test may import or compile: no example has a deadline.
+# No deadlines: machines may be slow, and the first example of a test may import or compile something.
 settings.register_profile("quick", deadline=None)
-# What `make test-slow` asks for: this many examples of every property. See `examples.py`.
+# The profile of `make test-slow`: this many examples of every property. See `examples.py`.
 settings.register_profile("thorough", deadline=None, max_examples=MANY)
 settings.load_profile("quick")
 
@@ -49,13 +49,13 @@ def generator() -> torch.Generator:
 
 @pytest.fixture(autouse=True)
 def _two_threads():
-    """Small tensors do not pay for more, and the answers must not depend on it."""
+    """Use two threads: small tensors do not benefit from more, and results must not depend on the number."""
     torch.set_num_threads(2)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _few_held_out_pixels() -> Iterator[None]:
-    """Most trainings of the tests end in fog, where the 4096 pixels that users get would take longer than the steps."""
+    """Use 512 held-out pixels: most tests train only to fog, where the default 4096 would take longer than training."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(held_out_pixels, "PIXELS", 512)
         yield
@@ -68,7 +68,7 @@ def spheres() -> scene.Scene:
 
 @pytest.fixture(scope="session")
 def spheres_run(spheres: scene.Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short but real training on the spheres, one for all processes of pytest-xdist. Do not write into it."""
+    """Train on the spheres, briefly but for real, once for all pytest-xdist processes. Do not write into this run."""
     shared = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         shared = shared.parent
@@ -86,7 +86,7 @@ def spheres_run(spheres: scene.Scene, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
-    """A scene of a few views in a place with a space and letters beyond ASCII."""
+    """A scene of a few views, in a path with a space and non-ASCII letters."""
     folder = tmp_path / "Küche 2" / "spheres"
     for split, names in (("train", range(4)), ("test", range(1))):
         (folder / split).mkdir(parents=True)
@@ -110,7 +110,7 @@ def finished(capture: Path) -> Path:
 
 
 def write_run(run: Path, captured: scene.Scene, model: Model, *, factor: int) -> None:
-    """The folder that a training of seven steps at 1 / factor of the resolution leaves, with any model."""
+    """Write the folder that a training of seven steps at 1 / factor of the resolution leaves, with the given model."""
     settings = TrainSettings(budget_seconds=None, steps=7)
     run.mkdir()
     write_json(run / CONFIG, RunConfig.describing(captured, settings, factor=factor, contraction="none").to_json())

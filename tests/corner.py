@@ -1,6 +1,6 @@
 """A room corner of three textured walls, rendered with known poses: a small capture for structure from motion.
 
-It carries what real folders hold: photos stored lying on their side, photos of a second size, a blank photo, a text
+It has the irregularities of real folders: photos stored on their side, photos of a second size, a blank photo, a text
 file, names with spaces.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 WIDTH, HEIGHT, FOCAL_PX = 480, 360, 450.0
-# Where the photos are taken from, and whether each is stored lying (EXIF orientation 6) or is of the smaller size.
+# Camera centres; then the photos stored on their side (EXIF orientation 6), and those of the smaller size.
 CENTRES = np.array(
     [
         (3.4, 1.6, 1.5),
@@ -31,7 +31,7 @@ SMALLER = {5, 6}
 
 @cache
 def wall(seed: int) -> np.ndarray:
-    """A 400 x 400 texture with detail at all scales, so that it looks like something from any distance."""
+    """Return a 400 x 400 texture with detail at all scales, so that it has features from any distance."""
     rng = np.random.default_rng(seed)
     layers = [
         cv2.resize(rng.uniform(-1, 1, (cells, cells, 3)), (400, 400), interpolation=cv2.INTER_CUBIC) * cells**-0.3
@@ -42,7 +42,7 @@ def wall(seed: int) -> np.ndarray:
 
 
 def cam_from_world(centre: np.ndarray) -> np.ndarray:
-    """(3, 4) pose of a camera at `centre` that looks at (0.5, 0.5, 0.5), z being up; OpenCV axes."""
+    """Return the (3, 4) pose of a camera at `centre` that looks at (0.5, 0.5, 0.5), with z up and OpenCV axes."""
     forward = np.array([0.5, 0.5, 0.5]) - centre
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -52,7 +52,7 @@ def cam_from_world(centre: np.ndarray) -> np.ndarray:
 
 
 def render(centre: np.ndarray, scale: float) -> np.ndarray:
-    """The corner x = 0, y = 0, z = 0 with walls of side 2, each drawn by its homography; none hides another."""
+    """Render the corner x = 0, y = 0, z = 0 with walls of side 2, each by its homography; no wall hides another."""
     intrinsics = np.array([[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, HEIGHT / 2], [0, 0, 1]]) * [[scale], [scale], [1]]
     size = (round(WIDTH * scale), round(HEIGHT * scale))
     pose = cam_from_world(centre)
@@ -70,7 +70,7 @@ def render(centre: np.ndarray, scale: float) -> np.ndarray:
 
 
 def write_capture(folder: Path) -> None:
-    """The seven views, a blank photo and a text file named like a photo."""
+    """Write the seven views, a blank photo and a text file named like a photo."""
     folder.mkdir()
     for index, name in enumerate(NAMES):
         picture = Image.fromarray(render(CENTRES[index], 0.8 if index in SMALLER else 1.0))

@@ -1,7 +1,7 @@
-"""Damage to files, drawn by a seeded generator, and what a reader of captures owes us when it meets one.
+"""Random damage to files from a seeded generator, and checks of how a capture reader handles it.
 
-A reader that is handed a damaged file either says so (a `UserError` that names the file) or returns a sound capture,
-where the damage did no harm. It never raises anything else, hangs, or allocates much more than the file is large.
+A reader given a damaged file either refuses it (a `UserError` that names the file) or, if the damage did no harm,
+returns a sound capture. It never raises anything else, hangs, or allocates much more than the file's size.
 """
 
 import json
@@ -53,9 +53,9 @@ _NUMBERS = tuple(
 
 
 def corrupted_binary(data: bytes, rng: np.random.Generator) -> bytes:
-    """Damaged bytes: cut off, longer, with a number overwritten anywhere, bits flipped, or a stretch lost."""
+    """Return damaged bytes: truncated, extended, with a number overwritten, a bit flipped, or a stretch removed."""
     at = int(rng.integers(0, len(data)))
-    # Counts, magic words and other structure stand at the beginning of most files: half of the hits go there.
+    # Most files begin with counts, magic words and other structure, so half of the damage is done there.
     start = int(rng.integers(0, min(len(data), 128))) if rng.random() < 0.5 else at
     kind = int(rng.integers(0, 6))
     if kind == 0:
@@ -73,7 +73,7 @@ def corrupted_binary(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def corrupted_text(data: bytes, rng: np.random.Generator) -> bytes:
-    """Damaged lines: cut off, a word replaced, dropped or doubled, a line dropped or doubled, or damaged bytes."""
+    """Return damaged text: truncated, words replaced, dropped or doubled, lines dropped or doubled, bytes damaged."""
     lines = data.decode("utf-8").split("\n")
     filled = [index for index, line in enumerate(lines) if line.strip() and not line.startswith("#")]
     kind = int(rng.integers(0, 7))
@@ -96,7 +96,7 @@ def corrupted_text(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def corrupted_json(data: bytes, rng: np.random.Generator) -> bytes:
-    """Damaged JSON: a value anywhere in the tree replaced by another type, NaN or a huge number, or dropped; or cut."""
+    """Return damaged JSON: a value dropped or replaced (another type, NaN, a huge number), truncated, bytes damaged."""
     kind = int(rng.integers(0, 6))
     if kind == 0:
         return data[: int(rng.integers(0, len(data)))]
@@ -104,7 +104,7 @@ def corrupted_json(data: bytes, rng: np.random.Generator) -> bytes:
         return corrupted_binary(data, rng)
     content = json.loads(data)
     places = list(_places(content))
-    # As many places at the top as in the leaves, where most places are.
+    # 30 % of the damage is done at the top level, as most places are leaves.
     top = [place for place in places if place[0] is content]
     chosen = top if rng.random() < 0.3 else places
     holder, key = chosen[int(rng.integers(0, len(chosen)))]
@@ -116,11 +116,11 @@ def corrupted_json(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def assert_refused_or_sound(read: Callable[[], Capture], path: Path) -> bool:
-    """Whether `read` refused the damaged file; else what it returned is a sound capture.
+    """Assert that `read` refuses the damaged file or returns a sound capture; return whether it refused.
 
     Args:
         read: reads the damaged capture.
-        path: the damaged file, which an error must name; for a format of several files their folder.
+        path: the damaged file, which an error must name; their folder for a format of several files.
     """
     refusal, capture = None, None
     tracemalloc.start()
@@ -145,7 +145,7 @@ def assert_refused_or_sound(read: Callable[[], Capture], path: Path) -> bool:
 
 
 def assert_sound(capture: Capture) -> None:
-    """Every number of a capture is finite and in its range, poses are rigid, names are unique, indices in range."""
+    """Assert that all numbers of a capture are finite, poses rigid, names unique, and indices and shapes valid."""
     assert len(capture.frames) > 0
     assert len({frame.name for frame in capture.frames}) == len(capture.frames)
     for frame in capture.frames:
@@ -179,7 +179,7 @@ def assert_sound(capture: Capture) -> None:
 
 
 def _places(node: Any) -> Iterator[tuple[Any, Any]]:
-    """Every value in a JSON tree as the list or dict that holds it and the index or key where it stands."""
+    """Yield every value in a JSON tree as its list or dict and its index or key there."""
     keys = list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
     for key in keys:
         yield node, key
@@ -188,7 +188,7 @@ def _places(node: Any) -> Iterator[tuple[Any, Any]]:
 
 @contextmanager
 def _at_most(seconds: int) -> Iterator[None]:
-    """Fail what takes longer, so that an endless loop is a failed test and not a frozen one."""
+    """Raise an error if the block takes longer, so that an endless loop fails the test rather than freezing it."""
 
     def fail(signum: int, frame: FrameType | None) -> None:
         raise AssertionError(f"not done after {seconds} seconds")

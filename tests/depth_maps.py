@@ -1,4 +1,4 @@
-"""Depth maps, their meanings, and the writers of all formats under one signature."""
+"""Depth maps, their metadata, and the writers of all formats with one signature."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +26,7 @@ FULL_META = DepthMeta(
 
 
 def plain_depth() -> np.ndarray:
-    """Between 0.5 and 60, a tenth of it without a value."""
+    """Return depths between 0.5 and 60, of which a tenth are NaN."""
     generator = np.random.default_rng(1)
     depth = generator.uniform(0.5, 60.0, (37, 53)).astype(np.float32)
     depth[generator.random(depth.shape) < 0.1] = np.nan

@@ -1,4 +1,4 @@
-"""How many examples a property is tried on: some in the quick suite, 2,000 in the slow one."""
+"""Number of examples for a property test: chosen per test in the quick suite, 2,000 in the slow one."""
 
 from hypothesis import settings
 
@@ -6,8 +6,8 @@ MANY = 2000
 
 
 def examples(quick: int) -> settings:
-    """Settings of a property that the quick suite tries on so many examples.
+    """Return the settings of a property test with `quick` examples in the quick suite.
 
-    The profile "thorough" (`make test-slow`) asks for its own number, in place of the one that a test would fix.
+    Under the profile "thorough" (`make test-slow`), the number is `MANY` instead.
     """
     return settings(max_examples=MANY if settings.get_current_profile_name() == "thorough" else quick)

@@ -1,7 +1,7 @@
-"""A model whose every ray is known in closed form: fog of density 1 and colour 1/2 in chosen cells of the cube.
+"""A model with a closed-form answer for every ray: fog of density 1 and colour 1/2 in chosen cells of the cube.
 
-One path through the networks carries a constant to the density, all else in them is 0: the colour is sigmoid(0). What
-is in the picture is then the occupancy grid's business alone.
+Features and networks are 0 except on one path to the log density, whose last weight is also 0: the density is exp(0),
+the colour sigmoid(0). The picture therefore depends only on the occupancy grid.
 """
 
 import torch
@@ -11,14 +11,14 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.render.model import Marching, Model
 
-# Rays are cut into steps of this length; a border of the fog is seen at most half a step off.
+# Length of the steps into which rays are cut; it moves a border of the fog by at most half a step.
 STEP = 1 / 256
 SIDE = 16
 TINY = HashFieldSettings(contraction="none", levels=2, log2_rows=8, coarsest=4, finest=16, width=16)
 
 
 def foggy_cells(low: tuple[float, float, float], high: tuple[float, float, float]) -> Tensor:
-    """(SIDE, SIDE, SIDE) bool, indexed [z, y, x]: the cells of [-1, 1]^3 whose centres lie in a box along the axes."""
+    """Return the cells of [-1, 1]^3 with centres in an axis-aligned box: (SIDE, SIDE, SIDE) bool, indexed [z, y, x]."""
     centres = (torch.arange(SIDE) + 0.5) / SIDE * 2 - 1
     x, y, z = ((centres >= a) & (centres <= b) for a, b in zip(low, high, strict=True))
     return z[:, None, None] & y[None, :, None] & x[None, None, :]
@@ -32,7 +32,7 @@ def fog(
     step: float = STEP,
     unit: str = "arbitrary",
 ) -> Model:
-    """The model; `training_from_scene.scale` is the density in 1 / scene unit."""
+    """Return the model; `training_from_scene.scale` is the density in 1 / scene unit."""
     field = HashField(TINY)
     with torch.no_grad():
         for parameter in field.parameters():

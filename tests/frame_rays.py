@@ -1,4 +1,4 @@
-"""Rays of all pixels of a frame, for tests that look at every one."""
+"""Rays of all pixels of a frame, for tests that check every pixel."""
 
 import numpy as np
 import torch
@@ -9,6 +9,6 @@ from nerfcli.render.rays import CENTRES, PictureRays, pixel_rays
 
 
 def frame_rays(frame: Frame, training_from_scene: Similarity, device: torch.device) -> PictureRays:
-    """Rays of every pixel centre of a frame, row by row."""
+    """Return the rays of all pixel centres of a frame, row by row."""
     pixels = np.arange(frame.camera.width * frame.camera.height)
     return pixel_rays(frame, training_from_scene, pixels=pixels, places=CENTRES, device=device)

@@ -1,4 +1,4 @@
-"""A disk that is full, for tests of writers."""
+"""A simulated full disk, for tests of writers."""
 
 import resource
 from collections.abc import Iterator
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
-    """What a full disk is to a writer: the system refuses to write on."""
+    """Simulate a full disk: within the block, the system refuses to write files beyond `size` bytes."""
     old = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
     try:

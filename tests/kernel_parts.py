@@ -1,4 +1,4 @@
-"""Single operations and fields at single points, for tests that look at one of them alone."""
+"""Single kernel operations, and fields evaluated at single points, for tests of one of them alone."""
 
 from types import ModuleType
 
@@ -10,19 +10,19 @@ from nerfcli.kernels import HashGrid, numba_cpu, reference, spherical_harmonics
 
 
 def parts_for(dtype: torch.dtype) -> ModuleType:
-    """The operations that a field of this precision is computed with on a CPU."""
+    """Return the module of operations that compute a field of this precision on a CPU."""
     return numba_cpu if dtype == torch.float32 else reference
 
 
 def density_of(field: Field, coordinates: Tensor) -> Tensor:
-    """Density (N,) of a field at coordinates (N, 3)."""
+    """Return the density (N,) of a field at coordinates (N, 3)."""
     return field.backend.density(coordinates, field.medium())
 
 
 def radiance_of(
     field: Field, coordinates: Tensor, directions: Tensor, rays: Tensor, *, detail: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Density (N,) and colour (N, 3) of a field at coordinates (N, 3), seen along directions (R, 3) of rays (N,)."""
+    """Return density (N,) and colour (N, 3) at coordinates (N, 3), seen along directions (R, 3) of rays (N,)."""
     medium = field.medium(detail)
     if not isinstance(medium, HashGrid):
         return medium.radiance(coordinates, directions, rays)

@@ -1,4 +1,4 @@
-"""Cameras of every model with random parameters: mild ones as of real lenses, and strong ones that turn back."""
+"""Cameras of every model with random parameters: mild, as of real lenses, or so strong that the lens turns back."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ WIDTH, HEIGHT = 1200, 900
 
 
 def random_camera(model: str, rng: np.random.Generator, *, strength: float = 1.0) -> Camera:
-    """A camera of 1200 x 900 pixels. Strength 1 distorts as real lenses do, at 5 most of them turn back."""
+    """Return a camera of 1200 x 900 pixels. Strength 1 distorts like real lenses; at 5 most lenses turn back."""
     if model == "EQUIRECTANGULAR":
         return Camera(model, WIDTH, HEIGHT, (WIDTH, HEIGHT))
     fisheye = model.endswith("FISHEYE") or model == "EUCM"
@@ -29,7 +29,7 @@ def random_camera(model: str, rng: np.random.Generator, *, strength: float = 1.0
 
 
 def random_directions(rng: np.random.Generator, count: int = 400) -> np.ndarray:
-    """(count, 3) unit, all around, half of them within 60 degrees of the axis and a few very close to it."""
+    """Return (count, 3) unit vectors, half within 60 degrees of the axis, a few very close to it, half anywhere."""
     angle = np.concatenate([rng.uniform(0, np.pi / 3, count // 2), np.arccos(rng.uniform(-1, 1, count - count // 2))])
     angle[:10] = 10.0 ** -np.arange(10)
     azimuth = rng.uniform(0, 2 * np.pi, count)
@@ -37,5 +37,5 @@ def random_directions(rng: np.random.Generator, count: int = 400) -> np.ndarray:
 
 
 def random_pixels(rng: np.random.Generator, count: int = 400, *, margin: float = 1.0) -> np.ndarray:
-    """(count, 2) over the picture and as much beyond each edge as `margin` times its size."""
+    """Return (count, 2) pixels, uniform over the picture and `margin` times its size beyond each edge."""
     return rng.uniform(-margin, 1 + margin, (count, 2)) * (WIDTH, HEIGHT)

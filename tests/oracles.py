@@ -1,4 +1,4 @@
-"""Slow, obvious float64 answers that the tests hold the program against."""
+"""Slow, obviously correct float64 answers for the tests to compare with."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def march_through_slabs(density, lengths, rgb, background):
-    """One ray by a double loop: weights, transmittance behind, colour."""
+    """Return weights, final transmittance and colour of one ray, by a double loop."""
     weights = []
     for i in range(len(density)):
         before = math.exp(-sum(density[j] * lengths[j] for j in range(i)))
@@ -19,7 +19,7 @@ def march_through_slabs(density, lengths, rgb, background):
 
 
 def quadrature_of_end_density(density, starts, ends, steps=20000):
-    """Integrals of p(t) and t p(t), p = T sigma, of a piecewise constant density, by the midpoint rule."""
+    """Return the integrals of p(t) and t p(t), p = T sigma, for a piecewise constant density, by the midpoint rule."""
     mass, first = 0.0, 0.0
     depth = 0.0
     for s, t0, t1 in zip(density, starts, ends, strict=True):
@@ -33,7 +33,7 @@ def quadrature_of_end_density(density, starts, ends, steps=20000):
 
 
 def quadrature_of_squares(density, starts, ends, steps=20000):
-    """Integral of t^2 p(t), as in `quadrature_of_end_density`."""
+    """Return the integral of t^2 p(t), as in `quadrature_of_end_density`."""
     second, depth = 0.0, 0.0
     for s, t0, t1 in zip(density, starts, ends, strict=True):
         h = (t1 - t0) / steps
@@ -44,7 +44,7 @@ def quadrature_of_squares(density, starts, ends, steps=20000):
 
 
 def trilinear_hash(point, table, resolutions, primes=(1, 2654435761, 805459861)):
-    """One point through the hash grid with Python integers."""
+    """Return the hash-grid features of one point, with hashes in Python integers."""
     out = []
     rows = table.shape[1]
     for level, resolution in enumerate(resolutions):

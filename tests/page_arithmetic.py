@@ -1,4 +1,4 @@
-"""What the page's shader computes, in NumPy with float32, from the numbers in the page: an oracle without a GPU."""
+"""The arithmetic of the page's shader in float32 NumPy, from the numbers in the page: an oracle without a GPU."""
 
 import base64
 import json
@@ -13,7 +13,7 @@ PRIMES = (np.uint32(2654435761), np.uint32(805459861))
 
 
 class Traced(NamedTuple):
-    """What rays see; distances in the training frame, NaN where undefined."""
+    """Rendered values of rays; distances are in the training frame, NaN where undefined."""
 
     rgb: np.ndarray
     opacity: np.ndarray
@@ -23,7 +23,7 @@ class Traced(NamedTuple):
 
 
 class PageField:
-    """The field of a page, read from its text as a browser reads it."""
+    """The field of a page, read from its text as a browser does."""
 
     def __init__(self, page: str):
         self.scene: dict[str, Any] = json.loads(element(page, "scene"))
@@ -37,7 +37,7 @@ class PageField:
         self.layers = self._layers(array(page, "networks", "<f4")) if self.field["kind"] == "hash" else []
 
     def _layers(self, numbers: np.ndarray) -> list[np.ndarray]:
-        """The matrices of the networks from their blocks of four columns."""
+        """Return the matrices of the networks, stored in the page as transposed 4 x 4 blocks."""
         hidden, encoded = self.field["width"], 4 * len(self.field["resolutions"])
         layers, at = [], 0
         for outputs, inputs in ((hidden, encoded), (16, hidden), (hidden, 32), (hidden, hidden), (4, hidden)):
@@ -52,7 +52,7 @@ class PageField:
         return layers
 
     def cube(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates of the unit cube, and how much of a width is left in it."""
+        """Return coordinates in the unit cube, and the factor by which widths shrink there."""
         if self.field["contraction"] == 0:
             return points * F(0.5) + F(0.5), np.full(len(points), F(0.5))
         if self.field["contraction"] == 1:
@@ -109,7 +109,7 @@ class PageField:
         return sigmoid(total * scale)
 
     def trace(self, view: dict[str, Any], tolerance: float = 1 / 1020) -> Traced:
-        """A picture of a view of the page, row by row."""
+        """Render a view of the page; pixels are in row order."""
         to_training, lens = self.scene["training_from_scene"], view["lens"]
         turn = np.array(to_training["rotation"]) @ np.array(view["turn"])
         origin = to_training["scale"] * np.array(to_training["rotation"]) @ view["place"] + to_training["translation"]
@@ -158,7 +158,7 @@ class PageField:
 
 
 def element(page: str, name: str) -> str:
-    """The text of a script element of the page."""
+    """Return the text of a script element of the page."""
     found = re.search(rf'<script type="[^"]*" id="{name}"[^>]*>(.*?)</script>', page, re.S)
     assert found, name
     return found[1]
@@ -174,7 +174,7 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
 
 
 def harmonics_of(direction: np.ndarray) -> np.ndarray:
-    """As the shader has them, number by number."""
+    """Return the spherical harmonics of a direction, with the shader's constants."""
     x, y, z = direction
     xx, yy, zz = x * x, y * y, z * z
     return np.array(

@@ -1,6 +1,6 @@
-"""Small scans as scanners and programs write them, each with its format's own formula of where a point is seen.
+"""Small scans in the formats of scanners and programs, each with its format's own projection formula.
 
-The formulas turn the object, as their sources do; nerfcli turns the source.
+The formulas rotate the object, as their sources do; nerfcli rotates the source.
 """
 
 import json
@@ -25,9 +25,9 @@ class Written:
     """A scan in a file.
 
     Args:
-        path: what is given to `nerfcli convert`.
-        seen: the format's own formula, in the unit of the scan.
-        values: what the reader should give for the stored values.
+        path: the argument of `nerfcli convert`.
+        seen: the format's own projection formula, in the unit of the scan.
+        values: the stored values that the reader should return.
     """
 
     path: Path
@@ -36,12 +36,12 @@ class Written:
 
 
 def numbers(views: int = VIEWS, rows: int = ROWS, columns: int = COLUMNS) -> np.ndarray:
-    """Transmissions between 0.2 and 0.9, different everywhere."""
+    """Return transmissions between 0.2 and 0.9, all different."""
     return np.random.default_rng(0).uniform(0.2, 0.9, (views, rows, columns)).astype(np.float32)
 
 
 def turned(angle: float, point: np.ndarray) -> np.ndarray:
-    """A point turned counter-clockwise about z."""
+    """Return a point rotated counter-clockwise about z."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([c * point[0] - s * point[1], s * point[0] + c * point[1], point[2]])
 
@@ -132,10 +132,10 @@ def r2_gaussian(folder: Path) -> Written:
 
 
 def _pinhole(origin: float, detector: float, pixel: tuple[float, float], offset: tuple[float, float]) -> Seen:
-    """NAF's: uu = (i + 0.5 - W / 2) d + off, of a camera with x right, y down, z forward."""
+    """Return NAF's projection: uu = (i + 0.5 - W / 2) d + off, for a camera with x right, y down, z forward."""
 
     def seen(view: int, point: np.ndarray) -> tuple[float, float]:
-        at = turned(-np.radians(ANGLES_DEG[view]), point)  # the source stands on +x
+        at = turned(-np.radians(ANGLES_DEG[view]), point)  # the source is on +x
         x, y, z = at[1], -at[2], origin - at[0]
         across, down = x / z * detector, y / z * detector
         return (across - offset[0]) / pixel[0] - 0.5 + COLUMNS / 2, (down - offset[1]) / pixel[1] - 0.5 + ROWS / 2
@@ -161,7 +161,7 @@ def nikon(folder: Path, *, top: float = 3.0, bottom: float = 3.0, recorded: bool
     offset = (top + bottom) / 2 * 100 / 400
 
     def seen(view: int, point: np.ndarray) -> tuple[float, float]:
-        # As the Core Imaging Library: source at 0 looking along +y, the axis at (-offset, 100), first pixel top right.
+        # As in the Core Imaging Library: source at 0 looking along +y, axis at (-offset, 100), first pixel top right.
         at = turned(np.radians(-step * view - 7 + 180), point)
         roll = -lean
         at = np.array(
@@ -188,7 +188,7 @@ def skyscan(folder: Path) -> Written:
     path.write_text("\n".join(lines))
 
     def seen(view: int, point: np.ndarray) -> tuple[float, float]:
-        # The object turns counter-clockwise; the source stands at +y, the picture is seen from behind the camera.
+        # The object turns counter-clockwise, the source is at +y, and the picture is seen from behind the camera.
         at = turned(np.radians(step * view), point)
         larger = 240 / (80 - at[1])
         return at[0] * larger / 0.6 + (COLUMNS - 1) / 2, 2 - at[2] * larger / 0.6
@@ -210,7 +210,7 @@ def heltomo(folder: Path) -> Written:
     scipy.io.savemat(path, {"CtDataFull": {"type": "2d", "sinogram": values[:, 0], "parameters": parameters}})
 
     def seen(view: int, point: np.ndarray) -> tuple[float, float]:
-        # ASTRA's fanflat.
+        # ASTRA's geometry "fanflat".
         at = turned(-np.radians(ANGLES_DEG[view]), point)
         return at[0] * 553.74 / (410.66 + at[1]) / 0.2 + (COLUMNS - 1) / 2, 0.0
 

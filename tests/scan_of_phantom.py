@@ -1,4 +1,4 @@
-"""Scans of the phantom, computed from its closed-form chords: no projector of the program is part of them."""
+"""Scans of the phantom, computed from its closed-form chords without any projector of the program."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ def phantom_circle(
     rows: int = 1,
     column_shift: float = 0.0,
 ) -> Circle:
-    """A circle around the phantom of `bean`, some 20 wide: a fan of 40 degrees for a cone beam."""
+    """Return a circle around the phantom of `bean`, about 20 wide, with a fan of 40 degrees for a cone beam."""
     angles = np.radians(first_deg + span_deg / views * np.arange(views))
     width = 24 / columns
     magnified = 2.0 if beam == "cone" else 1.0
@@ -43,12 +43,12 @@ def scan_of_phantom(
     phantom: Sequence[Ellipsoid] = (),
     seed: int = 0,
 ) -> Scan:
-    """Line integrals, or with photons transmissions with counting noise, of the phantom on a circle.
+    """Return a scan of the phantom: line integrals, or transmissions with counting noise if `photons` is given.
 
     Args:
-        circle: as the scanner really stood.
-        stated: as its file says.
-        photons: of an open pixel.
+        circle: the true geometry.
+        stated: the geometry that the scan states; None for the true one.
+        photons: mean count of an unobstructed pixel.
         phantom: instead of `bean`.
         seed: of the noise.
     """

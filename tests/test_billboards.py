@@ -1,7 +1,7 @@
 """The model without shape: right where shape cannot matter, and beaten where it does.
 
-Evidence: cameras that only turn see photos that are homographies of each other, whatever hangs at whatever distance
-(closed form); a wall at one distance from cameras that stand beside each other; and the spheres, with known geometry.
+Evidence: photos from cameras that only turn are homographies of each other, however far away the scene is (closed
+form); a wall at one distance, seen by cameras side by side; and the spheres, with known geometry.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ CAMERA = Camera.pinhole(80, 60, 70.0)
 
 
 def pattern(directions: np.ndarray) -> np.ndarray:
-    """(N, 3) smooth colours in [0, 1] of infinitely far directions."""
+    """Return smooth colours in [0, 1], (N, 3), of an infinitely distant scene in these directions."""
     waves = np.array([[5.0, 1.0, 0.0], [0.0, 6.0, 2.0], [3.0, -4.0, 1.0]])
     return 0.5 + 0.5 * np.sin(directions @ waves.T)
 
@@ -42,12 +42,12 @@ def far_photo(view: Frame) -> np.ndarray:
 
 
 def narrower(view: Frame) -> Frame:
-    """All of it lies within the views beside it."""
+    """Return the view with a narrower camera, so that its neighbours see all of its picture."""
     return replace(view, camera=Camera.pinhole(48, 40, 70.0))
 
 
 def turned(count: int) -> list[Frame]:
-    """From one place, in overlapping directions."""
+    """Return views from one place, in overlapping directions."""
     angles = np.linspace(-0.4, 0.4, count)
     return [frame(f"{i}", (0.05 * (-1) ** i, angle, 0.0), (1.0, 2.0, 3.0)) for i, angle in enumerate(angles)]
 
@@ -62,7 +62,7 @@ def test_photos_of_a_camera_that_only_turned_are_explained():
     views = turned(9)
     held_out, training = narrower(views[4]), [view for index, view in enumerate(views) if index != 4]
     billboards = Billboards(training, [far_photo(view) for view in training])
-    # What is left is the interpolation between pixels, and their rounding.
+    # The remaining error is from interpolation between pixels and their rounding.
     assert psnr_on(billboards, held_out, far_photo(held_out)) > 45
 
 
@@ -105,7 +105,7 @@ def test_the_distance_of_a_round_wall_is_found():
 
     billboards = Billboards(views, [photo(view) for view in views])
     middle = [billboards.distances[2], billboards.distances[3], billboards.distances[4]]
-    # They stand up to 0.3 from the centre, and distances are tried in steps of 14 %.
+    # The cameras are up to 0.3 from the centre, and distances are tried in steps of 14 %.
     assert middle == pytest.approx([5.0, 5.0, 5.0], rel=0.2)
 
 
@@ -125,7 +125,7 @@ def test_the_spheres_have_a_shape(spheres_run):
 
 
 def test_a_comparison_that_cannot_be_computed_ends_no_evaluation(spheres_run, monkeypatch: pytest.MonkeyPatch):
-    """The photos' own numbers are those without the comparison, and the warning says why it is missing."""
+    """The metrics of the photos equal those without the comparison, and a warning says why it is missing."""
     scene = scenes.load(SPHERES)
     photos = [over_white(photo.pixels) for photo in load_photos(scene.train_frames, factor=1, threads=1)]
     held_out = [

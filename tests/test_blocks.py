@@ -73,7 +73,7 @@ def random_rays(count: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Ten
 
 @pytest.mark.parametrize("kind", ["hash", "voxels"])
 def test_blocks_of_one_field_render_what_it_renders_in_float64(kind):
-    """Colour, opacity, and all that depths are made of, to rounding: a cut at a border changes no ray."""
+    """Colour, opacity and everything behind depths agree to rounding: cutting rays at borders changes nothing."""
     alone = cloudy(Similarity(0.5, np.eye(3), np.array([0.3, -0.2, 0.1])), kind=kind)
     alone = replace(alone, field=alone.field.double())
     together = joined([alone] * 4, division())
@@ -93,7 +93,7 @@ def test_blocks_of_one_field_render_what_it_renders_in_float64(kind):
 @pytest.mark.parametrize("convention", [*CONVENTIONS, "quantile:0.1"])
 @pytest.mark.parametrize("axis", ["ray", "z"])
 def test_pictures_of_blocks_of_one_field_are_those_of_the_field(spheres, convention, axis):
-    """In float32, to rounding where hardly anything is left out: spans of compiled marching join to the whole ray."""
+    """To float32 rounding, with hardly anything left out: the spans of compiled marching join into the whole ray."""
     frame = spheres.test_frames[0]
     frame = replace(frame, camera=frame.camera.resized(24, 18))
     alone = cloudy(Similarity(0.4, np.eye(3), np.zeros(3)))
@@ -107,7 +107,7 @@ def test_pictures_of_blocks_of_one_field_are_those_of_the_field(spheres, convent
 
 
 def test_blocks_of_other_fields_render_what_the_joined_field_gives_sample_by_sample():
-    """Each sample is of the block in whose cell it is, whatever spans a ray is traced in."""
+    """Each sample is evaluated by the block whose cell contains it, however a ray is split into spans."""
     models = [cloudy(Similarity(1.0 + n / 4, np.eye(3), np.full(3, n / 9)), seed=n) for n in range(4)]
     models = [replace(model, field=model.field.double()) for model in models]
     together = joined(models, division())
@@ -154,7 +154,7 @@ def test_every_bit_of_a_picture_of_blocks_is_the_same_in_tiles_of_any_size(spher
 
 
 def test_light_passes_from_block_to_block_by_the_law_of_absorption():
-    """Two fogs of other densities in frames of other sizes: T = exp(-(d1 l1 + d2 l2)), and where it is 1/2."""
+    """Two fogs with different densities and sizes of frames: T = exp(-(d1 l1 + d2 l2)), and where T is 1/2."""
     fogs = []
     for scale, level in ((0.25, 0.0), (0.8, 0.7)):
         model = cloudy(Similarity(scale, np.eye(3), -scale * np.array([0.5, 0.0, 0.0])))
@@ -205,7 +205,7 @@ def test_a_joined_field_is_the_same_when_it_is_read_again(tmp_path):
 
 @pytest.mark.parametrize("share", [0.67, 0.003])
 def test_occupied_cells_of_a_joined_field_hold_all_that_its_blocks_have(share):
-    """Lone cells of a block also reach into cells of which they hold no vertex."""
+    """A lone cell of a block also extends into joined cells of which it contains no vertex."""
     models = [cloudy(Similarity(1.0 + n, np.eye(3), np.full(3, n / 5)), seed=n) for n in range(4)]
     models = [replace(model, occupied=torch.rand(16, 16, 16) < share) for model in models]
     model = joined(models, division())
@@ -247,7 +247,7 @@ def test_every_place_is_in_one_cell_and_cells_have_equally_many_points(captured,
 
 
 def test_photos_belong_to_the_blocks_whose_points_they_see(captured):
-    """Of each photo only the observations of some points are kept; those in a margin count for the neighbour, too."""
+    """Photos keep only their observations of some points; points in a margin also count for the neighbouring block."""
     from nerfcli.cameras.formats.colmap import parse_colmap
 
     capture = parse_colmap(captured / "sparse/0")
@@ -260,15 +260,15 @@ def test_photos_belong_to_the_blocks_whose_points_they_see(captured):
     border = parts.cells[0].high[axis]
     order = np.argsort(places[:, axis])
     far = {0: set(order[:200].tolist()), 1: set(order[-200:].tolist())}
-    # The first six photos see the far end of the first block alone, the others that of the second.
+    # The first six photos see only the far end of the first block, the others only that of the second.
     side = np.where(seen.frame_index < 6, 0, 1)
     kept = np.array([p in far[s] for p, s in zip(seen.point_index.tolist(), side.tolist(), strict=True)])
-    # A fifth photo sees more of the other side than the least share, and a fourth less.
+    # Photo 5 sees more of the other side than the least fraction, and photo 4 less.
     share = np.flatnonzero((seen.frame_index == 5) & np.isin(seen.point_index, list(far[1])))
     kept[share[: round(2 * LEAST_SHARE * 200)]] = True
     share = np.flatnonzero((seen.frame_index == 4) & np.isin(seen.point_index, list(far[1])))
     kept[share[: round(0.5 * LEAST_SHARE * 200)]] = True
-    # Of the second block's margin, which reaches beyond its border, a third photo sees points, and a second one none.
+    # The second block's margin extends beyond its border: photo 3 sees points in it, and photo 2 only outside of it.
     spread = np.ptp(np.percentile(places[places[:, axis] >= border, axis], PERCENTILES))
     beyond = (border - places[seen.point_index, axis]) / (MARGIN * spread)
     for photo, (low, high) in ((3, (0.0, 0.9)), (2, (1.1, 2.0))):
@@ -302,7 +302,7 @@ def test_blocks_are_trained_into_the_run_and_joined(captured):
     for field, block in zip(model.field.fields, blocks, strict=True):
         assert all(map(torch.equal, field.parameters(), block.model().field.parameters()))
     assert Run(run).log[-1]["step"] == 2
-    # All at once gives the same, and changes nothing where it is there.
+    # Training all blocks at once gives the same field, and changes nothing where they exist.
     before = listing(run)
     again = nerfcli(*command, "--blocks", "2")
     assert again.stderr.count("is kept") == 2
@@ -404,7 +404,7 @@ def test_a_dry_run_names_the_photos_and_memory_of_each_block(captured):
 
 
 def test_the_array_job_of_the_examples_trains_and_joins_all_blocks(captured):
-    """Its command line, with the variables that Slurm sets, for two tasks and one step."""
+    """Run the command line of the example with the variables that Slurm sets, for two tasks and one step."""
     (line,) = re.findall(r"^nerfcli (.+)$", (EXAMPLES / "blocks.sbatch").read_text(encoding="utf-8"), re.MULTILINE)
     run = captured.with_name("r")
     for task in ("2", "1"):

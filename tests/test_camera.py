@@ -136,7 +136,7 @@ def test_opencv_fisheye_agrees_with_opencv():
 
 
 @given(k=st.integers(-600, 600).map(lambda thousandth: thousandth / 1000), radius=st.floats(0.01, 1.5))
-@example(k=0.1, radius=1.1)  # the root is 1, where the table of radii used to end, and the pixel counted as outside
+@example(k=0.1, radius=1.1)  # root 1: the table of radii used to end there, and the pixel to be invalid
 @examples(60)
 def test_simple_radial_bearing_is_the_smallest_root_of_its_cubic_or_invalid(k, radius):
     """r (1 + k r^2) = radius: closed form through the roots of the cubic, at any strength of the distortion."""
@@ -156,7 +156,7 @@ def test_simple_radial_bearing_is_the_smallest_root_of_its_cubic_or_invalid(k, r
 
 
 def test_barrel_distortion_ends_where_its_polynomial_turns():
-    """k1 = -0.35: r (1 + k1 r^2) is largest at r = (3 * 0.35)^-1/2, where it is 2/3 of r; no pixel lies beyond."""
+    """k1 = -0.35: r (1 + k1 r^2) is largest at r = (3 * 0.35)^-1/2, where it is 2/3 of r; pixels beyond are invalid."""
     camera = Camera("SIMPLE_RADIAL", 1000, 800, (800.0, 500.0, 400.0, -0.35))
     largest_px = 800 * 2 / 3 / np.sqrt(3 * 0.35)
     radius = np.linalg.norm(pixel_grid(1000, 800)[::97] - (500, 400), axis=1)
@@ -169,7 +169,7 @@ def test_barrel_distortion_ends_where_its_polynomial_turns():
 
 
 def test_an_outer_root_is_not_taken_for_the_direction():
-    """k1 = -0.35, k2 = 0.05 turns at r = 1.21 and grows again from r = 1.66: a root out there is no direction."""
+    """k1 = -0.35, k2 = 0.05 turns at r = 1.21 and grows again from r = 1.66: a root out there is not a direction."""
     camera = Camera("RADIAL", 1000, 800, (300.0, 500.0, 400.0, -0.35, 0.05))
     roots = np.sort(np.roots([5 * 0.05, 0, -3 * 0.35, 0, 1]).real)
     turn = roots[roots > 0][0]
@@ -180,7 +180,7 @@ def test_an_outer_root_is_not_taken_for_the_direction():
     np.testing.assert_array_equal(
         valid[np.abs(radius - largest_px) > 0.01], (radius < largest_px)[np.abs(radius - largest_px) > 0.01]
     )
-    beyond = np.array([[1.9, 0.0, 1.0]])  # its pixel lies inside the picture, but an inner direction owns it
+    beyond = np.array([[1.9, 0.0, 1.0]])  # its pixel is inside the picture, but belongs to an inner direction
     assert not camera.project(beyond)[1][0]
     assert (np.hypot(*directions[valid, :2].T) / directions[valid, 2]).max() <= turn
 
@@ -284,7 +284,7 @@ def test_json_that_is_no_camera_is_refused():
 
 
 def upright_pixels(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Where the pixels of a stored WIDTH x HEIGHT picture are once it is shown as its EXIF orientation says."""
+    """Return where pixels of a stored WIDTH x HEIGHT picture are in the picture turned by its EXIF orientation."""
     u, v = pixels.T
     return {3: np.stack([WIDTH - u, HEIGHT - v], 1), 6: np.stack([HEIGHT - v, u], 1), 8: np.stack([v, WIDTH - u], 1)}[
         orientation
@@ -307,7 +307,7 @@ def test_a_turned_camera_sees_the_world_in_the_upright_picture(model, orientatio
 
 def test_a_calibration_is_fitted_to_the_picture_on_disk(tmp_path):
     camera, pose, path = camera_of("PINHOLE"), np.eye(4), tmp_path / "a.jpg"
-    # Stored lying, shown upright; the calibration is for the stored pixels, or already for the upright ones.
+    # Stored on its side, shown upright; the calibration is for the stored pixels, or already for the upright ones.
     for calibrated in (camera, turned(camera, pose, orientation=6)[0]):
         fitted, _ = fit_to_picture(calibrated, pose, path=path, measure=lambda _: (40, 50, 6))
         assert (fitted.width, fitted.height) == (40, 50)

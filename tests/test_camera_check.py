@@ -1,4 +1,4 @@
-"""Focal lengths by matched features of known points and cameras, with noise, wrong matches and wrong poses."""
+"""Focal lengths from matched features of known points and cameras, with noise, wrong matches and wrong poses."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ LENSES = {
 
 
 def ring(camera: Camera, *, turned_deg: float = 0.0) -> list[LoadedPhoto]:
-    """Cameras on an arc that look at its middle, each turned by so much about an axis of its own."""
+    """Return cameras on an arc that look at its centre, each then turned by an angle about a random axis of its own."""
     rng = np.random.default_rng(1)
     photos = []
     for index in range(16):
@@ -40,7 +40,7 @@ def ring(camera: Camera, *, turned_deg: float = 0.0) -> list[LoadedPhoto]:
 
 
 def matched(photos: list[LoadedPhoto], *, noise_px: float, wrong: float) -> list[Matches]:
-    """What pairs of photos see of points in a ball; a share of it is wrong by tens of pixels."""
+    """Return matches of points in a ball between pairs of photos; a fraction of them is wrong by tens of pixels."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(400, 3)) * 0.8
     made = []
@@ -77,7 +77,7 @@ def test_the_focal_length_is_found_among_noise_and_wrong_matches(lens, factor):
     matches = matched(photos, noise_px=0.2, wrong=0.1)
     check = checked(with_lens(photos, math.log(factor)), matches)
     assert check.log_focal == pytest.approx(-math.log(factor), abs=4.0 * check.error)
-    assert 1e-5 < check.error < (3e-3 if lens == "fisheye" else 1e-3)  # the object fills the middle of it only
+    assert 1e-5 < check.error < (3e-3 if lens == "fisheye" else 1e-3)  # the object fills only the middle of it
     assert check.misses_px[1] < 0.3
     if factor != 1.0 and lens != "fisheye":
         assert check.misses_px[0] > 1.3 * check.misses_px[1]
@@ -92,7 +92,7 @@ def test_exact_matches_tell_it_to_a_hundredth_of_a_per_cent():
 
 
 def test_misses_are_in_pixels_of_the_pictures_that_features_are_sought_in():
-    """A move of one picture by d pixels across the line between the cameras is a miss of d."""
+    """Moving one picture by d pixels across the baseline gives a miss of d pixels."""
     photos = ring(PINHOLE)
     matches = [
         replace(m, pixels=(m.pixels[0], m.pixels[1] + np.array([0.0, 3.0])))
@@ -103,14 +103,14 @@ def test_misses_are_in_pixels_of_the_pictures_that_features_are_sought_in():
 
 
 def test_wrong_poses_are_not_taken_for_a_wrong_lens():
-    """Photos turned by half a degree: the misses stay, and the length is unsure by as much as it is off."""
+    """Photos turned by half a degree: the misses stay, and the focal length is off by no more than its uncertainty."""
     check = checked(ring(PINHOLE, turned_deg=0.5), matched(ring(PINHOLE), noise_px=0.2, wrong=0.1))
     assert abs(check.log_focal) < 4.0 * check.error
     assert min(check.misses_px) > 1.5
 
 
 def test_where_no_length_fits_the_misses_are_told():
-    """Lenses that are 35 % too long, which is far outside of what is looked at."""
+    """Focal lengths that are 35 % too long, far outside of the range that is searched."""
     photos = ring(PINHOLE)
     check = checked(with_lens(photos, 3 * FARTHEST), matched(photos, noise_px=0.2, wrong=0.0))
     assert (check.log_focal, check.error) == (0.0, math.inf)
@@ -130,7 +130,7 @@ def test_nothing_is_said_where_there_is_too_little():
 
 
 def test_rays_along_the_line_between_two_cameras_do_no_harm():
-    """Photos one behind the other: what is in the middle of both is on that line, and fits any length."""
+    """Photos one behind the other: the middle of both is on that line, and fits any focal length."""
     photos = []
     for index, photo in enumerate(ring(PINHOLE)):
         pose = np.eye(4)

@@ -1,4 +1,4 @@
-"""nerfstudio's camera-path JSON against its definition, round trips, and what damaged files are told."""
+"""nerfstudio's camera-path JSON against its definition, round trips, and the errors for damaged files."""
 
 import json
 import math
@@ -42,7 +42,7 @@ def written(folder: Path, value: Any) -> Path:
 
 
 def nerfstudio_directions(kind: str, fov: float, pixels: np.ndarray, *, width: int, height: int) -> np.ndarray:
-    """Unit directions in OpenGL camera axes, as nerfstudio's Cameras make them: get_path_from_json, then its rays."""
+    """Return unit directions in OpenGL axes as nerfstudio computes them: get_path_from_json, then rays of Cameras."""
     focal = height / 2 / np.tan(fov * np.pi / 180 / 2)
     fx, fy = (width / 2, height) if kind == "equirectangular" else (focal, focal)
     x, y = (pixels[:, 0] - width / 2) / fx, -(pixels[:, 1] - height / 2) / fy
@@ -59,7 +59,7 @@ def nerfstudio_directions(kind: str, fov: float, pixels: np.ndarray, *, width: i
 
 @pytest.mark.parametrize("kind", ["perspective", "fisheye", "equirectangular"])
 def test_pixels_see_where_nerfstudio_says(tmp_path, kind):
-    """An independent implementation of its formulas, in world coordinates, off the axis and off the diagonal."""
+    """An independent implementation of nerfstudio's formulas, in world coordinates, off axis and off the diagonal."""
     frame = read_path(written(tmp_path, content(camera_type=kind))).frames[0]
     np.testing.assert_allclose(frame.world_from_cam, OPENCV_POSE, rtol=0, atol=1e-15)
     pixels = np.array([[3.5, 7.5], [60.0, 11.0], [32.5, 40.0], [20.0, 24.5]])
@@ -243,7 +243,7 @@ def test_damaged_views_are_told_with_their_number(tmp_path, more, what):
 
 
 def test_two_hundred_corruptions_never_end_in_a_traceback(tmp_path):
-    """A cut, a changed byte, or a value of another kind: a path or a UserError that names the file."""
+    """A cut, a changed byte, or a value of another kind gives a path, or a UserError that names the file."""
     rng = np.random.default_rng(0)
     whole = json.dumps(content(fps=24, seconds=1.0))
     values = ["NaN", "-1e400", "1e308", "null", "[]", "{}", '"x"', "true", "9" * 400]

@@ -39,7 +39,7 @@ WITHOUT_INPUT = ("selftest",)
 USAGE = 2
 PROJECT = Path(__file__).parent.parent
 GUIDES = (PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md")))
-# Enough for a command that trains to do everything that it does.
+# Enough for a command that trains to go through all of its stages.
 QUICK = ("--steps", "1", "--downscale", "8", "--log2-rows", "10", "--threads", "2")
 
 
@@ -55,7 +55,7 @@ def write_photos(folder: Path, count: int) -> Path:
 
 
 def check_that_it_parses(line: str) -> None:
-    """Every `nerfcli ...` of a shell line names a command and options that exist, with values that they take."""
+    """Check that every `nerfcli ...` of a shell line names an existing command and options, with valid values."""
     for part in line.split("|"):
         words = shlex.split(part.split("->")[0], comments=True)
         if not words or words[0] != "nerfcli":
@@ -66,7 +66,7 @@ def check_that_it_parses(line: str) -> None:
 
 
 def needed(command: str, folder: Path) -> tuple[Any, ...]:
-    """What a command asks for besides its input."""
+    """Return the arguments that a command needs besides its input."""
     return {"convert": (folder / "out.npz", "--to", "npz"), "export": ("--to", "mesh")}.get(command, ())
 
 
@@ -85,7 +85,7 @@ def test_help_lists_every_command_and_the_exit_codes():
     result = nerfcli("--help")
     assert result.exit_code == 0
     assert all(re.search(rf"^\s+{command}\b", result.stdout, re.M) for command in (*COMMANDS, *WITHOUT_INPUT))
-    assert "..." not in result.stdout.split("Commands:")[1]  # what a command is for is told whole
+    assert "..." not in result.stdout.split("Commands:")[1]  # no description is cut short
     assert "130 interrupted; 143 ended by SIGTERM" in re.sub(r"\s+", " ", result.stdout)
     for line in result.stdout.splitlines():
         if line.strip().startswith("nerfcli "):
@@ -97,7 +97,7 @@ def test_version():
 
 
 def command_lines(guide: Path) -> list[str]:
-    """The command lines of a guide's fenced blocks, continued lines joined."""
+    """Return the command lines of a guide's fenced blocks, with continued lines joined."""
     blocks = re.findall(r"^```[a-z]*\n(.*?)^```", guide.read_text(encoding="utf-8"), re.M | re.S)
     lines = "".join(blocks).replace("\\\n", " ").splitlines()
     return [line.strip().removeprefix("$ ") for line in lines if re.search(r"(^|\|)\s*(\$ )?nerfcli ", line)]
@@ -395,7 +395,7 @@ def test_info_of_a_scene(capture):
     plain = nerfcli("info", capture).stdout
     assert plain.splitlines()[0] == str(capture)
     assert "  kind: blender" in plain
-    assert "None" not in plain  # how the unit is known was not written down
+    assert "None" not in plain  # the source of the unit was not recorded
 
 
 def test_the_doctor_writes_a_page_beside_the_photos_and_holds_it_against_a_gate(tmp_path):
@@ -430,7 +430,7 @@ def test_a_batch_goes_on_after_a_bad_path(capture, tmp_path):
     error, _ = error_of(result)
     assert error.startswith(f"Error: {tmp_path / 'missing'}")
     assert (capture.with_name("spheres-run") / "field.safetensors").exists()
-    # Those results, as they stand on stdout, are the next command's input.
+    # The results on stdout are the input of the next command, unchanged.
     result = nerfcli("evaluate", "-", "--json", stdin=result.stdout)
     assert result.exit_code == 0
     paths = [json.loads(line)["path"] for line in result.stdout.splitlines()]
@@ -439,8 +439,8 @@ def test_a_batch_goes_on_after_a_bad_path(capture, tmp_path):
 
 @pytest.mark.parametrize(("given", "used"), [(None, "1000"), ("7", "7")])
 def test_openmp_waits_briefly_unless_the_user_says_otherwise(given, used, monkeypatch):
-    # Not whether it helps: two trainings at a time are a matter for benchmarks.
-    monkeypatch.setenv("GOMP_SPINCOUNT", given or "")  # remembers what stood there, whatever main sets
+    # Whether it helps two trainings at a time is a matter for benchmarks.
+    monkeypatch.setenv("GOMP_SPINCOUNT", given or "")  # so that the old value is restored, whatever main sets
     if given is None:
         monkeypatch.delenv("GOMP_SPINCOUNT")
     monkeypatch.setattr(cli, "app", lambda prog_name: None)
@@ -619,7 +619,7 @@ def test_photos_are_held_out_by_the_rule_that_is_given(capture):
     assert result.exit_code == BAD_INPUT
     assert error_of(result)[1].endswith("give --holdout block:0.25")
     assert nerfcli("train", capture, *QUICK, "--holdout", "most", "-o", run).exit_code == 2
-    # Cameras whose split is not the one of the training are refused.
+    # Cameras whose split differs from that of the training are refused.
     write_json(run / "cameras.json", {"train": cameras["test"], "test": cameras["train"]})
     result = nerfcli("evaluate", run)
     assert result.exit_code == BAD_INPUT
@@ -668,7 +668,7 @@ def test_cameras_of_another_file_and_none_at_all(capture, finished, tmp_path):
 
 
 def views_of(folder: Path) -> list[dict[str, Any]]:
-    """Pose and camera of each frame that was rendered into a folder."""
+    """Return pose and camera of each frame that was rendered into a folder."""
     return json.loads((folder / "render.json").read_text())["frames"]
 
 
@@ -682,7 +682,7 @@ def test_views_are_written_and_rendered_from_again(finished, tmp_path):
         again = ("--cameras", tmp_path / "path" / name, "--outputs", "rgb", "-o", tmp_path / name)
         assert nerfcli("render", finished, *again).exit_code == 0
         for one, other in zip(views_of(tmp_path / "views"), views_of(tmp_path / name), strict=True):
-            if name == "cameras.json":  # the other has square pixels only, and says so
+            if name == "cameras.json":  # the other format has square pixels only, and says so
                 assert one["camera"] == other["camera"]
             np.testing.assert_allclose(one["world_from_cam"], other["world_from_cam"], rtol=0, atol=1e-12)
 
@@ -741,7 +741,7 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
 
     loop_train = loop.train
     monkeypatch.setattr(loop, "train", interrupted)
-    ticks = itertools.count(step=0.06)  # seconds of a step, however fast this machine is
+    ticks = itertools.count(step=0.06)  # a fake clock, independent of the speed of this machine
     monkeypatch.setattr(loop, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))
     stopped = nerfcli(*arguments)
     assert (stopped.exit_code, stopped.stdout) == (INTERRUPTED, "")
@@ -765,7 +765,7 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
     assert (again.exit_code, again.stdout) == (0, first.stdout)
     assert listing(run) == before
     assert "report.html is kept" in again.stderr
-    (run / "metrics.json").unlink()  # then the page tells of numbers that are there no more
+    (run / "metrics.json").unlink()  # the page now shows numbers that are gone
     nerfcli("evaluate", run)
     assert "report.html is kept" not in nerfcli(*arguments).stderr
 
@@ -806,9 +806,9 @@ def test_ctrl_c_and_sigterm_save_a_checkpoint_and_say_how_to_go_on(sent, exit_co
 @pytest.mark.skipif(os.name != "posix", reason="a terminal is made with the pty module")
 @pytest.mark.parametrize("exit_code", [INTERRUPTED, TERMINATED])
 def test_a_signal_to_all_processes_of_a_command_leaves_none_and_no_half_file(exit_code, finished, tmp_path):
-    """Ctrl-C on a terminal goes to those of --jobs, too, and SIGTERM as `timeout`, systemd and schedulers send it."""
+    """Ctrl-C on a terminal also reaches the processes of --jobs, like SIGTERM from `timeout`, systemd or schedulers."""
     ours, theirs = os.openpty()
-    program = "import os, signal; os.open(os.ttyname(0), os.O_RDWR); "  # it becomes the terminal of this session
+    program = "import os, signal; os.open(os.ttyname(0), os.O_RDWR); "  # makes it the terminal of this session
     program += "signal.signal(signal.SIGINT, signal.default_int_handler); from nerfcli.cli import main; main()"
     words = ("render", finished, "--cameras", "orbit", "--count", "2000", "--max-size", "64", "--jobs", "2", "--quiet")
     command = [sys.executable, "-c", program, *map(str, words), "-o", str(tmp_path / "out")]
@@ -827,7 +827,7 @@ def test_a_signal_to_all_processes_of_a_command_leaves_none_and_no_half_file(exi
     stdout, stderr = process.communicate(timeout=120)
     assert (process.returncode, stdout) == (exit_code, ""), stderr
     assert not any(word in stderr for word in ("Traceback", "stack trace"))
-    while _group_lives(process.pid) and time.monotonic() < deadline:  # multiprocessing's own process ends by itself
+    while _group_lives(process.pid) and time.monotonic() < deadline:  # multiprocessing's helper process ends by itself
         time.sleep(0.05)
     assert not _group_lives(process.pid)
     assert not list(tmp_path.rglob("*partial*"))

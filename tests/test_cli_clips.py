@@ -1,4 +1,4 @@
-"""nerfcli poses and run with a video: where its frames and its scene go, and what is told of one that will not do."""
+"""nerfcli poses and run with a video: where its frames and its scene go, and the errors for unusable videos."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ def nerfcli(*arguments: str | Path, stdin: str | None = None) -> Result:
 
 @pytest.fixture
 def estimated(monkeypatch) -> list[tuple[str, str, int]]:
-    """What structure from motion was asked for: folder, scene, photos in it. It makes an empty scene."""
+    """The calls of structure from motion: folder, scene, number of photos in the folder. Each makes an empty scene."""
     asked = []
 
     def estimate(folder: Path, scene: Path, settings: Any, **more: Any) -> None:
@@ -66,7 +66,7 @@ def test_run_takes_a_video_too(clip, estimated, monkeypatch):
 
 
 def test_videos_and_folders_on_standard_input(clip, estimated):
-    """What cannot be read is told, the rest goes on, and the exit code is that of the failure."""
+    """Unreadable files are reported, the rest is processed, and the exit code is that of the failure."""
     Path("photos").mkdir()
     ffmpeg("-f", "lavfi", "-i", "sine=duration=0.2", "sound.m4a")
     Path("cut.mp4").write_bytes(clip.read_bytes()[:-900])

@@ -1,4 +1,4 @@
-"""benchmarks/colour_capture.py: what is done to the colours of photos is what the file beside them says."""
+"""benchmarks/colour_capture.py: the colours of photos are changed exactly as the file beside them says."""
 
 import numpy as np
 import pytest

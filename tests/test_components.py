@@ -59,7 +59,7 @@ def test_only_a_grid_of_levels_can_let_them_fade_out():
 def test_stereo_without_points_is_refused():
     with pytest.raises(UserError, match="needs points"):
         TrainSettings(components=Components(stereo=True))
-    TrainSettings(components=Components(stereo=True), model="auto", fixed=("stereo",))  # points may come
+    TrainSettings(components=Components(stereo=True), model="auto", fixed=("stereo",))  # auto may add points
 
 
 def test_components_are_in_the_settings_as_json():
@@ -79,7 +79,7 @@ def test_help_names_every_component_with_its_values():
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_a_field_of_low_degree_sees_only_its_harmonics(degree):
-    # There are (l + 1)^2 harmonics up to degree l; those above the degree are gone, the others stay.
+    # There are (l + 1)^2 harmonics up to degree l; those above the degree are zero, the others stay.
     directions = torch.nn.functional.normalize(torch.randn(7, 3, dtype=torch.float64), dim=-1)
     kept = (degree + 1) ** 2
     assert torch.equal(spherical_harmonics(directions, degree)[:, :kept], spherical_harmonics(directions)[:, :kept])

@@ -51,7 +51,7 @@ def npz_of(tmp_path: Path, capture: Capture) -> Path:
 
 
 def farthest_px(a: Capture, b: Capture) -> float:
-    """The largest distance between projections of a's points by two captures, by nerfcli's own cameras."""
+    """Return the largest distance between projections of a's points by two captures, with nerfcli's own cameras."""
     worst = 0.0
     for one, other in zip(a.frames, b.frames, strict=True):
         first, seen = one.camera.project(rigid.apply(rigid.inverse(one.world_from_cam), a.points))
@@ -226,7 +226,7 @@ def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
 
 
 def test_intrinsics_for_another_size(tmp_path):
-    """A camera of twice the resolution, with its principal point off the middle, in a file that says the size here."""
+    """Intrinsics for twice the resolution, principal point off the middle, in a file with the size of the photos."""
     double = Camera("PINHOLE", 640, 480, (1000.0, 1010.0, 642.5, 477.0))
     source = npz_of(tmp_path, capture_of([double]))
     assert nerfcli("convert", source, tmp_path / "out", "--to", "colmap", "--from-size", "2").exit_code == 0
@@ -253,7 +253,7 @@ def test_the_world_frame_and_its_scale(tmp_path):
 
 
 def test_markers_in_the_photos_give_metres(tmp_path):
-    # Markers with a side of 120 pixels at 120 / 0.7 pixels per unit, which is said to be 0.05 m.
+    # Markers with a side of 120 pixels at 120 / 0.7 pixels per unit; --markers declares the side to be 0.05 m.
     frames = photos_of(tmp_path, sheet_of_markers([3, 17], 120), per_unit=120 / 0.7)
     source = npz_of(tmp_path, Capture(tuple(frames), np.zeros((0, 3)), (), None, "npz"))
     result = nerfcli("convert", source, tmp_path / "out.npz", "--to", "npz", "--markers", "DICT_4X4_50:0.05", "--json")
@@ -315,7 +315,7 @@ def test_features_are_left_out_with_a_warning(tmp_path):
 
 
 def test_what_a_lost_term_does_is_told_in_pixels(tmp_path):
-    """The distortion f k r^3 of the last corner of the picture is the most that its loss can do."""
+    """The loss of the distortion moves pixels by at most f k r^3 at the corner of the picture."""
     source = npz_of(tmp_path, capture_of([RADIAL]))
     result = nerfcli("convert", source, tmp_path / "out", "--to", "llff", "--allow-loss", "--json")
     assert result.exit_code == 0, result.stderr
@@ -354,7 +354,7 @@ def scalar_last(rotation: np.ndarray) -> np.ndarray:
 
 
 def rigid_with(**faults: Any) -> Any:
-    """The module `rigid` with some functions of another kind, for one module alone."""
+    """Return the module `rigid` with some functions replaced, to patch into a single module."""
     return SimpleNamespace(**{**vars(rigid), **faults})
 
 
@@ -387,7 +387,7 @@ def test_a_fault_of_a_writer_is_found_and_nothing_is_kept(name, tmp_path, monkey
 
         def fault(model: Any) -> np.ndarray:
             rows = right(model)
-            signs = [1, -1, -1, -1, 1, 1, 1]  # the conjugate: of the transposed rotation
+            signs = [1, -1, -1, -1, 1, 1, 1]  # the conjugate, for the transposed rotation
             return rows[:, [1, 2, 3, 0, 4, 5, 6]] if "order" in name else rows * signs
 
     with monkeypatch.context() as patched:

@@ -25,7 +25,7 @@ from nerfcli.multiview.features import Matches
 
 
 def silent(share: float, detail: str) -> None:
-    """Progress that nobody watches."""
+    """Ignore progress."""
 
 
 def with_poses(capture: Capture, poses: np.ndarray) -> Capture:
@@ -34,9 +34,9 @@ def with_poses(capture: Capture, poses: np.ndarray) -> Capture:
 
 
 def misread(capture: Capture, meant: Convention, parsed_axes: str) -> Capture:
-    """What is parsed from a file that was written in the convention `meant`, by one who takes it for the format's.
+    """Return the capture that a reader parses from a file in the convention `meant` if it assumes the format's own.
 
-    By hand, not by `expressed`: the file's matrices, then the format's axes taken off them.
+    Independent of `expressed`: it computes the matrices of the file, then removes the axes of the format.
     """
     in_file = poses_of(capture) @ opencv_from_axes(meant.axes)
     if meant.inverted:
@@ -78,17 +78,17 @@ def test_exact_observations_tell_every_convention(meant, parsed_axes):
     found = detect(capture, axes=parsed_axes, progress=silent)
     assert found.convention == meant
     assert set(verdicts(found).values()) == {"holds"}
-    assert all(question.ratio > 10 for question in found.questions)  # the first two are asked with a half pixel's error
+    assert all(question.ratio > 10 for question in found.questions)  # the first two still have a half pixel's error
     assert found.questions[-1].ratio > 100
     assert found.as_format_says == (meant == Convention(parsed_axes))
-    # What convert then makes of it is the capture that was spoiled.
+    # convert then restores the original capture.
     mended = reinterpreted(capture, found.convention, parsed_axes=parsed_axes)
     np.testing.assert_allclose(poses_of(mended), poses_of(capture_of([PINHOLE, BROWN])), rtol=0, atol=1e-12)
     assert mended.frames[1].camera.params == pytest.approx(BROWN.params, rel=1e-14)
 
 
 def test_a_half_pixel_below_the_noise_is_not_decided():
-    """20 px of noise in 360 observations: their median error is known to 1 px or so, not to 0.5 px."""
+    """20 px of noise in 360 observations: their median error is known to about 1 px, not to 0.5 px."""
     capture = capture_of([PINHOLE])
     assert capture.observations is not None
     rng = np.random.default_rng(1)
@@ -113,7 +113,7 @@ def test_poses_that_fit_in_no_convention_are_told():
 
 
 def matched_pairs(capture: Capture) -> list[Matches]:
-    """What a perfect matcher finds: the points that neighbours both see."""
+    """Return the matches of a perfect matcher: the points that both neighbours see."""
     seen = capture.observations
     assert isinstance(seen, Observations)
     where = [
@@ -151,8 +151,8 @@ def test_epipolar_errors_vanish_in_the_right_convention_alone(meant):
 
 
 def test_the_epipolar_error_is_the_distance_in_pixels():
-    """A camera moved sideways sees every point in the same row: off by 3 rows in one photo, the Sampson distance to the
-    epipolar geometry is 3 / sqrt(2) px near the optical axis."""
+    """A camera moved sideways sees every point in the same row. With one photo shifted by 3 rows, the Sampson distance
+    to the epipolar geometry is 3 / sqrt(2) px near the optical axis."""
     camera = Camera.pinhole(2000, 2000, 10_000.0)
     second = np.eye(4)
     second[0, 3] = 1.0
@@ -182,7 +182,7 @@ CARDS = ((-1.2, -0.9, 2.4, 1.8, 1.0), (-0.5, -0.4, 1.0, 0.8, 0.3))
 
 
 def photograph(folder: Path, *, count: int, camera: Camera) -> Capture:
-    """Photos of a textured card in front of a larger one (x, y, width, height, z of each), warped by homographies."""
+    """Make photos of a textured card in front of a larger one (x, y, width, height, z of each) by homographies."""
     folder.mkdir(parents=True)
     rng = np.random.default_rng(0)
     textures = []
@@ -220,7 +220,7 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def test_matches_lie_where_both_photos_show_the_same_place(photographed):
-    """Half a pixel off in the positions, or OpenCV's bias of a quarter, would make it 0.05 px."""
+    """Positions off by half a pixel, or by OpenCV's bias of a quarter, would raise the median error to 0.05 px."""
     pairs, cameras = match_neighbours(photographed.frames, progress=silent)
     assert len(pairs) >= 3
     evidence = MatchEvidence(pairs, cameras, 6)
@@ -229,7 +229,7 @@ def test_matches_lie_where_both_photos_show_the_same_place(photographed):
 
 
 def test_matches_are_found_where_opencvs_best_estimator_gives_up(photographed, monkeypatch):
-    """It asserts on some matches that all lie on a plane; the matches are then those of plain RANSAC."""
+    """OpenCV's MAGSAC fails an assertion on some coplanar matches; plain RANSAC is used instead."""
     find = cv2.findFundamentalMat
 
     def asserting(x, y, method, *options):
@@ -255,7 +255,7 @@ def test_photos_tell_the_convention_and_how_to_read_it(meant, photographed, tmp_
     axes, size, centre = report["questions"]
     assert (axes["verdict"], size["verdict"]) == ("holds", "holds")
     assert axes["ratio"] > 10
-    # These photos are sharp and without noise: their matches tell even the half pixel.
+    # These photos are sharp and without noise, so their matches reveal even half a pixel.
     assert (centre["verdict"], centre["hypotheses"][0]["pixel_centre"]) == ("holds", 0.5)
     assert report["as_format_says"] == (meant == Convention("opengl"))
     if meant.inverted:
@@ -292,7 +292,7 @@ def test_a_principal_point_in_the_middle_was_not_given():
 
 
 def test_what_is_written_in_a_convention_is_detected_as_that(tmp_path):
-    """The writer's way into a convention and the detector's way out are the same one."""
+    """The writer and the detector agree about what a convention means."""
     capture = capture_of([PINHOLE])
     wanted = Convention("llff", pixel_centre=0.0)
     written = expressed(capture, wanted, written_axes="opencv")

@@ -26,12 +26,12 @@ from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
 from nerfcli.media.images import read_image
 
 USAGE = 2
-# Upright from stored, with OpenCV: what EXIF 2.32 says of tag 0x0112.
+# OpenCV's rotation from stored to upright for each value of tag 0x0112, by EXIF 2.32.
 TURNS = {1: None, 3: cv2.ROTATE_180, 6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 
 def photographed(capture: Capture, folder: Path, orientations: dict[int, int] | None = None) -> Capture:
-    """The capture with photos on disk, some with an EXIF orientation; the cameras are for the pixels as stored."""
+    """Return the capture with photos on disk, some with an EXIF orientation; the cameras are for stored pixels."""
     frames = []
     for index, frame in enumerate(capture.frames):
         exif = Image.Exif()
@@ -61,7 +61,7 @@ def split_into(capture: Capture, *splits: str | None) -> Capture:
 
 
 def seen_upright(capture: Capture, index: int, orientation: int) -> np.ndarray:
-    """Where the stored photo of a frame shows the points, found in the photo that OpenCV turned upright."""
+    """Return where the photo of a frame shows the points after OpenCV has turned it upright."""
     frame = capture.frames[index]
     pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points))
     assert valid.all()
@@ -99,7 +99,7 @@ def test_a_known_distance_reaches_training_as_metres(tmp_path):
     np.testing.assert_allclose(scene.points, scale * capture.points, rtol=0, atol=1e-12)
     assert "the unit (metre)" in json.loads(result.stdout)["verification"]["same"]
     assert json.loads(nerfcli("info", tmp_path / "my scene", "--json").stdout)["unit"] == "metre"
-    # And from there to every format that knows units, and back with the source.
+    # From there the unit and its source also survive in a format that records units.
     assert nerfcli("convert", tmp_path / "my scene", tmp_path / "again.npz", "--to", "npz").exit_code == 0
     again = load(tmp_path / "again.npz", Given(), Doubt())[2]
     assert (again.unit, again.unit_source, again.pixels) == ("metre", "1 known distance", "upright")
@@ -139,7 +139,7 @@ def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
     ],
 )
 def test_other_programs_get_cameras_for_the_pixels_as_they_are_stored(form, place, tmp_path):
-    """From stored to upright and back nothing moves, and what training reads of the result is what was trained on."""
+    """From stored to upright and back nothing moves, and training reads the same cameras from the result."""
     capture = capture_of([BROWN])
     named = tuple(replace(f, name=f.name.replace(" ", "_")) for f in capture.frames)
     capture = photographed(replace(capture, frames=named, colours=None), tmp_path / "images", {0: 6, 1: 3, 2: 8})
@@ -161,7 +161,7 @@ def test_which_pixels_can_be_chosen(tmp_path):
     write_scene(in_pixels(capture, "upright").capture, tmp_path / "scene")
     out = tmp_path / "out.npz"
     assert nerfcli("convert", tmp_path / "scene", out, "--to", "npz").exit_code == 0
-    assert load(out, Given(), Doubt())[2].pixels == "upright"  # it can say so
+    assert load(out, Given(), Doubt())[2].pixels == "upright"  # npz records it
     options = ("--to", "colmap", "--pixels", "upright", "--allow-loss")
     assert nerfcli("convert", tmp_path / "scene", tmp_path / "out", *options).exit_code == 0
     assert load(tmp_path / "out", Given(), Doubt())[2].frames[0].camera.width == PINHOLE.height
@@ -170,7 +170,7 @@ def test_which_pixels_can_be_chosen(tmp_path):
 
 
 def test_markers_are_sought_in_photos_as_the_scene_shows_them(tmp_path):
-    """Half a turn is what a camera's shape does not tell: a scene's cameras must not be turned once more."""
+    """The shape of a camera does not reveal half a turn, and cameras of a scene must not be turned a second time."""
     frames = photos_of(tmp_path, sheet_of_markers([3, 17], 120), per_unit=120 / 0.7)
     for frame in frames:
         assert frame.image is not None
@@ -186,7 +186,7 @@ def test_markers_are_sought_in_photos_as_the_scene_shows_them(tmp_path):
     assert json.loads(result.stdout)["new_from_old"]["scale"] == pytest.approx(0.05 / 0.7, rel=1e-4)
 
 
-# What stands beside the cameras
+# Data beside the cameras
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_masks_and_depth_bounds_of_any_layout_are_kept(tmp_path):
 
 
 def test_a_mask_that_lies_otherwise_is_a_loss(tmp_path):
-    """Training turns masks of the stored pixels where their shape tells how they lie; of half a turn it does not."""
+    """Training turns masks of stored pixels if their shape reveals the turn, which it does not for half a turn."""
     capture = photographed(capture_of([PINHOLE]), tmp_path / "images", {0: 6, 1: 3})
     source = npz_of(tmp_path, masked(capture, tmp_path / "masks", 0, 1, 2))
     refused = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
@@ -367,7 +367,7 @@ def test_intrinsics_for_another_size_are_told_once(command, tmp_path):
     if command == "info":
         said = " ".join(json.loads(nerfcli("info", tmp_path, "--json").stdout)["rescaled"])
     elif command == "train":
-        said = nerfcli("train", tmp_path, "--resume", "-o", tmp_path / "run").stderr  # it ends for want of a run
+        said = nerfcli("train", tmp_path, "--resume", "-o", tmp_path / "run").stderr  # it fails, as there is no run
     else:
         said = nerfcli("convert", tmp_path, tmp_path / "out", "--to", "colmap").stderr
     assert said.count("5 photos are 640x480, but the intrinsics are for 1280x960") == 1

@@ -9,7 +9,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from nerfcli import kernels
 from nerfcli.errors import UserError
-from nerfcli.field.comparison import described_cost, others_of_equal_storage
+from nerfcli.field.comparison import described_cost, other_kinds_with_equal_storage
 from nerfcli.field.cost import field_bytes, optimiser_bytes, parameter_bytes, work
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.field.hash_field import HashFieldSettings
@@ -150,10 +150,10 @@ def test_memory_that_holds_no_field_is_told():
 
 def test_others_of_equal_storage_are_not_larger():
     for settings in (HASH, VoxelFieldSettings(contraction="l2", view_degree=2), FourierFieldSettings(contraction="l2")):
-        others = others_of_equal_storage(settings, 1 / 300)
+        others = other_kinds_with_equal_storage(settings, 1 / 300)
         assert set(others) == set(KINDS) - {settings.kind}
         for other in others.values():
             assert work(other).parameters <= 1.07 * work(settings).parameters
     # Nothing else is as small as this network.
     tiny = FourierFieldSettings(contraction="none", octaves=4, width=16, layers=1)
-    assert set(others_of_equal_storage(tiny, 1 / 300)) == set()
+    assert set(other_kinds_with_equal_storage(tiny, 1 / 300)) == set()

@@ -13,11 +13,11 @@ from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.pool import PixelPool
 
 SIDE = 32
-CAMERA = Camera.pinhole(20, 20, 20.0)  # half of the view is 0.5 per distance
+CAMERA = Camera.pinhole(20, 20, 20.0)  # half of the view is 0.5 wide at distance 1
 
 
 def pool_of(*places: float) -> PixelPool:
-    """Cameras at (x, 0, -1) that look along z."""
+    """Return the pixels of cameras at (x, 0, -1) that look along z."""
     photos = []
     for x in places:
         pose = np.eye(4)
@@ -27,18 +27,18 @@ def pool_of(*places: float) -> PixelPool:
 
 
 def known(pool: PixelPool, *distances: float) -> PointDepths:
-    """One pixel of each photo at a distance."""
+    """Return the known distance of one pixel of each photo."""
     return PointDepths(pool.first_pixel + 210, torch.tensor(distances), torch.ones(len(distances)))
 
 
 def views_of(x: float, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Whether the camera at x sees points, and their distances from it."""
+    """Return whether the camera at x sees each point, and the distances of the points from it."""
     away = points - torch.tensor([x, 0.0, -1.0])
     return (away[..., 2] > 0) & (away[..., :2].abs() < 0.5 * away[..., 2:]).all(-1), away.norm(dim=-1)
 
 
 def middles() -> torch.Tensor:
-    """(SIDE, SIDE, SIDE, 3) of the cells in the training frame, [z, y, x]."""
+    """Return the centres of cells in the training frame, (SIDE, SIDE, SIDE, 3), indexed [z, y, x]."""
     axis = (torch.arange(SIDE) + 0.5) / SIDE
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     return training_points(torch.stack([x, y, z], dim=-1), "l2")

@@ -1,4 +1,4 @@
-"""Intervals of depth: from known errors in closed form, and from stereo matching that is replaced by the truth."""
+"""Depth intervals: from known errors in closed form, and with the truth in place of stereo matching."""
 
 import json
 import shutil
@@ -32,7 +32,7 @@ TRUTH = Path(__file__).parent.parent / "sample_scenes" / "spheres" / "truth"
 
 @pytest.fixture
 def errors() -> DepthErrors:
-    """Evenly spread: within 40 % where one photo sees, 20 % and 10 % farther where two or three, 1 % from four on."""
+    """Uniform errors: -40 to 40 % where one photo sees, 0 to 20 % where two or three do, -1 to 1 % from four on."""
     spread = np.linspace(-1, 1, 1001)
     of_strata = [0.4 * spread, 0.1 + 0.1 * spread, 0.01 * spread]
     coverage = np.repeat([1.0, 3.0, 7.0], 1001)
@@ -53,7 +53,7 @@ def test_intervals_are_those_of_evenly_spread_errors(errors, level):
 
 @pytest.mark.parametrize("tolerance", [0.005, 0.05, 0.25, 1.0])
 def test_confidence_is_the_proportion_of_evenly_spread_errors(errors, tolerance):
-    """Of errors from -0.4 to 0.4, from 0 to 0.2 and from -0.01 to 0.01, those from -tolerance to tolerance."""
+    """Closed form: errors are uniform in ±0.4, 0 to 0.2 and ±0.01; the confidence is their fraction in ±tolerance."""
     coverage = np.array([0, 1, 2, 3, 4, 20, np.nan])
     confidence = errors.confidence(coverage, tolerance=tolerance)
     one, two, four = min(tolerance / 0.4, 1), min(tolerance / 0.2, 1), min(tolerance / 0.01, 1)
@@ -67,7 +67,7 @@ def test_confidence_is_1_where_all_errors_are_0():
 
 
 def test_where_too_little_was_measured_there_is_no_interval():
-    """Too few pixels in the first stratum, one photo alone in the second."""
+    """The first stratum has too few pixels, the second has pixels of only one photo."""
     coverage = np.repeat([1.0, 2.0, 4.0], [LEAST_PIXELS - 1, LEAST_PIXELS, LEAST_PIXELS])
     photos = np.where(coverage == 2, 0, np.arange(len(coverage)) % 2)
     errors = DepthErrors.of(np.zeros(len(coverage)), coverage, photos, matched=0.5)
@@ -80,7 +80,7 @@ def test_where_too_little_was_measured_there_is_no_interval():
 
 
 def matched_by_truth(share: float = 1.0) -> Callable[..., list[DenseDepth]]:
-    """In place of stereo matching: true distances of the held-out photos, of some of their pixels."""
+    """Return a replacement for stereo matching: true distances for a fraction of the held-out photos' pixels."""
 
     def dense_depths(photos: Sequence[LoadedPhoto], tracks: Tracks, **_: object) -> list[DenseDepth]:
         found = []
@@ -99,7 +99,7 @@ def matched_by_truth(share: float = 1.0) -> Callable[..., list[DenseDepth]]:
 
 
 def copied(run: Path, tmp_path: Path) -> Path:
-    """A copy of a run beside it, where the relative paths of its photos hold."""
+    """Copy a run to a folder beside it, where the relative paths of its photos stay valid."""
     return Path(shutil.copytree(run, run.with_name(f"{tmp_path.name}-run")))
 
 
@@ -120,7 +120,7 @@ def test_errors_are_those_between_matched_and_median_distances(spheres_run, monk
     assert found.photos == 3
     assert found.matched == pytest.approx(np.mean(matched))
     assert 0.9 * len(every) < sum(found.pixels) <= len(every)
-    # Nearly all is in the last stratum.
+    # Nearly all pixels are in the last stratum.
     np.testing.assert_allclose(found.quantiles[2][20:181], np.quantile(every, np.linspace(0.1, 0.9, 161)), atol=0.01)
 
 
@@ -175,7 +175,7 @@ def test_render_writes_the_interval_and_keeps_the_errors(spheres_run, tmp_path, 
 
 
 def test_render_writes_the_proportion_of_depths_within_the_tolerance(spheres_run, tmp_path, monkeypatch):
-    """Measured with the true distances of the same pictures, confidence is the proportion itself."""
+    """With errors measured from the true distances of the same pictures, confidence equals this proportion."""
     run = copied(spheres_run, tmp_path)
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth())
     common = ("render", run, "--depth", "median", "--depth-axis", "ray", "--depth-format", "tiff,exr", "--threads", "2")

@@ -28,7 +28,7 @@ from nerfcli.media.srgb import linear_light
 
 
 def odd_depth() -> np.ndarray:
-    """NaN with two payloads, both infinities and zeros, the smallest and the largest floats, and noise."""
+    """Return NaN with two payloads, both infinities and zeros, the smallest and the largest floats, and noise."""
     depth = np.random.default_rng(0).standard_normal((37, 53)).astype(np.float32)
     depth[0, :2] = np.array([0x7FC00000, 0xFFC12345], np.uint32).view(np.float32)
     depth[0, 2:8] = [np.inf, -np.inf, 0.0, -0.0, 1e-45, np.finfo(np.float32).max]
@@ -36,7 +36,7 @@ def odd_depth() -> np.ndarray:
 
 
 def read_elsewhere(path: Path) -> np.ndarray:
-    """The depth in a file by the library that its format belongs to."""
+    """Read the depth in a file with the reference library of its format."""
     match path.suffix:
         case ".tiff":
             return tifffile.imread(path)
@@ -67,7 +67,7 @@ def test_float_files_return_their_meaning(suffix, meta, tmp_path):
 
 
 def test_a_tiff_is_read_alike_by_four_libraries(tmp_path):
-    """OpenCV, Pillow and imageio decode with libtiff or their own code, tifffile wrote it."""
+    """Independent: OpenCV, Pillow and imageio decode with libtiff or their own code; tifffile wrote the file."""
     path, depth = tmp_path / "a.tiff", odd_depth()
     write_tiff(path, depth, META)
     with Image.open(path) as image:
@@ -86,7 +86,7 @@ def test_a_tiff_is_read_alike_by_four_libraries(tmp_path):
 
 
 def test_levels_are_read_alike_by_three_libraries(tmp_path):
-    """Millimetres: what a reader that knows nothing else takes them for."""
+    """Levels are millimetres, the unit that a reader assumes without further information."""
     path, depth = tmp_path / "a.png", plain_depth()
     write_png16(path, depth, FULL_META, units_per_level=1e-3)
     expected = np.where(np.isnan(depth), 0, np.rint(depth.astype(np.float64) * 1000)).astype(np.uint16)
@@ -199,7 +199,7 @@ def test_levels_are_within_half_a_level_of_the_depth(seed, size, tmp_path_factor
 
 
 def test_what_does_not_fit_into_levels_is_refused(tmp_path):
-    """Neither wrapped nor clipped, and no depth turns into "no depth"."""
+    """Values are neither wrapped nor clipped, and no depth becomes the level for "no depth"."""
     path = tmp_path / "a.png"
     for value, told in (
         (65.536, r"16 bits hold depth up to 65.535 at 0.001 per level, but the maximum is 65.536"),

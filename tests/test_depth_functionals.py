@@ -1,4 +1,4 @@
-"""The depths against quadrature, float64, and at the points where they degenerate."""
+"""Depth conventions against quadrature and float64, and in degenerate cases."""
 
 import itertools
 import math
@@ -57,7 +57,7 @@ def test_splitting_an_interval_changes_nothing_but_max_weight(seed, cut, at, exp
     )
     whole = depth.light_ends(density, starts, ends, offsets=offsets, shares=(0.05, 0.5, 0.9))
     for name in ("opacity", "transmittance", "mean", "spread", "quantiles"):
-        # Lengths are differences of distances, which lie below 6.
+        # Lengths are differences of distances, which are below 6.
         torch.testing.assert_close(
             getattr(split, name), getattr(whole, name), rtol=1e-11, atol=1e-14 if name == "spread" else 0,
             equal_nan=True, msg=lambda text, name=name: f"{name}: {text}",
@@ -197,8 +197,8 @@ def test_median_crossing_in_a_later_interval_and_through_a_gap():
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_gradient_of_a_median_that_lies_on_an_edge(dtype):
-    """Half of all light has ended just where the first of two equal slabs does: -1 / density by the first, 0 by the
-    second. By the smaller of place and length, and of the places in both slabs, it was a part of that."""
+    """The median is exactly at the end of the first of two equal slabs: its gradient is -1 / density for the first slab
+    and 0 for the second. Minima that split the gradient between equal arguments once gave only part of this."""
     density = torch.full((2,), math.log(2), dtype=dtype, requires_grad=True)
     starts = torch.tensor([1.0, 2.0], dtype=dtype)
     median = depth.quantile(density, starts, starts + 1, offsets=torch.tensor([0, 2]), share=0.5)
@@ -208,8 +208,8 @@ def test_gradient_of_a_median_that_lies_on_an_edge(dtype):
 
 
 def test_a_median_that_rounding_puts_into_thin_air_stays_inside_an_interval():
-    """Half of all light less a rounding has ended at a wall; 100 thin layers with gaps between bring the rest. A
-    rounding of the wall's optical depth is as much as sixty layers have: by the density of one it leads out."""
+    """A wall's optical depth is one rounding below the median's, and 100 thin layers with gaps follow. The rounding
+    equals the optical depth of sixty layers: divided by the density of one layer, it leads out of that layer."""
     target = torch.tensor(-math.log1p(-0.5))
     wall = torch.nextafter(target, torch.tensor(0.0))
     density = torch.cat([wall[None], torch.full((100,), 1e-6)])
@@ -220,8 +220,8 @@ def test_a_median_that_rounding_puts_into_thin_air_stays_inside_an_interval():
 
 
 def test_gradient_of_the_mean_of_a_far_thin_surface():
-    """Closed form: minus the variance of a thin interval, length^2 / 12. It is 1e8 times smaller than the distance, and
-    was the rounding of that."""
+    """Closed form: minus the variance of a thin interval, length^2 / 12. It is 1e8 times smaller than the
+    distance, and was once lost in the rounding of the distance."""
     density = torch.tensor([0.5], requires_grad=True)
     start, length = torch.tensor([200.0]), 2.0**-12
     mean = depth.light_ends(density, start, start + length, offsets=torch.tensor([0, 1]), shares=()).mean
@@ -254,7 +254,7 @@ def test_undefined_depths_are_nan_and_only_those():
 
 
 def test_conditional_gradient_is_bounded_in_empty_space():
-    # Zero density exactly: the value is NaN by definition, its gradient must not poison the rest.
+    # Density is exactly 0: the value is NaN by definition, but its gradient must not make other gradients NaN.
     density = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     starts = torch.arange(3, dtype=torch.float64)
     weights, _ = reference.interval_weights(density, torch.ones(3, dtype=torch.float64), torch.tensor([0, 3]))

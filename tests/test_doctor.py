@@ -1,4 +1,4 @@
-"""What the doctor says of captures with known faults: each is found and named, and a clean capture gets no alarm.
+"""The doctor's findings on captures with known faults: each is found and named; a clean capture gets no alarm.
 
 The photos are drawn by `walks`: boards with known textures at known distances, seen by a camera on a known path.
 """
@@ -39,7 +39,7 @@ FEATURES = 500
 
 @dataclass(frozen=True)
 class Examined:
-    """A capture that was read and compared, so that one photo can be spoilt without doing all again."""
+    """A capture that was read and compared, so that one photo can be spoilt without repeating this for the others."""
 
     folder: Path
     photos: tuple[np.ndarray, ...]
@@ -53,7 +53,7 @@ class Examined:
         return judged(subject, list(self.facts), list(self.pairs), unreadable={})
 
     def spoilt(self, photo: np.ndarray, tmp_path: Path) -> Diagnosis:
-        """The findings with another photo in the place of `ONE`."""
+        """Return the findings with another photo in place of `ONE`."""
         path = tmp_path / self.facts[ONE].name
         Image.fromarray(photo).save(path, quality=93)
         facts = list(self.facts)
@@ -83,7 +83,7 @@ def finding(diagnosis: Diagnosis, check: str) -> Finding:
 
 
 def alarms(diagnosis: Diagnosis) -> dict[str, tuple[str, ...]]:
-    """The names of photos by checks that are not good. The captures here are small on purpose."""
+    """Return photo names by checks that are not good, but for count and size: captures here are small on purpose."""
     found = {f.check: f.names for f in diagnosis.findings if f.verdict != GOOD}
     return {check: names for check, names in found.items() if check not in ("count", "size")}
 
@@ -162,7 +162,7 @@ def test_mixed_lenses_and_zooms_are_told_but_not_a_phone_on_its_side(clean):
 
 
 def test_exif_of_another_picture_is_named(clean):
-    """Recorded as 4032x3024, and stored in another shape; a photo that was only made smaller is none."""
+    """EXIF records 4032x2268, another shape than the file's; 4032x3024 has the same shape: only downscaled."""
     exif = replace(clean.facts[0].exif, make="Maker", model="One", focal_mm=4.0, focal_35mm=28.0)
     resized = replace(exif, taken_px=(4032, 3024))
     cropped = replace(exif, taken_px=(4032, 2268))
@@ -204,7 +204,7 @@ def test_something_that_moves_by_itself_is_found_where_it_is(tmp_path):
     diagnosis = examined(tmp_path / "moving", [with_mover(step) for step in np.linspace(-1, 1, 5)]).diagnosis()
     assert list(alarms(diagnosis)) == ["moving content"]
     found = finding(diagnosis, "moving content")
-    middle = dict(found.photos)["02.jpg"]  # the mover is at x 0.2, y 0.75 and distance 2.5 of it
+    middle = dict(found.photos)["02.jpg"]  # there the mover is at x 0.2, y 0.75, distance 2.5
     across, down = (int(word) for word in middle.replace(",", "").split() if word.isdigit())
     assert abs(across - 100 * (0.5 + 0.2 / 2.5 * FOCAL_PX / 560)) < 6
     assert abs(down - 100 * (0.5 + 0.75 / 2.5 * FOCAL_PX / 420)) < 8
@@ -217,7 +217,7 @@ def test_a_flat_world_is_told_from_a_camera_that_only_turns(tmp_path):
 
 
 def test_intrinsics_that_are_known_tell_how_far_things_are(tmp_path):
-    """A step of 0.5 before boards at 2.6 to 6; a focal length said to be twice as long makes all twice as far."""
+    """The camera moves by 0.5 in front of boards at 2.6 to 6; twice the stated focal length doubles all distances."""
     folder = write(tmp_path / "photos", [view((step, 0, 0)) for step in (0.0, 0.5)])
 
     def baseline_over_depth(focal_px: float) -> float:
@@ -278,7 +278,7 @@ def test_the_baseline_over_the_depth_is_measured(baseline):
 
 
 def test_a_plane_gives_no_more_than_its_baseline_over_its_distance():
-    """It is 0.2; where the focal length may be 1.45 times the given, 0.2 / 1.45 explains the same pixels."""
+    """The ratio is 0.2; if the focal length may be 1.45 times the given one, 0.2 / 1.45 explains the same pixels."""
     points, _ = two_view_points()
     flat = np.column_stack([points[:, :2], np.full(len(points), 5.0)])
     views = camera_motion.estimate(seen(flat, 0, (0, 0, 0)), seen(flat, 0, (1.0, 0, 0)), (700.0, 700.0))
@@ -304,12 +304,12 @@ def test_matches_are_those_of_a_double_loop():
 def test_heights_come_back_from_differences_of_which_some_are_wrong():
     rng = np.random.default_rng(0)
     truth = rng.normal(size=12)
-    pairs = [(i, j) for i in range(11) for j in range(i + 1, 11)]  # the last one stands alone
+    pairs = [(i, j) for i in range(11) for j in range(i + 1, 11)]  # the last one has no pair
     differences = np.array([truth[j] - truth[i] for i, j in pairs])
     differences[::9] += 5
     differences[4] = np.nan
     values, backing = consensus.potentials(12, pairs, differences, trust=np.ones(len(pairs)))
-    np.testing.assert_allclose(values[:11], truth[:11] - np.median(truth[:11]), atol=0.1)  # below 0.1 it is squares
+    np.testing.assert_allclose(values[:11], truth[:11] - np.median(truth[:11]), atol=0.1)  # squares below 0.1
     assert np.isnan(values[11])
     assert backing[11] == 0
 
@@ -324,7 +324,7 @@ def test_large_captures_are_not_compared_exhaustively(clean):
     pairs = connectivity.choose_pairs(photos)
     assert len(pairs) <= connectivity.pair_count(70) < 1000
     assert {(i, i + 1) for i in range(69)} <= set(pairs)
-    # Linear in the photos from here on: the time for a thousand is told before it starts.
+    # Linear in the number of photos from here on, so that the time for a thousand can be stated before the start.
     np.testing.assert_allclose(estimated_seconds(1000, 2), 4 * estimated_seconds(250, 2))
 
 
@@ -369,7 +369,7 @@ def test_cameras_at_one_place_and_one_far_off_are_told():
 
 
 def test_weakly_determined_intrinsics_of_a_scene_are_named(tmp_path):
-    """As nerfcli poses reports them: weak, firm, and of a report that says nothing of it."""
+    """As reported by nerfcli poses: weak, firm, and reports without uncertainties."""
     scene = replace(ring(24, span_deg=360), root=tmp_path, kind="nerfcli")
 
     def found(*cameras: dict[str, object]) -> Finding | None:
@@ -466,7 +466,7 @@ def test_photos_keep_their_digest(clean):
 
 
 def test_quality_thresholds_are_those_of_the_docstring():
-    """0.3 octaves are about a blur of 0.8 px of a sharp photo, 0.7 about 1.5 px."""
+    """Blurring a sharp photo by 0.8 px loses about 0.3 octaves of detail, by 1.5 px about 0.7."""
     photo = cv2.cvtColor(view(seed=3), cv2.COLOR_RGB2GRAY).astype(np.float32)
     sharp = measure(photo)[0].detail
     lack = [sharp - measure(cv2.GaussianBlur(photo, (0, 0), sigma))[0].detail for sigma in (0.8, 1.5)]

@@ -1,4 +1,4 @@
-"""What a command can know before its work it says before it: wrong inputs, read-only folders, nothing left to do."""
+"""Commands refuse before any work what they can know by then: wrong inputs, read-only folders, nothing left to do."""
 
 import shutil
 from pathlib import Path
@@ -44,7 +44,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_the_work(command, finis
 
 
 def test_resuming_what_has_used_its_budget_changes_nothing(capture, tmp_path):
-    """Before, photos were read and matched again to find that there is no step left."""
+    """Regression: photos were read and matched again only to find that no step was left."""
     train = ("train", capture, "--steps", "1", "--downscale", "8", "--log2-rows", "10", "-o", tmp_path / "run")
     assert nerfcli(*train).exit_code == 0
     before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.is_file()}

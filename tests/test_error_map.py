@@ -1,4 +1,4 @@
-"""Pixels drawn by the error of their block: the loss stays what it is on the mean, whatever the map says."""
+"""Pixels drawn by the error of their block: the expected loss stays the same for any error map."""
 
 from dataclasses import replace
 
@@ -30,8 +30,8 @@ def generator() -> torch.Generator:
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_weighted_means_are_those_of_all_pixels(masked, photos):
-    """The mean of a function of the pixels, with the weights, is its mean over all usable pixels; the error map knows
-    one block of 100 times the error of the others. By the standard error of the draws."""
+    """The weighted mean of a function of drawn pixels is its mean over all usable pixels, although one block of the map
+    has 100 times the error of the others. The tolerance is from the standard error of the draws."""
     pool = PixelPool(photos if masked else photos[:1], SAME, torch.device("cpu"))
     usable = torch.arange(len(pool.colours)) if pool.usable is None else pool.usable
     guided = ErrorMap(pool)
@@ -47,7 +47,7 @@ def test_weighted_means_are_those_of_all_pixels(masked, photos):
 
 
 def test_pixels_are_drawn_where_the_error_is(photos):
-    """Half of them anywhere; the others in one block, if only that one has an error, and evenly inside of it."""
+    """Half are drawn anywhere, the others evenly within the one block that has an error."""
     pool = PixelPool(photos[:1], SAME, torch.device("cpu"))
     height, width = photos[0].pixels.shape[:2]
     guided = ErrorMap(pool)
@@ -68,9 +68,9 @@ def test_a_block_remembers_its_error(photos):
     pool = PixelPool(photos[:1], SAME, torch.device("cpu"))
     guided = ErrorMap(pool)
     even = guided.draw(100, generator()).weights
-    torch.testing.assert_close(even, torch.ones(100))  # nothing is known: all are as likely
+    torch.testing.assert_close(even, torch.ones(100))  # no error is known: all are equally likely
     guided.learn(torch.tensor([0, 1, 500]), torch.tensor([1.0, 3.0, 2.0]))
-    assert (guided.errors == 2.0).all()  # the mean, everywhere, and the mean of block 0
+    assert (guided.errors == 2.0).all()  # the mean of all pixels for unknown blocks, and that of block 0
     guided.learn(torch.tensor([0, 1]), torch.tensor([4.0, 8.0]))
     assert guided.errors[0].item() == pytest.approx(0.8 * 2 + 0.2 * 6)
     assert (guided.errors[1:] == 2.0).all()

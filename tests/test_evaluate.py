@@ -20,7 +20,7 @@ from nerfcli.evaluate.protocol import Extras, HeldOutPhoto, evaluate_model, over
 from nerfcli.field.exposure import exposed
 
 EVERYTHING = np.ones((24, 32), dtype=bool)
-# Full coverage of the picture by an empty grid: what is seen is the background.
+# A grid without occupied cells: only the background is seen.
 NOWHERE = torch.zeros(4, 4, 4, dtype=torch.bool)
 
 
@@ -71,7 +71,7 @@ def test_psnr_and_ssim_are_those_of_torchmetrics():
     picture = (photo + rng.normal(0, 0.05, photo.shape)).clip(0, 1)
     one, other = (torch.from_numpy(p).permute(2, 0, 1)[None] for p in (picture, photo))
     used = np.ones((40, 30), dtype=bool)
-    # Its own mean takes in windows that hang over the border.
+    # The mean that it returns itself includes windows that extend beyond the border.
     full: Any = structural_similarity_index_measure(one, other, data_range=1.0, return_full_image=True)[1]
     assert ssim(picture, photo, used=used) == pytest.approx(float(full[0, :, 5:-5, 5:-5].mean()), abs=1e-12)
     assert psnr(picture, photo, used=used) == pytest.approx(float(peak_signal_noise_ratio(one, other, data_range=1.0)))
@@ -147,7 +147,7 @@ def test_evaluation_of_an_empty_model_is_the_distance_to_its_background():
     assert metrics["mean"]["ssim"] == pytest.approx((first["ssim"] + 1) / 2)
     assert calls[-1] == (2 * 12 * 16, 2 * 12 * 16)
     assert metrics["render"]["seconds_per_image"] > 0
-    # White is saturated: the colour correction says nothing of photos on white.
+    # White is saturated: photos on white give no colour correction.
     assert second["psnr_colour_aligned"] is None
     assert first["psnr_colour_aligned"] is not None
 
@@ -175,7 +175,7 @@ def test_gains_fitted_on_the_left_half_are_measured_on_the_right():
     assert (hidden["psnr_right_half"], hidden["psnr_gains_aligned"]) == (None, None)
     assert (clear["psnr_right_half"], clear["psnr_gains_aligned"]) == (100, None)
     assert "gains_aligned: median gain per channel in linear light of the left half" in metrics["protocol"]
-    # The columns of the plain protocol are the same with and without.
+    # The extras do not change the columns of the plain protocol.
     plain = evaluate_model(model, photos, on_image=lambda done, total: None)
     assert {key: first[key] for key in plain["images"][0] if key != "seconds"} == {
         key: value for key, value in plain["images"][0].items() if key != "seconds"

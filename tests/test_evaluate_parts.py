@@ -80,9 +80,9 @@ def test_gains_are_found_again_from_half_of_a_photo_though_parts_of_it_are_wrong
     picture = np.random.default_rng(0).uniform(0.0, 1.0, (40, 60, 3))
     photo = exposed(torch.from_numpy(picture), torch.tensor(wanted, dtype=torch.float64)).clamp(0, 1).numpy()
     left, right = halves(np.ones((40, 60), dtype=bool))
-    exact = np.where(right[..., None], 0.5, photo)  # what is on the right has no say
+    exact = np.where(right[..., None], 0.5, photo)  # the right half is not used
     assert align_gains(picture, exact, used=left, log_gains=(0.4,) * 3) == pytest.approx(wanted, abs=1e-9)
-    photo[::5], picture[1::5] = 1.0, 0.0  # neither white nor black says anything
+    photo[::5], picture[1::5] = 1.0, 0.0  # white and black pixels are not used
     photo[2, 1:5] = 0.5
     assert align_gains(picture, photo, used=left, log_gains=(0.4,) * 3) == pytest.approx(wanted, abs=1e-9)
 
@@ -138,7 +138,7 @@ def test_one_training_view_has_no_spacing():
 
 
 class Wall:
-    """A painted wall at z = 0, seen in closed form: stands for the renderer. The model only says what size is."""
+    """A painted wall at z = 0 in closed form, in place of the renderer; the model only sets the scale."""
 
     def __init__(self) -> None:
         self.model = fog(foggy_cells((0, 0, 0), (0, 0, 0)), Similarity(1 / 3, np.eye(3), np.zeros(3)))
@@ -163,7 +163,7 @@ class Wall:
 
 
 def test_a_pose_is_found_again_from_half_of_the_picture(monkeypatch):
-    # Closed form: a wall, seen from a pose that is off by some 2 pixels of turn and 2 of translation.
+    # Closed form: a wall, seen from a pose that is off by about 2 pixels of rotation and 2 of translation.
     wall = Wall()
     monkeypatch.setattr("nerfcli.evaluate.pose_refinement.render_rays", wall.render)
     pose = look_at(np.array([0.5, -0.4, -3.0]), np.array([0.2, 0.1, 0.0]), UP)
@@ -176,10 +176,10 @@ def test_a_pose_is_found_again_from_half_of_the_picture(monkeypatch):
     photo = seen.rgb.numpy().astype(np.float64).reshape(72, 96, 3)
     off = replace(truth, world_from_cam=pose @ transform_from_twist(np.array([0.06, -0.05, 0.1, 0.02, -0.02, 0.02])))
     left, right = halves(everything)
-    spoilt = np.where(right[..., None], 0.0, photo)  # what is on the right has no say
+    spoilt = np.where(right[..., None], 0.0, photo)  # the right half is not used
     found = align_pose(wall.model, off, spoilt, used=left, background=BLACK)
     assert found is not None
-    # Where the wall is seen in the right half, which was not looked at.
+    # Points of the wall seen in the right half, which the alignment did not use.
     seen_right = rays.directions.numpy().reshape(72, 96, 3)[::8, 48::8].reshape(-1, 3).astype(np.float64)
     on_wall = truth.centre - seen_right * (truth.centre[2] / seen_right[:, 2:])
     shifts = [

@@ -1,4 +1,4 @@
-"""What `export_frames` leaves on disk: files, their meaning, names, one range over all frames; all or nothing."""
+"""Files written by `export_frames`: their meaning and names, one range over all frames, and all or nothing."""
 
 import json
 from pathlib import Path

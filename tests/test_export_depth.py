@@ -1,4 +1,4 @@
-"""What is measured, in files of every format: the numbers of the picture, with the meaning of the map and the view."""
+"""Depth and other maps in files of every format: the values of the picture, the meaning of the map, and the view."""
 
 import json
 from dataclasses import replace
@@ -51,7 +51,7 @@ def ordered(frames: list[Frame], **settings: Any) -> Order:
 
 
 def export(model: Model, order: Order, folder: Path) -> list[str]:
-    """The notes of an export."""
+    """Export and return the notes."""
     notes: list[str] = []
     export_frames(model, order, folder, on_rays=lambda rays: None, notify=notes.append)
     return notes
@@ -119,7 +119,7 @@ def test_levels_of_a_clip_in_metres_are_millimetres(model, tmp_path):
         levels = np.asarray(Image.open(tmp_path / "views/depth16" / f"{name}.png"))
         expected = np.where(np.isnan(depth), 0, np.rint(depth.astype(np.float64) * 1000))
         np.testing.assert_array_equal(levels, expected)
-        # The floats that they were made of stay.
+        # The float files that the levels were made from are kept.
         np.testing.assert_array_equal(tifffile.imread(tmp_path / "views/depth" / f"{name}.tiff"), depth)
     description = json.loads((tmp_path / "views/render.json").read_text())
     assert description["depth16"] == {"units_per_level": 1e-3, "pixels_beyond": 0}
@@ -146,10 +146,10 @@ def test_a_few_far_pixels_do_not_make_levels_coarse(tmp_path):
     told = depth_meta_of(tmp_path / "depth16" / "a.png")
     assert told is not None
     assert told.error_bounds["pixels_beyond_levels"] == 3
-    # A length that is asked for holds all or is refused.
+    # A requested length per level must hold all depths, or it is refused.
     with pytest.raises(UserError, match="maximum is 1000"):
         write_levels(tmp_path, ["a"], settings=replace(settings, depth_scale=1e-3), meaning=meaning)
-    # Where all of it is within twice what most needs, all of it is held.
+    # If all depths are within twice the range that most of them need, the levels hold all.
     depths[0, :3, 0] = 5.0
     write_tiff(map_path(tmp_path, "depth", "a", "tiff"), depths[0], replace(meaning, unit="arbitrary"))
     written = write_levels(tmp_path, ["a"], settings=settings, meaning=replace(meaning, unit="arbitrary"))
@@ -166,7 +166,7 @@ def test_levels_that_are_too_short_leave_the_earlier_export_alone(model, tmp_pat
 
 @pytest.mark.parametrize("file_format", ["tiff", "exr", "npy", "npz"])
 def test_a_file_of_another_meaning_is_not_read_into_a_clip(file_format, model, tmp_path):
-    """Previews, levels and videos are made from the files: a foreign one among them is refused with its name."""
+    """Previews, levels and videos are made from the files: one with another meaning is refused by name."""
     settings = ordered([], formats=(file_format,)).settings
     meaning = depth_meta(model, DEPTH)
     write_maps(pictured(model), tmp_path, "a", settings=settings, meta=meaning)

@@ -1,4 +1,4 @@
-"""Exports that end early go on with what is missing; parts and processes leave the same files as one go does."""
+"""Exports that end early resume with the missing frames; parts and processes leave the same files as a single run."""
 
 import hashlib
 import json
@@ -32,7 +32,7 @@ from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 
 PIXELS = 10 * 8
-# A gif: the same frames give the same bytes, which no promise of the other encoders is.
+# A gif, since the other encoders do not promise the same bytes for the same frames.
 VIDEO = VideoSettings(layout="side-by-side", direction="ping-pong", fps=12, formats=("gif",))
 
 
@@ -56,7 +56,7 @@ def export(model: Model, ordered: Order, folder: Path, *, on_rays: Callable[[int
 
 
 def stop_in_frame(number: int, problem: BaseException) -> Callable[[int], None]:
-    """For `on_rays`: raises once the first tile of this frame is rendered; these frames are one tile."""
+    """Return an `on_rays` that raises once frame `number` (from 0) is rendered; each of these frames is one tile."""
     calls = iter(range(1000))
 
     def on_rays(rays: int) -> None:
@@ -90,7 +90,7 @@ def test_an_export_that_ends_early_goes_on_and_ends_the_same(model, tmp_path, in
     assert len(list(unfinished.rglob("v.tiff"))) == 2
     done: list[int] = []
     export(model, order(), folder, on_rays=done.append)
-    assert done == [2 * PIXELS, PIXELS, PIXELS]  # what is there counts at once
+    assert done == [2 * PIXELS, PIXELS, PIXELS]  # existing frames are counted at once
     assert contents(folder) == in_one_go
     assert not list(tmp_path.glob(".views*"))
 
@@ -132,7 +132,7 @@ def test_another_order_takes_nothing_from_it_and_leaves_it(model, tmp_path):
 
 
 def test_other_videos_of_the_same_pictures_take_them(model, tmp_path):
-    """What is made of the pictures afterwards does not decide over them."""
+    """Finished pictures are reused although the requested videos differ."""
     with pytest.raises(KeyboardInterrupt):
         export(model, order(), tmp_path / "views", on_rays=stop_in_frame(3, KeyboardInterrupt()))
     done: list[int] = []
@@ -228,7 +228,7 @@ def test_an_error_in_a_thread_ends_the_others_and_keeps_what_is_complete(model, 
 
 
 def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in_one_go):
-    """One of two is killed when the first frame is done; its frame is rendered by another, and all are told."""
+    """One of two processes is killed after the first frame: another renders its frame, and each frame is reported."""
     told: list[str] = []
     done: list[int] = []
 
@@ -260,7 +260,7 @@ def test_ctrl_c_or_sigterm_while_a_process_starts_is_kept_and_ends_it(sent, rais
 
     monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start_and_interrupt)
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores it
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in background suites
     install_handlers()
     try:
         with pytest.raises(raised):
@@ -315,7 +315,7 @@ def test_processes_that_die_again_and_again_end_the_export(model, tmp_path, monk
     assert "retrying it" in told[0]
 
 
-# What is made of pictures that are there
+# Videos, previews and levels from existing pictures
 
 
 @pytest.mark.parametrize(
@@ -329,14 +329,14 @@ def test_processes_that_die_again_and_again_end_the_export(model, tmp_path, monk
     ids=["video", "colours", "range", "levels"],
 )
 def test_other_videos_and_colours_of_a_finished_folder_are_made_without_rendering(model, tmp_path, changes, in_one_go):
-    """The files are those of an order that was rendered from the start."""
+    """The files are the same as if this order had been rendered from the start."""
     changed = replace(order(), settings=replace(order().settings, **changes))
     export(model, changed, tmp_path / "other")
     export(model, order(), tmp_path / "views")
     assert contents(tmp_path / "views") == in_one_go
     done: list[int] = []
     export(model, changed, tmp_path / "views", on_rays=done.append)
-    assert done == [4 * PIXELS]  # all of them at once: they are there
+    assert done == [4 * PIXELS]  # all at once, as they exist
     assert contents(tmp_path / "views") == contents(tmp_path / "other")
     assert not list(tmp_path.glob(".views*"))
 
@@ -386,7 +386,7 @@ def test_a_video_says_what_it_shows(model, tmp_path):
 
 
 def test_side_by_side_holds_colour_and_depth_in_one_picture(model, tmp_path, monkeypatch):
-    """The frames that go to the encoder: the picture left of its preview, forth and back without double ends."""
+    """The encoder gets the picture left of its preview, forwards and backwards without repeating the end frames."""
     seen: list[np.ndarray] = []
 
     def collect(path: Path, frames: Callable[[], Iterator[np.ndarray]], **options: Any) -> None:

@@ -42,16 +42,16 @@ SHORT = TrainSettings(
 
 
 def pose(x: float) -> np.ndarray:
-    """A camera at x, 2 in front of the origin, that looks along z."""
+    """Return the pose of a camera at (x, 0, -2) that looks along +z."""
     matrix = np.eye(4)
     matrix[:3, 3] = (x, 0.0, -2.0)
     return matrix
 
 
 def save_photo(path: Path, *, seconds: float | None, iso: int | None = 100, f_number: float = 4.0) -> Path:
-    """Random levels, with EXIF."""
+    """Save a photo of random levels with EXIF."""
     exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 1  # Pillow leaves out what has no entry of its own in a PNG
+    exif[ExifTags.Base.Orientation] = 1  # Pillow writes no EXIF into a PNG if its main directory is empty
     entries = exif.get_ifd(ExifTags.IFD.Exif)
     if seconds is not None:
         entries[ExifTags.Base.ExposureTime] = seconds
@@ -74,7 +74,7 @@ def capture(tmp_path: Path) -> Scene:
 
 
 def fit(scene: Scene, run: Path, settings: TrainSettings, *, resume: bool = False, stop_at: int = -1) -> list[float]:
-    """The losses of a training."""
+    """Train and return the loss of every step."""
     losses: list[float] = []
 
     def record(progress: Progress) -> None:
@@ -87,13 +87,13 @@ def fit(scene: Scene, run: Path, settings: TrainSettings, *, resume: bool = Fals
 
 
 def test_the_srgb_curve_is_that_of_the_standard_and_its_own_inverse():
-    # IEC 61966-2-1: 0.5 is 21.404 % of linear light, 0.04 lies on the straight piece.
+    # IEC 61966-2-1: 0.5 is 21.404 % of linear light, 0.04 is on the linear segment.
     levels = torch.tensor([0.0, 0.04, 0.5, 1.0], dtype=torch.float64)
     assert linear_from_srgb(levels).tolist() == pytest.approx([0.0, 0.04 / 12.92, 0.21404114, 1.0], abs=1e-8)
     dense = torch.linspace(0.0, 1.5, 1001, dtype=torch.float64)
     assert torch.allclose(
         srgb_from_linear(linear_from_srgb(dense)), dense, atol=1e-7, rtol=0
-    )  # the pieces meet to 1e-8
+    )  # the two segments meet within 1e-8
 
 
 def test_a_gain_multiplies_linear_light_and_its_gradient_is_right():
@@ -115,7 +115,7 @@ def test_only_differences_between_photos_are_learned():
     assert torch.allclose(one.log_gains(), other.log_gains(), atol=1e-5)
     one(torch.rand(4, 3), torch.tensor([0, 3, 3, 6])).square().sum().backward()
     assert one.free.grad is not None
-    assert one.free.grad.sum(0).abs().max() < 1e-5  # no pull on what all photos share
+    assert one.free.grad.sum(0).abs().max() < 1e-5  # no gradient for a gain that all photos share
 
 
 def test_exif_tells_stops_between_photos(capture, tmp_path):
@@ -127,7 +127,7 @@ def test_exif_tells_stops_between_photos(capture, tmp_path):
     assert (log_exposures(others) / math.log(2) - stops[0])[0] == pytest.approx(4.0)
     reference = mean_log_exposure(capture.train_frames)
     assert relative_log_exposures([*capture.test_frames, others[1]], reference).tolist() == pytest.approx(
-        [-2 * math.log(2), 0.0]  # what is silent counts as the mean
+        [-2 * math.log(2), 0.0]  # a photo without exposure in EXIF counts as the mean
     )
     assert mean_log_exposure(others[1:]) is None
     assert relative_log_exposures(capture.frames, None).tolist() == [0.0] * 4
@@ -208,7 +208,7 @@ def test_light_of_the_sky_does_not_end_before_it(capture, tmp_path):
 
 
 def test_directions_without_pixels_take_the_colours_of_their_neighbours(capture, tmp_path):
-    """No direction reads the grid's middle, so only its roughness lowers a vertex there that stands out."""
+    """No direction reads the middle of the grid, so only the roughness penalty lowers an outlying vertex there."""
     prepared = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
     fitting = prepared.fitting()
     assert fitting.parts.background is not None
@@ -248,7 +248,7 @@ def test_what_is_behind_an_object_is_not_exposed():
     assert seen[:, 0].tolist() == pytest.approx([0.5 * colour + 0.5 for colour in own])
     expected = drawn.colours[:, 3:] * drawn.colours[:, :3] + (1 - drawn.colours[:, 3:])
     assert torch.equal(measured, expected)
-    # Nothing of its own: what is behind shows as it is.
+    # Rays that meet no object show the background unchanged.
     clear, _ = parts.compared(behind, torch.ones(2), drawn, behind=behind)
     assert clear.flatten().tolist() == pytest.approx([1.0] * 6)
 

@@ -1,4 +1,4 @@
-"""Encodings, activations and the field: closed forms, SciPy, quadrature; what stands on disk comes back bit for bit."""
+"""Encodings, activations and the field: closed forms, SciPy, quadrature; files on disk come back bit for bit."""
 
 import hashlib
 import json
@@ -109,7 +109,7 @@ def test_uncontract_is_the_inverse_of_contract_across_magnitudes():
 
 
 def test_contraction_to_a_cube_keeps_the_inside_and_brings_infinity_to_its_faces():
-    """Against a loop over single numbers, from 1e-12 to 1e30, and back."""
+    """Independent: a loop over single numbers, from 1e-12 to 1e5, and back; 1e38 does not overflow."""
     g = torch.Generator().manual_seed(0)
     directions = torch.rand(400, 3, generator=g, dtype=torch.float64) * 2 - 1
     points = directions * torch.logspace(-12, 5, 400, dtype=torch.float64)[:, None]
@@ -129,7 +129,7 @@ def test_contraction_to_a_cube_has_the_gradient_of_its_formula():
         torch.randn(60, 3, generator=g, dtype=torch.float64) * torch.logspace(-2, 2, 60, dtype=torch.float64)[:, None]
     )
     assert torch.autograd.gradcheck(kernels.contract_to_cube, points.requires_grad_())
-    # Coordinates move by no more than the kernel that steps over empty space counts on.
+    # Coordinates move by at most the bound that the kernel for skipping empty space relies on.
     for contraction, most in (("l2", 0.25), ("linf", 0.25 * 1.025)):
         near = points.detach() + 1e-6 * torch.randn(60, 3, generator=g, dtype=torch.float64)
         moved = kernels.grid_coordinates(near, contraction) - kernels.grid_coordinates(points.detach(), contraction)
@@ -175,14 +175,14 @@ def test_a_fresh_field_is_a_thin_grey_fog():
     directions = torch.nn.functional.normalize(torch.randn(1000, 3, generator=g), dim=-1)
     density, rgb = radiance_of(field, torch.rand(1000, 3, generator=g), directions, torch.arange(1000))
     torch.testing.assert_close(density, torch.full((1000,), 1.0), rtol=0.01, atol=0)
-    # Grey on the mean: the colour depends on the direction from the start, by random weights.
+    # Grey on average: with random weights, the colour depends on the direction from the start.
     assert (rgb.mean(0) - 0.5).abs().max() < 0.25
 
 
 @pytest.mark.parametrize(("share", "learning"), [(None, 6), (0.0, 4), (0.24, 4), (0.26, 5), (0.5, 6), (1.0, 6)])
 def test_fine_levels_learn_later(share, learning):
-    """Of 6 levels, 4 from the start and the others one after the other up to half of the budget; a field that is read
-    from a file has all. Those that do not learn have no gradient, nor have the weights that read them."""
+    """Of 6 levels, 4 learn from the start and the others open one by one until half of the budget; a field read from a
+    file has all. Levels that do not learn have no gradient, nor do the weights that read them."""
     field = HashField(HashFieldSettings(contraction="none", levels=6, log2_rows=8, coarsest=4, finest=64, width=16))
     detail = {} if share is None else {"detail": share}
     directions = torch.nn.functional.normalize(torch.randn(5, 3), dim=-1)
@@ -208,7 +208,7 @@ def test_field_bytes_are_those_of_the_checkpoint():
 
 
 def awkward_tensors() -> dict[str, torch.Tensor]:
-    """All that could be lost on the way: signed zero, NaN, subnormals, flags, 64-bit integers, empty, transposed."""
+    """Return what a file could lose: signed zero, NaN, subnormals, flags, 64-bit integers, empty, transposed."""
     return {
         "floats": torch.tensor([0.0, -0.0, math.nan, math.inf, -math.inf, 1e-45, 3.4e38]),
         "doubles": torch.tensor([math.pi, 5e-324], dtype=torch.float64),
@@ -326,7 +326,7 @@ def test_model_of_another_format_is_named(tmp_path):
 
 @pytest.mark.parametrize("with_digest", [True, False])
 def test_checkpoints_whose_digest_stands_apart_or_is_missing_are_read(tmp_path, with_digest):
-    """As written by safetensors itself; the digest is that of an earlier version's file of the same content."""
+    """Files written by safetensors itself, with the separate digest of an earlier version or without one."""
     tensors, text = {"a": torch.arange(3.0)}, json.dumps({"step": 3, "name": "küche"})
     bytes_told = b"a torch.float32 (3,)" + tensors["a"].numpy().tobytes()
     digest = hashlib.blake2b(text.encode() + bytes_told, digest_size=16).hexdigest()
@@ -358,6 +358,6 @@ def test_a_bit_that_flips_anywhere_in_a_checkpoint_is_noticed(tmp_path):
             again, told = load_tensors(path, "cpu")
         except UserError:
             continue
-        # Where nothing says so, nothing is lost: spaces that fill up the header.
+        # Flips that go unnoticed lose nothing: they are in the spaces that pad the header.
         assert told == description
         assert {name: tensor.tolist() for name, tensor in again.items()} == {n: t.tolist() for n, t in tensors.items()}

@@ -60,7 +60,7 @@ def test_every_kind_is_made_here():
     ("kind", "text"),
     [
         ("hash", "hash grid, 8 levels of 4 to 32 cells per axis, 2^8 rows each; networks of width 32"),
-        ("voxels", "7x7x7 voxels"),  # between 8^3 = 2^9 vertices
+        ("voxels", "7x7x7 voxels"),  # 8^3 = 2^9 vertices
         ("mlp", "network of 2 layers of width 16 on 4 octaves of Fourier features"),
     ],
 )
@@ -137,7 +137,7 @@ def test_the_network_field_is_its_formula():
 
 
 def test_gradients_of_every_kind(field):
-    """gradcheck in float64 of density and colour by all parameters, rows among them."""
+    """gradcheck in float64 of density and colour with respect to all parameters, including rows."""
     field = field.double()
     coordinates, directions = places(3, torch.float64), looks(2, torch.float64)
     rays = torch.tensor([0, 0, 1])
@@ -165,7 +165,7 @@ class _Radiance(torch.nn.Module):
 @pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_rays_see_the_definition(kind, contraction):
-    """Marched by the reference, with the field's own density, and cut where the optical depth reaches the limit."""
+    """Against the reference's march with the field's own density, cut where the optical depth reaches the limit."""
     torch.manual_seed(0)
     field = fresh_field(replace(SMALL[kind], contraction=contraction))
     rows = field.rows()
@@ -199,7 +199,7 @@ def test_rays_see_the_definition(kind, contraction):
         index = kernels.ray_indices(samples.offsets)
         found = torch.stack([index.float(), samples.starts, samples.ends, samples.density], dim=1)
         np.testing.assert_allclose(found.numpy(), np.array(kept), rtol=2e-4, atol=1e-6)
-        assert len(kept) < int(offsets[-1])  # some stand behind others
+        assert len(kept) < int(offsets[-1])  # some are cut off behind others
         density, rgb = radiance_of(field, torch.cat(coordinates), directions, index)
         lengths = samples.ends - samples.starts
         wanted, _, _ = reference.composite(density, rgb, lengths, offsets=samples.offsets, background=torch.zeros(3))
@@ -222,7 +222,7 @@ def test_compiled_marching_is_the_reference(sizes, contraction):
 
 
 def test_the_sink_gets_the_gradient_of_the_rows(field):
-    """As autograd gives it, up to the order of sums; then the optimiser has changed only what a sample touched."""
+    """Against autograd, up to the order of sums; the optimiser then changes only rows that a sample touched."""
     directions, background = looks(5), torch.rand(5, 3, generator=torch.Generator().manual_seed(4))
     rays = Rays(-2 * directions, directions, torch.zeros(5))
     march = March(torch.linspace(1, 3, 9), torch.ones(4, 4, 4, dtype=torch.bool), "none", 50.0)
@@ -252,8 +252,8 @@ def test_the_sink_gets_the_gradient_of_the_rows(field):
 
 
 def test_rows_of_the_hash_grid_decay_where_photos_say_little():
-    """The gradient of a row of value 0.1 is -1e-15 plus the decay of 0.1: Adam's first step goes a whole rate towards
-    zero. Without that gradient nothing touches the row; a voxel's row does not decay."""
+    """The decay of a row of value 0.1 outweighs its gradient of -1e-15: Adam's first step moves it by the full learning
+    rate towards zero. Rows without a gradient stay unchanged, and a voxel's row does not decay."""
     fields = (fresh_field(SMALL["hash"]), fresh_field(SMALL["voxels"]))
     for made, towards_zero in zip(fields, (1, -1), strict=True):
         optimiser, rows = FieldOptimiser(made), made.rows()
@@ -272,8 +272,8 @@ def test_rows_of_the_hash_grid_decay_where_photos_say_little():
 
 
 def test_marching_and_learning_see_pixels_of_the_same_width():
-    """Density and colour with gradients are those that the march saw, and levels count min(1, cell / width) in both;
-    without antialias, nothing has a width."""
+    """Density and colour with gradients equal those of the march, and both weight levels by min(1, cell / width);
+    without antialias, the width has no effect."""
     settings = HashFieldSettings(contraction="l2", log2_rows=8, coarsest=4, finest=64, antialias=True)
     blurred, sharp = HashField(settings), HashField(replace(settings, antialias=False))
     with torch.no_grad():
@@ -301,7 +301,7 @@ def test_marching_and_learning_see_pixels_of_the_same_width():
         assert torch.equal(sharp.backend.trace_rays(rays, march, sharp.medium(), background=background).rgb, plain.rgb)
         whole = reference.hash_encode(shown["coordinates of samples"], blurred.table, settings.resolutions)
         middles = (seen.intervals.starts + seen.intervals.ends) / 2
-        # All of them lie inside the unit ball, where a coordinate is a quarter of a length.
+        # All middles are inside the unit ball, where a length in coordinates is a quarter of the true one.
         assert (middles < 3).all()
         left = 1 / (width * middles[:, None] / 4 * torch.tensor(settings.resolutions)).clamp_min(1.0)
         code = whole * left.repeat_interleave(4, dim=1)

@@ -1,4 +1,4 @@
-"""The flight through poses: it passes through them, at constant speed, without flying past; and frames by name."""
+"""Flights through poses: they pass through each one at constant speed, without overshooting; and frames by name."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def angles_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def per_radian(poses: np.ndarray) -> float:
-    """What a radian counts: all turning is a quarter of all moving."""
+    """Return the length that one radian counts as: all turning counts a quarter of all movement."""
     moved = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
     return 0.25 * moved / angles_between(poses[:-1], poses[1:]).sum()
 
@@ -47,10 +47,10 @@ def steps_of(path: np.ndarray, radian: float) -> np.ndarray:
 
 
 @given(seed=seeds, count=st.integers(2, 12))
-@example(seed=2088, count=12)  # 0.2 % too long where the length was measured at 8192 places
+@example(seed=2088, count=12)  # steps were 0.2 % too long when the length was measured at 8192 places
 @few
 def test_a_flight_passes_through_its_poses_in_order_at_constant_speed(seed, count):
-    """A step is the larger one of distance and turn; none is longer, and chords of curves are hardly shorter."""
+    """A step is the larger of distance and turn; all are equal, except for slightly shorter chords of curves."""
     poses = random_poses(np.random.default_rng(seed), count)
     path = fly(poses, 4001)
     radian = per_radian(poses)
@@ -87,7 +87,7 @@ def test_a_flight_around_a_circle_converges_to_it_and_turns_evenly():
 @given(seed=seeds, count=st.integers(2, 9))
 @few
 def test_on_a_line_and_about_an_axis_the_camera_never_goes_back(seed, count):
-    """Steps and turns of 1 : 1000, in any mixture: cubic splines overshoot here, by a quarter of all turning."""
+    """Steps and turns with ratios of up to 1 : 1000, where cubic splines overshoot by a quarter of all turning."""
     rng = np.random.default_rng(seed)
     x = np.cumsum(10.0 ** rng.uniform(-3, 0, count))
     angle = np.cumsum(10.0 ** rng.uniform(-3, 0, count) * rng.integers(0, 2, count))
@@ -140,24 +140,24 @@ def test_two_poses_are_joined_by_a_line_and_by_the_turn_about_one_axis():
 
 
 @given(seed=seeds)
-@example(seed=268435457)  # drawn without a bound, its ways were 1 : 5094, and the shorter one four steps long
+@example(seed=268435457)  # unbounded, the ratio of the legs was 1 : 5094, and the shorter one had four steps
 @few
 def test_a_flight_passes_a_pose_along_the_bisector(seed):
-    """Closed form: with centripetal times the velocity at a pose is along the sum of the ways' unit vectors."""
+    """Closed form: with centripetal times, the velocity at a pose is along the sum of the legs' unit vectors."""
     rng = np.random.default_rng(seed)
     u, v = (way / np.linalg.norm(way) for way in rng.normal(size=(2, 3)))
-    before, after = 10.0 ** rng.uniform(-0.75, 0.75, 2)  # a step is at most 1/120 of the shorter way
+    before, after = 10.0 ** rng.uniform(-0.75, 0.75, 2)  # a step is at most 1/120 of the shorter leg
     centres = np.stack([-before * u, np.zeros(3), after * v])
     path = fly(rigid.from_parts(np.broadcast_to(np.eye(3), (3, 3, 3)), centres), 4001)[:, :3, 3]
     nearest = int(np.linalg.norm(path, axis=1).argmin())
     direction = path[nearest + 1] - path[nearest - 1]
     bisector = (u + v) / np.linalg.norm(u + v)
-    if np.linalg.norm(u + v) > 0.5:  # a sharper turn is bent too narrowly for this step
+    if np.linalg.norm(u + v) > 0.5:  # the curve of a sharper turn is too tight for this step
         np.testing.assert_allclose(direction / np.linalg.norm(direction), bisector, rtol=0, atol=5e-2)
 
 
 def test_many_poses_are_each_passed():
-    """More poses than a fixed number of samples would see."""
+    """There are more poses than a fixed number of samples could resolve."""
     angle = np.linspace(0, 20, 3000)
     centres = np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1)
     poses = rigid.from_parts(np.broadcast_to(np.eye(3), (3000, 3, 3)), centres)

@@ -1,4 +1,4 @@
-"""What EXIF says of the focal length, and whether it holds for the file: against cameras and edits that are known."""
+"""The focal length in EXIF, and whether it is valid for the file: against known cameras and edits."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,9 +29,9 @@ def sized(exif: Exif, width: int, height: int) -> Exif:
     [
         (CAMERA, 7600.0),
         (sized(CAMERA, 3648, 5472), 7600.0),  # held upright
-        (sized(CAMERA, 1600, 1067), 7600.0 * 1600 / 5472),  # resized: the resolution counts pixels that are gone
+        (sized(CAMERA, 1600, 1067), 7600.0 * 1600 / 5472),  # resized: the resolution is that of the original pixels
         (replace(CAMERA, focal_35mm=50.0), 7600.0),
-        (PHONE, 28 / 43.27 * 5040),  # by the diagonal: of 4:3, the width would give 3136 px rather than 3261
+        (PHONE, 28 / 43.27 * 5040),  # by the diagonal; by the width it would be 3136 px, not 3261
         (replace(PHONE, taken_px=(4032, 3024)), 28 / 43.27 * 5040),
         (replace(sized(PHONE, 1008, 756), taken_px=(4032, 3024)), 28 / 43.27 * 1260),
         (replace(sized(PHONE, 1600, 1200), taken_px=(3024, 4032)), 28 / 43.27 * 2000),
@@ -59,7 +59,7 @@ def test_a_focal_length_that_holds(exif: Exif, focal_px: float | None):
     ],
 )
 def test_a_focal_length_of_another_picture(exif: Exif, focal_px: float, words: str):
-    """Cropped and resized: what is told is that of the largest crop, and it is doubted."""
+    """Cropped and resized: the result is the focal length of the largest possible crop, and it is doubted."""
     found = focal_evidence(exif)
     assert not found.holds
     assert words in found.doubt
@@ -68,7 +68,7 @@ def test_a_focal_length_of_another_picture(exif: Exif, focal_px: float, words: s
 
 @pytest.mark.parametrize("exif", [replace(CAMERA, sensor_px_per_mm=3000.0), replace(CAMERA, sensor_px_per_mm=20.0)])
 def test_a_resolution_that_no_sensor_has_tells_nothing(exif: Exif):
-    """5472 pixels on 1.8 or on 274 mm: the tag counts the pixels of another size."""
+    """5472 pixels on a sensor of 1.8 or 274 mm: the tag is for another image size."""
     assert focal_evidence(exif).focal_px is None
 
 

@@ -25,7 +25,7 @@ POINTS = 200
 def pairs_of(
     cameras: list[NDArray[np.float64]], points: NDArray[np.float64], *, wrong: float = 0.0, focal_px: float = FOCAL_PX
 ) -> list[VerifiedPair]:
-    """Pairs of cameras (3, 4), two by two, that see points (pairs, n, 3) with noise of 0.5 px; some matches wrong."""
+    """Return pairs of successive cameras (3, 4) that see points (pairs, n, 3) with 0.5 px noise and wrong matches."""
     rng = np.random.default_rng(1)
     pairs = []
     for number, (one, other, seen) in enumerate(zip(cameras[::2], cameras[1::2], points, strict=True)):
@@ -41,7 +41,7 @@ def pairs_of(
 
 
 def freely(count: int) -> list[NDArray[np.float64]]:
-    """Two cameras each, about 1 apart, that look at the origin's surroundings from about 5, not at one point."""
+    """Return pairs of cameras, about 1 apart, that look around the origin from about 5 away, not at one point."""
     rng = np.random.default_rng(0)
     cameras = []
     for _ in range(count):
@@ -68,9 +68,9 @@ def test_the_focal_length_is_found_within_a_percent_where_pairs_determine_it():
 
 
 def test_spread_and_rise_say_where_pairs_leave_it_open():
-    """Degenerate by theory: a plane, and cameras that look at one point from one distance.
+    """Degenerate in theory: a plane, and cameras that look at one point from the same distance.
 
-    A camera that turns on the spot does determine it.
+    A camera that turns on the spot does determine the focal length.
     """
     rng = np.random.default_rng(3)
     flat = cloud(40)
@@ -125,7 +125,7 @@ def focal_px_of(job: Job) -> list[float]:
 
 
 def test_mapping_starts_from_the_estimate_and_no_match_is_lost(job: Job):
-    """Synthetic truth, within 5 % as the lens is bent; 1.2 times the longer side is 50 % too long."""
+    """Synthetic truth, within 5 % because of the distortion; 1.2 times the longer side is 50 % too long."""
     before, notes = verified(job), []
     started = with_focal_lengths(job, notes.append)
     (px,) = focal_px_of(job)
@@ -133,13 +133,13 @@ def test_mapping_starts_from_the_estimate_and_no_match_is_lost(job: Job):
     assert notes == [notes[0]]
     assert notes[0].startswith(f"starting from a focal length of {px:.0f} px, estimated from ")
     assert verified(started) == before
-    register_photos(job)  # as the next call does, which goes on from here
+    register_photos(job)  # as the next call does when it resumes
     assert focal_px_of(job) == [1200.0]
     assert verified(job) == before
 
 
 def test_what_is_known_of_a_lens_is_left_alone(job: Job):
-    """By definition: a file's intrinsics, EXIF to rely on, a fisheye."""
+    """By definition: intrinsics from a file, reliable EXIF, a fisheye."""
     (group,) = job.groups
     for known in (
         replace(group, params=WIDE.params),

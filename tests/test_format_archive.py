@@ -17,7 +17,7 @@ from nerfcli.errors import UserError
 
 
 def full(folder: Path) -> Capture:
-    """A capture with all that one can have."""
+    """Return a capture with everything that one can have."""
     capture = ring(*CAMERAS.values(), num_frames=len(CAMERAS))
     frames = [replace(frame, image=folder / frame.name) for frame in capture.frames]
     frames[0] = replace(frames[0], split="val", mask=folder.parent / "masks" / "ö.png", image=None)
@@ -60,7 +60,7 @@ def test_numpy_alone_reads_it(tmp_path):
 
 @pytest.mark.parametrize("compress", [True, False])
 def test_arrays_of_other_writers_are_read(tmp_path, compress):
-    """float32, big endian, columns first and compression, as other programs may save them."""
+    """float32, big endian, Fortran order and compression, as other programs may save them."""
     capture = replace(ring(CAMERAS["PINHOLE"]), observations=None)
     write_npz(capture, tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz") as loaded:

@@ -20,12 +20,12 @@ SIZE = (64, 48)
 
 
 def measure(_: Path) -> tuple[int, int, int]:
-    """Stands for media: every image is 64 x 48 and upright."""
+    """Stand in for media: every image is 64 x 48 and upright."""
     return *SIZE, 1
 
 
 def bundler_cameras() -> list[tuple[np.ndarray, np.ndarray]]:
-    """R and t of three cameras, four units from the origin, which they see in front: along their -z."""
+    """Return R and t of three cameras, four units from the origin, looking at it along their -z."""
     turns = Rotation.random(3, rng=np.random.default_rng(6)).as_matrix()
     return [(turn, np.array([0.1 * index, -0.2, -4.0])) for index, turn in enumerate(turns)]
 

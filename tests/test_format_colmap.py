@@ -116,7 +116,7 @@ def test_a_model_of_a_rig_is_read_as_pycolmap_wrote_it(tmp_path, suffix):
 
 
 def test_features_whose_points_are_gone(tmp_path):
-    """A model whose points were all removed still has features; one where some are missing is not of one piece."""
+    """A model without any points keeps its features; one with some of them missing is inconsistent and refused."""
     capture = ring(CAMERAS["PINHOLE"])
     assert capture.observations is not None
     write_colmap_text(capture, tmp_path / "model")

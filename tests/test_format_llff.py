@@ -63,7 +63,7 @@ def test_rows_are_in_the_order_of_the_photos_names(tmp_path):
 
 
 def test_depth_bounds_are_percentiles_of_what_each_view_sees(tmp_path):
-    """Three cameras on a line; the points that they observe, lie within their picture, or neither."""
+    """Three cameras on a line: bounds from observed points, else from the points within the picture."""
     camera = Camera.pinhole(64, 48, 50.0)
     capture = ring(camera, num_frames=3)
     frames = tuple(
@@ -72,7 +72,7 @@ def test_depth_bounds_are_percentiles_of_what_each_view_sees(tmp_path):
     )
     depths = np.linspace(2.0, 5.0, 31)
     points = np.column_stack([np.zeros(31), np.zeros(31), depths])
-    points[30, 0] = 100.0  # beside every picture
+    points[30, 0] = 100.0  # outside every picture
     observations = Observations(np.array([1, 0, 0, 1, 0]), np.array([3, 0, 30, 4, -1]), np.zeros((5, 2)))
     seen = replace(capture, frames=frames, points=points, colours=None, observations=observations)
     write_llff(seen, tmp_path)

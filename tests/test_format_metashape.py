@@ -255,7 +255,7 @@ def test_entities_are_not_expanded(tmp_path, encoding):
 def test_two_hundred_damaged_files_are_refused_or_sound(tmp_path):
     cameras = "".join(camera_xml(name) for name in ("a.jpg", "b.jpg", "ü.jpg"))
     text = document(sensor_xml(FULL), cameras, components=f'\n<component id="0">{WORLD}</component>\n')
-    # A value to a word, so that damage hits values and not whole elements.
+    # Spaces around each value, so that damage hits values and not whole elements.
     data = re.sub(r"(?<=>)(?=[^<\s])|(?<=[^>\s])(?=<)", " ", text).encode()
     path = tmp_path / "cameras.xml"
     path.write_bytes(data)

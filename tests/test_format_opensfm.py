@@ -113,7 +113,7 @@ def test_shots_points_and_names_by_hand(tmp_path):
     one = reconstruction(names=("b c.jpg", "ü.jpg"))
     path = write_file(tmp_path / "reconstruction.json", reconstruction(), one)
     capture = parse_opensfm(path)
-    assert [frame.name for frame in capture.frames] == ["b c.jpg", "ü.jpg"]  # of the larger of the two
+    assert [frame.name for frame in capture.frames] == ["b c.jpg", "ü.jpg"]  # of the larger of the two reconstructions
     assert capture.frames[1].image == tmp_path / "images" / "ü.jpg"
     assert capture.kind == "opensfm"
     assert capture.unit == "arbitrary"
@@ -164,7 +164,7 @@ def test_round_trip_reprojects_to_a_millionth_of_a_pixel(tmp_path, model):
         )
         assert valid.any()
         np.testing.assert_array_equal(valid_again, valid)
-        np.testing.assert_allclose(pixels_again, pixels, rtol=0, atol=1e-9)  # asked for: 1e-6
+        np.testing.assert_allclose(pixels_again, pixels, rtol=0, atol=1e-9)  # required: 1e-6
 
 
 def test_what_is_lost_is_said(tmp_path):

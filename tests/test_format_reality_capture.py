@@ -28,7 +28,7 @@ SIZES = {"wide": (64, 48), "tall": (48, 64)}
 
 
 def measure(path: Path) -> tuple[int, int, int]:
-    """Stands for media: the name tells the size; on.jpg is stored lying and shown upright."""
+    """Stand in for media: the name gives the size; on.jpg is stored sideways and shown upright."""
     return (48, 64, 6) if path.stem == "on" else (*SIZES.get(path.stem, (64, 48)), 1)
 
 
@@ -121,7 +121,7 @@ def test_names_photos_and_a_line_before_the_header(tmp_path):
     ]
     assert capture.missing == ("gone.jpg",)
     assert (capture.kind, capture.unit) == ("reality_capture", "arbitrary")
-    # The last photo is stored lying, 64 x 48, and that is what its camera refers to.
+    # The last photo is stored sideways, 64 x 48, and its camera refers to this orientation.
     assert {frame.camera for frame in capture.frames} == {Camera("PINHOLE", 64, 48, (64, 64, 32, 24))}
 
 

@@ -68,7 +68,7 @@ def test_round_trip_reprojects_to_a_millionth_of_a_pixel(tmp_path, kind):
         pixels_again, valid_again = CAMERA.project(rigid.apply(rigid.inverse(again.world_from_cam), points))
         assert valid.any()
         np.testing.assert_array_equal(valid_again, valid)
-        np.testing.assert_allclose(pixels_again, pixels, rtol=0, atol=1e-9)  # asked for: 1e-6
+        np.testing.assert_allclose(pixels_again, pixels, rtol=0, atol=1e-9)  # required: 1e-6
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ OPENCV_POSE = [[0.0, 0.0, -1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, -1.0, 0.0, 3.0
 
 
 def measure(_: Path) -> tuple[int, int, int]:
-    """Stands for media: every image is 64 x 48 and upright."""
+    """Stand in for media: every image is 64 x 48 and upright."""
     return 64, 48, 1
 
 
@@ -138,7 +138,7 @@ def test_poses_stay_in_the_files_world(tmp_path):
 
 
 def test_names_and_sizes_without_the_photos(tmp_path):
-    """Suffixes are taken from what is on disk; a size that is not given is measured, or the one of the other photos."""
+    """Suffixes come from the files on disk; a missing size is measured, or taken from the other photos."""
     entries = ["./images\\a b.jpg", "images/no_suffix", "images/gone", "/home/you/c.d/x.png"]
     frames = [{"file_path": name, "transform_matrix": OPENGL_POSE} for name in entries]
     path = write_json(tmp_path / "transforms.json", camera_angle_x=1.0, frames=frames)
@@ -233,7 +233,7 @@ def test_blender_files_are_read_back(tmp_path):
         assert (again.name, again.image, again.split) == (frame.name, frame.image, frame.split)
         np.testing.assert_allclose(again.camera.params, frame.camera.params, rtol=1e-14)
         np.testing.assert_allclose(again.world_from_cam, frame.world_from_cam, rtol=0, atol=1e-15)
-    png.unlink()  # the name of a picture that is not there ends as NeRF's loader has it
+    png.unlink()  # a missing picture's name gets the suffix of NeRF's loader
     (tmp_path / "my photos/ä 02.jpg").write_bytes(b"")
     assert parse_blender(tmp_path, lambda _: (640, 480, 1)).frames[0].name == "train/r 0.png"
 

@@ -1,4 +1,4 @@
-"""Readers of captures against files made by hand and, for COLMAP, by pycolmap; and what they say of damaged files."""
+"""Readers of captures against files made by hand and, for COLMAP, by pycolmap; and their errors on damaged files."""
 
 import json
 from pathlib import Path
@@ -32,7 +32,7 @@ SHARED = {"fl_x": 50.0, "fl_y": 51.0, "cx": 33.0, "cy": 23.0, "w": 64.0, "h": 48
 
 
 def measure(_: Path) -> tuple[int, int, int]:
-    """Stands for media: every image is 64 x 48 and upright."""
+    """Stand in for media: every image is 64 x 48 and upright."""
     return 64, 48, 1
 
 
@@ -218,7 +218,7 @@ def llff_rows(count: int) -> np.ndarray:
 
 def test_llff_by_hand(tmp_path):
     np.save(tmp_path / "poses_bounds.npy", llff_rows(2))
-    # images/ holds another number of photos than there are poses, images_4/ the right one, at a quarter of the size.
+    # images/ has a different number of photos than poses; images_4/ has the right number, at a quarter of the size.
     touch(tmp_path, "images/1.jpg", "images_4/b.png", "images_4/a.png")
     capture = read_llff(tmp_path, measure, list_files)
     assert [frame.name for frame in capture.frames] == ["images_4/a.png", "images_4/b.png"]
@@ -322,7 +322,7 @@ def test_colmap_images_that_are_not_on_disk_are_missing(tmp_path, synthetic):
     "name", ["cameras.bin", "images.bin", "points3D.bin", "cameras.txt", "images.txt", "points3D.txt"]
 )
 def test_a_damaged_colmap_file_is_named(tmp_path, synthetic, name):
-    """A file that is cut off anywhere never hangs and never passes for whole; pycolmap loops on some of these."""
+    """A truncated file never causes a hang or passes as complete; pycolmap loops forever on some of them."""
     (synthetic.write_binary if name.endswith("bin") else synthetic.write_text)(str(tmp_path))
     path = tmp_path / name
     whole = path.read_bytes()

@@ -1,4 +1,4 @@
-"""Pictures of another size, part or lens: against projections of points, which move as the picture does."""
+"""Pictures of another size, crop or lens: against projections of points, which move with the picture."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ PERSPECTIVE = [camera for camera in CAMERAS.values() if not camera.is_spherical]
 
 @given(camera=st.sampled_from(PERSPECTIVE), width=st.integers(1, 3000), height=st.integers(1, 3000))
 def test_another_size_scales_and_cuts_and_never_stretches(camera, width, height):
-    """A point at p of w x h is at s (p - middle) + new middle, with one factor s for both axes that covers W x H."""
+    """Pixel p moves to s (p - old middle) + new middle, with the same s for both axes that covers the new size."""
     new = sized(camera, width, height)
     assert (new.width, new.height) == (width, height)
     scale = max(width / camera.width, height / camera.height)

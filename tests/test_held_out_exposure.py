@@ -1,4 +1,4 @@
-"""Exposures of held-out photos by those of the photos around: closed forms, and their way into a run and out of it."""
+"""Exposures of held-out photos from neighbouring photos: closed forms, and storing them in a run and using them."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,7 +24,7 @@ from nerfcli.train.loop import train
 
 
 def drifting(places: np.ndarray) -> np.ndarray:
-    """(N, 3) gains that go up along a line, each channel by its own."""
+    """Return (N, 3) gains that are linear in the place, with a slope per channel."""
     return places[:, None] * np.array([0.1, 0.05, -0.02]) - 0.3
 
 
@@ -37,7 +37,7 @@ def test_gains_that_drift_are_those_between_the_neighbours_and_of_the_last_beyon
 
 @pytest.mark.parametrize("seed", range(20))
 def test_gains_of_chance_are_told_to_be_the_mean(seed):
-    """Two neighbours tell of independent gains with 1.5 times their variance, the mean with 1."""
+    """The mean squared error for independent gains is 1.5 variances from two neighbours, and 1 from the mean."""
     gains = np.random.default_rng(seed).normal(size=(60, 3))
     places = np.arange(60) * 2
     assert np.array_equal(gains_between(places, gains - gains.mean(0), np.array([1, 7, 119])), np.zeros((3, 3)))
@@ -63,7 +63,7 @@ def test_exif_that_tells_less_than_neighbours_or_the_mean_is_not_followed():
 
 
 def test_gains_follow_exif_and_drift_beyond_it_as_those_of_the_photos_around():
-    """Exposures that jump, on gains that drift along the capture, channel by channel: both are predicted within 0.1."""
+    """Exposures jump, and gains drift along the capture in each channel: their sum is predicted within 0.1."""
     places, wanted = np.arange(0, 60, 2), np.array([1, 21, 47])
     rng = np.random.default_rng(2)
     exif, held_out = rng.choice([-0.4, 0.0, 0.4], 30), np.array([0.4, -0.4, 0.0])
@@ -82,7 +82,7 @@ def test_gains_follow_exif_and_drift_beyond_it_as_those_of_the_photos_around():
 
 
 def test_exif_counts_if_it_predicts_gains_only_together_with_the_photos_around():
-    """A drift three times as large as the jumps: EXIF alone is worse than the photos around, both are better."""
+    """The drift is three times as large as the jumps: EXIF alone is worse than the neighbours, both together better."""
     places, rng = np.arange(60), np.random.default_rng(4)
     exif = rng.permutation(np.repeat([-0.2, 0.2], 30))
     drift = np.sin(places / 10.0)[:, None] * np.full(3, 0.6)
@@ -116,7 +116,7 @@ def test_two_photos_tell_nothing_and_nobody_may_ask():
 
 
 def test_a_training_keeps_what_its_photos_tell_of_the_held_out_ones_which_it_does_not_open(tmp_path: Path):
-    """Grey photos that become brighter one after another; the last but one is held out, and nearly black: its gains are
+    """Grey photos become brighter one by one; the last but one is held out and nearly black. Its gains are nevertheless
     between those of its neighbours, which are brighter than the mean."""
     camera, frames = Camera.pinhole(16, 12, 14.0), []
     for index in range(9):
@@ -142,18 +142,18 @@ def test_a_training_keeps_what_its_photos_tell_of_the_held_out_ones_which_it_doe
     told = log_gains_of(scene.test_frames, model)
     assert told.tolist() == [list(model.exposures["7.png"])]
     assert told.mean() == pytest.approx(log_ratio(144, 107), rel=0.3)
-    assert log_gains_of(scene.train_frames, model) == pytest.approx(np.zeros((8, 3)))  # EXIF tells nothing
+    assert log_gains_of(scene.train_frames, model) == pytest.approx(np.zeros((8, 3)))  # there is no EXIF
 
 
 def test_a_run_keeps_the_offset_to_exif_of_held_out_photos(tmp_path: Path):
-    """Photos that jump as EXIF says and become brighter along the capture, whose brightness EXIF does not explain."""
+    """Exposures jump as EXIF says, and also rise along the capture, which EXIF does not explain."""
     camera, frames = Camera.pinhole(16, 12, 14.0), []
     drift, jumps = np.linspace(-0.5, 0.5, 13), np.array([1, -1, -1, 1, 1, -1, 1, 1, -1, -1, 1, -1, 1]) * 0.25
     for index, light in enumerate(0.15 * np.exp(drift + jumps)):
         level = round(255 * (1.055 * light ** (1 / 2.4) - 0.055)) if index != 9 else 10
         noise = np.random.default_rng(index).integers(-3, 4, (12, 16, 1))
         exif = Image.Exif()
-        exif[ExifTags.Base.Orientation] = 1  # Pillow leaves out what has no entry of its own in a PNG
+        exif[ExifTags.Base.Orientation] = 1  # Pillow writes no EXIF into a PNG if its main directory is empty
         exif.get_ifd(ExifTags.IFD.Exif).update(
             {
                 ExifTags.Base.ExposureTime: float(np.exp(jumps[index])) / 100,
@@ -185,7 +185,7 @@ def test_a_run_keeps_the_offset_to_exif_of_held_out_photos(tmp_path: Path):
 
 
 def test_what_exif_tells_of_a_held_out_photo_goes_before_its_neighbours(monkeypatch):
-    """Two photos, EXIF knows one of them; without exposures in the model it is asked for none."""
+    """EXIF has the exposure of one photo only; a model without a mean exposure does not use it."""
     frames = [Frame(name, Camera.pinhole(4, 4, 4.0), np.eye(4)) for name in ("a", "b", "c")]
     monkeypatch.setattr(
         "nerfcli.photos.held_out_exposure.log_exposures", lambda frames: np.array([1.5, np.nan, np.nan])[: len(frames)]
@@ -211,5 +211,5 @@ def test_what_exif_tells_of_a_held_out_photo_goes_before_its_neighbours(monkeypa
 
 
 def log_ratio(one: int, other: int) -> float:
-    """Of two levels, in linear light."""
+    """Return the log ratio of two levels in linear light."""
     return float(np.log(((one / 255 + 0.055) / (other / 255 + 0.055)) ** 2.4))

@@ -1,4 +1,4 @@
-"""Held-out photos are opened by no stage of training or of the selection of components; only when both are over.
+"""No stage of training or component selection opens held-out photos; they are opened only when both are over.
 
 Evidence: the interpreter's own audit of opened files; and fields that are the same to the bit whatever is in the
 held-out photos, which also covers what a library opens by itself. (Reading the scene comes first: where a format has no
@@ -39,12 +39,12 @@ def _audit(event: str, arguments: tuple[object, ...]) -> None:
             listener.append(name)
 
 
-sys.addaudithook(_audit)  # for the rest of the process: Python has no way to take it away
+sys.addaudithook(_audit)  # for the rest of the process: Python cannot remove it
 
 
 @pytest.fixture
 def opened() -> Iterator[list[str]]:
-    """The names of files that are opened meanwhile."""
+    """Names of the files opened during the test."""
     names: list[str] = []
     _listeners.append(names)
     yield names
@@ -130,7 +130,7 @@ def test_no_held_out_photo_is_opened_before_the_training_is_over(case, capture, 
 def test_the_field_does_not_depend_on_what_is_in_held_out_photos(case, capture, tmp_path, monkeypatch):
     monkeypatch.setattr(selection, "FEWEST_STEPS", 1)
     monkeypatch.setattr(preparation, "SEARCH_SHARE", 1.0)
-    # Trials are as long by steps; seconds would differ.
+    # A budget in steps gives trials of equal length; seconds would differ.
     asked = settings(*CASES[case])
     fit(scenes.load(capture), tmp_path / "run", asked)
     noise = np.random.default_rng(0).integers(0, 256, (72, 96, 4), dtype=np.uint8)
@@ -141,7 +141,7 @@ def test_the_field_does_not_depend_on_what_is_in_held_out_photos(case, capture, 
     assert {name: tensor.numpy().tobytes() for name, tensor in before.items()} == {
         name: tensor.numpy().tobytes() for name, tensor in after.items()
     }
-    # What is measured does.
+    # The metrics of held-out photos do depend on them.
     psnr, of_noise = (read_log(tmp_path / name)[-1].get("heldout_psnr", 0.0) for name in ("run", "other"))
     assert psnr != pytest.approx(of_noise, abs=0.1)
 

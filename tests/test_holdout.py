@@ -1,4 +1,4 @@
-"""Which photos are held out: rules in closed form, and what no rule can mean."""
+"""Which photos are held out: rules in closed form, and invalid rules."""
 
 import pytest
 
@@ -18,7 +18,7 @@ def test_every_n_counts_names_in_order():
 
 
 def test_a_block_is_the_middle_of_the_capture_with_numbers_counted():
-    # 15 % of 20 are 3; in the order of the alphabet, frame_10 would stand before frame_2.
+    # 15 % of 20 are 3; in alphabetical order, frame_10 would be before frame_2.
     assert names_held_out("block:0.15", NAMES) == {"frame_9.png", "frame_10.png", "frame_11.png"}
     assert len(names_held_out("block:0.001", NAMES)) == 1
 

@@ -56,7 +56,7 @@ def exif_with(entries: Mapping[Any, Any], ifds: Mapping[Any, Mapping[Any, Any]] 
 
 
 def icc_profile(columns: tuple, curve: Curve) -> bytes:
-    """An ICC v2 matrix profile, built by hand: header, tags, one curve of 1024 values for all channels."""
+    """Return an ICC v2 matrix profile, built by hand: header, tags, one curve of 1024 values for all channels."""
 
     def s15(number: float) -> bytes:
         return round(number * 65536).to_bytes(4, "big", signed=True)
@@ -198,7 +198,7 @@ def test_pixels_without_a_known_white_are_refused(tmp_path, dtype, kind):
 @pytest.mark.parametrize(("columns", "curve"), [(P3, linear_from_srgb), (SRGB, lambda value: value)])
 @pytest.mark.parametrize("channels", [3, 4])
 def test_colours_of_another_profile_are_converted_as_by_the_formula(tmp_path, columns, curve, channels):
-    """Display P3, and linear sRGB, against the same in float64; alpha stays."""
+    """Display P3 and linear sRGB, against the formula in float64; alpha is unchanged."""
     path, pixels = tmp_path / "other.png", noise(9, 8, channels)
     Image.fromarray(pixels).save(path, icc_profile=icc_profile(columns, curve))
     picture = read_image(path)
@@ -210,7 +210,7 @@ def test_colours_of_another_profile_are_converted_as_by_the_formula(tmp_path, co
 
 
 def test_srgb_and_broken_and_foreign_profiles_leave_the_pixels_alone(tmp_path):
-    """The second sRGB is a table, as cameras write it: converting would change colours by one level."""
+    """The second sRGB profile has a table, as cameras write it: converting would change colours by one level."""
     pixels = noise(99, 80, 3)
     srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     lab = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
@@ -268,7 +268,7 @@ def test_unreadable_files_are_told_by_name(tmp_path):
 @settings(examples(30), derandomize=True)
 @given(data=st.data())
 def test_a_photo_with_any_byte_changed_is_read_or_refused(data, tmp_path_factory, kind):
-    """No damage to header or EXIF leads to another exception, or to a warning (an error in tests)."""
+    """Damage to header or EXIF raises nothing but a UserError, and no warning (an error in tests)."""
     exif = exif_with(
         {ExifTags.Base.Make: "Maker"}, {ExifTags.IFD.Exif: {ExifTags.Base.FocalLength: IFDRational(35, 2)}}
     )
@@ -308,7 +308,7 @@ def test_list_images_is_sorted_and_takes_pictures_only(tmp_path):
 
 
 def downscaled_by_loops(image: np.ndarray, factor: float) -> np.ndarray:
-    """The definition, in float64: colours weighted by covered area and alpha, over the sum of the weights."""
+    """Downscale by definition, in float64: colours weighted by covered area and alpha, over the sum of weights."""
     height, width, channels = image.shape
     out_height, out_width = max(1, round(height / factor)), max(1, round(width / factor))
     result = np.zeros((out_height, out_width, channels))

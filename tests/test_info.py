@@ -1,4 +1,4 @@
-"""nerfcli info on files: what ours say of themselves, what is known of others', damage told in two lines."""
+"""nerfcli info on files: descriptions in our own, facts about those of other programs, two-line errors for damage."""
 
 import json
 import subprocess
@@ -162,7 +162,7 @@ def test_a_preview_is_not_taken_for_numbers(tmp_path):
 
 
 def test_the_comment_of_a_video_is_read_back(tmp_path):
-    """Everything that ffmpeg escapes: =, ;, #, backslash, line ends."""
+    """Includes everything that ffmpeg escapes: =, ;, #, backslash, line ends."""
     path = tmp_path / "a;b #1.mp4"
     told = {**META.to_json(), "provenance": {"run": "a=b;c#d\\e\nf 北"}}
     frames = np.zeros((3, 16, 16, 3), np.uint8).tobytes()
@@ -177,7 +177,7 @@ def test_the_comment_of_a_video_is_read_back(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".tiff", ".exr", ".npz", ".npy", ".png", ".mp4"])
 def test_a_damaged_file_is_told_in_two_lines(suffix, tmp_path, capfd):
-    """Cut anywhere, it is refused: never half a map, no traceback, no chatter of libraries."""
+    """A file cut anywhere is refused: no half of a map, no traceback, and no messages of libraries."""
     path = tmp_path / f"a{suffix}"
     if suffix == ".mp4":
         path.write_bytes(bytes(range(256)) * 40)
@@ -207,7 +207,7 @@ def test_what_is_no_file_of_depth_is_refused(tmp_path):
 
 
 def test_renders_whose_depth_files_differ_are_refused(tmp_path):
-    """Another axis, in a file that somebody put beside the others."""
+    """A file with another axis has been put beside the others."""
     description = {"frames": [{}, {}], "settings": {"outputs": ["depth"]}, "depth_meaning": META.to_json(), "run": "r"}
     (tmp_path / RENDERS).write_text(json.dumps(description))
     write_tiff(tmp_path / "depth" / "a.tiff", plain_depth(), META)

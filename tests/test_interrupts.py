@@ -1,4 +1,4 @@
-"""SIGTERM in processes of their own, as nothing else shows what C++ and C make of it."""
+"""SIGTERM in processes of their own, as nothing else shows how C and C++ code handles it."""
 
 import signal
 import subprocess
@@ -17,7 +17,7 @@ def ended(program: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_pycolmap_leaves_sigterm_alone_and_keeps_its_traces_of_crashes():
-    """Of a C++ library's handlers only the process itself can tell: they answer real signals."""
+    """The handlers of a C++ library answer only real signals, so they are tested in a process of their own."""
     imported = "import os, signal; import nerfcli.cameras.camera; os.kill(os.getpid(), signal.{}); signal.pause()"
     terminated = ended(imported.format("SIGTERM"))
     assert (terminated.returncode, terminated.stderr) == (-signal.SIGTERM, "")
@@ -71,5 +71,5 @@ def test_sigterm_ends_poses_and_its_worker_without_a_stack_trace(tmp_path):
     assert stderr.splitlines()[-1] == "Ended by SIGTERM; completed work is kept."
     assert not any(word in stderr for word in ("Traceback", "stack trace"))
     assert not (scene / "scene.json").exists()
-    with workspace(scene):  # whose lock the worker has as long as it lives
+    with workspace(scene):  # the worker holds its lock as long as it lives
         pass

@@ -30,10 +30,10 @@ def distortion_of(camera: Camera) -> tuple[Distortion, ...]:
 
 
 def assert_seen_at(camera: Camera, directions: np.ndarray, pixels: np.ndarray) -> None:
-    """All directions are seen, to 1e-9 px at their pixels."""
+    """Assert that all directions are seen, to 1e-9 px at their pixels."""
     again, seen = camera.project(directions)
     assert seen.all()
-    # Only where a lens spreads 4e-6 rad over a pixel, far out of the picture, is a direction in float64 too coarse.
+    # float64 directions are too coarse only far outside of the picture, where a pixel spans less than 4e-6 rad.
     px_per_rad = np.linalg.svd(camera.project_jacobian(directions)[0], compute_uv=False)[:, 0]
     assert (np.abs(again - pixels).max(axis=1) <= np.maximum(1e-9, 4e-15 * px_per_rad)).all()
 
@@ -60,11 +60,11 @@ def test_projecting_a_bearing_gives_the_pixel_in_and_around_the_picture(model, s
 @given(model=models, seed=seeds, strength=strengths)
 @many
 def test_the_direction_that_made_a_pixel_is_the_one_found(model, seed, strength):
-    """Over the whole domain: a pixel has one direction, and it is never another root."""
+    """Over the whole domain: the bearing of a pixel is the direction that made it, never another root."""
     rng = np.random.default_rng(seed)
     camera, directions = random_camera(model, rng, strength=strength), random_directions(rng)
     pixels, seen = camera.project(directions)
-    # Beyond, rounding of the pixel alone moves the direction; closer to the turn than this, too.
+    # Beyond 1e5 px, and closer to the turn than this, rounding of the pixel alone moves the direction.
     weakest = np.linalg.svd(camera.project_jacobian(directions)[0], compute_uv=False)[:, 1]
     sharp = seen & (np.abs(pixels) < 1e5).all(axis=1) & (weakest > 1e-3 * camera.focal_px)
     found, valid = camera.bearings(pixels[sharp])
@@ -73,7 +73,7 @@ def test_the_direction_that_made_a_pixel_is_the_one_found(model, seed, strength)
 
 
 def test_a_direction_next_to_the_pole_of_a_rational_model_is_found():
-    """0.3 % from the pole F magnifies the rounding of its own argument beyond that of its value."""
+    """At 0.3 % from the pole, F magnifies the rounding of its argument beyond the rounding of its value."""
     radial, divisor = (0.2131718564, 0.0704780748, -0.0059814991), (0.0065467647, 0.0167121516, -0.0015507858)
     tangential = (-0.0090150200, 0.0149705343)
     params = (735.6, 707.0, 600.0, 450.0, *radial[:2], *tangential, radial[2], *divisor)
@@ -104,7 +104,7 @@ def test_the_jacobian_keeps_its_sign_up_to_the_reach(model, seed, strength):
 @given(model=st.sampled_from(POLYNOMIAL), seed=seeds, strength=strengths)
 @many
 def test_a_radial_distortion_reaches_exactly_to_where_its_radius_stops_growing(model, seed, strength):
-    """The first fall of g on a fine grid, or its pole, where the sign of g changes."""
+    """Against the first decrease of g on a fine grid, or its pole, where the sign of g changes."""
     camera = random_camera(model, np.random.default_rng(seed), strength=strength)
     radial = Distortion(radial=distortion_of(camera)[0].radial, divisor=distortion_of(camera)[0].divisor)
     step = 1e-4
@@ -120,7 +120,7 @@ def test_a_radial_distortion_reaches_exactly_to_where_its_radius_stops_growing(m
 @given(seed=seeds, strength=st.sampled_from([1.0, 5.0]))
 @few
 def test_tangential_terms_cost_little_of_the_domain(seed, strength):
-    """The proof of uniqueness is no excuse: of what has a positive determinant inside, 2 % of the radius at most."""
+    """The proof of uniqueness costs at most 2 % of the radius within which the determinant is positive."""
     distortion = distortion_of(random_camera("OPENCV", np.random.default_rng(seed), strength=strength))[0]
     radii = np.linspace(0, 3, 3000)[:, None]
     azimuths = np.linspace(0, 2 * np.pi, 180, endpoint=False)
@@ -132,10 +132,10 @@ def test_tangential_terms_cost_little_of_the_domain(seed, strength):
 
 
 def test_what_only_points_beyond_the_reach_are_moved_to_is_not_found():
-    # A barrel that turns back at 1.0541, at a radius of 0.7027.
+    # A barrel distortion that turns back at a radius of 1.0541, which it moves to 0.7027.
     _, found = Distortion(radial=(-0.3,)).invert(np.array([[0.7026, 0.7028, 0.9, 30.0], [0.0] * 4]))
     assert found.tolist() == [True, False, False, False]
-    # One that grows again farther out: Newton's method finds points out there too, for some of these targets.
+    # A distortion that grows again farther out, where Newton's method also finds points for some of these targets.
     distortion = Distortion(radial=(-0.3, 0.026), tangential=(1e-2, 0.0))
     angles, radii = 37 * np.linspace(0, 6.28, 4000), np.linspace(0.0, 5.0, 4000)
     points, found = distortion.invert(distortion.apply(radii * np.array([np.cos(angles), np.sin(angles)])))

@@ -1,4 +1,4 @@
-"""What a capture determines of a lens, against synthetic truth: noise, highlights that slide, and little depth."""
+"""How well a capture determines a lens, against synthetic truth: noise, highlights that slide, and little depth."""
 
 import numpy as np
 import pycolmap
@@ -25,7 +25,7 @@ def robot_capture(
 
 
 def test_deviations_are_those_of_repeated_captures():
-    """Monte Carlo: 24 captures that differ in their noise alone, adjusted with the principal point free."""
+    """Monte Carlo: 24 captures that differ only in their noise, adjusted with the principal point free."""
     found, predicted = [], []
     for seed in range(24):
         model = ring_model("SIMPLE_RADIAL", (800.0, 512.0, 384.0, 0.05), seed=seed)
@@ -38,7 +38,7 @@ def test_deviations_are_those_of_repeated_captures():
 
 
 def test_one_step_is_where_an_adjustment_goes():
-    """Against bundle adjustment by Ceres with the principal point free, to a standard deviation."""
+    """Against bundle adjustment by Ceres with the principal point free, to one standard deviation."""
     model = ring_model("SIMPLE_RADIAL", (800.0, 527.0, 380.0, 0.05))
     start = started_from(model, "SIMPLE_RADIAL")
     found = lens_evidence(start, 1, seed=0).estimate(["f", "cx", "cy", "k1"])
@@ -68,7 +68,7 @@ def test_what_is_there_is_found_in_spite_of_highlights(shiny: float):
 
 
 def test_highlights_pull_a_robust_adjustment_less():
-    """The focal length: the mean over three captures, a fifth of their points highlights."""
+    """By the mean focal length over three captures in which a fifth of the points are highlights."""
     plain, robust = [], []
     for seed in range(3):
         model = robot_capture(seed=seed, shiny=0.2)

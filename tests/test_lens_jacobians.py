@@ -20,7 +20,7 @@ STENCIL = {-3: -1 / 60, -2: 3 / 20, -1: -3 / 4, 1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
 
 
 def difference(evaluate: Callable[[float], tuple[np.ndarray, np.ndarray]], step: float) -> np.ndarray:
-    """The derivative at 0 of a function that also says where it is valid; NaN where some step is not."""
+    """Return the derivative at 0 of a function that also says where it is valid; NaN where some step is not."""
     values = {offset: evaluate(offset * step) for offset in STENCIL}
     derivative = sum(weight * values[offset][0] for offset, weight in STENCIL.items()) / step
     return np.where(np.all([valid for _, valid in values.values()], axis=0)[:, None], derivative, np.nan)
@@ -29,9 +29,9 @@ def difference(evaluate: Callable[[float], tuple[np.ndarray, np.ndarray]], step:
 def assert_is_derivative(
     answer: np.ndarray, evaluate: Callable[[float], tuple[np.ndarray, np.ndarray]], *, step: float, noise: float
 ) -> None:
-    """The answer (N, columns) to 1e-8 of its largest entry, wherever halving the step says that the difference is true.
+    """Assert the answer (N, columns) to 1e-8 of its largest entry, wherever halving the step confirms the difference.
 
-    `noise` is the rounding of what is evaluated.
+    `noise` is the rounding error of `evaluate`.
     """
     coarse, fine = difference(evaluate, step), difference(evaluate, step / 2)
     tolerance = 1e-8 * max(np.nanmax(np.abs(fine), initial=0), 1e-3) + 4 * noise / step
@@ -41,7 +41,7 @@ def assert_is_derivative(
 
 
 def well_inside(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Points that are not close to where the model turns or goes to infinity."""
+    """Return the points that are not close to where the model turns or goes to infinity."""
     _, valid = camera.project(points)
     singular = np.linalg.svd(camera.project_jacobian(points)[0], compute_uv=False)
     singular *= np.linalg.norm(points, axis=1)[:, None]
@@ -142,7 +142,7 @@ def test_footprint_of_a_fisheye_is_sinc_over_f_squared_behind_the_camera_too():
 
 @pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "SIMPLE_FISHEYE", "SIMPLE_DIVISION", "EUCM"])
 def test_the_footprints_of_a_picture_add_up_to_its_solid_angle(model):
-    """All around 4 pi; a cap out to the angle a, 2 pi (1 - cos a). The midpoint rule leaves what the rim cuts."""
+    """4 pi all around; 2 pi (1 - cos a) for a cap out to the angle a, to the error of pixels cut by the rim."""
     size, centre = 600, 300.0
     if model == "EQUIRECTANGULAR":
         camera, expected = Camera(model, size, size // 2, (size, size // 2)), 4 * np.pi

@@ -15,7 +15,7 @@ seeds = st.integers(0, 2**32 - 1)
 many = examples(100)
 few = examples(40)
 
-# COLMAP projects these on all sides; of the others it turns what is behind the camera over.
+# COLMAP projects points on all sides with these models; with the others it mirrors points behind the camera.
 ALL_AROUND_IN_COLMAP = ("EUCM", "SIMPLE_DIVISION", "DIVISION", "EQUIRECTANGULAR")
 
 
@@ -24,12 +24,12 @@ def colmap_of(camera: Camera) -> pycolmap.Camera:
 
 
 def assert_same_pixels(pixels: np.ndarray, expected: np.ndarray) -> None:
-    """To 1e-8 px where pixels are of a picture's size, and to as many digits where a point is far out of it."""
+    """Assert equality to 1e-8 px within the size of a picture, and to as many digits far outside of it."""
     np.testing.assert_allclose(pixels, expected, rtol=1e-11, atol=1e-8)
 
 
 def has_colmaps_wrong_series(camera: Camera) -> bool:
-    """COLMAP's projection for omega below 0.01 is the series of its own inverse: up to 0.1 px off the closed form."""
+    """Return whether COLMAP projects by the series of its own inverse (omega to 0.01): 0.1 px off the closed form."""
     return camera.model == "FOV" and abs(camera.params[4]) <= 0.01
 
 
@@ -51,7 +51,7 @@ def test_projection_agrees_with_colmap(model, seed, strength):
 @given(model=st.sampled_from(MODELS), seed=seeds)
 @many
 def test_bearings_agree_with_colmap(model, seed):
-    """COLMAP's undistortion stops after a step of 1e-5: what is left of it is 1e-10 rad or, near the turn, 1e-8."""
+    """COLMAP's undistortion stops after a step of 1e-5, which leaves an error of 1e-10 rad or, near the turn, 1e-8."""
     rng = np.random.default_rng(seed)
     camera = random_camera(model, rng)
     assume(not has_colmaps_wrong_series(camera))
@@ -103,7 +103,7 @@ def test_the_fisheye_and_its_derivatives_agree_with_opencv(seed):
     pixels, valid = camera.project(points)
     by_point, by_parameters, _ = camera.project_jacobian(points)
     assert_same_pixels(pixels[valid], np.reshape(expected, (-1, 2))[valid])
-    # OpenCV takes a point within 1e-8 of the axis for one on it.
+    # OpenCV treats a point within 1e-8 of the axis as being on it.
     off_axis = valid & (np.hypot(points[:, 0], points[:, 1]) > 1e-5 * points[:, 2])
     np.testing.assert_allclose(by_point[off_axis], derivatives[off_axis, :, 11:14], rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(by_parameters[off_axis], derivatives[off_axis, :, :8], rtol=1e-9, atol=1e-9)

@@ -49,7 +49,7 @@ def test_without_a_gpu_none_can_be_named(monkeypatch):
 
 
 def test_a_benchmark_names_the_gpu_and_reads_its_memory(monkeypatch):
-    """Of the device that is given, which need not be the first."""
+    """It uses the given device, which need not be the first."""
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"GPU of {device}")
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda device: None)
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: {"cuda:1": 7}[device])

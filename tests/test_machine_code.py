@@ -1,4 +1,4 @@
-"""nerfcli.kernels.numba_cpu.machine_code: compiled kernels belong to the sources as they stand."""
+"""nerfcli.kernels.numba_cpu.machine_code: compiled kernels belong to the current sources."""
 
 import errno
 import os
@@ -13,7 +13,7 @@ from nerfcli.kernels.numba_cpu.machine_code import discard_outdated, folder, is_
 
 @pytest.fixture
 def compiled(tmp_path: Path) -> Path:
-    """Two sources, and beside them machine code that was made of these."""
+    """A folder with two sources and a cache with the machine code compiled from them."""
     for name in ("caller.py", "called.py"):
         (tmp_path / name).write_text(f"# {name}\n")
     (tmp_path / "cache").mkdir()
@@ -38,7 +38,7 @@ def test_machine_code_of_these_sources_stays(compiled):
 
 @pytest.mark.parametrize("change", ["edited", "renamed", "added", "removed"])
 def test_a_change_of_any_source_discards_the_machine_code_of_all(compiled, change):
-    if change == "edited":  # as long as before, and as old: Numba itself would look at no more
+    if change == "edited":  # as long as before: Numba itself compares only size and time
         (compiled / "called.py").write_text("# callee.py\n"[: len("# called.py\n")])
     elif change == "renamed":
         (compiled / "called.py").rename(compiled / "other.py")

@@ -21,7 +21,7 @@ WIDTH, HEIGHT = 120, 80
 
 
 def write_photo(path: Path, *, orientation: int = 1, size: tuple[int, int] = (WIDTH, HEIGHT), seed: int = 0) -> Path:
-    """Noise, stored with an EXIF orientation."""
+    """Write a photo of noise, stored with an EXIF orientation."""
     exif = Image.Exif()
     exif[0x0112] = orientation
     noise = np.random.default_rng(seed).integers(0, 255, (*size[::-1], 3), dtype=np.uint8)
@@ -68,12 +68,12 @@ def test_a_mask_is_named_after_its_photo(masks, there, found):
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_mask_as_the_photo_is_stored_turns_with_it(tmp_path, orientation):
-    """Evidence: the photo itself, thresholded as stored, and as Pillow's transposition turns it."""
+    """Evidence: the photo itself, thresholded as stored and as turned by Pillow's transposition."""
     photo = write_photo(tmp_path / "p.png", orientation=orientation)
     stored = np.asarray(Image.open(photo).convert("L")) > 127
     write_png(tmp_path / "upright.png", (read_image(photo).mean(-1) > 99).astype(np.uint8) * 255)
     np.testing.assert_array_equal(read_mask(tmp_path / "upright.png", photo) > 0, read_image(photo).mean(-1) > 99)
-    if orientation >= 5:  # 2 to 4 keep the size, so that only the upright mask can be meant
+    if orientation >= 5:  # 2 to 4 keep the size: a mask is taken as upright
         write_png(tmp_path / "stored.png", stored.astype(np.uint8) * 255)
         upright = np.asarray(Image.fromarray(read_image(photo)).convert("L")) > 127
         np.testing.assert_array_equal(read_mask(tmp_path / "stored.png", photo) > 0, upright)
@@ -172,7 +172,7 @@ def test_features_lie_where_the_mask_is_white(photos, masks, tmp_path):
 
 
 def test_a_small_part_gets_as_many_features_as_a_whole_photo_would(masks, tmp_path):
-    """A quarter of the picture is used: it has as many features, within a half, as the whole of the same picture."""
+    """A quarter of the picture gets at least half as many features as the whole of the same picture."""
     photos = tmp_path / "photos"
     photos.mkdir()
     noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
@@ -191,7 +191,7 @@ def test_a_small_part_gets_as_many_features_as_a_whole_photo_would(masks, tmp_pa
 
 
 def test_another_mask_means_other_features(photos, masks, tmp_path):
-    """So that they are found anew, and only of the photo whose mask has changed."""
+    """The keys change so that features are extracted again, only for the photo whose mask has changed."""
     keys = []
     for level in (255, 0):
         for index in range(2):

@@ -1,4 +1,4 @@
-"""Exposures by pixels that photos have in common, on photos whose gains are known."""
+"""Exposures from pixels that photos have in common, on photos whose gains are known."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -18,14 +18,14 @@ NOTHING = DenseDepth(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
 
 
 def exposed(one: LoadedPhoto, log_gains: np.ndarray) -> LoadedPhoto:
-    """The same photo with other gains in linear light."""
+    """Return the same photo with other gains in linear light."""
     light = ((one.pixels / 255 + 0.055) / 1.055) ** 2.4 * np.exp(log_gains)
     levels = 255 * (1.055 * light ** (1 / 2.4) - 0.055)
     return LoadedPhoto(one.frame, np.clip(np.rint(levels), 0, 255).astype(np.uint8), None)
 
 
 def depth(one: LoadedPhoto) -> DenseDepth:
-    """The true one of every third pixel."""
+    """Return the true depth of every second pixel of every second row."""
     rows, columns = (axis.ravel() for axis in np.mgrid[:150:2, :200:2])
     distances = truth(PINHOLE, one.frame.world_from_cam)[0][rows, columns]
     return DenseDepth(np.stack([columns, rows], axis=-1), distances, np.full(len(rows), 0.01))
@@ -68,7 +68,7 @@ def test_white_pixels_tell_nothing():
     ids=["confirms", "all alike", "unknown", "contradicts"],
 )
 def test_exposures_count_where_exif_confirms_them(exif, is_kept, monkeypatch):
-    """What shines differs from photo to photo, too."""
+    """EXIF has to confirm them because shiny surfaces differ from photo to photo, too."""
     gains = [-0.6, 0.6, -0.3, 0.3, 0.0, 0.1]
     photos = [exposed(photo(0.12 * k, contrast=1.5), np.full(3, gain)) for k, gain in enumerate(gains)]
     monkeypatch.setattr("nerfcli.train.evidence.log_exposures", lambda frames: np.array(exif))

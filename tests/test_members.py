@@ -30,7 +30,7 @@ QUICK = ("--steps", "1", "--downscale", "8", "--log2-rows", "10", "--threads", "
 
 @pytest.fixture
 def ensemble(capture):
-    """A run of `capture` with three members: fog that begins at other distances, over other backgrounds."""
+    """A run of `capture` with three members: fogs that begin at different distances, over different backgrounds."""
     loaded = scenes.load(capture)
     similarity, _ = object_frame(loaded)
     run = capture.with_name("spheres-run")
@@ -93,7 +93,7 @@ def test_a_random_start_fills_the_coarsest_levels_with_numbers_of_its_size():
 
 
 def test_training_leaves_random_numbers_where_no_ray_passes(spheres, tmp_path):
-    """Rows of the coarsest level that no sample touches are, after training, what the seed made them."""
+    """Rows of the coarsest level that no sample touches still have the values from the seed after training."""
     from nerfcli.train.loop import train
 
     settings = TrainSettings(budget_seconds=None, steps=3, downscale=8, random_start=0.1, log2_rows=14, seed=5)
@@ -124,7 +124,7 @@ def test_members_are_trained_into_the_run_and_kept(capture):
     assert listing(run) == before
     described = json.loads(nerfcli("info", run, "--json").stdout)["members"]
     assert described == [f"{number}: seed {number}, photo_fraction 0.8, complete" for number in (1, 2)]
-    # One member is lost, and no other is touched.
+    # One member is lost; training it again touches no other.
     (run / "members" / "2" / "field.safetensors").unlink()
     (run / "members" / "2" / "state.safetensors").unlink()
     assert nerfcli(*command).exit_code == 0
@@ -145,7 +145,7 @@ def test_members_are_trained_into_the_run_and_kept(capture):
 
 
 def test_tasks_of_an_array_job_train_one_member_each(capture):
-    """Out of order, and the same fields as by one command; the run itself is never touched."""
+    """Trained out of order, they have the same fields as from one command; the run itself is never touched."""
     together, apart = capture.with_name("together"), capture.with_name("apart")
     assert nerfcli("train", capture, *QUICK, "-o", together, "--members", "3").exit_code == 0
     task = ("train", capture, *QUICK, "-o", apart, "--members")
@@ -193,7 +193,7 @@ def test_an_interrupted_member_is_resumed_by_the_same_command(capture, monkeypat
 
 
 def test_members_keep_to_the_memory_of_the_run(capture):
-    """The run is complete and kept before, so that only a member can be refused."""
+    """The run is complete beforehand, so only a member can be refused."""
     run = capture.with_name("r")
     assert nerfcli("train", capture, *QUICK, "-o", run).exit_code == 0
     result = nerfcli("train", capture, *QUICK, "-o", run, "--members", "2", "--memory", "1MB")
@@ -255,7 +255,7 @@ def test_the_deviation_is_that_of_the_members_that_have_a_value():
 
 
 def test_deviations_of_fog_are_those_of_its_closed_form(ensemble, tmp_path):
-    """Rays meet cubes of fog: the picture of each member is rendered by itself, and NumPy takes the deviation."""
+    """For cubes of fog, against NumPy's deviation of the pictures of the members, each rendered by itself."""
     common = (
         "--min-opacity",
         "0",
@@ -284,7 +284,7 @@ def test_deviations_of_fog_are_those_of_its_closed_form(ensemble, tmp_path):
     np.testing.assert_allclose(read_tiff(of_depth)[0], np.std(depths, axis=0, ddof=1), rtol=1e-4, atol=1e-6)
     expected = np.sqrt(np.var(colours, axis=0, ddof=1).mean(axis=-1))
     np.testing.assert_allclose(read_tiff(of_colour)[0], expected, atol=1.5 / 255)
-    # Beside all cubes there are the three backgrounds alone: 3/4, 1/2, 1/4.
+    # Outside of all cubes only the three backgrounds are visible: 3/4, 1/2, 1/4.
     assert read_tiff(of_colour)[0].max() == pytest.approx(0.25, abs=0.05)
     channels = read_exr(next((tmp_path / "all" / "exr").rglob("*.exr")))
     np.testing.assert_array_equal(channels["depth_deviation.V"], read_tiff(of_depth)[0])
@@ -300,7 +300,7 @@ def test_deviations_of_fog_are_those_of_its_closed_form(ensemble, tmp_path):
 
 
 def test_the_mean_of_the_pictures_of_members_is_measured_beside_theirs(ensemble, tmp_path):
-    """PSNR of the mean of three pictures, against pictures that `render` writes and the photo on white."""
+    """PSNR and SSIM of members against `evaluate` on each; the mean picture is better than the members on average."""
     result = nerfcli("evaluate", ensemble, "--members", "--threads", "1", "--json")
     assert result.exit_code == 0, result.stderr
     found = json.loads(result.stdout.splitlines()[-1])["members"]
@@ -309,7 +309,7 @@ def test_the_mean_of_the_pictures_of_members_is_measured_beside_theirs(ensemble,
         alone = nerfcli("evaluate", ensemble / "members" / str(number), "--threads", "1", "--json")
         assert json.loads(alone.stdout)["mean"]["psnr"] == pytest.approx(found["members"][number - 1]["psnr"])
         assert json.loads(alone.stdout)["mean"]["ssim"] == pytest.approx(found["members"][number - 1]["ssim"])
-    # The mean is nearer than the members are on average, as the squared error is convex.
+    # The error of the mean picture is below the average error of the members, as the squared error is convex.
     errors = [10 ** (-0.1 * member["psnr_float"]) for member in found["members"]]
     assert 10 ** (-0.1 * found["mean_picture"]["psnr_float"]) < np.mean(errors)
     assert "is kept" in nerfcli("evaluate", ensemble, "--members", "--threads", "1").stderr

@@ -9,7 +9,7 @@ import pytest
 from nerfcli.memory import keep_freed_memory, return_freed_memory
 
 _MEGABYTE = 2**20
-# Arrays of 40 MB, freed and allocated again: the system clears each of their pages, or hands out none.
+# Arrays of 40 MB are allocated and freed: the system provides cleared pages for each, or none if memory is kept.
 _PROGRAM = """
 import os, resource
 from nerfcli.memory import keep_freed_memory, resident_bytes, return_freed_memory

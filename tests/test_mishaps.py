@@ -1,6 +1,6 @@
 """What happens around a command: a full disk, Ctrl-C, SIGTERM, another command on the folder, photos that are gone.
 
-Each ends with its exit code and a line or two, and everything that was there is as it was.
+Each ends with its exit code and a line or two, and leaves everything that existed before unchanged.
 """
 
 import os
@@ -25,7 +25,7 @@ from nerfcli.runs.files import LOCK, PHOTO_DEPTHS
 ONE_STEP = ("--steps", "1", "--downscale", "8", "--log2-rows", "10", "--threads", "2")
 FEW = ("--cameras", "test", "--max-size", "16", "--threads", "2")
 
-# Of commands that write: their words, with the capture and a run of it, and the bytes that a file may have.
+# Commands that write: their arguments, from the capture and a run of it, and the bytes that a file may have.
 Words = Callable[[Path, Path], tuple[Any, ...]]
 WRITERS: dict[str, tuple[Words, int]] = {
     "train": (lambda capture, run: ("train", capture, "-o", run.with_name("new"), *ONE_STEP), 50_000),
@@ -38,7 +38,7 @@ WRITERS: dict[str, tuple[Words, int]] = {
 
 
 def with_leftovers(folder: Path, before: dict[str, bytes]) -> dict[str, bytes]:
-    """What has come into a folder or changed, aside from locks and what the same command takes up again."""
+    """Return files that are new or changed, except locks and those from which the same command resumes."""
     kept = ("unfinished", LOCK, PHOTO_DEPTHS, "new/")
     return {
         name: content
@@ -50,7 +50,7 @@ def with_leftovers(folder: Path, before: dict[str, bytes]) -> dict[str, bytes]:
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_full_disk_is_told_and_what_was_there_is_as_it_was(name, finished, capture):
     words, size = WRITERS[name]
-    kernels.prepare(lambda text: None)  # they are written beside the program
+    kernels.prepare(lambda text: None)  # compiled kernels are written beside the program
     before = listing(capture.parent)
     with files_of_at_most(size):
         result = nerfcli(*words(capture, finished))
@@ -66,7 +66,7 @@ def test_a_full_disk_is_told_and_what_was_there_is_as_it_was(name, finished, cap
 
 @pytest.fixture(params=[signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "sigterm"])
 def interrupted_when_written(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[list[str]]:
-    """Ctrl-C or SIGTERM as the first result is about to get its name; which one that is."""
+    """Send Ctrl-C or SIGTERM when the first result is about to get its name, which the list then contains."""
     met: list[str] = []
     replace = os.replace
 
@@ -78,7 +78,7 @@ def interrupted_when_written(monkeypatch: pytest.MonkeyPatch, request: pytest.Fi
 
     monkeypatch.setattr(atomic.os, "replace", replace_and_interrupt)
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores it
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
     install_handlers()
     yield met
     signal.signal(signal.SIGINT, before)
@@ -103,7 +103,7 @@ def test_ctrl_c_and_sigterm_end_a_command_in_one_line(name, finished, capture, i
 
 @pytest.mark.parametrize("name", ["info", pytest.param("render", marks=pytest.mark.slow)])
 def test_a_reader_that_goes_away_loses_nothing(name, finished, capture):
-    """As `| true`: the results are complete, and nobody complains."""
+    """As with `| true`: the results are complete, and there is no message."""
     process = started("info", capture, "--json") if name == "info" else started("render", finished, *FEW, "--quiet")
     assert process.stdout is not None
     assert process.stderr is not None
@@ -136,7 +136,7 @@ def test_a_run_whose_photos_were_moved_elsewhere_says_which_and_how_to_mend_it(f
     missing = moved.parent / "spheres" / "test" / "r_000.png"
     assert error == f"Error: photo not found: {missing}"
     assert "put a link to the photo folder there" in hint
-    (moved.parent / "spheres").symlink_to(photos)  # as it says
+    (moved.parent / "spheres").symlink_to(photos)  # as the hint says
     assert nerfcli("evaluate", moved).exit_code == 0
 
 
@@ -151,7 +151,7 @@ def test_what_a_killed_evaluation_left_goes_with_the_next(finished):
 
 
 def test_a_scene_is_read_while_it_is_trained_on(capture):
-    """Two commands on one scene take no lock of it: it is only read."""
+    """Commands do not lock a scene, as they only read it."""
     with exclusive(capture.with_name("new") / LOCK, "nerfcli train is working"):
         assert len(scene.load(capture).frames) == 5
         assert nerfcli("info", capture).exit_code == 0

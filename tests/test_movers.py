@@ -1,4 +1,4 @@
-"""Something that moves is left out of the loss: by its size and place where those are known, and never elsewhere."""
+"""Moving things are left out of the loss: exactly at their size and place where these are known, nowhere else."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,7 +33,7 @@ def photos(spheres: Scene) -> list[LoadedPhoto]:
 
 
 def learned(pool: PixelPool, residual_of: Callable[[int, np.ndarray, np.ndarray], np.ndarray]) -> Movers:
-    """Movers that have seen every pixel once, with residuals (H, W, 3) by photo, rows and columns, and noise."""
+    """Return movers that have seen every pixel once, with residuals (H, W, 3) by photo, row and column, plus noise."""
     movers, rng = Movers(pool), np.random.default_rng(0)
     residuals = []
     for photo, (height, width) in enumerate(pool.sizes.tolist()):
@@ -47,14 +47,15 @@ def learned(pool: PixelPool, residual_of: Callable[[int, np.ndarray, np.ndarray]
 
 
 def square(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return where two by two blocks are: (H, W) bool."""
+    """Return which pixels are in a square of two by two blocks, (H, W) bool."""
     return (rows >= BLOCKS.start) & (rows < BLOCKS.stop) & (columns >= BLOCKS.start) & (columns < BLOCKS.stop)
 
 
 def test_a_square_of_one_photo_is_left_out(photos):
-    """Two by two blocks of the second photo, and no others: of the nine blocks around each of these, four have the
-    residual, of the nine around a neighbour two or one: 0.11, 0.06, 0.03, with the limit at 0.07. A photo that is
-    brighter by more than the limit is no mover: its median goes."""
+    """Two by two blocks of the second photo are left out, and no others.
+
+    Of the nine blocks around each of them, four have the residual; around a neighbour, two or one: 0.11, 0.06, 0.03,
+    with the limit at 0.07. A photo that is brighter by more than the limit is no mover: its median is subtracted."""
     pool = PixelPool(photos, SAME, CPU)
 
     def residual(photo: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -77,7 +78,7 @@ def test_detail_that_is_not_learned_yet_counts(photos):
 
 
 def test_pixels_count_again_when_the_field_agrees(photos):
-    """Of a residual that one of eleven steps had, a tenth is left in the mean, less than the limit."""
+    """A residual in one of eleven steps leaves about a tenth of it in the mean, less than the limit."""
     pool = PixelPool(photos, SAME, CPU)
     movers = learned(pool, lambda photo, rows, columns: 0.3 * (photo == 1) * square(rows, columns)[..., None])
     numbers = torch.arange(len(pool.colours))
@@ -88,7 +89,7 @@ def test_pixels_count_again_when_the_field_agrees(photos):
 
 
 def test_nothing_moves_at_the_beginning(photos):
-    """Before `BEGINS` the field explains no photo; and of blocks that no pixel was seen of, nothing is known."""
+    """Before `BEGINS` the field explains no photo; and nothing is known about blocks without a seen pixel."""
     movers = Movers(PixelPool(photos, SAME, CPU))
     movers.learn(torch.arange(500), torch.ones(500, 3), share=0.9 * BEGINS, step=0)
     assert not movers.moving.any()
@@ -98,8 +99,8 @@ def test_nothing_moves_at_the_beginning(photos):
 
 
 def test_a_training_leaves_out_what_one_photo_shows(spheres, spheres_run, tmp_path):
-    """A trained field that is held still, and a square of one photo with its colours inverted: after 100 steps it is
-    black in the mask of that photo, which is the only one written, and does not count in the loss."""
+    """A trained field is held fixed, and the colours in a square of one photo are inverted. After 100 steps the square
+    is black in the mask of that photo, which is the only one written, and does not count in the loss."""
     tensors, description = load_tensors(spheres_run / STATE, "cpu")
     extent = Extent.from_json(description["extent"])
     photos = load_photos(spheres.train_frames, factor=1, threads=1)

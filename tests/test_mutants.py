@@ -1,4 +1,4 @@
-"""The list of mutants keeps up with the code; whether they are killed, `benchmarks/mutants.py` tells."""
+"""The list of mutants matches the code; `benchmarks/mutants.py` tests whether they are killed."""
 
 from collections import Counter
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Where to stand next: the choice against all choices, the surface of balls in closed form, and the command."""
+"""Where to take photos next: the choice against all choices, the surface of balls in closed form, and the command."""
 
 import itertools
 import json
@@ -23,7 +23,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def ball_map(angle_deg: float, *, name: str = "a", distance: float = 3.0) -> DepthMap:
-    """What a camera on a level ring sees of the unit ball, in closed form."""
+    """Return the depth map of the unit ball from a camera on a level ring, in closed form."""
     angle = np.radians(angle_deg)
     frame = Frame(name, CAMERA, look_at(distance * np.array([np.cos(angle), np.sin(angle), 0.3]), np.zeros(3), UP))
     rays, _ = CAMERA.pixel_bearings()
@@ -53,7 +53,7 @@ def test_the_choice_is_within_its_bound_of_the_best_of_all(seed):
 def test_no_view_is_chosen_that_adds_nothing():
     seen = np.array([[True, False, True], [False, False, True]])
     assert next_views(seen, np.array([1.0, 2.0]), count=3) == [(0, 1)]
-    # Nor the same one twice, though the point needs two.
+    # Nor is a view chosen twice, though the point needs two.
     assert next_views(seen, np.array([0.0, 2.0]), count=3) == [(0, 1), (2, 1)]
 
 

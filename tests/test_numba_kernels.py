@@ -34,7 +34,7 @@ def assert_close(actual, expected, name, relative=RELATIVE, floor=1e-30):
 
 
 def offsets_of(samples, generator):
-    """Rays of random sizes, empty ones among them."""
+    """Return the offsets of rays with random numbers of samples, some with none."""
     cuts = torch.randint(0, samples + 1, (max(1, samples // 7),), generator=generator).sort()[0]
     return torch.cat([torch.tensor([0]), cuts, cuts[-1:], torch.tensor([samples])])
 
@@ -46,7 +46,7 @@ def threads(request):
     torch.set_num_threads(2)
 
 
-# For what sets the threads itself, or has none.
+# For tests that set the number of threads themselves, or use none.
 once = pytest.mark.parametrize("threads", [1], ids=["1 thread"], indirect=True)
 
 
@@ -58,7 +58,7 @@ def test_hash_encode(samples, magnitude, generator):
     points = torch.rand(samples, 3, generator=generator) * 1.2 - 0.1  # some are clamped
     gradient = torch.randn(samples, 20, generator=generator)
     for feature in range(4):
-        gradient[feature::5, [i for i in range(20) if i % 4 != feature]] = 0.0  # one feature alone has a gradient
+        gradient[feature::5, [i for i in range(20) if i % 4 != feature]] = 0.0  # only one feature has a gradient
     fast, exact = table.clone().requires_grad_(), table.double().requires_grad_()
     encoded = numba_cpu.hash_encode(points, fast, resolutions, None, None)
     encoded.backward(gradient)
@@ -77,7 +77,7 @@ def test_hash_encode(samples, magnitude, generator):
     reference.hash_encode(points, same_precision, resolutions, widths).backward(gradient)
     assert_close(faded.grad, same_precision.grad, "table gradient, with widths")
     if samples and fast.grad is not None and exact.grad is not None:
-        # Against float64 the place inside a cell is off by 700 * eps; so are weights and gradients.
+        # Compared with float64, the position inside a cell is off by 700 * eps; so are weights and gradients.
         assert (fast.grad.double() - exact.grad).norm() <= 700 * 2e-7 * exact.grad.norm()
 
 
@@ -87,7 +87,7 @@ def test_hash_encode_by_points(samples, magnitude, generator):
     resolutions = (4, 7, 0, 40, 700)
     table = torch.randn(5, 512, 4, generator=generator) * magnitude
     points = torch.rand(samples, 3, generator=generator) * 1.2 - 0.1
-    points[::7, 0], points[1::7, 1] = 0.0, 1.0  # on the border the slope is that inside
+    points[::7, 0], points[1::7, 1] = 0.0, 1.0  # on the border the slope is that of the inside
     gradient = torch.randn(samples, 20, generator=generator)
     fast, same_precision, exact = (
         points.to(t).clone().requires_grad_() for t in (torch.float32,) * 2 + (torch.float64,)
@@ -162,7 +162,7 @@ def test_radiance_ends_where_the_logarithm_of_a_density_does():
 
 
 @pytest.mark.parametrize("samples", SIZES)
-# At 0.4 what goes into the sigmoid reaches 20 to 40, whose float32 rounding of 2e-6 the sigmoid passes on.
+# At 0.4 the input of the sigmoid reaches 20 to 40, and its float32 rounding of 2e-6 carries through.
 @pytest.mark.parametrize("magnitude", [1e-4, 0.2, 0.4])
 def test_radiance_and_density(samples, magnitude, generator):
     encoded = torch.randn(samples, 32, generator=generator)
@@ -185,7 +185,7 @@ def test_radiance_and_density(samples, magnitude, generator):
         else:
             # exp(log density) turns the rounding of a logarithm of up to 15 into a relative error 15 times as large,
             # and a hidden value that rounds to the other side of 0 moves one term of a sum.
-            # Where a sigmoid saturates, float64's own 1 - value ends at 1e-16; the kernel goes on.
+            # Where a sigmoid saturates, 1 - value in float64 ends at 1e-16, and the kernel goes on below.
             assert_close(actual, expected, name, relative=5 * RELATIVE, floor=1e-15)
     assert_close(numba_cpu.density(encoded, tuple(weights)), exact[0], "density alone")
 
@@ -300,8 +300,8 @@ def test_visible_samples(rays, contraction, contrast, with_cones, least, generat
     fast = numba_cpu.visible_samples(*given, visits[0])
     exact = reference.visible_samples(*given, visits[1])
     torch.testing.assert_close(visits[0], visits[1], rtol=1e-4, atol=1e-12)  # exponentials of sums of up to 15
-    # A middle that rounds into the neighbouring cell, or an optical depth that rounds across the limit, is kept by one
-    # and not by the other; none is for these seeds.
+    # A midpoint that rounds into the neighbouring cell, or an optical depth that rounds across the limit, could be
+    # kept by only one of the two; this does not happen for these seeds.
     assert torch.equal(fast[5], exact[5])
     names = ("starts", "ends", "density", "encoded", "coordinates")
     for name, actual, expected in zip(names, fast[:5], exact[:5], strict=True):
@@ -313,7 +313,7 @@ def test_visible_samples(rays, contraction, contrast, with_cones, least, generat
 
 @pytest.mark.parametrize("least", [0.0, 1e-4, 1e-3, 0.1])
 def test_visible_samples_leave_out_what_absorbs_little_light(least, generator):
-    # Law: the others are the same, and what is left out takes less than `least` of the light, each sample by itself.
+    # Law: the kept samples are unchanged, and each sample that is left out absorbs less than `least` of the light.
     rays, edges = 300, torch.rand(60, generator=generator).cumsum(0) * 0.2
     origins = torch.randn(rays, 3, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator), dim=-1)
@@ -326,7 +326,7 @@ def test_visible_samples_leave_out_what_absorbs_little_light(least, generator):
     visits = torch.full((2, 64, 64, 64), -1.0)
     every = numba_cpu.visible_samples(given, march, grid, visits[0])
     kept = numba_cpu.visible_samples(given, march._replace(least_weight=least), grid, visits[1])
-    # A cell in which all samples are faint is known to be empty, and not left open as if none had been there.
+    # A cell in which all samples are faint is known to be empty, not left open as if it had no samples.
     assert torch.equal(visits[0], visits[1])
     lengths = (every.ends - every.starts).double()
     weights, _ = reference.interval_weights(every.density.double(), lengths, every.offsets)
@@ -359,8 +359,8 @@ def test_visible_samples_of_a_transparent_field_are_all_kept(backend, generator)
 @pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
 @pytest.mark.parametrize("steps", [2000, 150, 20])
 def test_visible_samples_misses_no_lonely_cell(side, contraction, steps, generator):
-    # Nearly all blocks of cells are empty and stepped over as a whole; steps from within a block to many blocks long.
-    # A side of 30 leaves a narrow last block. Against the reference, which looks at every step.
+    # Nearly all blocks of cells are empty and skipped as a whole; steps are from a part of a block to many blocks long.
+    # A side of 30 leaves a narrow last block. Against the reference, which evaluates every step.
     rays = 300 if steps > 20 else 3000
     origins = torch.randn(rays, 3, generator=generator)
     directions = torch.nn.functional.normalize(-origins + 0.5 * torch.randn(rays, 3, generator=generator), dim=-1)
@@ -370,13 +370,13 @@ def test_visible_samples_misses_no_lonely_cell(side, contraction, steps, generat
     given = (Rays(origins, directions, jitter), along, EMPTY)
     fast, exact = numba_cpu.visible_samples(*given), reference.visible_samples(*given)
     assert len(exact[0]) > 20
-    # A middle that rounds across a cell's border may differ; a lost block is many samples.
+    # A midpoint that rounds across a cell's border may differ; a lost block would be many samples.
     counts = [out[5].diff() for out in (fast, exact)]
     assert (counts[0] - counts[1]).abs().sum() <= 2
 
 
 def test_visible_samples_holds_many_rays_of_many_samples(generator):
-    # More samples than the buffers start with, in order of rays: through fog so thin that no ray ends early.
+    # More samples than the buffers first hold, in order of rays, in fog so thin that no ray ends early.
     rays, edges = 200, torch.linspace(0, 2, 402)
     origins = torch.tensor([0.0, 0.0, -1.0]).repeat(rays, 1)
     directions = torch.tensor([0.0, 0.0, 1.0]).repeat(rays, 1)
@@ -479,7 +479,7 @@ def test_starting_numba_leaves_the_thread_count_alone():
 
 @once
 def test_numba_follows_when_the_thread_count_changes():
-    # Its own count used to stay where the last loop had left it, and loops that asked for two threads got one.
+    # Numba's own count used to stay where the last loop had left it, and loops that asked for two threads got one.
     for wanted in (1, 2, 1, 2):
         torch.set_num_threads(wanted)
         assert use_threads() == numba.get_num_threads() == min(wanted, os.cpu_count() or 1)

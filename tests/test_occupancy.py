@@ -18,13 +18,13 @@ EVERYTHING = slice(None)
 
 @dataclass(frozen=True)
 class Size:
-    """Of a field: all that the grid asks it for."""
+    """The only setting of a field that the grid reads."""
 
     contraction: str
 
 
 class Fake:
-    """A field that is its own medium, at any detail; notes which it was asked for."""
+    """A field that is its own medium, at any detail; records the requested detail."""
 
     def __init__(self, contraction: str = "none"):
         self.settings = Size(contraction)
@@ -37,7 +37,7 @@ class Fake:
 
 
 class Ramp(Fake):
-    """Density x + 10 y + 100 z of the unit cube; notes where it was asked."""
+    """Density x + 10 y + 100 z in the unit cube; records where it was evaluated."""
 
     def __init__(self, contraction: str = "none"):
         super().__init__(contraction)
@@ -72,14 +72,14 @@ def grid() -> Occupancy:
 
 
 def test_a_cell_is_asked_at_a_random_point_of_its_own(grid):
-    """Indexed [z, y, x]; each point lies inside its cell, and not in a corner of it."""
+    """Cells are indexed [z, y, x]; each point is inside its cell, and not in a corner of it."""
     field = Ramp()
     refreshed(grid, field)
     x, y, z = (field.asked * SIDE).floor().to(torch.int64).T
     assert torch.equal((z * SIDE + y) * SIDE + x, torch.arange(SIDE**3))
     inside = field.asked * SIDE % 1
     assert 0.4 < inside.mean() < 0.6
-    assert inside.std() > 0.2  # of a uniform one, 0.29
+    assert inside.std() > 0.2  # 0.29 for a uniform distribution
     expected = field.asked @ torch.tensor([1.0, 10.0, 100.0]) * 0.5
     torch.testing.assert_close(grid.optical_depth.view(-1), expected)
 
@@ -108,7 +108,7 @@ def test_only_the_chosen_cells_are_looked_at(grid):
     refreshed(grid, Even(2.0), cells=slice(1, None, 8))
     known = grid.optical_depth.view(-1).isfinite()
     assert torch.equal(known.nonzero()[:, 0], torch.arange(1, SIDE**3, 8))
-    # What nobody has looked at counts as full, and what holds as much as the threshold as empty.
+    # Cells that were never evaluated count as full, and cells exactly at the threshold as empty.
     assert torch.equal(grid.above(1.0).view(-1), ~known)
     assert grid.above(1 - 1e-6).all()
 
@@ -119,7 +119,7 @@ def test_a_cell_with_nan_is_looked_into(grid):
 
 
 def test_the_fullest_cells_of_thin_fog_stay_open(grid):
-    """With nothing above the threshold, those above the mean of all; NaN in one of them changes the others little."""
+    """With nothing above the threshold, cells above the mean stay open; a NaN in one cell is left out of the mean."""
     refreshed(grid, Ramp())
     depth = grid.optical_depth
     assert torch.equal(grid.above(1e9), depth > depth.double().mean())

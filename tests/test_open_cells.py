@@ -27,7 +27,7 @@ class Size:
 
 
 class Slab:
-    """A field of optical depth 1 per step up to x = 1/2 of the unit cube, and empty behind; its own medium."""
+    """A field of optical depth 1 per step up to x = 1/2 of the unit cube, and empty beyond; its own medium."""
 
     closing_steps = 1
 
@@ -59,7 +59,7 @@ def visit(cells: OpenCells, where: tuple[int, int, int], depth: float) -> None:
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("name", KEEPERS)
 def test_the_largest_value_of_a_cell_is_kept(name, threads):
-    """Against NumPy's `maximum.at`, with places on and beyond the border, several in a cell, and none in most."""
+    """Against NumPy's `maximum.at`, with points on and beyond the border, several in a cell, and none in most."""
     g = torch.Generator().manual_seed(threads)
     coordinates = torch.rand(500, 3, generator=g) * 1.2 - 0.1
     coordinates[0], coordinates[1], coordinates[2] = 0.0, 1.0, torch.tensor([0.0, 1.0, 0.5])
@@ -88,7 +88,7 @@ def test_nan_is_no_value_and_no_sample_changes_nothing(name):
 
 @pytest.mark.parametrize("wanted", ["reference", "numba_cpu"])
 def test_rendering_notes_the_optical_depths_of_its_samples(wanted):
-    """Against the samples that the tracing of a step shows."""
+    """Against the samples that a step shows to `trace`."""
     torch.manual_seed(0)
     field = HashField(HashFieldSettings(contraction="l2", log2_rows=8, coarsest=4, finest=16))
     with torch.no_grad():
@@ -119,14 +119,14 @@ def test_cells_close_where_samples_found_nothing_and_only_there():
     assert coarse.shape == (OCCUPANCY_SIDE,) * 3
     assert coarse[:, :, : OCCUPANCY_SIDE // 2].all()
     assert not coarse[:, :, OCCUPANCY_SIDE // 2 :].any()
-    # All other cells are as open as the coarse ones that they are part of.
+    # All other fine cells are as open as the coarse cells that contain them.
     assert fine[full]
     assert not fine[empty]
     assert int(fine.sum()) == FINE_SIDE**3 // 2 - 1
 
 
 def test_fine_cells_of_thin_fog_stay_open():
-    """As the coarse ones: of a short training everything is thinner than the threshold."""
+    """Like the coarse ones: after a short training everything is thinner than the threshold."""
 
     class Fog(Slab):
         def density(self, coordinates: Tensor) -> Tensor:
@@ -190,7 +190,7 @@ def test_cells_that_may_not_be_filled_stay_closed():
 def test_the_samples_of_every_rank_count():
     class Two(Alone):
         def keep_largest(self, tensor: Tensor) -> None:
-            tensor[0, 0, 0] = max(float(tensor[0, 0, 0]), 0.0)  # the other one found this cell empty
+            tensor[0, 0, 0] = max(float(tensor[0, 0, 0]), 0.0)  # the other rank found this cell empty
 
     cells = cells_of(Slab())
     refresh(cells, REFRESH_EVERY, ranks=Two())
@@ -199,7 +199,7 @@ def test_the_samples_of_every_rank_count():
 
 
 def test_a_restored_state_goes_on_as_the_saved_one():
-    """What was found since the last refresh is part of it."""
+    """The state includes what samples have found since the last refresh."""
     first, second = cells_of(Slab()), cells_of(Slab())
     visit(first, (0, 0, 0), 0.02)
     refresh(first, REFRESH_EVERY)

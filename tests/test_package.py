@@ -1,4 +1,4 @@
-"""What an installed nerfcli is besides its commands: a package for Python programs, its licence, completion."""
+"""The installed package apart from its commands: the Python interface, the licence and shell completion."""
 
 import ast
 import hashlib
@@ -23,7 +23,7 @@ PROJECT = ROOT.parent
 
 
 def in_python(code: str) -> subprocess.CompletedProcess[str]:
-    """What a Python of its own says to some code."""
+    """Run code in a separate Python process."""
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
 
 
@@ -40,7 +40,7 @@ def test_compression_works_after_pycolmap():
 
 
 def test_zlib_comes_first_for_every_module_that_imports_pycolmap():
-    """A package's __init__ runs before any of its modules: no other place can come before the import in there."""
+    """A package's __init__ runs before any of its modules, so nothing can come before an import there."""
     first = next(node for node in ast.parse((ROOT / "__init__.py").read_text("utf-8")).body[1:])
     assert isinstance(first, ast.Import)
     assert [alias.name for alias in first.names] == ["zlib"]
@@ -57,7 +57,7 @@ def test_the_licence_is_apache_2_and_the_metadata_says_so():
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text("utf-8"))["project"]
     assert (project["license"], project["license-files"]) == ("Apache-2.0", ["LICENSE"])
     words = " ".join((PROJECT / "LICENSE").read_text("utf-8").split())
-    # Of https://www.apache.org/licenses/LICENSE-2.0.txt, whatever its spaces.
+    # The hash of https://www.apache.org/licenses/LICENSE-2.0.txt with white space normalised.
     assert (
         hashlib.sha256(words.encode()).hexdigest() == "0ffddef9e48f8a09aed5caf2d44f7ba1c1be2d9b8e0a6f693b1635b2d5566645"
     )
@@ -67,7 +67,7 @@ def test_the_licence_is_apache_2_and_the_metadata_says_so():
 
 
 def completed(words: str, *, shell: str = "bash") -> list[str]:
-    """What the shell offers at the end of a line."""
+    """Return the completions that the shell offers at the end of a line."""
     environment = {**os.environ, "_NERFCLI_COMPLETE": f"complete_{shell}", "COMP_WORDS": words}
     environment |= {"COMP_CWORD": str(len(words.split(" ")) - 1), "_TYPER_COMPLETE_ARGS": words}
     command = [sys.executable, "-m", "nerfcli"]
@@ -81,7 +81,7 @@ def test_the_shell_completes_commands_and_options():
 
 @pytest.mark.parametrize("option", ["--show-completion", "--install-completion"])
 def test_completion_is_shown_and_installed_for_the_shell_that_asks(option, tmp_path):
-    # A shell that has more to do than this command is its parent process, by which it is recognised.
+    # The shell is recognised as the parent process; `; exit $?` keeps bash from replacing itself with the command.
     line = f"{sys.executable} -m nerfcli {option}; exit $?"
     result = subprocess.run(
         ["bash", "-c", line], env={**os.environ, "HOME": str(tmp_path)}, capture_output=True, text=True
@@ -138,7 +138,7 @@ def python_blocks(guide: Path) -> list[str]:
 
 
 def test_the_examples_of_the_readme_and_the_guides_run(capture, tmp_path, monkeypatch, capsys):
-    """As it stands, but for the budget. Structure from motion has its own tests: here it finds the known poses."""
+    """They run with a smaller budget. Structure from motion has its own tests: here it returns the known poses."""
 
     def known_poses(folder: Path, scene: Path, **settings: Any) -> SimpleNamespace:
         shutil.copytree(capture, scene)
@@ -156,7 +156,7 @@ def test_the_examples_of_the_readme_and_the_guides_run(capture, tmp_path, monkey
     assert "photos-scene-run/renders/test-conditional-z/depth" in said[2]
     assert (tmp_path / "photos-scene-run" / "renders" / "test-conditional-z" / "depth").is_dir()
 
-    # The guides go on with these folders.
+    # The guides continue with these folders.
     for guide, names in (("python-api.md", 4), ("depth.md", 1)):
         blocks = python_blocks(PROJECT / "docs" / guide)
         assert len(blocks) == names

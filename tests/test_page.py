@@ -1,4 +1,4 @@
-"""The page that renders a field by itself: its numbers by NumPy, and all of it in a browser where there is one."""
+"""The page that renders a field by itself: its numbers with NumPy, and all of it in a browser if there is one."""
 
 import base64
 import json
@@ -42,24 +42,24 @@ from nerfcli.viewer.pictures import PagePhotos
 from nerfcli.viewer.proof import HEIGHT, WIDTH, make_proof
 from nerfcli.workflows.export import export_run
 
-# What 16-bit rows, single precision and the colours that neither side asks for change of a colour in [0, 1].
+# The change of a colour in [0, 1] by 16-bit rows, single precision and the colours that neither side evaluates.
 COLOUR_BOUND = 2e-3
 COMPRESSED_NOTHING = base64.b64encode(zlib.compress(b"")).decode()
-# The share of pixels within the bound of depths: at edges a median jumps from one surface to another.
+# The fraction of pixels within the bound of depths: at edges a median jumps from one surface to another.
 AGREEING = 0.98
 UNSEEN = np.zeros((2, 2, 2), "<u2")
 SIMILARITY = Similarity(0.7, rotation_from_vector(np.array([0.2, -0.4, 0.9])), np.array([0.1, -0.2, 0.3]))
 
 
 def at(place: tuple[float, float, float]) -> Frame:
-    """A small camera of the scene that looks at what is the middle of the training frame."""
+    """Return a small camera of the scene that looks at the centre of the training frame."""
     world = SIMILARITY.inverse()
     pose = look_at(world.apply(np.array(place)), world.apply(np.zeros(3)), np.array([0.1, 0.2, 1.0]))
     return Frame("a.png", Camera("PINHOLE", 16, 12, (11.0, 12.0, 8.5, 5.75)), pose)
 
 
 def rough(field: Field, *, sky: bool = False) -> Model:
-    """A model of random numbers: dense and thin places everywhere, in some cells only."""
+    """Return a model of random parameters, dense and thin throughout, with 40 % of the cells occupied."""
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():
         for parameter in field.parameters():
@@ -103,7 +103,7 @@ def hash_settings(contraction: str, *, antialias: bool = False, view_degree: int
     ids=["none", "l2 with a sky", "linf, antialiased, degree 1", "voxels"],
 )
 def test_the_numbers_in_the_page_render_what_the_kernels_render(field, sky):
-    """An independent implementation of the shader, on the page's own text."""
+    """Against an independent implementation of the shader, applied to the page's own text."""
     model, frame = rough(field, sky=sky), at((1.6, -0.4, 0.8))
     page = page_of(model, [frame])
     pages_view = json.loads(element(page, "scene"))["home"]
@@ -134,7 +134,7 @@ def test_levels_are_off_by_half_a_level_and_zero_stays_zero(largest, worth):
 
 @pytest.mark.parametrize("side", [4, 7, 13, 40, 101])
 def test_interpolation_in_occupied_cells_reads_only_reached_rows(side):
-    """Rows that are not reached hold 1e6: nothing of them may arrive at random points, or at corners of cells."""
+    """Unreached rows hold 1e6, which must not affect random points or corners of occupied cells."""
     rng, rows = torch.Generator().manual_seed(side), 2**12
     occupied = torch.rand(8, 8, 8, generator=rng) < 0.02
     cells = occupied.nonzero().flip(-1)
@@ -172,7 +172,7 @@ def test_the_proof_holds_the_pictures_of_nerfcli_render():
 
 
 def plane_from(x: float) -> DepthMap:
-    """What a camera 1.2 above the plane z = 0 of the scene sees of it, through a lens of 40 degrees."""
+    """Return the depths of the scene's plane z = 0 from a camera 1.2 above it, with a field of view of 40 degrees."""
     pose = look_at(np.array([x, 0.0, 1.2]), np.array([x, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
     frame = Frame("a.png", Camera.pinhole(240, 240, 120 / np.tan(np.radians(20))), pose)
     rays, _ = frame.camera.pixel_bearings()
@@ -180,14 +180,14 @@ def plane_from(x: float) -> DepthMap:
 
 
 def cell_values(model: Model, cells: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Of the cells that points (N, 3) of the scene lie in."""
+    """Return the values of the cells that contain points (N, 3) of the scene."""
     places = grid_coordinates(torch.from_numpy(model.training_from_scene.apply(points)), model.contraction).numpy()
     x, y, z = np.floor(places * len(cells)).astype(int).T
     return cells[z, y, x]
 
 
 def test_cells_hold_the_coverage_and_parallax_of_the_surface_in_them():
-    """Of a plane below three cameras: how many have a point in the picture, and the angle between their rays."""
+    """Closed form for a plane below three cameras: how many see a point, and the angle between their rays."""
     model = rough(VoxelField(VoxelFieldSettings(contraction="none", view_degree=1, log2_vertices=11)))
     places = (-0.3, 0.0, 0.35)
     cells = seen_cells(model, [plane_from(x) for x in places])
@@ -298,7 +298,7 @@ def test_the_browser_draws_what_nerfcli_renders(opened):
 
 
 def test_the_browser_shows_how_many_photos_see_the_surface(opened, spheres_run):
-    """In the cell of the median point, by the kernels; nearly everywhere in the stratum that `render` gives."""
+    """The value of the cell at the kernels' median depth; nearly everywhere in the same stratum as `render`."""
     run = Run(spheres_run)
     model, photos = run.model(), depth_maps(run.model(), run.cameras.train)
     cells = seen_cells(model, photos)
@@ -402,7 +402,7 @@ def test_a_photo_is_stood_at_wiped_over_and_subtracted(opened):
     )
     opened.wait("/ dB at/.test(document.getElementById('status').textContent)")
     decibels = float(re.findall(r"([\d.]+) dB", opened.run("document.getElementById('status').textContent"))[0])
-    assert decibels > 15  # the training of the fixture is short; a picture beside its place has some 8
+    assert decibels > 15  # the training of the fixture is short; a misplaced picture has about 8
     opened.key("w", seconds=0.1)
     assert opened.run("document.getElementById('photo-name').textContent") == "none"
 

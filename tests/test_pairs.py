@@ -69,7 +69,7 @@ def test_the_clock_orders_a_walk_but_not_a_holiday(gap: float, rule: str):
     assert pairing.rule == rule
     if rule == "sequential":
         assert {(i, i + 1) for i in range(79)} <= set(pairing.pairs)
-        # What is far in time is compared only at powers of two.
+        # Photos far apart in time are compared only at steps that are powers of two.
         assert (0, 13) not in pairing.pairs
 
 
@@ -89,7 +89,7 @@ def wrapped(longitude: float) -> float:
 
 
 def test_photos_that_gps_tells_apart_are_compared_with_the_nearest():
-    """On a square grid the 20 nearest of an inner photo are all within 3 steps, and the 8 around it among them."""
+    """On a square grid, the 20 photos nearest to an inner one are within 3 steps and include the 8 around it."""
     pairing = choose_pairs(grid(spacing_deg=0.0002))  # 22 metres
     pairs = set(pairing.pairs)
     assert pairing.rule == "spatial"
@@ -161,7 +161,7 @@ def test_a_file_of_pairs_that_is_not_there_is_told(tmp_path: Path):
 
 
 def shared_descriptors(photos: int, *, seed: int = 0) -> tuple[list[np.ndarray], np.ndarray]:
-    """Photos that see windows of one row of things: their features, and how many each two share, which is the truth."""
+    """Return descriptors of photos that see windows of one row of things, and the true number that each pair shares."""
     rng = np.random.default_rng(seed)
     things = rng.integers(0, 256, (20 * photos + 80, 128))
     noise = rng.integers(-8, 9, (photos, *things.shape))
@@ -217,7 +217,7 @@ def test_the_estimate_falls_with_threads_and_features():
 
 
 def test_small_photos_are_not_planned_with_as_many_features_as_large_ones():
-    """By the plan's own figure: 0.015 features per pixel that is searched, and never more than are wanted."""
+    """The plan's own figure: 0.015 features per searched pixel, but never more than the settings allow."""
     photos = lettered(100)
     pixels = photos[0].width * photos[0].height
     assert plan_of(choose_pairs(photos, rule="exhaustive")).features == round(0.015 * pixels) < 4096
@@ -240,7 +240,7 @@ def test_looking_for_similar_photos_stays_affordable(photos: int, seconds: float
 
 
 def test_the_outlook_measures_and_stretches_what_is_to_come():
-    """At twice the planned time for the first stage, the rest will take twice its time too, or as the fastest stage."""
+    """If the first stage takes twice its planned time, so will the rest, until a later stage proves faster."""
     seconds = {"extract": 10.0, "match": 30.0, "map": 10.0}
     now = 0.0
     outlook = Outlook(Plan(10, 1600, 4096, "exhaustive", 45, seconds), clock=lambda: now)
@@ -249,10 +249,10 @@ def test_the_outlook_measures_and_stretches_what_is_to_come():
     assert outlook.update("extract", 5, 10) == (pytest.approx(0.1), pytest.approx(90.0))
     now = 20.0
     assert outlook.update("extract", 10, 10)[1] == pytest.approx(80.0)
-    # Half of it was there already: what is left is measured on the rest alone.
+    # Half of the pairs were already done: the rate is measured on the other half alone.
     outlook.update("match", 20, 40)
     now = 25.0
-    # 5 s for what the plan has 7.5 s for: the machine is no slower than that.
+    # A quarter planned for 7.5 s takes 5 s, so the machine is faster than planned, and mapping will be too.
     assert outlook.update("match", 30, 40)[1] == pytest.approx(5.0 + 10.0 * 5 / 7.5)
     now = 30.0
     outlook.update("map", 10, 10)
@@ -261,7 +261,7 @@ def test_the_outlook_measures_and_stretches_what_is_to_come():
 
 
 def test_a_stage_that_takes_long_does_not_stretch_the_others():
-    """A stage planned for 1 s takes 20; the other 100 s are not announced to take 2000."""
+    """A stage planned for 1 s takes 20 s; the other 100 s are not predicted to become 2000 s."""
     now = 0.0
     seconds = {"extract": 50.0, "pair": 1.0, "match": 100.0}
     outlook = Outlook(Plan(10, 1600, 4096, "sequential", 45, seconds), clock=lambda: now)
@@ -299,21 +299,21 @@ def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_fro
     now = 22.0
     share, left = outlook.update("enlarge", 4, 5)
     assert (share, left) == (pytest.approx(22.0 / 35.0), pytest.approx(3.0 + 10.0))
-    # Later stages are stretched by how the machine did, not by how many photos were searched twice.
+    # Later stages scale with the speed of the machine, not with the number of photos that were searched twice.
     now = 25.0
     outlook.update("enlarge", 5, 5)
     assert outlook.update("match", 0, 45)[1] == pytest.approx(10.0)
 
 
 def test_merging_and_locating_add_to_what_is_left_and_take_nothing_from_the_share():
-    """A fifth of the plan's time for mapping, on a machine as fast as planned; it is done before the checks begin."""
+    """Merging takes a fifth of the planned mapping time on a machine as fast as planned, and precedes the checks."""
     now = 0.0
     outlook = Outlook(Plan(10, 1600, 4096, "exhaustive", 45, {"map": 100.0, "check": 20.0}), clock=lambda: now)
     outlook.update("map", 0, 10)
     now = 100.0
     assert outlook.update("map", 10, 10) == (pytest.approx(100.0 / 120.0), pytest.approx(20.0))
     assert outlook.update("merge", 0, 4) == (pytest.approx(100.0 / 120.0), pytest.approx(20.0 + 20.0))
-    # The first of four has nothing to be merged with and takes no time, which says little of the others.
+    # The first of four has nothing to merge with and takes no time, which says little about the others.
     assert outlook.update("merge", 1, 4)[1] == pytest.approx(0.75 * 15.0 + 0.75 * 20.0)
     now = 105.0
     assert outlook.update("merge", 1, 4)[1] == pytest.approx(15.0 + 20.0)
@@ -341,8 +341,8 @@ def test_merging_and_locating_add_to_what_is_left_and_take_nothing_from_the_shar
 def test_what_is_left_is_right_within_a_half_from_a_quarter_on(
     planned: tuple[int, ...], taken: tuple[int, ...], checked: tuple[float, ...]
 ):
-    """Captures that were measured on one core; within a stage, work goes on evenly, the mapper's as it grows, and the
-    four checks as they were measured on the 50 photos and on 20 others.
+    """Captures measured on one core. Within a stage, progress is even, except that the mapper slows down as the model
+    grows, and that the four checks advance as measured on the 50 photos and on 20 others.
     """
     stages = ("extract", "match", "map", "check")
     now = 0.0

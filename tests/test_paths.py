@@ -59,7 +59,7 @@ def test_focus_is_where_all_axes_meet(seed):
     focus = rng.normal(size=3)
     frames = frames_at(focus + rng.normal(size=(12, 3)), focus)
     np.testing.assert_allclose(focus_point(frames), focus, rtol=0, atol=1e-9)
-    # Four of sixteen cameras that look elsewhere do not move it by more than a fraction of what they are off.
+    # Three of fifteen cameras that look elsewhere move it by only a small fraction of their own offset.
     strays = frames_at(focus + rng.normal(size=(3, 3)), focus + rng.normal(size=(3, 3)) + 3.0)
     assert np.linalg.norm(focus_point([*frames, *strays]) - focus) < 1e-3
 
@@ -159,7 +159,7 @@ def test_orbit_of_an_elongated_ring_is_its_ellipse():
 @given(seed=seeds)
 @few
 def test_an_ellipse_through_cameras_on_an_ellipse_is_that_ellipse(seed):
-    """In any frame of the world; where all cameras are as far out as the farthest on each axis, it is theirs."""
+    """In any frame of the world: the path is the cameras' own ellipse, but for the percentile that sets its axes."""
     rng = np.random.default_rng(seed)
     similarity = Similarity(
         10.0 ** rng.uniform(-2, 2), Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3)
@@ -250,7 +250,7 @@ def test_interpolation_flies_at_constant_speed_through_all_frames():
 
 
 def test_interpolation_turns_on_the_spot_and_stands_still():
-    """Frames at one place: a turn at constant angular speed. One frame, or the same one again: the camera stands."""
+    """Frames at one place: a turn at constant angular speed. One frame several times: the camera stands still."""
     angle = np.linspace(0, 2, 5)
     around = np.stack([np.cos(angle), np.sin(angle), np.zeros(5)], axis=1)
     path = interpolate(frames_at(np.zeros((5, 3)), around), count=21)

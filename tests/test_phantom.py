@@ -40,7 +40,7 @@ def test_line_integrals_are_those_of_quadrature() -> None:
 
 
 def test_mass_of_voxels_is_the_volume_of_the_ellipsoid() -> None:
-    """Closed form: 4/3 pi abc times the attenuation, in a tilted ellipsoid; 1 % for voxels of 1/8 of an axis."""
+    """Closed form: 4/3 pi abc times the attenuation, of a tilted ellipsoid; 1 % for voxels of 1/8 of a semi-axis."""
     solid = Ellipsoid((0.3, -0.2, 0.1), (3, 2, 2.5), 0.7, turn=0.4, tilt=1.1)
     axis = (np.arange(28) - 13.5) * 0.25
     voxels = attenuation_of_voxels([solid], x=axis, y=axis, z=axis, samples=2)
@@ -48,8 +48,8 @@ def test_mass_of_voxels_is_the_volume_of_the_ellipsoid() -> None:
 
 
 def test_the_sample_scan_follows_its_statement(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Chords along the rays that the program reads from scan.json explain the counts as noise alone; the script's own
-    geometry is written without the program. Its files are those that it writes again.
+    """Chords along the rays read from scan.json leave only noise in the counts; the script states its geometry
+    independently of the program. Running the script again writes the same files.
     """
     scan = read_scan(PHANTOM)
     assert (scan.geometry.views, scan.geometry.rows, scan.geometry.columns) == (48, 48, 64)

@@ -33,7 +33,7 @@ def trained(spheres_run: Path) -> tuple[Model, Frame]:
 
 
 def same_bits(one: RenderedPicture, other: RenderedPicture) -> list[str]:
-    """The maps that differ."""
+    """Return the names of the maps that differ in any bit."""
     return [name for name in MAPS if not np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True)]
 
 
@@ -72,7 +72,7 @@ def test_what_is_left_out_stays_within_the_bound_and_the_tolerance(background, t
 
 
 def test_a_ray_that_sees_all_misses_nothing():
-    # Fog of optical depth 1/2 before a background: no stop, and every sample is worth a colour.
+    # Fog of optical depth 1/2 in front of a background: no early stop, and every sample's colour is evaluated.
     picture = render_picture(
         fog(foggy_cells((-1, -1, 0), (1, 1, 0.5)), Similarity.identity()), TOWARDS, background=BLACK
     )
@@ -98,7 +98,7 @@ COARSE = Frame("view", Camera.pinhole(2, 2, 4.0), from_parts(np.eye(3), np.array
 
 
 def two_walls() -> Model:
-    """Dense walls: one in front that covers the outer part of the left pixels, and one behind that covers all."""
+    """Return dense walls: the front one covers the outer part of the left pixels, the back one covers everything."""
     cells = foggy_cells((-1, -1, 0.5), (1, 1, 1)) | foggy_cells((-1, -1, -0.5), (-0.15, 1, 0.0))
     dense = fog(cells, Similarity.identity())
     assert isinstance(dense.field, HashField)
@@ -135,7 +135,7 @@ def test_a_pixel_of_several_samples_is_their_mixture(convention):
 
 
 def _at_place(model: Model, place: np.ndarray, request: DepthRequest) -> tuple[float, float]:
-    """z of the conditional mean and opacity at one place of the pixel (0, 0) of `COARSE`, as a picture of its own."""
+    """Return conditional z and opacity at one place in pixel (0, 0) of `COARSE`, rendered as a picture of its own."""
     camera = Camera("PINHOLE", 2, 2, (4.0, 4.0, 1.0 - (place[0] - 0.5), 1.0 - (place[1] - 0.5)))
     picture = render_picture(
         model,

@@ -57,7 +57,7 @@ def test_a_turn_about_their_own_axes_is_told_from_the_rest(benchmark):
 
 
 def test_one_camera_that_lies_elsewhere(benchmark):
-    """Closed form at first order: of many cameras one is off by d, so the RMS distance is d / sqrt(N)."""
+    """Closed form at first order: one of N cameras is off by d, so the RMS distance is d / sqrt(N)."""
     poses = random_poses(100)
     off = poses.copy()
     off[7, :3, 3] += [1e-3, 0, 0]

@@ -1,4 +1,4 @@
-"""What never ends is ended: matching, merging and each check stop far beyond their plan, and the result says so."""
+"""Time limits: matching, merging and each check are stopped far beyond their plan, and the result says so."""
 
 import json
 import shutil
@@ -35,7 +35,7 @@ def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
 
 
 def looked_at(job: Job) -> set[tuple[int, int]]:
-    """The pairs that the matcher has been at, with or without a result."""
+    """Return the pairs that the matcher has tried, with or without a result."""
     with pycolmap.Database.open(str(job.database)) as database:
         return {(i, j) for i, j in all_pairs(8) if database.exists_two_view_geometry(i + 1, j + 1)}
 
@@ -56,7 +56,7 @@ def test_pairs_of_photos_near_in_the_order_come_first():
 def test_matching_ends_at_its_limit_and_the_next_call_does_the_rest(
     job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """A clock on which every look at the time is 200 s after the last, and a limit of 300 s: one part of 10 pairs."""
+    """The clock advances by 200 s at each reading and the limit is 300 s: time for one batch of 10 pairs."""
     shutil.copytree(job.database.parent, tmp_path / "again")
     job = replace(job, folder=str(tmp_path / "again" / "work"))
     clear_matches(job, "matches", "two_view_geometries")
@@ -82,9 +82,9 @@ def test_what_was_cut_short_is_kept_with_the_models(job: Job):
 
 
 def test_no_attempt_begins_after_the_time_for_all(job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Two of eight photos are not placed, and other starts would be tried; the clock goes 100 s at each look.
+    """Two of eight photos are not placed, so other starts would be tried; the clock advances by 100 s at each reading.
 
-    One run may take 120 s and all 240 s: the third look is too late.
+    One run may take 120 s, and all together 240 s: the third reading is too late.
     """
     shutil.copytree(job.database.parent, tmp_path / "again")
     job = replace(job, folder=str(tmp_path / "again" / "work"))
@@ -111,7 +111,7 @@ def test_no_attempt_begins_after_the_time_for_all(job: Job, tmp_path: Path, monk
 def test_a_way_to_map_that_was_ended_is_reported_and_a_check_once(
     job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Two names by which the worker was ended before: one is a check of the accepted model, the other is not."""
+    """The worker was ended before in two stages: one is a check of the accepted model, the other is a mapper."""
     shutil.copytree(job.database.parent, tmp_path / "again")
     ended = (("pose uncertainty", "it took longer than 5 min"), ("global mapper", "it took longer than 2 min"))
     job = replace(job, folder=str(tmp_path / "again" / "work"), skipped_checks=ended)
@@ -125,7 +125,7 @@ def test_a_way_to_map_that_was_ended_is_reported_and_a_check_once(
 
 
 def test_merging_ends_at_its_limit(job: Job, tmp_path: Path):
-    """Without time, models that would be one stay two; with time, they do not."""
+    """Without time, two overlapping models stay two; with time, they become one."""
     whole = climb(job, lambda *progress: None).models[0]
     first, second = pycolmap.Reconstruction(whole), pycolmap.Reconstruction(whole)
     for photo in range(1, 9):
@@ -150,7 +150,7 @@ def test_merging_ends_at_its_limit(job: Job, tmp_path: Path):
 
 
 def test_a_check_that_never_ends_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """It may take half a second, and sleeps for an hour; the scene is there, mapped once, and says what it lacks."""
+    """The check may take half a second and sleeps for an hour; the scene is mapped once, and says what it lacks."""
     photos = tmp_path / "corner"
     write_capture(photos)
     (photos / "notes.jpg").unlink()

@@ -61,7 +61,7 @@ def mapped_model(job: Job) -> pycolmap.Reconstruction:
 
 
 def examined(model: pycolmap.Reconstruction, job: Job, checks: Checks | None = None) -> dict[str, Any]:
-    """What the report gets of a model, after a way through JSON."""
+    """Return what the report says about a model, after a round trip through JSON."""
     found = examine.examine([model], job, lambda *progress: None, checks=checks)
     content = {"verdict": found.verdict.to_json(), "blur": found.blur_px, "left_out": found.left_out, **found.details}
     content, _ = finite(content)
@@ -93,7 +93,7 @@ def test_a_damaged_model_is_reported_and_ends_nothing(
 
 @pytest.mark.parametrize("spread", [0.0, 1.0])
 def test_cameras_in_one_place_or_on_a_line_are_refused_or_reported(job: Job, spread: float):
-    """Evidence: all centres are put at the origin, or on the x axis; the verdict has numbers and no exception."""
+    """All centres are put at the origin, or on the x axis: the model is refused, without an exception."""
     model = mapped_model(job)
     for index, image_id in enumerate(sorted(model.reg_image_ids())):
         image = model.image(image_id)
@@ -114,7 +114,7 @@ def test_degenerate_intrinsics_are_reported(job: Job, value: float):
 
 
 def test_photos_without_a_pose_do_not_end_the_covariance(job: Job):
-    """pycolmap's covariance raises on a frame without a pose; the lens models and the uncertainty do without it."""
+    """pycolmap's covariance raises on a frame without a pose; the lens models and the uncertainty leave it out."""
     model = mapped_model(job)
     model.deregister_frame(model.image(3).frame_id)
     content = examined(model, job)
@@ -163,7 +163,7 @@ def test_finite_leaves_finite_content_as_it_is():
 
 
 def test_components_say_what_joins_them(job: Job):
-    """Photos 1...5 and 6...8 of one capture: their pairs are in the database, so that is what is said."""
+    """Photos 1...5 and 6...8 of one capture: the database has pairs that connect them, and the report says so."""
     first, second = mapped_model(job), mapped_model(job)
     for image_id in range(1, 9):
         model = first if image_id > 5 else second
@@ -206,7 +206,7 @@ def estimated(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
 def test_a_check_that_ends_the_process_is_left_out(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The worker aborts in the covariance, as C++ may; the scene is there, and says which check it lacks."""
+    """The worker aborts in the covariance, as C++ may; the scene is written and says which check it lacks."""
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(
         "import os\nfrom nerfcli.poses.judge import uncertainty\n"
@@ -227,7 +227,7 @@ def test_a_check_that_ends_the_process_is_left_out(photos: Path, tmp_path: Path,
 
 @pytest.fixture(scope="module")
 def refusing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder for PYTHONPATH with which every model is refused."""
+    """A folder for PYTHONPATH whose sitecustomize makes the program refuse every model."""
     site = tmp_path_factory.mktemp("site")
     (site / "sitecustomize.py").write_text(
         "from nerfcli.poses.judge import acceptance\n"
@@ -279,7 +279,7 @@ def test_a_component_that_is_not_there_is_bad_input(
 
 
 def test_after_the_time_limit_in_a_check_only_the_checks_are_left(photos: Path, tmp_path: Path):
-    """The limit is what is left after mapping, by a progress that waits; the next call maps nothing."""
+    """The first call is ended in its first check, after mapping; the next call maps nothing."""
 
     class EndedError(Exception):
         pass
@@ -315,7 +315,7 @@ def test_closing_notes_name_components_and_checks(estimated: tuple[Path, PosesRe
 def test_photos_without_features_and_a_failing_search_for_motions_end_nothing(
     job: Job, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
-    """What looks for a turntable is auxiliary: what it raises is told, and the photos are mapped as they are."""
+    """The search for a turntable is auxiliary: if it raises, a note says so, and the photos are mapped as they are."""
 
     def broken(job: Job, training: Job, tell: Callable[[str], None]) -> None:
         raise IndexError("tuple index out of range")
@@ -329,7 +329,7 @@ def test_photos_without_features_and_a_failing_search_for_motions_end_nothing(
 
 
 def test_reasons_name_the_users_photos(job: Job, monkeypatch: pytest.MonkeyPatch):
-    """The photo with file 00001.jpg is called frame_00002.jpg, which holds the file name of the next one."""
+    """The photo stored as 00001.jpg is called frame_00002.jpg, which contains the stored name of the next photo."""
     named = replace(job, names=tuple(f"frame_{number + 1:05d}.jpg" for number in range(8)))
     reason = "contradicts the rest: its 28.5 matches with 00001.jpg cannot be"
     monkeypatch.setattr(examine, "leave_out_contradicting", lambda model, pairs: (model, {3: reason}))

@@ -1,6 +1,6 @@
 """Which model becomes the scene where the photos form several: two boulders far apart, against synthetic truth.
 
-In each, the last photos and half of the points are in a wrong place, as a mapper leaves them that was misled.
+In each, the last photos and half of the points are in a wrong place, as a misled mapper leaves them.
 """
 
 import shutil
@@ -36,7 +36,7 @@ def apart(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], Mapped]
     synthetic.write_database(folder / "database.db", views, scene, noise=Noise(outliers=0.2), seed=0)
     reports: list[tuple[str, int, int]] = []
     climbed = climb(synthetic.synthetic_job(folder, views, seed=0), lambda *progress: reports.append(progress))
-    # A second model does not set the progress back: 2 to 10 photos of the first, then 10 while it grows.
+    # A second model does not set progress back: it counts 2 to 10 photos of the first, then stays at 10.
     placed = [done for stage, done, _ in reports if stage == "map"]
     assert placed[:17] == [*range(2, 11), *[10] * 8]
     assert [sorted(model.reg_image_ids()) for model in climbed.models] == [FIRST, SECOND]
@@ -59,7 +59,7 @@ def choose(mapped: Mapped, component: int) -> tuple[Chosen, list[str]]:
 
 
 def worst_rotation_deg(model: pycolmap.Reconstruction, views: list[View]) -> float:
-    """Of the photos of a model, relative to its first one."""
+    """Return the largest rotation error of a model's photos, relative to its first one."""
     truth = synthetic.true_model(views)
     first, *others = sorted(model.reg_image_ids())
     turned = [
@@ -108,7 +108,7 @@ def test_components_keep_the_numbers_that_were_reported(misled: Mapped):
 def test_a_component_has_most_of_its_photos_for_itself(
     apart: tuple[list[View], Mapped], misled: Mapped, monkeypatch: pytest.MonkeyPatch, taken: int, components: list[int]
 ):
-    """The second chance of the largest takes in six or four photos of the nine of the other one."""
+    """The second chance of the largest component takes in six or four of the other's nine photos."""
     views, right = apart
     grown = synthetic.true_model(views)
     for image_id in range(taken + 1, 20):

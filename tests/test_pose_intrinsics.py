@@ -32,7 +32,7 @@ from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
 
 ONE_THREAD = PoseSettings(max_features=300, threads=1)
-# Twice the size of the larger photos; the truth, in a model with terms that stay at zero.
+# The true camera at twice the size of the larger photos, in a model whose distortion terms are zero.
 TRUE = Camera("OPENCV", 960, 720, (2 * FOCAL_PX, 2 * FOCAL_PX, 480, 360, 0, 0, 0, 0))
 
 
@@ -70,7 +70,7 @@ def unaided(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_fixed_intrinsics_stay_to_the_last_bit_and_only_mapping_is_done_again(
     photos: Path, unaided: Path, tmp_path: Path
 ):
-    """Synthetic truth: rescaled to each size exactly; the poses are better than without."""
+    """Synthetic truth, rescaled exactly to each photo size; the poses are better than without given intrinsics."""
     scene, notes = shutil.copytree(unaided, tmp_path / "scene"), []
     given = GivenIntrinsics(Calibration(tmp_path / "cameras.txt", (TRUE,), {}), "fixed")
     assert not is_same_scene(scene, photos, ONE_THREAD, given=given)
@@ -96,7 +96,7 @@ def test_fixed_intrinsics_stay_to_the_last_bit_and_only_mapping_is_done_again(
 
 
 def test_a_prior_is_where_the_adjustment_starts(photos: Path, unaided: Path, tmp_path: Path):
-    """Synthetic truth: 4 % too long at the start, within 1 % in the end; the model is the one that was given."""
+    """Synthetic truth: the focal length starts 4 % too long and ends within 1 %; the lens model is the given one."""
     scene = shutil.copytree(unaided, tmp_path / "scene")
     camera = Camera("SIMPLE_PINHOLE", 480, 360, (1.04 * FOCAL_PX, 240, 180))
     report = estimate(photos, scene, GivenIntrinsics(Calibration(tmp_path / "c.txt", (camera,), {}), "prior"))
@@ -106,7 +106,7 @@ def test_a_prior_is_where_the_adjustment_starts(photos: Path, unaided: Path, tmp
 
 
 def capture_named(photos: Path) -> Capture:
-    """A ring whose frames are called as the photos are, and look at them: of two cameras, in turns."""
+    """Return a ring of frames with the names and files of the photos, from two alternating cameras."""
     cameras = CAMERAS["OPENCV"], Camera("OPENCV", 320, 240, (300, 301, 161, 119, 0.05, -0.02, 0.001, 0.002))
     capture = ring(*cameras, num_frames=4)
     named = (replace(f, name=f"{i}.jpg", image=photos / f"{i}.jpg") for i, f in enumerate(capture.frames))
@@ -162,7 +162,7 @@ def only(calibration: Calibration, picture: Picture) -> Camera:
 
 
 def test_a_lying_photo_turns_its_camera():
-    """Closed form: a quarter clockwise takes (x, y) of a 360x480 picture to (480 - y, x)."""
+    """Closed form: a quarter turn clockwise takes (x, y) of a 360x480 picture to (480 - y, x)."""
     stored = Calibration(Path("c"), (Camera("PINHOLE", 360, 480, (450, 460, 170, 250)),), {})
     assert only(stored, photo(480, 360, 6)) == Camera("PINHOLE", 480, 360, (460, 450, 230, 170))
     upright = Calibration(Path("c"), (Camera("PINHOLE", 480, 360, (460, 450, 230, 170)),), {}, upright=True)

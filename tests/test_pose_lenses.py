@@ -41,7 +41,7 @@ def synthetic_model(
 
 
 def started_from(model: pycolmap.Reconstruction, name: str) -> pycolmap.Reconstruction:
-    """The model as a mapper leaves it that knew one distortion term and no principal point."""
+    """Return the model adjusted with a simpler lens and a central principal point, as a mapper leaves it."""
     started = pycolmap.Reconstruction(model)
     for camera in started.cameras.values():
         camera.principal_point_x, camera.principal_point_y = camera.width / 2, camera.height / 2
@@ -65,7 +65,7 @@ def camera_of(model: pycolmap.Reconstruction) -> pycolmap.Camera:
     ],
 )
 def test_the_lens_model_is_the_one_that_took_the_pictures(name: str, params: tuple[float, ...]):
-    """Synthetic truth; nothing richer is kept than what was there, and the principal point stays at the centre."""
+    """Synthetic truth; no richer lens than the true one is kept, and the principal point stays at the centre."""
     lenses = choose_lenses(started_from(ring_model(name, params), "SIMPLE_RADIAL"), seed=0, threads=1)
     camera = camera_of(lenses.model)
     assert camera.model.name == name
@@ -122,7 +122,7 @@ def test_a_named_model_stays():
 
 @pytest.mark.parametrize("name", ["RADIAL", "OPENCV", "SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE"])
 def test_a_converted_lens_sees_the_same(name: str):
-    """To a pixel in the corners of a normal lens."""
+    """Within a pixel, also in the corners, for a normal lens."""
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 900.0, 1024, 768)
     camera.params = [900.0, 512.0, 384.0, -0.05]
     pixels = np.random.default_rng(0).uniform(0, [1024, 768], size=(50, 2))
@@ -131,7 +131,7 @@ def test_a_converted_lens_sees_the_same(name: str):
 
 
 def test_held_out_observations_are_a_tenth_and_off_by_the_noise():
-    """Without adjustment each is off by a Rayleigh distance, whose median is 1.177 sigma."""
+    """Without adjustment, their errors have a Rayleigh distribution, whose median is 1.177 sigma."""
     truth, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 512.0, 384.0, 0.05], points=600)
     _, held = held_out.split(noisy, seed=0)
     errors = held_out.errors_px(truth, held)

@@ -5,7 +5,7 @@ import sys
 
 
 def test_pictures_can_be_written_beside_pycolmap() -> None:
-    """pycolmap's zlib in Pillow's hands ended the process: see nerfcli/__init__.py."""
+    """Pillow crashed the process when it used pycolmap's zlib: see nerfcli/__init__.py."""
     program = (
         "import nerfcli.poses, pycolmap, io, numpy as np; from PIL import Image; import cv2\n"
         "for seed in range(30):\n"

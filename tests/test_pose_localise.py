@@ -23,7 +23,7 @@ from nerfcli.poses.model.point_looks import KnownPoints, PhotoFeatures
 POINTS = synthetic.boulder(700, seed=0)
 VIEWS = synthetic.ring(7, [WIDE], seed=0, turn_deg=180)
 LAST = 8  # the id of the photo that is left out
-# What a photo shows: pixels (n, 2), and the points that they look like.
+# What a photo shows: pixels (n, 2), and the points whose appearance they have.
 Shown = tuple[np.ndarray, np.ndarray]
 
 
@@ -61,7 +61,7 @@ def refusal(folder: Path, last: Shown) -> str:
 
 @pytest.mark.parametrize("angle_deg", [77.0, 215.0])
 def test_a_photo_without_any_pair_is_placed_where_it_was_taken(tmp_path: Path, angle_deg: float):
-    """Between others, and beyond the last of them; as near as the noise lets half a ring of photos be adjusted."""
+    """Between other photos, and beyond the last one; as accurate as noise permits for half a ring of photos."""
     angle = np.radians(angle_deg)
     view = View(WIDE, looking_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.5]), np.array([0.1, 0.0, 0.1])))
     model, job = capture(tmp_path, shown(view))
@@ -75,10 +75,10 @@ def test_a_photo_without_any_pair_is_placed_where_it_was_taken(tmp_path: Path, a
     np.testing.assert_allclose(
         relative.translation, true.translation, atol=0.01 * float(np.linalg.norm(true.translation))
     )
-    # What it sees now are the points that it shows.
+    # It now observes most of the points by which it was placed.
     assert grown.image(LAST).num_points3D > 0.8 * attempt.found
     assert grown.image(LAST).name == synthetic.photo_name(LAST - 1)
-    # No pair holds it, and yet a contradiction between others does not tear it off.
+    # No verified pair holds it, yet the check for contradictions does not remove it.
     held = shared_pairs(grown, [LAST], min_matches=15)
     assert {pair.other for pair in held} == {LAST}
     assert leave_out_contradicting(grown, held)[1] == {}
@@ -90,7 +90,7 @@ def test_a_photo_of_something_else_is_not_placed(tmp_path: Path):
 
 
 def test_a_detail_that_looks_like_one_elsewhere_places_nothing(tmp_path: Path):
-    """A picture of the boulder, seen from afar so that it fills a fiftieth of the photo; all around is unknown."""
+    """The boulder, seen from so far that it fills a fiftieth of the photo, with unknown features all around."""
     far = View(WIDE, looking_at(np.array([9.0, 6.0, 3.0]), np.zeros(3)))
     pixels, looks = shown(far, clutter=600)
     assert "of the picture agrees with the model" in refusal(tmp_path, (pixels, looks))
@@ -118,7 +118,7 @@ def test_a_place_that_the_photos_own_matches_contradict_is_not_kept(tmp_path: Pa
 
 
 def test_only_a_photo_that_resembles_a_placed_one_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Three are left: one that is placed, one of something else, and one that shows 15 points of the first, too few."""
+    """Of three left photos, one is placed, one shows something else, and one shows 15 points of the first: too few."""
     model, job = capture(tmp_path, shown(VIEWS[3]))
     pixels, looks = shown(VIEWS[3])
     few = np.where(np.arange(len(looks)) < 15, looks, -1)
@@ -142,7 +142,7 @@ def test_only_a_photo_that_resembles_a_placed_one_is_tried_again(tmp_path: Path,
 
 
 def test_nothing_is_placed_without_a_known_lens(tmp_path: Path):
-    """A camera of its own, of which nobody has said anything."""
+    """The photo has a camera of its own with unknown intrinsics."""
     model, job = capture(tmp_path, shown(VIEWS[3]), camera_id=2)
     _, attempts = localise(model, job, image_ids=[LAST])
     assert attempts == [Attempt(LAST, refused="its camera is unknown")]

@@ -1,4 +1,4 @@
-"""Going on: what a killed or an earlier `poses` left is used, never taken for more than it is, and for nothing else.
+"""Resuming: what a killed or an earlier `poses` left is used, but only for the same input and as far as it is whole.
 
 The evidence is that models agree to the last bit with one thread, and what pycolmap's database holds at which time.
 """
@@ -31,7 +31,7 @@ from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene, plan_poses
 from nerfcli.poses.workspace import database_bytes, drop_database, workspace
 
-# A lens of its own choice would only be adjusted more often.
+# A fixed lens model: choosing one would only add adjustments.
 ONE_THREAD = PoseSettings(max_features=300, threads=1, camera_model="SIMPLE_RADIAL")
 Progress = Callable[[str, int, int], None]
 
@@ -52,7 +52,7 @@ def estimate(
 
 
 def killed_at(stage: str, done: int) -> Progress:
-    """Have the worker killed (SIGKILL) once it tells this much of a stage."""
+    """Have the worker killed (SIGKILL) once it reports this much progress in a stage."""
 
     def progress(told: str, told_done: int, total: int) -> None:
         if told == stage and told_done >= done:
@@ -67,7 +67,7 @@ def model(scene: Path) -> dict[str, bytes]:
 
 
 def rows(scene: Path, table: str, column: str = "image_id") -> dict[int, bytes]:
-    """A table of the database: key and what the row holds."""
+    """Return a table of the database as {key: data of the row}."""
     with closing(sqlite3.connect(scene / "database.db")) as database:
         return dict(database.execute(f"SELECT {column}, data FROM {table}"))
 
@@ -82,7 +82,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def unpublished(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a call leaves that ends between the worker's last file and the scene's."""
+    """The scene folder of a call that ended after the worker's last file and before the scene's."""
     scene = tmp_path_factory.mktemp("unpublished") / "scene"
 
     def interrupted(scene_dir: Path, describe: Callable[[], None], *, keep_models: bool) -> None:
@@ -97,7 +97,7 @@ def unpublished(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(photos: Path, unpublished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scene, of a model that was there already: nothing but the last step is done."""
+    """The complete scene, made from the unpublished model: only the last step is done."""
     scene = shutil.copytree(unpublished, tmp_path_factory.mktemp("whole") / "scene")
     stages: list[str] = []
     assert estimate(photos, scene, progress=lambda stage, done, total: stages.append(stage)).registered == len(NAMES)
@@ -152,17 +152,17 @@ def test_another_camera_model_extracts_and_matches_nothing_again(photos: Path, w
     assert rows(again, "descriptors") == rows(whole, "descriptors")
     assert rows(again, "matches", "pair_id") == rows(whole, "matches", "pair_id")
     assert {camera["model"] for camera in report.cameras} == {"SIMPLE_PINHOLE"}
-    # It went back to the same start: with the first model again, the first result.
+    # Mapping had restarted from the same state: with the first camera model again, the result is the first one.
     assert estimate(photos, again).registered == len(NAMES)
     assert model(again) == model(whole)
 
 
 def void(value: object) -> None:
-    """What a lambda makes of a value."""
+    """Discard a value, so that a lambda returns None."""
 
 
 def test_another_photo_and_other_pairs_do_only_what_is_new(photos: Path, whole: Path, again: Path, tmp_path: Path):
-    """The photo that comes first by name pushes the others' places, but not their numbers in the database."""
+    """A photo that is first by name shifts the others' positions, but not their ids in the database."""
     more = shutil.copytree(photos, tmp_path / "more")
     shutil.copy(photos / NAMES[2], more / "a first one.png")
     (tmp_path / "pairs.txt").write_text(f"a first one.png {NAMES[2]}\n" + "\n".join(chain()))
@@ -195,7 +195,7 @@ def test_a_changed_photo_is_extracted_again_and_no_other(photos: Path, whole: Pa
 
 
 def _holds_the_same_again(photos: Path, whole: Path, scene: Path) -> None:
-    """All that mapping starts from: as it comes out of that is what the tests above show."""
+    """Check that all that mapping starts from is restored; the tests above show that the result follows from it."""
     with pytest.raises(KilledError):
         estimate(photos, scene, progress=killed_at("map", 0))
     for table, key in (("descriptors", "image_id"), ("keypoints", "image_id"), ("two_view_geometries", "pair_id")):
@@ -238,7 +238,7 @@ def test_a_damaged_stage_is_none(tmp_path: Path, text: str):
 
 
 def test_damaged_stages_are_done_again(photos: Path, whole: Path, again: Path):
-    """Each in another way: cut off, of the wrong type, another content, no text."""
+    """Each is damaged in another way: cut off, of the wrong type, with other content, not text."""
     stages = sorted(path for path in (again / "work").glob("*.json"))
     assert {path.stem for path in stages} >= {"enlarged", "features", "geometries", "matches", "photos"}
     for number, path in enumerate(stages):

@@ -38,7 +38,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, PoseSe
 
 
 def test_a_held_out_photo_is_placed_and_moves_nothing_by_a_bit(solved):
-    """Synthetic truth for the pose; a hash of every bit of the rest, taken before and again here, from the disk."""
+    """Synthetic truth for the pose; for the rest, a hash of every bit, taken before and again here from disk."""
     _, scene_dir, _, report = solved
     model = pycolmap.Reconstruction(str(scene_dir / "sparse" / "0"))
     name = NAMES[HELD_OUT]

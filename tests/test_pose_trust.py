@@ -31,7 +31,7 @@ from nerfcli.poses.judge.acceptance import Failure, Verdict, judge
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
 from nerfcli.poses.judge.examine import Examined, examine
-from nerfcli.poses.judge.parallax import best_turn
+from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model import merging
 from nerfcli.poses.model.intrinsics import converted
 from nerfcli.poses.model.lens_family import as_fisheye
@@ -116,7 +116,7 @@ def test_every_rotation_of_a_pair_agrees_with_a_right_result(solved: Solved):
 
 
 def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
-    """Two halves, each right in itself: what the reprojection error praises, the matches between them refuse."""
+    """Two parts, each right by itself: the reprojection error is low, but matches between them contradict the poses."""
     wrong = synthetic.bent(solved.model, 6)
     assert wrong.compute_mean_reprojection_error() < 1.05 * solved.model.compute_mean_reprojection_error()
     with pycolmap.Database.open(str(solved.job.database)) as database:
@@ -130,7 +130,7 @@ def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
 
 
 def wrongly_mapped(solved: Solved, folder: Path) -> Mapped:
-    """The whole capture with photos 8, 9 and 10 in a wrong place, as a mapper leaves it that was misled."""
+    """The whole capture with photos 8, 9 and 10 in a wrong place, as a misled mapper leaves it."""
     shutil.copytree(solved.job.database.parent, folder)
     job = replace(solved.job, folder=str(folder / "work"))
     return Mapped(
@@ -177,7 +177,7 @@ def in_two_parts(solved: Solved, tmp_path: Path) -> Mapped:
 
 
 def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(solved: Solved, tmp_path: Path):
-    """Synthetic truth: of a right model in two parts, the larger grows over the three photos of the smaller one."""
+    """Synthetic truth: of a right model in two parts, the larger takes in the three photos of the smaller one."""
     mapped = in_two_parts(solved, tmp_path)
     notes: list[str] = []
     for _ in range(2):  # the second time, from what was kept
@@ -238,7 +238,7 @@ def test_a_model_that_takes_in_no_further_photo_is_not_checked_again(
 
 
 def test_nothing_is_mapped_again_where_the_camera_only_turned():
-    """The capture is at fault: rotations explain its matches to 2 px; at 20 px, it is the model."""
+    """If rotations explain the matches to 2 px, the capture is at fault; at 20 px, the model is."""
     contradicted = Failure("the poses contradict pairs of photos", "40 % of the matches ...", "take more photos")
     assert not is_contradicted(Verdict({"parallax_px": 2.0}, (contradicted,)))
     assert is_contradicted(Verdict({"parallax_px": 20.0}, (contradicted,)))
@@ -259,7 +259,7 @@ def test_a_second_chance_says_what_contradicts_where_no_pair_does(solved: Solved
 def test_each_hypothesis_stands_in_for_the_one_before(
     solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int, attempts: list[list[int]]
 ):
-    """The first, the first two, or all that map again give nothing; the last one keeps what agrees with itself."""
+    """The first one, two or all three that map again give nothing; the last hypothesis keeps the consistent part."""
     wrong = wrongly_mapped(solved, tmp_path / "again")
     first = examine(wrong.models, wrong.job, lambda *progress: None)
     for name in ("_regrown", "_all_at_once", "_from_nothing")[:failing]:
@@ -284,7 +284,7 @@ def test_a_second_chance_is_bounded_in_time(solved: Solved, tmp_path: Path):
 def test_a_hypothesis_is_skipped_that_takes_longer_than_what_is_left(
     solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Of 200 s, the first two take 130: mapping from scratch, 100 s as the first time, does not fit; its part does."""
+    """Of 200 s, the first two take 130: mapping from scratch (100 s as before) does not fit; the sound part does."""
     wrong = replace(wrongly_mapped(solved, tmp_path / "again"), seconds=100.0)
     first = examine(wrong.models, wrong.job, lambda *progress: None)
     now = [0.0]
@@ -305,7 +305,7 @@ def test_a_hypothesis_is_skipped_that_takes_longer_than_what_is_left(
 def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(
     solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Eight of ten are placed; what goes on from them is tried, what begins again is not."""
+    """Eight of ten are placed: attempts that continue from them are made, attempts from scratch are not."""
     shutil.copytree(solved.job.database.parent, tmp_path / "again")
     job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
     real = ladder.map_photos
@@ -322,7 +322,7 @@ def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(
     climbed = climb(job, lambda *progress: None, notes.append)
     assert [attempt["what"] for attempt in climbed.attempts][:2] == ["default thresholds", "lower angles"]
     assert not any("start from" in attempt["what"] for attempt in climbed.attempts)
-    # By the plan, 10 photos take 0.38 + 10 * 0.0025 s each.
+    # By the plan, 10 photos take 0.38 + 10 * 0.0005 s each.
     assert "not trying other starts, which take about 4 s each: most photos are registered" in notes
 
 
@@ -339,7 +339,7 @@ def test_the_mapper_counts_the_photos_that_it_goes_on_from(solved: Solved, tmp_p
 
 
 def test_a_run_of_the_mapper_ends_at_its_limit(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Ten times the plan's 0.38 + 0.0005 n seconds a photo, two minutes at least; what it has placed is kept."""
+    """Ten times the plan's 0.38 + 0.0005 n seconds a photo, two minutes at least; photos placed by then are kept."""
     assert [mapping.mapper_limit_seconds(photos) for photos in (10, 300)] == [120, 1590]
     shutil.copytree(solved.job.database.parent, tmp_path / "again")
     job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
@@ -362,7 +362,7 @@ def test_a_run_of_the_mapper_ends_at_its_limit(solved: Solved, tmp_path: Path, m
 
 
 def test_groups_hold_together_against_what_speaks_against_them():
-    """By hand: two strong pairs, held apart although one join between them is positive."""
+    """By hand: two strong pairs stay apart, although one join between them is positive."""
     joins = [(1, 2, 9.0), (3, 4, 9.0), (2, 3, 5.0), (1, 4, -6.0), (5, 1, -1.0)]
     assert consistent_groups([1, 2, 3, 4, 5], joins) == [[1, 2], [3, 4], [5]]
     assert consistent_groups([4, 3, 2, 1], [(1, 2, 9.0), (3, 4, 9.0), (2, 3, 7.0), (1, 4, -6.0)]) == [[4, 3, 2, 1]]
@@ -396,7 +396,7 @@ def test_a_photo_far_from_all_others_is_left_out(solved: Solved):
 
 
 def common_pixels(views: Sequence[View], points: np.ndarray, *, noise_px: float) -> list[VerifiedPair]:
-    """All pairs of views, each matched in what both see of the points (n, 3)."""
+    """Return all pairs of views, each matched at those of the points (n, 3) that both see."""
     rng = np.random.default_rng(0)
     found = []
     for number, view in enumerate(views):
@@ -419,7 +419,7 @@ def side_by_side(count: int) -> list[View]:
 
 
 def test_points_far_away_agree_whichever_side_noise_makes_their_rays_meet():
-    """Synthetic truth: a parallax of 0.4 px and a noise of 0.5 px; of a camera turned by 3 degrees, nothing agrees."""
+    """Synthetic truth: a parallax of 0.4 px and a noise of 0.5 px; a camera turned by 3 degrees is contradicted."""
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-40, 40, 400), rng.uniform(90, 110, 400), rng.uniform(-30, 30, 400)])
     views = side_by_side(2)
@@ -455,7 +455,7 @@ def test_a_scene_that_repeats_itself_is_recognised(tmp_path: Path):
 
 
 def test_a_photo_placed_by_points_is_judged_with_what_holds_it(solved: Solved):
-    """Photo 10 has one mistaken pair of 20 matches; without the points that place it, that would refuse the model."""
+    """Photo 10 has a mistaken pair of 20 matches, which refuses the model unless the pairs that hold it count."""
     with pycolmap.Database.open(str(solved.job.database)) as database:
         pairs = read_verified_pairs(database, min_matches=15)
     held = [pair for pair in pairs if pair.other == 10]
@@ -473,14 +473,14 @@ def test_a_photo_placed_by_points_is_judged_with_what_holds_it(solved: Solved):
 
 
 def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
-    """What fits all matches is a turn, with the true focal length."""
+    """A rotation with the true focal length fits all matches."""
     views = synthetic.panorama(6, WIDE, turn_deg=120)
     still = solve(tmp_path, views, synthetic.room(900, seed=0))
     assert still.kinds[0] == "no baseline (pure rotation)"
     assert [rung["what"] for rung in still.climbed.attempts] == ["default thresholds"]  # no other attempt can help
     with pycolmap.Database.open(str(still.job.database)) as database:
         pairs = read_verified_pairs(database, min_matches=30)
-    turn = best_turn(pairs, dict.fromkeys(still.job.image_ids, (WIDE.width, WIDE.height)))
+    turn = best_rotation_fit(pairs, dict.fromkeys(still.job.image_ids, (WIDE.width, WIDE.height)))
     assert turn is not None
     assert turn.parallax_px < 1.5
     assert turn.focal_px == pytest.approx(WIDE.params[0], rel=0.03)
@@ -510,7 +510,7 @@ def test_every_rung_is_written_down_with_its_result(tmp_path: Path):
 
 
 def test_a_photo_that_no_pair_holds_is_placed_by_what_the_model_knows(tmp_path: Path):
-    """It has no match with any photo; its place is right, and the rungs list it."""
+    """It has no match with any photo; its pose is right, and the list of attempts names it."""
     views = synthetic.ring(7, [WIDE], seed=0, turn_deg=140)
     weak = solve(tmp_path, views, synthetic.boulder(500, seed=0), pairs=lambda i, j: 3 not in (i, j))
     assert [(rung["what"], rung["models"]) for rung in weak.climbed.attempts] == [
@@ -539,7 +539,7 @@ def test_a_fisheye_of_which_nothing_is_known_is_recognised(tmp_path: Path):
 
 
 def test_a_focal_length_that_exif_tells_wrong_is_left_out(tmp_path: Path):
-    """Six times too long, as a stale resolution of the sensor makes it: without it all photos are placed, and right."""
+    """EXIF's is six times too long, as by a stale sensor resolution; without it, all photos are placed correctly."""
     views = synthetic.ring(8, [WIDE], seed=0, turn_deg=120)
     synthetic.write_database(tmp_path / "database.db", views, synthetic.boulder(700, seed=0), noise=Noise(), seed=0)
     job = synthetic.synthetic_job(tmp_path, views, seed=0)
@@ -579,7 +579,7 @@ def test_a_given_initial_pair_is_tried_once(solved: Solved, tmp_path: Path, monk
 @pytest.mark.parametrize(
     ("placed", "size", "words"),
     [
-        # A missing share of 0.9 is worth 4.5 times the first search, of which the matches take a part.
+        # A missing fraction of 0.9 is worth 4.5 times the first search, part of which goes to matching.
         (1, 3634, "next: more features from photos of 3634 pixels (takes about 4.5 times as long"),
         (7, 1871, "next: more features from photos of 1871 pixels (takes about 1.5 times as long"),
         (8, None, "default thresholds"),
@@ -656,7 +656,7 @@ def test_models_with_nothing_in_common_stay_apart(solved: Solved, tmp_path: Path
 
 
 def test_the_bottleneck_is_the_weakest_join_of_the_strongest_chain():
-    """By hand: 1-2-3 holds with 5, the direct join with 2; 4 is alone with 5."""
+    """By hand: the chain 1-2-3 holds with 5, the direct join only with 2; photo 4 is joined to photo 5 alone."""
     chains = Bottlenecks([1, 2, 3, 4, 5], [(1, 2, 9.0), (2, 3, 5.0), (1, 3, 2.0), (4, 5, 1.0)])
     assert chains.between(1, 3) == chains.between(3, 1) == 5
     assert chains.between(1, 2) == 9

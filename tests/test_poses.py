@@ -66,7 +66,7 @@ def similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndar
 
 
 def test_poses_agree_with_the_truth(solved: Solved):
-    """Synthetic truth. The cameras are 4 units from the corner; the errors seen are 0.003 and 0.09 degrees."""
+    """Synthetic truth. The cameras are 4 units from the corner; the observed errors are 0.003 and 0.09 degrees."""
     model = solved.model
     estimated = [model.find_image_with_name(name) for name in NAMES]
     centres = np.array([image.projection_center() for image in estimated])
@@ -184,7 +184,7 @@ def test_photos_without_overlap_are_too_few_and_leave_no_scene(tmp_path: Path):
             notify=told.append,
             progress=lambda stage, done, total: told.append(stage),
         )
-    # What was tried is told while the work goes on, not after it.
+    # Attempts are reported while the work goes on, not after it.
     announced = next(number for number, note in enumerate(told) if note.startswith("next: more features from"))
     assert told.index("default thresholds: none of 5 photos registered") < announced
     assert "match" in told[announced:]
@@ -214,7 +214,7 @@ def test_an_interrupt_ends_the_worker_and_leaves_no_scene(tmp_path: Path, monkey
 
 
 def test_a_dying_worker_is_told_with_its_last_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Its own words: it takes no library from where the user happens to be."""
+    """The message is the worker's own: it imports no library from the current directory."""
     (tmp_path / "pycolmap.py").write_text("raise RuntimeError('another library of this name')")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=r"crashed \(exit status 1\) while starting: .*FileNotFoundError.*job\.json"):

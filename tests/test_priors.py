@@ -1,4 +1,4 @@
-"""What a scene knows besides colours: points of structure from motion, empty space behind masks, decided rays."""
+"""Priors besides colour: points of structure from motion, empty space behind masks, rays that are opaque or clear."""
 
 import math
 from dataclasses import replace
@@ -33,12 +33,12 @@ from nerfcli.train.loop import train
 from nerfcli.train.preparation import prepare
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
-# Seen by both cameras, the first with an error of half a pixel in the second.
+# Both cameras see them; the first point is off by half a pixel in the second camera.
 POINTS = np.array([[0.0, 0.0, 1.0], [0.3, 0.1, 2.0], [-0.2, -0.1, 4.0]])
 
 
 def camera_at(x: float) -> np.ndarray:
-    """It stands at x, 2 in front of the origin, and looks along z."""
+    """Return the pose of a camera at (x, 0, -2) that looks along z."""
     matrix = np.eye(4)
     matrix[:3, 3] = (x, 0.0, -2.0)
     return matrix
@@ -90,8 +90,8 @@ def test_points_are_found_at_their_pixels_with_their_distances_and_trust(capture
     # A ray goes through the middle of its pixel: half a pixel's diagonal off at most, at these distances.
     off = (reached - expected).norm(dim=-1) / known.distances
     assert (off[[1, 2, 4, 5]] <= math.sqrt(0.5) / 12 + 1e-6).all()
-    # The rays to the first point are e = 0.5 px apart in height where they meet at the angle a: nearest to both lies
-    # a^2 / (a^2 + e^2) of the way.
+    # The rays to the first point are e = 0.5 px apart in height where they meet at the angle a: the point nearest to
+    # both is at a^2 / (a^2 + e^2) of the way.
     share = (0.2 / 3) ** 2 / ((0.2 / 3) ** 2 + (0.5 / 12) ** 2)
     assert known.distances[[0, 3]].tolist() == pytest.approx([0.5 * 3 * share] * 2, rel=0.01)
     assert pool.photo_of(known.numbers).tolist() == [0, 0, 0, 1, 1, 1]
@@ -110,7 +110,7 @@ def test_points_behind_a_mask_are_not_looked_at(capture):
 
 
 def test_only_training_photos_tell_where_points_are(capture):
-    """With the first photo held out, each point is left to a single one, which tells no distance: the file does."""
+    """With the first photo held out, a single training photo sees each point, which gives no distance."""
     held_out = replace(capture, test_names=frozenset({"0.png"}))
     one = Similarity(1.0, np.eye(3), np.zeros(3))
     tracks = tracks_in(held_out)
@@ -200,7 +200,7 @@ def test_black_of_a_mask_is_ignored_or_is_empty_space(capture):
 
 
 def test_training_takes_all_of_them_at_once(capture, tmp_path):
-    # Bits are those of the same seed; the loss is finite with every prior on.
+    # Equal seeds give equal losses, which are finite with every prior on.
     components = Components(masks="empty", points=0.1, entropy=0.01)
     settings = TrainSettings(
         budget_seconds=None, steps=4, first_samples_per_step=2**9, samples_per_step=2**9, components=components
@@ -239,7 +239,7 @@ def test_a_short_training_does_not_wait_for_photos_to_be_compared(capture, tmp_p
 
 @pytest.mark.parametrize("cameras", ["focal", "all", "poses", "fixed"])
 def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capture, tmp_path, monkeypatch):
-    """Of the components that are asked for, without a search; poses alone leave lenses as they are."""
+    """With requested components and no search; refining poses alone leaves lenses as they are."""
     check = CameraCheck(-0.019, 0.0006, (0.26, 0.14), 900)
     facts = Facts("hash", has_alpha=False, has_exif=False, cameras=check, fixed=("cameras",))
     monkeypatch.setattr("nerfcli.train.preparation._facts", lambda *asked, **known: facts)
@@ -257,7 +257,7 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
 
 
 def test_comparing_photos_has_a_price_once(spheres):
-    """0.7 us for each pixel of photos that are compared; nothing once it is done."""
+    """0.7 us for each pixel of the compared photos, divided by two threads; 0 once it is done."""
     photos = load_photos(spheres.train_frames, factor=4, threads=1)
     shared = Shared(spheres, photos, threads=2)
     wanted = {index for pair in chosen_pairs(photos) for index in pair}

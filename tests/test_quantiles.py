@@ -1,4 +1,4 @@
-"""nerfcli.media.quantiles: exact order statistics of what does not fit in memory."""
+"""nerfcli.media.quantiles: exact order statistics of data that do not fit in memory."""
 
 import numpy as np
 import pytest

@@ -29,8 +29,8 @@ from nerfcli.workflows import machine
 from nerfcli.workflows.train import train_scene
 
 SPHERES = Path(__file__).parents[1] / "sample_scenes" / "spheres"
-# Each with the steps of its budget and the one at which it is stopped. Where cameras move, from a tenth of them on,
-# or rays end by their opacity, a last bit decides about whole samples, also between one thread and two: not for long.
+# Each variant with its budget of steps and the step at which it is stopped. Once cameras move (after a tenth of the
+# budget) or rays end by opacity, a last bit decides about whole samples, even between one thread and two: stop soon.
 VARIANTS = {
     "": (200, 50),
     "exposure": (200, 50),
@@ -111,7 +111,7 @@ def two_ranks(program: str, *arguments: str | Path) -> list[subprocess.Popen[str
 
 
 def ended(processes: Sequence[subprocess.Popen[str]]) -> list[tuple[int, str, list[str]]]:
-    """Exit codes, results and what was said; a process that hangs fails the test."""
+    """Return exit code, stdout and lines of stderr of each process; a process that hangs fails the test."""
     try:
         said = [process.communicate(timeout=90) for process in processes]
     finally:
@@ -130,8 +130,8 @@ def by_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("number", range(len(VARIANTS)), ids=[name or "default" for name in VARIANTS])
 def test_two_processes_train_what_one_does(by_two, tmp_path, number):
-    """The same rays in two halves: all that differs is the order of float32 sums. Adam makes whole steps from gradients
-    that are 0 but for it, so that a few numbers may differ by more."""
+    """The same rays in two halves: only the order of float32 sums differs. Where a gradient is 0 but for rounding,
+    Adam makes whole steps, so that a few numbers may differ by more."""
     components, (steps, last) = list(VARIANTS.items())[number]
     train_until(last, tmp_path, settings_with(components, steps))
     runs = (tmp_path, by_two / str(number))
@@ -155,7 +155,7 @@ def test_a_number_that_is_not_finite_in_one_process_takes_all_of_them_back(by_tw
 
 
 def killed(tmp_path: Path, victims: Sequence[int], sent: signal.Signals) -> list[tuple[int, str, list[str]]]:
-    """Two ranks that train, of which some get a signal after some steps."""
+    """Train with two ranks, send some of them a signal after some steps, and return what `ended` does."""
     run = tmp_path / "run"
     program = "from nerfcli.cli import main; main()"
     options = ("--steps", "4000", "--model", "default", "--batch", "1024", "--log2-rows", "10", "--threads", "1")
@@ -234,7 +234,7 @@ def test_every_pixel_of_a_step_is_one_rank_s_and_points_stay_last(count):
 
 @pytest.mark.parametrize(("count", "rows"), [(1, 16), (2, 17), (4, 18)])
 def test_rows_of_tables_follow_the_threads_of_all_ranks(spheres, tmp_path, monkeypatch, count, rows):
-    """Twice the processes, twice the samples in the same time, twice the rows; without a budget of time none more."""
+    """Twice the processes take twice the samples and get twice the rows in a time budget; a step budget adds none."""
 
     class PreparedError(Exception): ...
 

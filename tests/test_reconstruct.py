@@ -21,7 +21,7 @@ from nerfcli.tomography.hash_fit import ARRAYS, fit_hash, hash_volume, new_array
 from nerfcli.tomography.hash_fit import line_integrals as hash_line_integrals
 from nerfcli.tomography.likelihood import Gaussian, Poisson, likelihood_of, noise, photons_per_value
 from nerfcli.tomography.marks import OUTSIDE, TRUNCATED, UNSEEN, WEDGE, marks, missing_wedge_deg
-from nerfcli.tomography.quick import telling_row
+from nerfcli.tomography.quick import highest_contrast_row
 from nerfcli.tomography.reconstruct import Problem, Projector, mean_attenuation, reconstruct, start
 from nerfcli.tomography.scan import Scan, held_out_views, load_scan, save_scan
 from nerfcli.tomography.scores import resampled, score_volume
@@ -39,7 +39,7 @@ def cone(views: int = 30, *, rows: int = 24, columns: int = 40, turn: float = 2 
 
 
 def scan_of(geometry: ScanGeometry, *, photons: float = PHOTONS, seed: int = 0, held_out: tuple[int, ...] = ()) -> Scan:
-    """Photon counts of the bean behind 1,000 detector values that stand for `photons`; a pixel averages 3 x 3 rays."""
+    """Return Poisson counts of the bean, scaled so that `photons` are a value of 1,000; a pixel averages 3 x 3 rays."""
     parts = 3 if geometry.rows > 1 else 1
     fine = replace(
         geometry,
@@ -76,9 +76,9 @@ def problem_of(scan: Scan, grid: VoxelGrid) -> Problem:
 
 
 def test_fit_beats_the_baselines_with_the_same_views(scan: Scan, grid: VoxelGrid) -> None:
-    """Against the phantom's own voxels, with the weights that the scan chooses; the others get projector and views."""
+    """Against the phantom's own voxels, with weights chosen from the scan; the baselines use the same views."""
     views = scan.training_views
-    trial = choose_strength(scan, scan.geometry, grid, most_seconds=3600)  # never cut short, also on a busy machine
+    trial = choose_strength(scan, scan.geometry, grid, max_seconds=3600)  # never cut short, also on a busy machine
     problem = problem_of(scan, grid)
     assert isinstance(problem.likelihood, Poisson)
     problem = replace(problem, likelihood=problem.likelihood.with_model_error(trial.model_error))
@@ -146,7 +146,7 @@ def test_line_integrals_of_a_constant_hash_grid_are_chords_of_the_box(generator:
 
 
 def test_hash_grid_takes_no_step_without_time(scan: Scan, grid: VoxelGrid) -> None:
-    """The pass limit is there for a fit that ignores the time."""
+    """The pass limit only stops a fit that ignores the time."""
     problem = problem_of(scan, grid)
     volume = hash_volume(grid, mean_attenuation(problem), new_arrays(0))
     before = volume.on_grid(grid)
@@ -278,7 +278,7 @@ def test_photons_are_found_from_the_noise() -> None:
 
 
 def test_few_photons_are_not_biased(grid: VoxelGrid) -> None:
-    """20 photons of open beam, 2 behind the middle: the mean comes out right where a logarithm's would not."""
+    """20 photons of open beam, 2 behind the middle: the mean is right, unlike with a fit to logarithms."""
     scan = scan_of(cone(60), photons=20.0)
     problem = problem_of(scan, grid)
     volume = reconstruct(problem, start(problem), strength=0.3, passes=12).volume.numpy()
@@ -289,15 +289,15 @@ def test_few_photons_are_not_biased(grid: VoxelGrid) -> None:
     logs = scan.line_integrals(np.arange(60))
     integrals = line_integrals(bean(), *scan.geometry.rays())
     thick = integrals > 2
-    assert float((logs - integrals)[thick].mean()) > 0.05  # what a fit to logarithms would have had to live with
+    assert float((logs - integrals)[thick].mean()) > 0.05  # the bias of a fit to logarithms
 
 
 def test_trial_takes_the_usual_strength_unless_another_is_far_better(grid: VoxelGrid) -> None:
-    """The scale of the strength takes the dose out: 200 and 2e5 photons get the same; the error is the one of edges."""
+    """Strengths are scaled by dose, so the usual one suits 200 and 2e5 photons; the model error is that of edges."""
     errors = []
     for photons in (200.0, 2e5):
         scan = scan_of(cone(), photons=photons)
-        trial = choose_strength(scan, scan.geometry, grid, most_seconds=3600)  # never cut short, also on a busy machine
+        trial = choose_strength(scan, scan.geometry, grid, max_seconds=3600)  # never cut short, also on a busy machine
         tried = dict(trial.tried)
         assert set(tried) == set(STRENGTHS)
         assert tried[trial.strength] <= tried[1.0]
@@ -307,7 +307,7 @@ def test_trial_takes_the_usual_strength_unless_another_is_far_better(grid: Voxel
 
 
 def test_model_error_is_found_where_it_is_put_in(generator: torch.Generator) -> None:
-    """Line integrals that are off by normal numbers of known size, at any dose that shows them."""
+    """Line integrals with Gaussian errors of known size, at a dose that reveals them."""
     views = torch.arange(4)
     true = torch.rand(4, 5000, generator=generator) * 2
     for error in (0.0, 0.01, 0.1):
@@ -325,7 +325,7 @@ def test_centre_of_rotation_is_found(shift: float) -> None:
     told = Scan(
         geometry.shifted(-shift), "counts", scan.values, scan.open_beam, photons_per_value=scan.photons_per_value
     )
-    found = centre_of(telling_row(told))
+    found = centre_of(highest_contrast_row(told))
     assert found.shift == pytest.approx(shift, abs=0.15)
     assert found.is_off == (shift != 0)
 
@@ -334,7 +334,7 @@ def test_centre_of_a_parallel_half_turn_is_found() -> None:
     geometry = circular_parallel(np.arange(90) * np.pi / 90, pixel_width=0.5, pixel_height=0.5, rows=1, columns=48)
     scan = scan_of(geometry)
     told = Scan(geometry.shifted(-2.0), "counts", scan.values, scan.open_beam, photons_per_value=20.0)
-    assert centre_of(telling_row(told)).shift == pytest.approx(2.0, abs=0.15)
+    assert centre_of(highest_contrast_row(told)).shift == pytest.approx(2.0, abs=0.15)
 
 
 def test_tilt_of_the_detector_is_found() -> None:

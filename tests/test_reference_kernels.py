@@ -83,7 +83,7 @@ def test_no_rays_at_all():
 
 @pytest.mark.parametrize("exponent", [-30, -10, 0, 10, 30])
 def test_weights_in_float32_across_magnitudes(exponent):
-    # The same function in float64; densities log-uniform over 1e-10 ... 1e10 around the exponent, in one ray.
+    # Against float64; the densities of one ray are log-uniform over 1e-5 ... 1e5 times 10^(exponent / 10).
     g = torch.Generator().manual_seed(exponent + 100)
     logs = torch.rand(20, 64, generator=g, dtype=torch.float64) * 20 - 10
     density = (10.0 ** (logs * 0.5 + exponent * 0.1)).flatten()

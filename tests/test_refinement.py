@@ -1,4 +1,4 @@
-"""Cameras that learn: derivatives against differences, what the gauge may not change, a known noise that goes away."""
+"""Camera refinement: derivatives against differences, what the gauge must not change, and removal of a known noise."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -81,7 +81,7 @@ def pool_of(scene: Scene) -> PixelPool:
 
 
 def linear_loss(pool: PixelPool, refinement: Refinement, numbers: torch.Tensor, slopes: torch.Tensor) -> float:
-    """A loss that is linear in the rays: exactly what the gradients of rays are a gradient of."""
+    """Return a loss that is linear in the rays, so that `slopes` are exactly its gradients by them."""
     drawn = refinement.refined(pool.rays_of(numbers))
     return float((torch.stack([drawn.origins, drawn.directions]).double() * slopes).sum())
 
@@ -168,7 +168,7 @@ def test_bearings_of_a_changed_lens_move_as_the_derivative_says(model, seed):
 @given(seed=seeds)
 @examples(40)
 def test_taking_out_the_mean_leaves_cameras_as_they_stand_to_each_other(seed):
-    """Turns between cameras stay, distances between them by one common factor."""
+    """Relative rotations do not change, and distances between cameras change by one common factor."""
     rng = np.random.default_rng(seed)
     before = random_poses(rng, 5)
     after = before @ transform_from_twist(rng.normal(size=(5, 6)) * 0.05)
@@ -183,7 +183,7 @@ def test_taking_out_the_mean_leaves_cameras_as_they_stand_to_each_other(seed):
 @given(seed=seeds)
 @examples(40)
 def test_a_similarity_of_all_cameras_is_taken_out_whole(seed):
-    """To first order, and so wholly when it is done again and again."""
+    """One removal is exact to first order, so repeated removals are complete."""
     rng = np.random.default_rng(seed)
     before = random_poses(rng, 6)
     moved = Similarity(np.exp(0.1 * rng.normal()), rotation_from_vector(0.1 * rng.normal(size=3)), rng.normal(size=3))
@@ -197,8 +197,8 @@ def test_a_similarity_of_all_cameras_is_taken_out_whole(seed):
 
 @pytest.mark.parametrize("radius", [0.01, 1.0, 30.0])
 def test_a_turn_of_each_camera_on_its_spot_counts_as_the_move_that_it_would_be(radius):
-    """Closed form for a tetrahedron, whose arms are alike in all directions: of a turn w of all on their spots, w /
-    (1 + 2/3) is taken for one of the whole, whatever the size of the capture."""
+    """Closed form for a tetrahedron, whose arms are alike in all directions: if all turn by w on
+    their spots, w / (1 + 2/3) counts as a turn of the whole, whatever the size of the capture."""
     centres = radius * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
     before = from_parts(np.broadcast_to(np.eye(3), (4, 3, 3)), centres)
     turn = np.array([1e-3, -2e-3, 5e-4])
@@ -208,7 +208,7 @@ def test_a_turn_of_each_camera_on_its_spot_counts_as_the_move_that_it_would_be(r
 
 
 def test_a_step_of_poses_leaves_no_mean_and_far_cameras_see_moves_less(small):
-    """The gauge after a step; and what moves change in the picture is one over the distance."""
+    """A step leaves no mean motion; the effect of a move on the picture is inverse to the distance."""
     pool, generator = pool_of(small), torch.Generator().manual_seed(0)
     poses = Refinement("poses", pool).poses
     assert poses is not None
@@ -226,7 +226,7 @@ def test_a_step_of_poses_leaves_no_mean_and_far_cameras_see_moves_less(small):
 
 
 def test_how_the_picture_moves_with_a_pose(small):
-    """Against differences: 6 x 6 pixels of a camera at distance 3, at 2/3, 1 and 2 of that, as it moves by twists."""
+    """Against differences by twists: points on 6 x 6 pixels of a camera, at 2/3, 1 and 2 times its distance of 3."""
     camera, step = small.frames[0].camera, 1e-6
     pose = look_at(np.array([3.0, 0.0, 0.0]), np.zeros(3), np.array([0, 0, 1]))
     x, y = ((np.arange(6) + 0.5) / 6 * side for side in (camera.width, camera.height))
@@ -246,7 +246,7 @@ def test_how_the_picture_moves_with_a_pose(small):
 @given(seed=seeds, turned_only=st.booleans())
 @examples(10)
 def test_what_was_right_says_where_the_cameras_are(seed, turned_only):
-    """Turns that were wrong do not enter the similarity, nor do centres: those that were right come back."""
+    """Wrong rotations do not enter the similarity, nor do wrong centres: the part that was right is restored."""
     rng = np.random.default_rng(seed)
     before = random_poses(rng, 12)
     noisy = before.copy()
@@ -301,7 +301,7 @@ def test_whitened_steps_are_those_of_adam_in_whitened_coordinates():
 
 
 def newton(rng: np.random.Generator, strengths: np.ndarray) -> tuple[NewtonSteps, torch.Tensor, torch.Tensor]:
-    """Steps that have learned from scalar residuals J (x - wanted), loss r^2 / 2, at x = 0; wanted, and the slope."""
+    """Return steps that learned from scalar residuals J (x - wanted), loss r^2 / 2, at x = 0; `wanted`; the slope."""
     wanted = torch.from_numpy(rng.normal(scale=0.1, size=(3, 6)))
     rows = torch.from_numpy(rng.normal(size=(600, 6)) * np.sqrt(strengths))
     photos = torch.arange(600) % 3
@@ -313,14 +313,14 @@ def newton(rng: np.random.Generator, strengths: np.ndarray) -> tuple[NewtonSteps
 
 
 def test_an_undamped_step_solves_least_squares():
-    """Residuals that are linear in the numbers: the way to their zero, however unequal the numbers' effects are."""
+    """If residuals are linear in the parameters, the step ends at their zero, however unequal their effects."""
     steps, wanted, slope = newton(np.random.default_rng(0), np.array([1, 1e-3, 1e-2, 1, 10, 100]))
     found = steps.change(slope, torch.zeros(3, 6, dtype=torch.float64), damping=0.0, holding=0.0)
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
 
 
 def test_what_hardly_moved_is_held_and_what_moved_far_is_not():
-    """Turns of 10 pixels against moves of a thousandth: moves go back, by what holds them; turns stay."""
+    """Turns of 10 pixels and moves of a thousandth of a pixel: holding pulls the moves back, and the turns stay."""
     steps, _, _ = newton(np.random.default_rng(0), np.ones(6))
     so_far = torch.tensor([[1e-5] * 3 + [0.2] * 3] * 3, dtype=torch.float64)
     found = steps.change(torch.zeros_like(so_far), so_far, damping=0.0, holding=1.0)
@@ -354,7 +354,7 @@ NO_RAYS = (
 
 
 def steps_of(monkeypatch: pytest.MonkeyPatch, twist: float) -> list[dict[str, float]]:
-    """What steps are asked for with: each of them wants all poses to go by a twist."""
+    """Replace Newton steps by a constant twist of the poses, and return the list that records their settings."""
     asked: list[dict[str, float]] = []
 
     def change(self: NewtonSteps, slope: torch.Tensor, so_far: torch.Tensor, **settings: float) -> torch.Tensor:
@@ -471,7 +471,7 @@ def test_lenses_that_have_not_changed_give_the_same_rays(small):
 
 
 def test_frames_are_where_the_cameras_of_the_training_frame_are(small):
-    """The law of the frame: what is exported, normalised, is what rays were cast from."""
+    """Exported poses, mapped to the training frame, are those from which rays were cast."""
     similarity = Similarity(2.5, rotation_from_vector(np.array([0.3, -0.2, 0.9])), np.array([1.0, 2.0, 3.0]))
     pool = PixelPool(load_photos(small.train_frames, factor=1, threads=1), similarity, torch.device("cpu"))
     refinement = Refinement("poses", pool)
@@ -485,8 +485,8 @@ def test_frames_are_where_the_cameras_of_the_training_frame_are(small):
 
 
 def test_photos_find_back_into_a_field_that_knows_better(spheres, spheres_run):
-    """A trained field that is held still, and photos turned by half a degree: in 40 steps, what is at the middle of the
-    scene is twice as near to its place in the pictures."""
+    """With a trained field frozen and photos turned by half a degree, 40 steps bring points at the centre of the scene
+    twice as near to their places in the pictures."""
     noisy = turned(spheres, 0.5)
     tensors, description = load_tensors(spheres_run / STATE, "cpu")
     extent = Extent.from_json(description["extent"])
@@ -528,7 +528,7 @@ def fit(scene: Scene, run: Path, settings: TrainSettings, *, resume: bool = Fals
 def test_resuming_goes_on_with_the_cameras_bit_for_bit(small, tmp_path):
     settings = replace(FEW, components=Components(cameras="all"))
     fit(small, tmp_path / "straight", settings)
-    # Shares count steps of the whole: half of the steps alone would be another schedule.
+    # Schedules depend on the fraction of all steps: a training of half the steps would have another schedule.
     stopped: list[int] = []
 
     def stop(progress) -> None:
@@ -560,7 +560,7 @@ def test_a_run_has_the_cameras_of_its_field_and_those_of_the_scene(small, tmp_pa
         assert np.array_equal(frame.world_from_cam, old.world_from_cam)
     moves = camera_moves(before.train, refined.train, radius=1.0)
     assert all(moves[name]["max"] > 0 for name in ("rotation_deg", "translation_percent", "focal_percent"))
-    # A held-out photo has the lens that training photos have told, and the pose that it had.
+    # A held-out photo gets the lens learned from training photos, and keeps its pose.
     (held_out,) = refined.test
     assert held_out.camera == refined.train[0].camera != small.test_frames[0].camera
     assert np.array_equal(held_out.world_from_cam, small.test_frames[0].world_from_cam)

@@ -41,15 +41,15 @@ NEAR, FAR = 1.9 / SIMILARITY.scale, 2.4 / SIMILARITY.scale  # z of its sides, sc
 
 
 def cosines() -> np.ndarray:
-    """(H, W) of the rays of `CAMERA` with the optical axis, by hand."""
+    """Return the cosines (H, W) between the rays of `CAMERA` and the optical axis, by hand."""
     x, y = np.meshgrid(np.arange(16) + 0.5 - 8, np.arange(12) + 0.5 - 6)
     return 14.0 / np.sqrt(x**2 + y**2 + 14.0**2)
 
 
 def inside_slab(far: float = 2.4) -> np.ndarray:
-    """(H, W) pixels whose ray stays within the sides of the cube up to `far`, z from the camera in the training frame.
+    """Return which pixels (H, W) have a ray that stays within the sides of the cube up to z = `far` from the camera.
 
-    By default that is the far side of the slab.
+    `far` is in the training frame, by default the far side of the slab.
     """
     x, y = np.meshgrid(np.arange(16) + 0.5 - 8, np.arange(12) + 0.5 - 6)
     return (np.abs(0.01 + far * x / 14) < 0.99) & (np.abs(-0.02 + far * y / 14) < 0.99)
@@ -94,12 +94,12 @@ def test_a_finer_step_brings_the_closed_form_nearer():
 
 
 def expected_z(convention: str, *, background_distance: float) -> np.ndarray:
-    """(H, W) z of each convention behind the near side of the slab, by closed form, in scene units."""
+    """Return z (H, W) of a convention for fog from the slab's near side on, in closed form and scene units."""
     cos = cosines()
     length = (FAR - NEAR) / cos
     tau = SIGMA * length
     opacity = -np.expm1(-tau)
-    mean = NEAR / cos + 1 / SIGMA - length / np.expm1(tau)  # where light ends that ends inside
+    mean = NEAR / cos + 1 / SIGMA - length / np.expm1(tau)  # mean distance of the light that ends inside
     distance = {
         "conditional": mean,
         "moment": opacity * mean,
@@ -215,7 +215,7 @@ def test_tiles_leave_no_trace(tile):
 
 @pytest.mark.parametrize(("gigabytes", "rays"), [(80, 2**16), (8, 2**8 * 142), (1, 2**14)])
 def test_tiles_of_a_gpu_fit_into_its_memory(gigabytes, rays, monkeypatch):
-    """An eighth of it, were every step of 250 in an occupied cell; but never so few that they do not fill a GPU."""
+    """A tile takes an eighth of it if all 250 steps are in occupied cells, but is never too small to fill a GPU."""
     device = SimpleNamespace(total_memory=gigabytes * 10**9)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda of: device)
     marching = SimpleNamespace(edges=lambda: torch.zeros(250))

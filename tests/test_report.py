@@ -78,7 +78,7 @@ def facts(label: str = "a run", **changes: Any) -> RunFacts:
 
 @pytest.fixture(scope="module")
 def seen() -> tuple[list[Seen], np.ndarray]:
-    """What a cube of fog shows of a grey photo."""
+    """Return views of a cube of fog from the poses of held-out grey photos, and the photo."""
     cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     model = fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
     photo = np.full((8, 10, 3), 128, np.uint8)
@@ -102,7 +102,7 @@ def test_views_hold_the_photo_and_what_the_field_shows_of_it(seen):
     assert view.with_depth == np.isfinite(view.depth).mean()
     low, high = depth_range(look)
     assert 1.5 <= low < high <= 2.5  # between the cube's front and back
-    # The photo from the same side sees it, the one from behind does not.
+    # The training photo from the same side sees the surface, the one from behind does not.
     np.testing.assert_array_equal(view.coverage[3:5, 4:6], 1.0)
     assert np.isnan(view.coverage[0, 0])
 
@@ -307,7 +307,7 @@ def test_labels_are_the_shortest_ends_that_differ():
 
 
 def test_curves_go_where_their_values_say():
-    """The first at the left, the last at the right; half of a linear axis half-way; decades evenly on the other."""
+    """Linear values on a linear axis, and decades on a logarithmic one, are evenly spaced and rise to the right."""
 
     def rows(y: list[float], *, logarithmic: bool) -> np.ndarray:
         drawn = curves([Curve(0, "a", [0, 1, 2], y)], x_title="s", y_title="y", logarithmic=logarithmic)

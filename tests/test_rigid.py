@@ -1,4 +1,4 @@
-"""Laws of rigid transforms, quaternions and similarities; scipy and numpy.linalg are the independent witnesses."""
+"""Laws of rigid transforms, quaternions and similarities; scipy and numpy.linalg are the independent references."""
 
 import json
 
@@ -90,7 +90,7 @@ def test_a_quarter_turn_about_z_by_hand():
 
 
 def test_quaternions_are_wxyz_and_scipys_are_xyzw():
-    """A turn by 0.6 about x alone: the real part stands first here and last in scipy."""
+    """A turn by 0.6 about x alone: the real part comes first here and last in scipy."""
     rotation = Rotation.from_rotvec([0.6, 0, 0])
     expected = [np.cos(0.3), np.sin(0.3), 0, 0]
     np.testing.assert_allclose(rigid.quaternion_from_rotation(rotation.as_matrix()), expected, rtol=0, atol=1e-15)

@@ -16,7 +16,7 @@ def test_equal_steps_cover_near_to_far():
 def test_steps_grow_with_distance():
     edges = step_edges(0.1, 300.0, shortest_step=0.01, growth=0.05)
     steps = edges.diff()
-    # Equal shares of the distance up to 1, equal steps in 1 / distance beyond.
+    # A constant fraction of the distance up to 1, equal steps in 1 / distance beyond.
     expected = (edges[:-1] * edges[:-1].clamp_min(1.0) * 0.05).clamp_min(0.01)
     torch.testing.assert_close(steps, expected, rtol=1e-9, atol=0)
     assert edges[-2] >= 300.0

@@ -1,4 +1,4 @@
-"""Scale from known distances, GPS and printed markers, on scenes of known size; and how well the errors are told."""
+"""Scale from known distances, GPS and printed markers, on scenes of known size; and their standard errors."""
 
 from pathlib import Path
 
@@ -63,7 +63,7 @@ def test_a_capture_is_scaled_to_metres():
 
 
 def test_distances_by_hand():
-    """Units 1, 2 and 4 for 2, 4.04 and 8: in the logarithm the mean is 2 * 1.01^(1/3)."""
+    """1, 2 and 4 units for 2, 4.04 and 8 m: the mean of the logarithms gives 2 * 1.01^(1/3)."""
     known = [KnownDistance("a", 1.0, 2.0), KnownDistance("b", 2.0, 4.04), KnownDistance("c", 4.0, 8.0)]
     estimate = scale_from_distances(known)
     scale = 2 * 1.01 ** (1 / 3)
@@ -82,7 +82,7 @@ def test_tolerances_weigh_and_give_the_error_unless_the_distances_disagree_by_mo
     estimate = scale_from_distances(agree)
     assert estimate.metres_per_unit == pytest.approx(2 * np.sqrt(1.01), rel=1e-12)
     assert estimate.standard_error == pytest.approx(estimate.metres_per_unit * 0.01 / np.sqrt(2), rel=1e-12)
-    # One with a tenth of the error counts a hundred times.
+    # A distance with a tenth of the error counts a hundred times.
     estimate = scale_from_distances([KnownDistance("a", 1.0, 2.0, 0.002), KnownDistance("b", 1.0, 2.02, 0.0202)])
     assert np.log(estimate.metres_per_unit / 2) == pytest.approx(np.log(1.01) / 101, rel=1e-9)
     apart = [KnownDistance("a", 1.0, 2.0, 0.002), KnownDistance("b", 1.0, 2.2, 0.0022)]
@@ -104,7 +104,7 @@ def test_scale_and_inverse_scale_are_estimated_alike(seed, factor):
 
 
 def test_the_standard_error_of_distances_is_the_spread_of_estimates():
-    """Five distances with errors of 1 %: the scatter of 2000 estimates is what the mean error says."""
+    """Five distances with errors of 1 %: the scatter of 2000 estimates is the RMS of their standard errors."""
     rng = np.random.default_rng(0)
     estimates = [
         scale_from_distances([KnownDistance("d", u, 3.0 * u * np.exp(0.01 * rng.normal())) for u in range(1, 6)])
@@ -272,7 +272,7 @@ def test_the_standard_error_of_gps_is_the_spread_of_estimates():
 
 
 def test_the_standard_error_of_gps_knows_that_neighbours_err_alike():
-    """On a walk around a block, three photos in a row have one error: sqrt(3) times what independent errors give."""
+    """On a walk around a block, three photos in a row share one error: sqrt(3) times that of independent errors."""
     rng = np.random.default_rng(4)
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     walk = 150 * np.stack([np.cos(angle), np.sin(angle), np.zeros(60)], axis=1)
@@ -287,7 +287,7 @@ def test_the_standard_error_of_gps_knows_that_neighbours_err_alike():
 
 
 def test_gps_is_refused_up_to_a_spread_of_three_times_the_noise():
-    """3 m in each coordinate are 5.2 m; a square of side a is spread over a / sqrt(6), and the noise adds to it."""
+    """3 m in each coordinate are 5.2 m; a square of side a has a spread of a / sqrt(6), to which the noise adds."""
     for ratio in (2.0, 2.6, 3.5, 5.0):
         size = 3 * np.sqrt(3) * np.sqrt(6 / 1.02 * (ratio**2 - 1))
         for seed in range(5):
@@ -319,7 +319,7 @@ def test_gps_of_photos_within_a_few_metres_is_refused_with_numbers():
 
 
 def test_centimetres_over_a_few_metres_are_accepted():
-    """An RTK receiver tells the scale of a house: what counts is the ratio."""
+    """An RTK receiver gives the scale of a house: only the ratio of spread to noise counts."""
     frames, gps, truth = photographed(np.random.default_rng(3), count=30, size=4.0, noise=0.02)
     fit = scale_from_gps(frames, gps)
     assert fit.estimate.metres_per_unit == pytest.approx(truth.scale, rel=0.01)
@@ -335,7 +335,7 @@ def test_two_photos_far_apart_give_the_scale_alone_and_three_on_a_line_too():
         fit = scale_from_gps(frames, gps)
         assert fit.estimate.metres_per_unit == pytest.approx(7.0, rel=1e-4)
         assert fit.enu_from_world is None
-        # 3 m in each place along the line.
+        # An error of 3 m at each position along the line.
         expected = 7.0 * 3.0 / (np.sqrt(len(metres)) * fit.spread)
         assert fit.estimate.standard_error == pytest.approx(expected, rel=1e-3)
 
@@ -375,7 +375,7 @@ SUPERSAMPLED = 4
 
 
 def photo_of(plane: np.ndarray, world_from_plane: np.ndarray, per_unit: float, frame: Frame) -> np.ndarray:
-    """What a pinhole camera sees of a picture on a plane, by a homography; grey around it.
+    """Return a pinhole camera's photo of a picture on a plane, by a homography, with grey around it.
 
     The plane's pixel (x, y), centres at 0.5, is at (x, y, 0) / per_unit in its frame.
     """
@@ -430,7 +430,7 @@ def test_scale_from_aruco_markers(tmp_path):
     assert [name for name, _ in estimate.residuals] == ["marker 3", "marker 17"]
     assert estimate.rms_residual < 0.01
     assert estimate.source == "ArUco markers (DICT_4X4_50, 0.05 m), 8 sides"
-    # A marker that is there twice is not used.
+    # A marker that appears twice is not used.
     frames = photos_of(tmp_path, sheet_of_markers([3, 17, 3], 100), per_unit=100 / 0.7)
     assert [name for name, _ in scale_from_markers(frames, 0.05, dictionary="DICT_4X4_50").residuals] == ["marker 17"]
 
@@ -519,7 +519,7 @@ def test_a_point_from_rays_is_exact_and_one_wrong_ray_moves_it_little(seed, wron
 
 
 def test_corners_through_distorted_lenses_and_how_well_their_error_is_told():
-    """Corners seen through a fisheye and a distorted lens, with 0.2 px of noise: exact without, and told with it."""
+    """Corners seen through a fisheye and a distorted lens, exact without noise; right standard error with 0.2 px."""
     rng = np.random.default_rng(0)
     lenses = [
         Camera("OPENCV_FISHEYE", 640, 480, (300, 305, 322, 239, 0.05, -0.01, 0, 0)),

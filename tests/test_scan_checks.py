@@ -72,12 +72,12 @@ def test_constant_columns_are_rings() -> None:
     clear = scan_of_phantom(phantom_circle(views=VIEWS, columns=COLUMNS), photons=1e6, phantom=SOLID)
     found = finding("rings", changed(clear, wrong))
     assert found.verdict != "good"
-    # A wrong column also lifts what its neighbours are compared with.
+    # A wrong column also changes the values with which its neighbours are compared.
     assert 2 / 60 <= (found.number or 0) <= 6 / 60
 
 
 def test_few_photons() -> None:
-    """Closed form: 100 photons through 2 * 8 * 0.3 = 4.8 leave 0.8, and 500 leave 4."""
+    """Closed form: through a line integral of 2 * 8 * 0.3 = 4.8, 100 photons leave 0.8, and 500 leave 4."""
     low = scan_of_phantom(phantom_circle(views=VIEWS, columns=COLUMNS), photons=500, phantom=SOLID)
     found = finding("counts", low)
     assert found.verdict == "bad"
@@ -118,7 +118,7 @@ def test_0_and_360_degrees(held_out: tuple[int, ...], verdict: str) -> None:
     ],
 )
 def test_the_missing_wedge_is_named(beam: str, span: float, missing: float, verdict: str) -> None:
-    """Closed form, to a step of the views."""
+    """Closed form, within two steps between views."""
     kind = "cone" if beam == "cone" else "parallel"
     circle = phantom_circle(beam=kind, views=VIEWS, columns=COLUMNS, span_deg=span)
     found = finding("missing wedge", scan_of_phantom(circle))
@@ -147,7 +147,7 @@ def test_a_centre_off_the_middle(beam: str) -> None:
 
 @pytest.mark.parametrize(("bend", "verdict"), [(0.0, "good"), (0.10, "look"), (0.30, "bad")])
 def test_beam_hardening_is_named(bend: float, verdict: str) -> None:
-    """Line integrals lowered by a square that takes a known part at the longest path, 16 * 0.3 = 4.8."""
+    """Line integrals minus a quadratic term, which takes a known fraction of the longest one, 16 * 0.3 = 4.8."""
     circle = phantom_circle(views=VIEWS, columns=COLUMNS)
     hard = scan_of_phantom(circle, phantom=SOLID)
     found = finding("beam hardening", changed(hard, lambda p: p * (1 - bend * p / 4.8)))
@@ -177,7 +177,7 @@ def test_the_command_writes_a_page_and_holds_a_gate(tmp_path: Path) -> None:
 
 
 def test_flats_tell_the_photons() -> None:
-    """Known truth: 8000 photons a pixel at a gain of 0.25 values a photon, with noise of reading and drift; 5 %."""
+    """Known truth, within 5 %: 8000 photons a pixel at a gain of 0.25 values a photon, with read noise and drift."""
     from nerfcli.tomography.open_beam import open_beam_of
 
     rng = np.random.default_rng(0)

@@ -151,7 +151,7 @@ def test_commands_for_runs_of_photos_name_what_works(bean_run: Path) -> None:
 
 
 def test_lists_of_runs_on_standard_input(bean_run: Path, tmp_path: Path) -> None:
-    """Reconstructions between other paths: each is worked on, and what is no run is reported."""
+    """Runs mixed with other paths: each run is processed, and a path that is no run is reported."""
     lines = f"{bean_run}\n{tmp_path}\n"
     for arguments, suffix in ((("render",), ".tif"), (("export", "--to", "volume"), ".nrrd")):
         result = CliRunner().invoke(app, [*arguments, "-", "-o", str(tmp_path / "out")], input=lines)

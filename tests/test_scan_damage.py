@@ -80,7 +80,7 @@ def cut(path: Path, share: float) -> Path:
 
 
 class Bomb:
-    """What a pickle that runs a program looks like."""
+    """An object whose pickle runs a program when it is loaded."""
 
     def __init__(self, mark: Path):
         self.mark = mark
@@ -146,7 +146,7 @@ def other_mat(folder: Path) -> Path:
     return folder / "b.mat"
 
 
-# What is made in a folder, options, and what the error says.
+# For each case: the function that makes the input in a folder, options, and the expected error.
 REFUSED: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
     # Code in pickles.
     "pickle with code": (bomb, (), "tries to call .*system and was not opened"),
@@ -348,7 +348,7 @@ def test_damage_is_told_in_two_lines_and_nothing_is_written(name: str, tmp_path:
 
 
 def test_the_bomb_would_have_gone_off(tmp_path: Path) -> None:
-    """The pickle of the test above is one that runs a program where it is loaded."""
+    """The pickle of the test above does run a program if `pickle` loads it."""
     pickle.loads(bomb(tmp_path).read_bytes())
     assert (tmp_path / "executed").exists()
 
@@ -384,7 +384,7 @@ def test_dead_pixels_of_the_flats_are_left_out(tmp_path: Path) -> None:
 
 
 def test_a_flat_with_the_object_in_the_beam_is_an_outlier(tmp_path: Path) -> None:
-    """The mean of the others, to a per mille."""
+    """The open beam is the mean of the other flats, within 0.4 %."""
     flats = np.random.default_rng(0).normal(1100, 2, (8, ROWS, COLUMNS))
     flats[2, 2:4, 3:8] = 300
     scan = read_scan(rewritten(data_exchange(tmp_path).path, "exchange/data_white", flats))

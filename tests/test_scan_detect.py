@@ -15,7 +15,7 @@ from nerfcli.tomography.scan import save_scan
 
 @pytest.mark.parametrize("truth", ["as stated", "mirrored", "reversed", "both"])
 def test_a_mirrored_detector_is_told_from_a_fan_beam(truth: str) -> None:
-    """A wrong side is worse by a large margin; mirrored and reversed together are the mirror image, and hold."""
+    """A wrong side is worse by a large margin; mirrored and reversed together give the mirror image, which holds."""
     circle = phantom_circle()
     angles = tuple(-a for a in circle.angles) if truth in ("reversed", "both") else circle.angles
     real = replace(circle, angles=angles, mirrored=truth in ("mirrored", "both"))
@@ -75,7 +75,7 @@ def test_few_views_are_refused() -> None:
 
 
 def test_air_decides_nothing() -> None:
-    """Without an object no reading is better."""
+    """Without an object, no hypothesis is better than another."""
     scan = scan_of_phantom(phantom_circle())
     noise = np.random.default_rng(0).normal(0, 0.01, scan.values.shape).astype(np.float32)
     assert judge(replace(scan, values=noise)).verdict == "undecided"

@@ -1,4 +1,4 @@
-"""Formats of scans: pixels by each format's own formula, and what is stated found again in stored vectors."""
+"""Formats of scans: pixels by each format's own formula, and the stated circle recovered from stored vectors."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ from nerfcli.tomography.truth import load_truth
 
 
 def pixels_by_formula(written: Written, geometry: ScanGeometry) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows (views, points, 2) by `pixel_of` and by the format's own formula, of points near the axis."""
+    """Return columns and rows (views, points, 2) of points near the axis, by `pixel_of` and by the format's formula."""
     size = geometry.pixel_at_origin[1]
     points = np.random.default_rng(1).normal(0, 2 * size, (8, 3))
     if geometry.rows == 1:

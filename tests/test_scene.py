@@ -278,7 +278,7 @@ def test_fingerprint_knows_names_cameras_poses_and_split_and_nothing_else(own):
     assert len(different) == 6
     zeros = with_first(world_from_cam=np.eye(4))
     assert zeros == with_first(world_from_cam=np.where(np.eye(4) == 0, -0.0, np.eye(4)))
-    # The order of frames, where the files are, and the last bits of a pose are not part of it.
+    # The order of frames, the location of files and the last bits of a pose are not part of the fingerprint.
     last_bits = first.world_from_cam * (1 + 2e-16)
     same = {
         with_first(world_from_cam=last_bits),

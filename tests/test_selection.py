@@ -45,7 +45,7 @@ FITTED = Facts("hash", has_alpha=False, has_exif=False, cameras_known="they are 
 
 
 def trial(psnr: float, *, halfway: float | None = None, seconds: float = 1.0, noise_db: float = 0.0) -> Trial:
-    """Every photo has the PSNR, give or take what cancels in the sum of their logarithms."""
+    """Return a trial in which photos have the PSNR plus or minus `noise_db` in turn, which cancels in the mean."""
     counts = np.full(PHOTOS, 300)
     away = noise_db * np.array([1.0, -1.0] * (PHOTOS // 2))
 
@@ -60,14 +60,14 @@ def judged(base: list[Trial], tried: list[Trial]) -> Decision:
 
 
 def told(gain_db: float) -> float:
-    """A gain of all photos alike, as it is told: a share of the mean error is added to both."""
+    """Return the reported gain if all photos gain alike: `FLOOR` times the mean error is added to both errors."""
     return 10.0 * math.log10((1.0 + FLOOR) / (10.0 ** (-gain_db / 10.0) + FLOOR))
 
 
 def test_a_gain_is_told_as_it_is_and_kept():
     decision = judged([trial(20.0), trial(21.0)], [trial(20.4), trial(21.6)])
     assert decision.gain_db == pytest.approx((told(0.4) + told(0.6)) / 2, abs=1e-9)
-    # Two seeds that differ by d: variance d^2 / 2, of their mean d^2 / 4; all photos gain the same.
+    # Two seeds that differ by d have a variance of d^2 / 2, their mean one of d^2 / 4; all photos gain the same.
     assert decision.error_db == pytest.approx((told(0.6) - told(0.4)) / 2, abs=1e-9)
     assert decision.kept
     assert decision.cost == pytest.approx(0.0, abs=1e-12)
@@ -103,7 +103,7 @@ def test_a_gain_that_rests_on_a_few_photos_is_not_clear():
 
 @given(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
 def test_gains_that_differ_as_much_as_they_are_large_are_not_kept(first, second):
-    """Two seeds with gains of mean m and distance d have an error of d / 2: kept is what is above 2 of those."""
+    """Two gains of mean m and distance d have an error of d / 2; kept if m exceeds the least gain by two errors."""
     decision = judged([trial(20.0), trial(20.0)], [trial(20.0 + first), trial(20.0 + second)])
     expected = (told(first) + told(second)) / 2 > LEAST_GAIN_DB + abs(told(first) - told(second))
     assert decision.kept == expected
@@ -116,7 +116,7 @@ def test_gains_that_differ_as_much_as_they_are_large_are_not_kept(first, second)
         ([trial(20.3), trial(21.3)], True, "the loss without it is below"),
         ([trial(20.0 - MOST_LOSS_DB * 1.2), trial(21.0 - MOST_LOSS_DB * 1.2)], False, "needed: PSNR drops without it"),
         ([trial(19.8), trial(21.2)], False, "may be needed"),
-        # 0.2 dB better, after 0.6 dB halfway: 0.2 dB worse when as many steps again are over.
+        # 0.6 dB better halfway and 0.2 dB better at the end: extrapolated to twice the steps, 0.2 dB worse.
         ([trial(20.2, halfway=19.6), trial(21.2, halfway=20.6)], False, "may be needed"),
     ],
 )
@@ -133,7 +133,7 @@ def test_time_counts_only_where_time_is_what_is_spent():
 
 
 def test_one_seed_is_enough_only_where_the_gain_is_clear():
-    """All photos gain alike, so the error is what seeds are known to differ by: five of those and the least gain."""
+    """All photos gain alike, so the error is `SEED_DB`: the gain must exceed the least gain by `CLEAR_ERRORS` of it."""
     least = LEAST_GAIN_DB + CLEAR_ERRORS * SEED_DB
     for gain, kept in ((1.1 * least, False), (1.5 * least, True)):
         decision = judged([trial(20.0)], [trial(20.0 + gain)])
@@ -143,7 +143,7 @@ def test_one_seed_is_enough_only_where_the_gain_is_clear():
 
 
 def test_the_margins_in_numbers():
-    """0.05 dB is what nobody sees, 0.1 dB the most that a simpler model may lose; a step that costs a third more has to
+    """0.05 dB is invisible, and 0.1 dB the most that a simpler model may lose; a step that costs a third more has to
     gain what a third more steps would: 0.4 of the 0.9 dB that twice as many bring."""
     base = [trial(20.0), trial(21.0)]
 
@@ -209,7 +209,7 @@ def test_what_is_left_out_is_nothing_that_the_user_or_the_field_decided():
 
 
 class Scripted:
-    """Trials that answer at once, with the gains in dB that a function says components have."""
+    """Trials that answer at once, with gains in dB that a function gives for components."""
 
     def __init__(self, gain: Callable[[Components], float], *, spread: float = 0.1, far: float = 0.05):
         self.gain, self.spread, self.far = gain, spread, far
@@ -295,7 +295,7 @@ def test_points_are_asked_only_where_the_cameras_fit(misses, tells):
 
 @pytest.mark.parametrize(("far", "kept"), [(0.05, False), (0.15, True)])
 def test_a_sky_that_signs_speak_for_is_kept_at_a_smaller_gain(far, kept):
-    """Gains of 0.13 and 0.45 dB with two seeds: between one and two standard errors above what counts at all."""
+    """Gains of 0.13 and 0.45 dB with two seeds: one to two standard errors above the least gain that counts."""
     scripted = Scripted(lambda c: 0.0, spread=0.0, far=far)
     scripted.go_on = lambda start, components, *, seed, steps: trial(  # type: ignore[method-assign]
         20.0 + seed + (0.13 if seed == 0 else 0.45) * (components.background == "sphere")
@@ -315,7 +315,7 @@ def test_what_is_needed_stays():
 
 
 def test_what_another_component_does_better_is_left_out_beside_it():
-    """Without exposures the view explains them, as on photos whose exposure drifts: alone it would be needed."""
+    """View dependence alone explains drifting exposures and would be kept; with learned exposures it is not needed."""
     scripted = Scripted(lambda c: 0.6 if c.exposure == "learned" else 0.5 * (c.view > 0))
     assert chosen_by(scripted).components == Components(view=0, exposure="learned")
 
@@ -341,7 +341,7 @@ def test_of_two_values_of_a_component_the_better_is_kept():
 
 
 def test_what_there_was_no_time_for_stays_as_it_is():
-    """A fifth of the steps is for the start, a tenth for each of eight trials: view would need others."""
+    """A fifth of the steps is for the start, a tenth for each of eight trials: none is left for view."""
     scripted = Scripted(lambda c: 0.6 * (c.exposure == "learned") + 0.4 * (c.background == "sphere"))
     chosen = chosen_by(scripted, steps=1000)
     assert len(scripted.asked) <= 8
@@ -368,7 +368,7 @@ def test_a_decision_says_in_words_what_was_and_what_was_not_tried():
 
 
 def test_cameras_are_tried_where_photos_do_not_agree_or_nobody_knows():
-    """Structure from motion has seen to them; matched features may say that they fit, or do not."""
+    """Known cameras are not tried; for unknown ones, matched features may say that they fit, or that they do not."""
 
     def tried(facts: Facts) -> list[object]:
         return [value for name, value in proposals(Components(), signs(0.0), facts)[0] if name == "cameras"]
@@ -410,7 +410,7 @@ def test_a_focal_length_that_matched_features_are_sure_of_is_taken(check, kept):
     assert with_known_cameras(Components(), FITTED) == (Components(), 0.0, [])
     for asked in (Components(cameras="focal"), Components(cameras="all")):
         components, log_focal, decisions = with_known_cameras(asked, replace(facts, fixed=("cameras",)))
-        assert components == asked  # it is not doubted, and begins where features say
+        assert components == asked  # the request is kept, and starts where features say
         assert log_focal == (check.log_focal if kept else 0.0)
         assert [one.in_words().startswith(f"cameras={asked.cameras}: kept, ") for one in decisions] == [True] * kept
 
@@ -439,7 +439,7 @@ def test_poses_that_are_decided_on_learn_in_no_trial():
 
 
 def test_what_is_clear_is_not_tried_again_and_what_is_surely_missed_neither():
-    """2 dB: one trial with it, one without. Without view 0.5 dB less: one trial."""
+    """A gain of 2 dB takes one trial with it and one without; a loss of 0.5 dB without view takes one trial."""
     scripted = Scripted(lambda c: 2.0 * (c.background == "sphere") - 0.5 * (c.view == 0), spread=0.0)
     chosen = chosen_by(scripted)
     assert chosen.components == Components(background="sphere")
@@ -496,7 +496,7 @@ def test_a_long_search_does_not_make_a_long_start():
 
 
 def test_of_values_that_gain_as_much_the_plainest_is_kept():
-    """What EXIF tells is there for nothing; what has to be learned must gain more than seeds differ by."""
+    """EXIF's exposures cost nothing; learned ones must gain more than seeds differ by."""
     for ahead, kept in ((0.5 * SEED_DB, "exif"), (3.0 * SEED_DB, "learned")):
         gains = {"none": 0.0, "exif": 1.0, "learned": 1.0 + ahead}
         chosen = chosen_by(Scripted(lambda c, gains=gains: gains[c.exposure]), facts=replace(FITTED, has_exif=True))
@@ -513,7 +513,7 @@ def test_leaving_out_may_not_use_up_a_limit_of_time_but_may_use_up_steps():
 
 @pytest.mark.parametrize(("gain", "kept"), [(0.04, True), (-0.04, True), (-0.3, False)])
 def test_cameras_whose_photos_disagree_only_must_not_lose(gain, kept):
-    """Matched features miss by 2 pixels: 0.04 dB is less than what others have to gain. All photos gain alike."""
+    """Features miss by 2 pixels, so even +-0.04 dB, less than others have to gain, suffices. All photos gain alike."""
     wrong = replace(FITTED, cameras_known=None, cameras=CameraCheck(0.02, 0.01, (2.3, 2.2), 900))
     chosen = chosen_by(Scripted(lambda c: gain * (c.cameras == "poses"), spread=0.0), facts=wrong)
     assert chosen.components.cameras == ("poses" if kept else "fixed")

@@ -1,4 +1,4 @@
-"""The selftest passes here, and catches operations that are written as textbooks write them."""
+"""The selftest passes here, and catches operations that are written the way textbooks write them."""
 
 import json
 import math
@@ -36,7 +36,7 @@ def all_rows() -> list[Row]:
 
 @pytest.fixture(scope="module")
 def own_rows() -> list[Row]:
-    """What the command measures: the kernels against the definitions in float64."""
+    """The rows that the command measures: the kernels against the definitions in float64."""
     return list(suite.rows("cpu", lambda text: None))
 
 
@@ -47,7 +47,7 @@ def test_every_bound_is_met_and_has_a_reason(all_rows, own_rows):
 
 
 def test_the_command_tries_what_the_strict_suite_tries_and_is_about_as_strict(all_rows, own_rows):
-    """The same operations on kernels; the compiled ones within the same bounds."""
+    """The same kernel operations; bounds of compiled ones are at most four times as loose."""
     for name in ("float32", "bfloat16", "compiled"):
         tried = {row.operation for row in all_rows if row.precision == name}
         cameras = {"frame_rays", "uncontract", "Occupancy.above", "visible_samples, composite, light_ends", "radiance"}
@@ -143,7 +143,7 @@ def test_the_gradients_of_depths_are_difference_quotients_in_sixty_digits():
 
 
 def test_optical_depth_by_subtraction_and_half_precision_are_caught(monkeypatch):
-    for module in (reference, compositing):  # what is asked, and what the weights of intervals ask
+    for module in (reference, compositing):  # the function itself, and the one used by the weights of intervals
         monkeypatch.setattr(
             module, "optical_depth_before", lambda *given: textbook.optical_depth_before(*given[:2], offsets=given[2])
         )
@@ -231,5 +231,5 @@ def test_the_command_prints_a_line_per_row_and_ends_with_7_where_a_bound_is_not_
 
 
 def test_a_nan_in_the_occupancy_was_once_lost():
-    """Found by the selftest: the cell was closed."""
+    """A fault found by the selftest: a NaN closed its cell."""
     assert NOT_MET not in {row.verdict for row in learning.rows((SINGLE,))}

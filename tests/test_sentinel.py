@@ -85,7 +85,7 @@ def test_a_failure_is_passed_with_smaller_steps_and_counted(views, tmp_path, mon
 
 
 def test_the_way_back_is_exact(views, tmp_path, monkeypatch):
-    # After the failure everything but the learning rate is as in a training that knew it from the start of the copy.
+    # After the rollback, training equals one whose learning rate is halved from the snapshot on.
     rate = Fitting.learning_rate
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
     monkeypatch.setattr(Fitting, "learning_rate", lambda self, share: rate(self, share) * (self.step < 4 or 0.5))
@@ -100,7 +100,7 @@ def test_the_way_back_is_exact(views, tmp_path, monkeypatch):
 
 
 def read_a_step_later(self: Delayed, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...] | None:
-    """As on a GPU."""
+    """Return tensors one call late, as on a GPU."""
     before = self.take()
     copies = tuple(tensor.detach().clone() for tensor in tensors)
     self._sent = copies, SimpleNamespace(synchronize=lambda: None)  # type: ignore[assignment]
@@ -128,7 +128,7 @@ def test_a_fault_that_does_not_come_back_changes_nothing(bad_call, on_gpu, views
 
 
 def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, tmp_path, monkeypatch):
-    """And what does not come back is nobody's fault."""
+    """A fault that does not come back is put down to a device that does not repeat its results."""
     monkeypatch.setattr(NumbaBackend, "deterministic", False)
     rate = Fitting.learning_rate
 
@@ -206,7 +206,7 @@ def test_replay_of_something_else_is_refused(spheres_run):
 
 
 def test_a_field_that_overflows_is_no_picture(spheres, spheres_run, tmp_path):
-    # Finite weights whose products are not: found in the picture, by name and pixel.
+    # The weights are finite and their products are not: found in the picture, by name and pixel.
     model = load_model(spheres_run / "field.safetensors", "cpu")
     with torch.no_grad():
         for name, parameter in model.field.named_parameters():

@@ -18,7 +18,7 @@ PIXELS = 150
 
 
 def directions_of(count: int, seed: int) -> Tensor:
-    """Uniform on the half of the sphere in front of a wall."""
+    """Return directions, uniform on the half of the sphere in front of a wall."""
     directions = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
     directions[:, 2] = directions[:, 2].abs()
     return torch.nn.functional.normalize(directions, dim=-1)
@@ -30,7 +30,7 @@ def gradient(directions: Tensor) -> Tensor:
 
 
 def test_a_painted_background_has_the_colours_of_its_directions():
-    """Directions in one half of the sphere see one colour, in the other another: painted are both."""
+    """Directions in one half of the sphere see one colour, in the other half another: both are painted."""
     generator = torch.Generator().manual_seed(0)
 
     def seen() -> tuple[Tensor, Tensor]:
@@ -48,7 +48,7 @@ def test_a_painted_background_has_the_colours_of_its_directions():
 
 
 def seen_by_photos(colour: Callable[[Tensor, Tensor], Tensor], *, noise: float = 0.02) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels of photos from the corners of a square of side 2; `colour` is that along directions from places."""
+    """Return pixels of photos at random places in a square of side 2; `colour` takes places and directions."""
     generator = torch.Generator().manual_seed(1)
     photos = torch.arange(PHOTOS).repeat_interleave(PIXELS)
     centres = torch.cat([2.0 * torch.rand(PHOTOS, 2, generator=generator) - 1.0, torch.zeros(PHOTOS, 1)], dim=1)
@@ -58,7 +58,7 @@ def seen_by_photos(colour: Callable[[Tensor, Tensor], Tensor], *, noise: float =
 
 
 def stripes(places: Tensor, directions: Tensor) -> Tensor:
-    """A wall 1 in front of the photos, in stripes as wide as their centres are apart."""
+    """Return colours of a wall at distance 1, in stripes about as wide as the photos are apart."""
     on_wall = places + directions / directions[:, 2:].clamp_min(0.1)
     return 0.5 + 0.4 * torch.sin(4.0 * on_wall[:, :1]).sign().expand(-1, 3)
 
@@ -78,7 +78,7 @@ def test_a_sky_of_one_colour_is_told_by_directions_too(level):
 
 
 def test_directions_that_nobody_has_told_have_the_one_colour():
-    """Photos that look left tell, those that look right are explained."""
+    """Photos that look right are explained by those that look left, which saw none of their directions."""
     directions, colours, photos = seen_by_photos(lambda places, directions: torch.full((len(places), 3), 0.9))
     directions[:, 0] = directions[:, 0].abs() * (1 - 2 * (photos % 2))
     assert min(explained_by_direction(directions, colours, photos)) > 25.0

@@ -13,7 +13,7 @@ GAINS = (1.0, 0.8, 1.2, 0.9, 1.0)
 
 
 def photo(x: float, *, turned: float = 0.0, gain: float = 1.0, below: bool = False) -> LoadedPhoto:
-    """The sky's colour goes with the direction; below a skyline 10 degrees above the horizon is noise."""
+    """Return a photo whose sky has a colour by direction, with noise under a skyline 10 degrees above the horizon."""
     pose = np.eye(4)
     pose[:3, :3] = rotation_from_vector(np.array([0.0, turned, 0.0]))
     pose[0, 3] = x

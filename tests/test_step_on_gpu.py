@@ -1,7 +1,7 @@
 """A step of a training on a GPU waits for it once. There is no GPU: the device is torch's `meta`, which has no numbers.
 
-Kernels are counted instead of launched. Whatever needs a number of the device on the host, or a copy that is waited
-for, is counted as a wait, and gets a number that was made up.
+Kernels are counted instead of launched. An operation that needs a number of the device on the host, or a blocking
+copy, counts as a wait and gets a made-up number.
 """
 
 import traceback
@@ -33,14 +33,14 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 
 GPU = torch.device("meta")
-# Whatever a copy from the device brings.
+# The number that any copy from the device returns.
 ANY = 2
 # Operations whose result has a size that only the device knows.
 SIZED_BY_NUMBERS = ("nonzero", "masked_select", "repeat_interleave", "unique_dim", "_unique2", "unique_consecutive")
 
 
 class Waits(TorchDispatchMode):
-    """Counts what makes the host wait for the device, with the lines that do."""
+    """Counts the host's waits for the device, with the lines that cause them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -94,11 +94,11 @@ class OfCpu(torch.Generator):
 
 @pytest.fixture
 def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
-    """Have `meta` be a GPU."""
+    """Make `meta` act as a GPU."""
     found = Waits()
 
     class Event:
-        """Is waited for, unless the host has waited for the device since it was recorded."""
+        """Counts as a wait, unless the host has waited for the device since the event was recorded."""
 
         def record(self, stream: object) -> None:
             self._before = len(found.lines)
@@ -151,6 +151,6 @@ def test_a_step_waits_once_for_the_device(components, most, waits, spheres: Scen
     for step in range(20):
         before = len(waits.lines)
         fitting.advance(0.2 + step / 40)
-        if step > 1:  # before, room for samples is learned, and there is no loss to show
+        if step > 1:  # earlier steps learn the room for samples and have no loss to show
             assert len(waits.lines) - before <= most, waits.lines[before:]
     assert waits.launches > 20 * 10

@@ -44,7 +44,7 @@ CAMERA = Camera("PINHOLE", 120, 90, (130.0, 126.0, 58.3, 46.1))
 
 
 def ball_view(place: np.ndarray, *, camera: Camera = CAMERA, name: str = "a.png") -> DepthView:
-    """What a camera sees of an opaque ball, in closed form, and nothing behind it."""
+    """Return a camera's view of an opaque ball with nothing behind it, in closed form."""
     pose = look_at(place, CENTRE, np.array([0.1, 0.2, 1.0]))
     rays = plane_rays(camera) @ pose[:3, :3].T
     off = place - CENTRE
@@ -87,7 +87,7 @@ def fused(ball_views) -> Fused:
 
 @pytest.mark.parametrize("looks_out", [False, True])
 def test_the_box_leaves_out_what_is_far_behind(looks_out, monkeypatch):
-    """Also where all that is seen lies beyond the unit ball, around the cameras of a narrow baseline."""
+    """Also if everything seen is outside the unit ball, which is around the cameras for a narrow baseline."""
     place = CENTRE - np.array([0.0, 3.0, 0.0])
     near, far = ball_view(place), ball_view(place)
     far = replace(far, depth=far.depth[::2, ::2] * 10, frame=replace(far.frame, camera=CAMERA.resized(60, 45)))
@@ -116,7 +116,7 @@ def test_the_mesh_of_a_ball_is_the_ball(fused):
     assert len(mesh.faces) > 5000
     assert np.sqrt((off**2).mean()) < 0.06 * 0.025
     assert np.abs(off).max() < 0.5 * 0.025
-    # A picture half a pixel aside would move or swell it by 0.2 voxels.
+    # Pictures shifted by half a pixel would move or swell it by 0.2 voxels.
     assert np.abs(off.mean()) < 0.03 * 0.025
     assert np.abs(mesh.vertices.mean(0) - CENTRE).max() < 0.05 * 0.025
     outwards = (mesh.normals * (mesh.vertices - CENTRE)).sum(1) / RADIUS
@@ -124,7 +124,7 @@ def test_the_mesh_of_a_ball_is_the_ball(fused):
 
 
 def test_pictures_half_a_pixel_aside_make_another_ball(ball_views):
-    """The test above would see it: the same depths, with cameras whose principal point is half a pixel off."""
+    """The test above would notice: the same depths, with cameras whose principal point is half a pixel off."""
     fx, fy, cx, cy = CAMERA.params
     shifted = Camera("PINHOLE", 120, 90, (fx, fy, cx + 0.5, cy + 0.5))
     moved = [
@@ -148,7 +148,7 @@ def test_the_mesh_of_a_ball_has_no_gap_between_blocks_and_bricks(fused):
 
 
 def test_what_no_photo_sees_is_not_closed():
-    """One side of the ball is seen: the mesh ends where it does, and nothing joins it to what was not looked at."""
+    """One side of the ball is seen: the mesh ends with it, and no face reaches the side that was not seen."""
     views = [ball_view(CENTRE + np.array([2.0, 0.1 * step, 0.05])) for step in range(3)]
     mesh = surface_of(fuse(views, Grid.over((*(CENTRE - 0.7), *(CENTRE + 0.7)), 0.025)))
     off = np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS
@@ -164,7 +164,7 @@ def test_the_order_of_the_photos_changes_the_last_digits_alone(ball_views, fused
 
 
 def test_rays_that_meet_nothing_clear_what_stands_in_them(ball_views):
-    """A floater that one photo sees, in what others see to be free."""
+    """A floater that one photo sees, in space that others see to be free."""
     wrong = ball_views[0]
     depth = wrong.depth.copy()
     depth[:12, :12] = 1.4
@@ -199,7 +199,7 @@ def test_points_of_a_ball_are_on_it_and_say_how_well_they_are_seen(ball_views):
 
 
 def facing(centre: np.ndarray, point: np.ndarray) -> float:
-    """The cosine between the ball's normal at a point and the way to a camera."""
+    """Return the cosine between the ball's normal at a point and the direction to a camera."""
     return float((centre - point) @ (point - CENTRE) / np.linalg.norm(centre - point) / RADIUS)
 
 
@@ -356,7 +356,7 @@ def test_damaged_files_are_told(name, tmp_path):
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize("far", [0.0, 5e6])
 def test_points_come_back_from_las_files(suffix, far, tmp_path):
-    """With eight digits of their extent, wherever they are; read by laspy."""
+    """Coordinates keep eight digits of their extent at any offset, as read by laspy."""
     laspy = pytest.importorskip("laspy", reason="an extra")
     rng = np.random.default_rng(0)
     places = far + rng.uniform(-40, 40, (500, 3))
@@ -394,7 +394,7 @@ def test_las_files_say_what_they_need(monkeypatch, blocked, tmp_path):
 
 
 def test_undistorted_photos_have_straight_lines_and_half_pixels():
-    """A picture of the bearings themselves: after the resampling each pixel has that of its own centre."""
+    """A picture that encodes bearings: after resampling, each pixel has the bearing of its own centre."""
     camera = Camera("OPENCV", 160, 120, (150.0, 148.0, 81.0, 58.5, -0.2, 0.05, 1e-3, -1e-3))
     pinhole = pinhole_of(camera)
     assert pinhole.params == (camera.focal_px, camera.focal_px, 81.0, 58.5)
@@ -428,7 +428,7 @@ def blocked(finished: Path) -> Path:
 
 
 def sides_of(run: Path, points: np.ndarray) -> np.ndarray:
-    """The largest coordinate of points in the training frame, where the block ends at 0.5."""
+    """Return the largest coordinate of each point in the training frame, where the block ends at 0.5."""
     return np.abs(Run(run).model().training_from_scene.apply(points)).max(axis=1)
 
 
@@ -479,7 +479,7 @@ def test_points_volume_and_distances_are_written(blocked, tmp_path):
 
 
 def test_colmap_fuses_the_maps_of_a_ball(ball_views, tmp_path):
-    """COLMAP's own fusion, in its own code, gives points on the ball: depths, normals, pixels and tracks are its."""
+    """COLMAP's own fusion gives points on the ball: it reads depths, normals, pixels and tracks as they are meant."""
     views = [ball_view(place, name=f"{index:02d}.png") for index, place in enumerate(places_around(24))]
     points = agreed_points(views, Grid.over((*(CENTRE - 0.7), *(CENTRE + 0.7)), 0.1))
     frames = [view.frame for view in views]

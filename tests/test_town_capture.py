@@ -1,4 +1,4 @@
-"""benchmarks/town_capture.py: what a rendered photo shows is where the camera says it is."""
+"""benchmarks/town_capture.py: rendered photos agree with the poses of their cameras."""
 
 import cv2
 import numpy as np
@@ -9,12 +9,12 @@ K = np.array([[FOCAL_PX, 0, 80], [0, FOCAL_PX, 60], [0, 0, 1]])
 
 
 def test_the_ground_moves_as_a_plane_does():
-    """Independent: photo 10 warped by OpenCV with the ground's homography, is photo 11 below the horizon."""
+    """Independent: photo 10, warped by OpenCV with the ground's homography, matches photo 11 below the horizon."""
     one, other = walk(12)[10:12]
     first, second = (photo(pose, size=SIZE, focal_px=FOCAL_PX).mean(axis=2) for pose in (one, other))
 
     def from_ground(world_from_cam: np.ndarray) -> np.ndarray:
-        """Pixels of points (x, y, 1) on the ground, z = 0."""
+        """Return the homography from points (x, y, 1) on the ground, z = 0, to pixels."""
         cam_from_world = np.linalg.inv(world_from_cam)[:3]
         return K @ cam_from_world[:, [0, 1, 3]]
 
@@ -27,7 +27,7 @@ def test_the_ground_moves_as_a_plane_does():
 
 
 def test_the_walk_has_equal_steps_and_comes_back():
-    """By the loops' plan: around one block of 24 m, corners cut, back where it began after 151 photos of 0.6 m."""
+    """By the plan of the loops: around a block of 24 m with cut corners, back after 151 photos at steps of 0.6 m."""
     poses = walk(1000)
     centres = poses[:, :3, 3]
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)

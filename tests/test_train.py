@@ -48,9 +48,9 @@ from nerfcli.train.loop import Progress, train
 FEW = TrainSettings(
     budget_seconds=None, steps=24, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=12, threads=2
 )
-# The number of rows is chosen, as it is by default.
+# The number of rows is chosen automatically, as by default.
 CHOSEN_ROWS = replace(FEW, log2_rows=None)
-# Enough samples that the number of rays follows what the rays before had.
+# Enough samples that the number of rays adapts to the samples of earlier rays.
 ADAPTIVE = replace(FEW, first_samples_per_step=2**15, samples_per_step=2**15)
 
 
@@ -103,8 +103,8 @@ def test_held_out_views_are_far_better_than_one_colour(spheres, spheres_run):
 @pytest.mark.slow
 @pytest.mark.parametrize("with_points", [True, False])
 def test_photos_of_a_desk_are_learned_too(with_points, tmp_path):
-    # Photos without alpha, of a scene without an end, with the cameras that they were rendered with, and points as
-    # structure from motion would give them, from the true depth of the held-out views.
+    # Photos without alpha, of an unbounded scene, with the cameras that rendered them, and points as structure from
+    # motion would give them, from the true depth of the held-out views.
     desk = SPHERES.with_name("desk")
     known = json.loads((desk / "truth" / "cameras.json").read_text())
     camera = Camera.from_json(known["camera"])
@@ -119,7 +119,7 @@ def test_photos_of_a_desk_are_learned_too(with_points, tmp_path):
         bearings, _ = camera.pixel_bearings()
         in_camera = (bearings / bearings[:, 2:] * depth.reshape(-1, 1))[::400]
         points.append(apply(frame.world_from_cam, in_camera))
-    # Points tell how near to the cameras things begin.
+    # Points show how near to the cameras the scene begins.
     cloud = np.concatenate(points) if with_points else np.zeros((0, 3))
     scene = Scene(desk, "transforms", frames, names, cloud, ())
     settings = TrainSettings(budget_seconds=None, steps=400, downscale=8, samples_per_step=2**14, threads=2)
@@ -179,7 +179,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(views, tmp_
 
 
 def test_the_reference_trains_as_the_compiled_kernels_do(views, tmp_path, monkeypatch):
-    # What CUDA tensors and machines without Numba take. Rounding grows from step to step; after few it is still small.
+    # CUDA tensors and machines without Numba use the reference. Rounding grows with each step but is small after six.
     settings = replace(FEW, steps=6)
     compiled = fit(views, tmp_path / "compiled", settings)
     monkeypatch.setattr(kernels, "_numba_cpu", lambda: None)
@@ -196,7 +196,7 @@ def test_interrupted_and_resumed_equals_straight_bit_for_bit(views, tmp_path):
     straight = fit(views, tmp_path / "straight", ADAPTIVE)
     with pytest.raises(KeyboardInterrupt):
         fit(views, tmp_path / "parts", ADAPTIVE, on_progress=stop)
-    halfway = load_model(tmp_path / "parts" / "field.safetensors", "cpu")  # what Ctrl-C left can be looked at
+    halfway = load_model(tmp_path / "parts" / "field.safetensors", "cpu")  # the run left by Ctrl-C can be loaded
     assert all(torch.isfinite(tensor).all() for tensor in halfway.field.state_dict().values())
     assert not Run(tmp_path / "parts").is_complete(ADAPTIVE)
     second = fit(views, tmp_path / "parts", ADAPTIVE, resume=True)
@@ -267,7 +267,7 @@ def test_longer_trainings_have_more_rows_and_given_ones_stay():
 
 
 def test_a_training_that_goes_on_to_a_larger_total_keeps_its_rows(views, tmp_path, monkeypatch):
-    """The larger total alone would have chosen more; rows that are asked for by number are refused."""
+    """The larger total would by default choose more rows; a different number given explicitly is refused."""
     fit(views, tmp_path / "run", replace(CHOSEN_ROWS, steps=2))
     monkeypatch.setattr("nerfcli.runs.settings.FEWEST_LOG2_ROWS", 17)
     assert replace(CHOSEN_ROWS, steps=3).chosen_log2_rows == 17
@@ -283,7 +283,7 @@ def test_detailed_fields_train_and_resume_bit_for_bit_with_their_fine_cells(view
         if progress.step == 11:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)  # the state is looked at, too
+    monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)  # also while the sentinel takes snapshots
     settings = replace(FEW, log2_rows=17)
     straight = fit(views, tmp_path / "straight", settings)
     with pytest.raises(KeyboardInterrupt):
@@ -316,7 +316,7 @@ def test_resume_goes_on_to_a_larger_total(views, tmp_path):
 
 
 def test_what_has_learned_goes_on_learning_in_a_larger_budget(views, tmp_path):
-    """The finest level of the grid is not due at 4 of 400 steps, but in a field that has it already."""
+    """At step 4 of 400 the finest level of the grid does not learn, except in a field that has learned it before."""
 
     def stop(progress: Progress) -> None:
         if progress.step == 4:
@@ -327,7 +327,7 @@ def test_what_has_learned_goes_on_learning_in_a_larger_budget(views, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         fit(views, tmp_path / "fresh", replace(FEW, steps=400), on_progress=stop)
-    assert finest(tmp_path / "fresh").abs().max() <= 1e-4  # as it was made
+    assert finest(tmp_path / "fresh").abs().max() <= 1e-4  # as initialised
     fit(views, tmp_path / "run", replace(FEW, steps=3))
     learned = finest(tmp_path / "run")
     assert learned.abs().max() > 1e-4
@@ -338,7 +338,7 @@ def test_what_has_learned_goes_on_learning_in_a_larger_budget(views, tmp_path):
 
 @pytest.mark.parametrize("last", ["field.safetensors", "state.safetensors"])
 def test_a_kill_between_field_and_state_is_no_harm(last, views, tmp_path):
-    # The second checkpoint dies after its first file, or the first one does.
+    # The process dies between the two files of the second checkpoint, or of the first.
     def stop(progress: Progress) -> None:
         if progress.step == 9:
             raise KeyboardInterrupt
@@ -348,7 +348,7 @@ def test_a_kill_between_field_and_state_is_no_harm(last, views, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         fit(views, tmp_path / "run", ADAPTIVE, on_progress=stop)
     if last == "state.safetensors":
-        (tmp_path / "run" / "field.safetensors").unlink()  # state first, the first time
+        (tmp_path / "run" / "field.safetensors").unlink()  # the first time, the state is written first
     else:
         shutil.copy(straight / "field.safetensors", tmp_path / "run")  # a field that is ahead of the state
     with (tmp_path / "run" / "log.jsonl").open("a") as log:
@@ -536,7 +536,7 @@ def test_a_log_line_that_a_kill_cut_short_is_left_out(tmp_path):
 
 
 def as_convert_reads(run: Path) -> Capture:
-    """The cameras of a run as `nerfcli convert` reads them."""
+    """Read the cameras of a run as `nerfcli convert` does."""
     form, found = recognise(run)
     assert form.parse is not None
     return form.parse(found, Given())
@@ -557,7 +557,7 @@ def test_a_digit_that_changes_in_the_description_of_a_run_is_noticed(file, read,
     fit(views, tmp_path / "run", replace(FEW, steps=1))
     path = tmp_path / "run" / file
     whole = path.read_text()
-    name = whole.index('"blake2b"')  # without it, it is a file of an earlier version
+    name = whole.index('"blake2b"')  # without this name the file would pass as one of an earlier version
     digits = [index for index, letter in enumerate(whole) if letter.isdigit() and not 0 <= index - name < 9]
     for index in digits[:: max(1, len(digits) // 40)]:
         changed = whole[:index] + str((int(whole[index]) + 1) % 10) + whole[index + 1 :]

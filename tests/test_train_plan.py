@@ -1,4 +1,4 @@
-"""The plan of a training beside what a training leaves, and through the command."""
+"""The plan of a training against the files that a training leaves, and through the command."""
 
 import json
 from dataclasses import replace
@@ -24,7 +24,7 @@ def test_disk_space_covers_a_run_and_the_state_that_is_replaced(spheres_run: Pat
 
 
 def test_photos_that_memory_cannot_hold_are_on_the_disk() -> None:
-    """96 x 72 RGBA bytes of 24 photos, and what the search and cameras keep beside them."""
+    """At least the RGBA bytes of 24 photos of 96 x 72, besides those that the search and cameras keep."""
     free = plan_training(SPHERES, STEPS)
     assert (free.train_photos, free.held_out_photos, free.downscale, free.pixels) == (21, 3, 1, 21 * 96 * 72)
     limited = plan_training(SPHERES, STEPS, memory_bytes=free.memory_bytes - 10_000)

@@ -1,4 +1,4 @@
-"""What training is fed: the normalised frame, photos at the size they are trained on, pixels with their rays."""
+"""Inputs of training: the normalised frame, photos at the size of training, pixels with their rays."""
 
 import math
 import os
@@ -82,7 +82,7 @@ def test_bounded_scenes_are_as_wide_as_the_widest_picture():
     distances = np.linalg.norm(centres, axis=1)
     half_width = distances * math.tan(math.radians(max(CAMERA.fov_deg)) / 2)
     assert half_width.max() == pytest.approx(1, abs=1e-9)
-    # All of the cube is between near and far of every camera.
+    # The whole cube is between near and far of every camera.
     corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     to_corners = np.linalg.norm(centres[:, None] - corners, axis=-1)
     assert marching.far >= to_corners.max()
@@ -97,7 +97,7 @@ def test_the_training_frame_can_be_undone_and_does_not_depend_on_where_the_captu
     second, marching_there = frame_of(there)
     np.testing.assert_allclose(first.inverse().apply(first.apply(points)), points, atol=1e-12)
     np.testing.assert_allclose(second.inverse().apply(second.apply(there.points)), there.points, rtol=1e-12)
-    # Up to a rotation, which the normalisation leaves alone, the two training frames are the same.
+    # Up to a rotation, which the normalisation does not change, the two training frames are the same.
     rotated = Similarity(1.0, MOVED.rotation, np.zeros(3))
     np.testing.assert_allclose(second.apply(there.points), rotated.apply(first.apply(points)), atol=1e-8)
     for name in ("near", "far", "shortest_step", "growth"):
@@ -105,18 +105,18 @@ def test_the_training_frame_can_be_undone_and_does_not_depend_on_where_the_captu
 
 
 def test_the_unit_ball_reaches_what_cameras_see_where_it_is_behind_them():
-    """Walls at 10 about cameras at 3 and 6 from the middle: their median depths are about 13 and 16."""
+    """Walls at 10 and cameras at 3 and 6 from the middle: the median depths of cameras are about 13 and 16."""
     directions = np.random.default_rng(0).normal(size=(20000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     middle = np.array([1.0, 2.0, 3.0])
     walls = middle + 10 * directions
     radius = 1 / contracted_frame(scene_of(ring(), walls))[0].scale
     assert radius == pytest.approx(0.75 * 14.5, rel=0.05)
-    # A few wrong points far away change little, too few tell nothing.
+    # A few stray points far away change little; too few points are ignored.
     stray = np.concatenate([walls, middle + 1e6 * directions[:500]])
     assert 1 / contracted_frame(scene_of(ring(), stray))[0].scale == pytest.approx(radius, rel=0.02)
     assert 1 / contracted_frame(scene_of(ring(), walls[:20]))[0].scale == pytest.approx(4.5, rel=1e-9)
-    # What the cameras stand around is before them and changes nothing.
+    # An object surrounded by the cameras is in front of them and changes nothing.
     assert 1 / contracted_frame(scene_of(ring(), middle + directions))[0].scale == pytest.approx(4.5, rel=1e-9)
 
 
@@ -141,7 +141,7 @@ def test_a_box_needs_points():
 
 
 def test_near_is_before_what_the_cameras_see():
-    # Points on a ball of radius 2 about the focus; the nearest of what each camera sees is 1 or more away.
+    # Points on a ball of radius 2 around the focus; the nearest one to each camera is at least 1 away.
     normals = np.random.default_rng(0).normal(size=(4000, 3))
     points = np.array([1.0, 2.0, 3.0]) + 2 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
     scene = scene_of(ring(), points)
@@ -151,7 +151,7 @@ def test_near_is_before_what_the_cameras_see():
 
 
 def test_depth_bounds_of_forward_facing_captures_set_the_focus():
-    # Parallel cameras have no point that all look at: it lies at the harmonic mean of the bounds, 1.6, before them.
+    # Parallel cameras do not look at a common point: the focus is 1.6, the harmonic mean of the bounds, before them.
     frames = [replace(f, world_from_cam=np.eye(4)) for f in ring(5)]
     for index, frame in enumerate(frames):
         frame.world_from_cam[:3, 3] = (index - 2, 0, 0)
@@ -184,7 +184,7 @@ def test_a_narrow_baseline_is_one_below_half_of_the_nearest_depth(spread):
     assert not has_narrow_baseline(
         replace(scene_of(side_by_side(0.0, 0.0)), depth_bounds=np.array([[0.0, 8.0], [0.0, 8.0]]))
     )
-    # Of an object on nothing, no depth is needed.
+    # An object on an empty background needs no depth.
     assert choose_extent(scene, TrainSettings(), fills_frame=False).contraction == "none"
 
 
@@ -237,7 +237,7 @@ def test_a_downscaled_camera_fits_the_area_averaged_picture(size, factor):
 
 
 def numbered_photo(index: int, camera: Camera, frame: Frame, channels: int = 3) -> LoadedPhoto:
-    """A photo whose colours say which pixel of which photo it is: (photo, row, column)."""
+    """Return a photo whose colours encode each pixel's (photo, row, column)."""
     rows, columns = np.indices((camera.height, camera.width))
     layers = [np.full_like(rows, index), rows, columns, np.full_like(rows, 255)][:channels]
     return LoadedPhoto(replace(frame, camera=camera), np.stack(layers, axis=-1).astype(np.uint8), None)
@@ -250,7 +250,7 @@ SIMILARITY = Similarity(0.3, rotation_from_quaternion(np.array([0.8, 0.2, -0.4, 
 
 
 def drawn(pool: PixelPool, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Origins, directions, and (count, 3) numbers (photo, row, column) of random pixels."""
+    """Draw random pixels; return their origins, directions, and (count, 3) numbers (photo, row, column)."""
     origins, directions, colours = pool.draw(count, torch.Generator().manual_seed(0))[:3]
     assert colours.dtype == torch.float32
     return origins.numpy(), directions.numpy(), np.round(colours[:, :3].numpy() * 255).astype(int)
@@ -391,7 +391,7 @@ def test_photos_in_files_give_the_same_rays_as_in_memory(alpha, masked, tmp_path
         write_png(mask, rng.choice([0, 255, 255, 255], size=(14, camera.width)).astype(np.uint8))
         frames.append(Frame(path.name, camera, np.eye(4), path, mask if masked else None))
     in_memory, album, pool = drawn_from(frames, IN_MEMORY)
-    in_files, _, _ = drawn_from(frames, InFiles(tmp_path / "room", 1))  # a limit that is always passed
+    in_files, _, _ = drawn_from(frames, InFiles(tmp_path / "room", 1))  # a limit that is always exceeded
     assert in_files == in_memory
     one_by_one = PixelPool(load_photos(frames, factor=2, threads=1), SIMILARITY, CPU)
     drawn = one_by_one.draw(3000, torch.Generator().manual_seed(4))
@@ -427,7 +427,7 @@ def test_what_does_not_fit_is_refused_up_front(tmp_path):
 
 
 def test_a_gpu_without_room_is_refused_up_front(monkeypatch):
-    needs = Needs(photos=3 * 10**9, step=10**9, rest=9 * 10**9)  # what the host decodes does not count there
+    needs = Needs(photos=3 * 10**9, step=10**9, rest=9 * 10**9)  # decoding is on the host and does not count
     device = torch.device("cuda:1")
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (4 * 10**9, 8 * 10**9))
     assert check_device_memory(needs, device, None) == "memory on cuda:1: about 4.00 GB of 4.00 GB that are free"
@@ -439,7 +439,7 @@ def test_a_gpu_without_room_is_refused_up_front(monkeypatch):
 
 
 def test_a_limit_of_memory_is_that_of_the_gpu(monkeypatch, tmp_path):
-    """Torch keeps to it; the machine's own memory then has its usual limit."""
+    """The limit is passed to torch; the host's memory then has its default limit."""
     needs, device = Needs(photos=3 * 10**9, step=10**9, rest=0), torch.device("cuda:1")
     kept: list[tuple[float, torch.device]] = []
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (6 * 10**9, 10 * 10**9))

@@ -1,4 +1,4 @@
-"""Short trainings that go on from a common start, and what residuals tell before anything is tried."""
+"""Short trainings from a common start, and the signs in residuals before any trial."""
 
 import itertools
 import math
@@ -33,7 +33,7 @@ def trials(spheres) -> Trials:
 
 @pytest.fixture(scope="module")
 def start(trials) -> Iterator[TrialStart]:
-    """Early in a schedule: cells that close within a few dozen steps would leave nothing to see."""
+    """A start early in a schedule, without closing cells: within a few dozen steps they would leave nothing to see."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nerfcli.search.trials.FORK_SHARE", 0.02)
         patch.setattr("nerfcli.fit.open_cells.CLOSING_SHARE", 1e9)
@@ -41,13 +41,13 @@ def start(trials) -> Iterator[TrialStart]:
 
 
 def test_what_begins_late_changes_nothing_at_first(trials, start):
-    """Harmonics without weight, and gains of 1: no step further, every change has the errors of no change."""
+    """Harmonics begin with weight 0 and gains with 1: before any further step, changed components keep the errors."""
     same = trials.go_on(start, Components(view=0), seed=0, steps=0)
-    assert same.psnr == pytest.approx(start.trial.psnr, abs=1e-4)  # levels that do not learn yet are told by a step
+    assert same.psnr == pytest.approx(start.trial.psnr, abs=1e-4)  # which levels learn is set by a step
     assert np.array_equal(trials.go_on(start, Components(view=3), seed=0, steps=0).errors, same.errors)
     free = trials.go_on(start, Components(view=0, cameras="poses"), seed=0, steps=0)
-    assert free.errors == pytest.approx(same.errors, rel=1e-6)  # rays are turned by nothing, and rounded
-    # Of exposures that EXIF tells to be equal.
+    assert free.errors == pytest.approx(same.errors, rel=1e-6)  # rays are rotated by 0, with rounding
+    # EXIF says that all exposures are equal.
     exif = trials.go_on(start, Components(view=0, exposure="exif"), seed=0, steps=0)
     assert exif.errors == pytest.approx(same.errors, rel=1e-3)
 
@@ -59,7 +59,7 @@ def test_trials_with_the_same_seed_are_the_same_and_leave_their_start_alone(tria
 
 
 def clock(monkeypatch: pytest.MonkeyPatch, seconds: Iterable[float]) -> list[int]:
-    """Every step takes the next of these seconds, and is done nothing in; gives the steps that were gone."""
+    """Make each step do nothing but report the next of `seconds`; return the list of steps taken, which grows."""
     times, gone = iter(seconds), []
 
     def advance(self: Trials, fitting: Fitting, share: float) -> float:
@@ -83,12 +83,12 @@ def test_a_start_takes_longer_for_the_fewest_steps_but_twice_as_long_at_most(tri
 
 
 def test_a_start_that_cannot_come_to_the_fewest_steps_ends_at_once(trials, monkeypatch):
-    """Steps of a second, but for every fifth, which something else on the machine makes ten times as long."""
+    """Steps take a second, except that every fifth takes ten, as under other load on the machine."""
     gone = clock(monkeypatch, itertools.cycle([1.0, 1.0, 1.0, 1.0, 10.0]))
     assert trials.begin(Components(), steps=1000, seconds=100.0, fewest=260) is None
     assert gone[-1] == 10
     assert trials.begin(Components(), steps=1000, seconds=100.0, fewest=240) is None
-    assert gone[-1] > 60  # there was hope
+    assert gone[-1] > 60  # at first the fewest steps seem possible
 
 
 def test_a_trial_has_its_cameras_learn_from_the_fork_on(trials, start, monkeypatch):
@@ -101,7 +101,7 @@ def test_a_trial_has_its_cameras_learn_from_the_fork_on(trials, start, monkeypat
 
     monkeypatch.setattr(Trials, "_fitting", fitting)
     trials.go_on(start, Components(view=0), seed=0, steps=0)
-    assert begun == [0.02]  # what the start has forked at
+    assert begun == [0.02]  # where the start forked
 
 
 def test_the_learning_rate_falls_by_half_a_cosine_after_its_warm_up(trials):
@@ -125,8 +125,8 @@ def test_trials_have_the_small_tables_of_short_trainings(trials, monkeypatch):
     [(16, "fixed", [4, 6, 8]), (17, "fixed", [4, 4, 4]), (16, "poses", [3, 3, 3])],
 )
 def test_large_tables_have_their_levels_by_steps(trials, monkeypatch, rows_of_large, cameras, learning):
-    """At the start of a budget, however long, half of 4 steps open all 8 levels of tables that count as large, whose
-    rows then move; but cameras find their places in a coarse field."""
+    """In tables that count as large, half of 4 steps open all 8 levels, even at fraction 0 of a budget, and their rows
+    move; but learned cameras keep the field coarse at first."""
     monkeypatch.setattr("nerfcli.field.hash_field.DETAILED_LOG2_ROWS", rows_of_large)
     monkeypatch.setattr("nerfcli.fit.fitting.LARGE_TABLE_STEPS", 4)
     fitting = trials._fitting(Components(view=0, cameras=cameras), seed=0, log_gains=None, cameras_from=0.0)
@@ -139,7 +139,7 @@ def test_large_tables_have_their_levels_by_steps(trials, monkeypatch, rows_of_la
 
 
 def test_cameras_learn_from_the_fork_on(trials, start):
-    """Before it no step moves them, however far the training; behind it one does."""
+    """A step at the fork, after 0.6 of the budget, does not move the cameras; a later one does."""
     fitting = trials._fitting(Components(view=0, cameras="poses"), seed=0, log_gains=None, cameras_from=0.6)
     trials._take_up(fitting, start)
     assert fitting.parts.cameras is not None
@@ -154,15 +154,15 @@ def test_cameras_learn_from_the_fork_on(trials, start):
 
 @pytest.mark.parametrize("distance", [0.3, 1.1, math.inf])
 def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkeypatch, distance):
-    """Fog of one density sigma everywhere: exp(-sigma t), t the way from the middle of the first step to that of the
-    last one before the distance."""
+    """Closed form for fog of density sigma: exp(-sigma t), where t is the distance from the middle of the first step to
+    the middle of the last step before the given distance."""
     album = load_album(spheres.train_frames, factor=4, threads=1, storage=IN_MEMORY)
     everywhere = replace(choose_extent(spheres, SETTINGS, fills_frame=False), contraction="l2")
     exif = np.zeros(len(album.photos))
     trials = Trials(album.photos, everywhere, settings=SETTINGS, exif=exif, colours=album.colours)
     fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
     fitting.edges = torch.linspace(0.1, 1.4, 14)
-    fitting.step, fitting.furthest = DETAILED_STEPS, 1.0  # no steps are left out
+    fitting.step, fitting.furthest = DETAILED_STEPS, 1.0  # no steps are skipped
     sigma = 0.1
 
     class Fog:
@@ -180,7 +180,7 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
 
 
 def test_trials_see_through_the_lens_that_is_known_before(spheres):
-    """Matches say that lenses are 5 % longer: what learns them starts there, and its rays are closer together."""
+    """Matches give focal lengths 5 % longer: learned lenses start from these, so their rays are closer together."""
     album = load_album(spheres.train_frames, factor=4, threads=1, storage=IN_MEMORY)
     extent = choose_extent(spheres, SETTINGS, fills_frame=False)
     exif = np.zeros(len(album.photos))
@@ -231,10 +231,10 @@ def test_photos_of_one_exposure_have_no_spread_and_an_empty_photo_is_left_alone(
 
 
 def test_the_field_ends_where_a_background_begins(trials):
-    """Behind the unit ball as the farthest camera sees it; without a learned background the extent stays as it is."""
+    """It ends beyond the unit ball, seen from the farthest camera; without a learned background it is unchanged."""
     extent = replace(trials._extent, reach=2.0 + BALLS_BEFORE_BACKGROUND)
     assert extent.before("sphere").marching.far == min(extent.marching.far, 3.5)
     assert extent.before("auto") is extent
     assert Extent.from_json(extent.to_json()).to_json() == extent.to_json()
     assert extent.before("constant").before("constant").to_json() == extent.before("constant").to_json()
-    assert trials._extent.before("sphere") is trials._extent  # of photos with alpha: it ends by itself
+    assert trials._extent.before("sphere") is trials._extent  # photos with alpha: it is already bounded

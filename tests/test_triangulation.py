@@ -16,7 +16,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
 from nerfcli.multiview.features import Matches
-from nerfcli.multiview.tracks import Tracks, places_of, tracks_of_matches
+from nerfcli.multiview.tracks import Tracks, indices_by_value, tracks_of_matches
 from nerfcli.multiview.training_matches import MOST_PHOTOS, chosen_pairs, match
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.loading import LoadedPhoto
@@ -29,7 +29,7 @@ SETTINGS = TrainSettings(budget_seconds=None, steps=1)
 
 
 def wall_photo(x: float, turned: float, *, used: np.ndarray | None = None) -> LoadedPhoto:
-    """What a camera at (x, 0, 0), turned about its vertical axis, sees of a wall with spots at z = 3."""
+    """Render a wall with spots at z = 3, seen by a camera at (x, 0, 0) turned about its vertical axis."""
     rng = np.random.default_rng(0)
     spots = cv2.GaussianBlur(rng.uniform(0, 255, (600, 800)).astype(np.float32), (0, 0), 3)
     texture = cv2.normalize(spots, spots, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
@@ -37,7 +37,7 @@ def wall_photo(x: float, turned: float, *, used: np.ndarray | None = None) -> Lo
     pose[:3, :3] = rotation_from_vector(np.array([0.0, turned, 0.0]))
     pose[0, 3] = x
     matrix = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
-    # The wall point (X, Y, 3) has the texture's pixel (100 X + 400, 100 Y + 300), its centre half a pixel on.
+    # Wall point (X, Y, 3) is at the texture's pixel (100 X + 400, 100 Y + 300), whose centre is half a pixel further.
     wall_from_texture = np.array([[0.01, 0, -3.995], [0, 0.01, -2.995], [0, 0, WALL_Z]])
     world_to_cam = pose[:3, :3].T @ (wall_from_texture - np.outer(pose[:3, 3], [0, 0, 1]))
     to_index = np.array([[1.0, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
@@ -52,14 +52,14 @@ def scene_of(photos: list[LoadedPhoto]) -> Scene:
 
 
 def found_in(photos: list[LoadedPhoto], *, threads: int = 1) -> np.ndarray:
-    """Points that photos agree on by their own features."""
+    """Return the points triangulated from matched features of the photos."""
     tracks = tracks_of_matches(photos, match(photos, threads=threads))
     return triangulate([photo.frame for photo in photos], tracks).found
 
 
 @pytest.fixture(scope="module")
 def photos() -> list[LoadedPhoto]:
-    """Five of a wall at z = 3, from places 0.3 apart, with axes that meet at z = 1."""
+    """Five photos of a wall at z = 3, taken 0.3 apart, with axes that meet at z = 1."""
     return [wall_photo(0.3 * i, 0.3 * (2 - i)) for i in range(5)]
 
 
@@ -84,7 +84,7 @@ def test_masked_parts_of_photos_give_no_points(photos):
 
 
 def test_the_unit_ball_follows_what_is_found(photos):
-    """Cameras whose axes meet 1 before them, and a wall 3 away."""
+    """The cameras' axes meet 1 in front of them, and the wall is 3 away."""
     scene = scene_of(photos)
     assert lacks_depth(scene, SETTINGS, fills_frame=True)
     scene = replace(scene, points=found_in(photos))
@@ -148,7 +148,7 @@ def tracks_of(points: np.ndarray, centres: np.ndarray, seen: list[tuple[int, int
 
 @pytest.mark.parametrize("offset", [0.0, 4e6])
 def test_points_of_exact_rays_are_exact_wherever_the_world_begins(offset):
-    """To 1e-12 of the distances, and of what coordinates of GPS have left after the point."""
+    """To 1e-12 of the distances, plus the rounding of coordinates as large as those of GPS."""
     rng = np.random.default_rng(0)
     centres, points = rng.uniform(-1, 1, (5, 3)) + offset, rng.uniform(-1, 1, (40, 3)) * (2, 2, 1) + (0, 0, 5) + offset
     seen = [(photo, point) for point in range(40) for photo in rng.permutation(5)[: 2 + point % 4]]
@@ -162,14 +162,14 @@ def test_points_of_exact_rays_are_exact_wherever_the_world_begins(offset):
 
 @given(st.lists(st.integers(-1, 6), max_size=30), st.integers(0, 5))
 def test_places_of_numbers_are_those_that_are_equal(numbers, count):
-    found = places_of(np.array(numbers, dtype=int), count)
+    found = indices_by_value(np.array(numbers, dtype=int), count)
     assert [list(places) for places in found] == [
         [place for place, number in enumerate(numbers) if number == wanted] for wanted in range(count)
     ]
 
 
 def test_photos_that_do_not_agree_tell_nothing():
-    """Rays that meet behind a camera, that pass each other, at 0.1 degrees, of one photo only, and none at all."""
+    """Rays that meet behind a camera, miss each other, meet at 0.1 degrees, or are of one photo only; and no rays."""
     centres = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     points = np.array(
         [[0.5, 0.1, 2.0], [0.5, 0.1, -2.0], [0.5, 0.5, 2.0], [0.2, 0.0, 500.0], [0.3, 0.3, 3.0], [1, 1, 4.0]]
@@ -177,7 +177,7 @@ def test_photos_that_do_not_agree_tell_nothing():
     tracks = tracks_of(points, centres, [(photo, point) for point in range(6) for photo in (0, 1)])
     rays = tracks.rays.copy()
     rays[2:4] *= -1  # the second
-    rays[4] += (0.0, 0.05, 0.0)  # of the third: 5 px off for both
+    rays[4] += (0.0, 0.05, 0.0)  # the third: 5 px off in both photos
     rays[8] = np.nan
     surface = triangulate(frames_at(centres), replace(tracks, rays=rays))
     assert np.isfinite(surface.points).all(axis=1).tolist() == [True, False, False, False, False, True]
@@ -189,9 +189,9 @@ def test_photos_that_do_not_agree_tell_nothing():
 
 
 def test_a_point_that_a_single_photo_is_left_to_have_seen_is_none():
-    """Rays that pass each other 0.03 apart, 1 before one camera and 10 before the other: 4.5 px off in the first photo,
-    0.45 in the second, which alone knows no distance. A third, on the other side of the first, hides it until it is
-    found to be wrong itself."""
+    """Two rays miss each other by 0.03, 1 in front of one camera and 10 in front of the other: 4.5 px off in the first
+    photo and 0.45 in the second, which alone gives no distance. A third ray, on the other side of the first, hides this
+    until it is itself found to be wrong."""
     centres = np.array([[0.3, 0.0, 0.0], [0.0, 0.0, -9.0], [-0.3, 0.0, 0.0]])
     rays = np.array([[0.0, 0.03, 1.0], [0.3, 0.0, 10.0], [0.6, 0.06, 1.0]])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

@@ -1,6 +1,6 @@
 """The GPU kernels without a GPU: their numbers in Triton's interpreter, their machine code, and how they are launched.
 
-Triton reads TRITON_INTERPRET when it is imported, so that what is interpreted runs in a process of its own.
+Triton reads TRITON_INTERPRET when it is imported, so interpreted kernels run in a separate process.
 """
 
 import ctypes
@@ -33,7 +33,7 @@ from nerfcli.kernels.triton_cuda.launch import Variant
 
 HERE = Path(__file__).parent
 CUOBJDUMP = Path(nvidia.__file__).parent / "bin" / "cuobjdump"
-# Of an Ampere, Ada or Blackwell desktop card, in bytes per program.
+# Shared memory of an Ampere, Ada or Blackwell desktop card, in bytes per program.
 MOST_SHARED = 99 * 1024
 
 
@@ -76,7 +76,7 @@ def kernel_cache(pytestconfig: pytest.Config, monkeypatch: pytest.MonkeyPatch, t
     """Keep machine code from one run of the tests to the next."""
     kept = pytestconfig.cache.mkdir("kernels") if hasattr(pytestconfig, "cache") and pytestconfig.cache else tmp_path
     monkeypatch.setenv("NERFCLI_KERNEL_CACHE", str(kept))
-    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path / "triton"))  # it keeps every intermediate form
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path / "triton"))  # Triton's own cache keeps every intermediate form
 
 
 def test_kernels_agree_with_the_reference_in_the_interpreter(interpreted):
@@ -84,7 +84,7 @@ def test_kernels_agree_with_the_reference_in_the_interpreter(interpreted):
 
 
 def machine_code(path: Path) -> tuple[str, int]:
-    """Instructions of a kernel, and how many bytes of a thread's registers are spilled to memory."""
+    """Return a kernel's instructions, and how many bytes of a thread's registers are spilled to memory."""
     done = subprocess.run([CUOBJDUMP, "-res-usage", "-sass", path], capture_output=True, text=True, check=True)
     uses = re.search(r"STACK:(\d+)", done.stdout)
     assert uses, done.stdout[:500]
@@ -93,7 +93,7 @@ def machine_code(path: Path) -> tuple[str, int]:
 
 @pytest.mark.gpu
 def test_kernels_agree_with_the_reference_on_a_gpu():
-    """Twice: what two programs write at once may be right by chance."""
+    """Run twice, as a race between two programs may give the right result by chance."""
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     plain = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
@@ -114,7 +114,7 @@ ALL, EACH, HOTTEST = "all", "each", "hottest"
     ],
 )
 def test_kernels_compile_within_the_limits_of_each_generation(interpreted, kernel_cache, capability, which, tmp_path):
-    """What the interpreter cannot see: types, shared memory, spilled registers, vector instructions, tensor cores."""
+    """Check what the interpreter cannot: types, shared memory, spilled registers, vector instructions, tensor cores."""
     assert len(interpreted.variants) > 40, interpreted.output
     path, sizes = tmp_path / "kernel.cubin", set()
     chosen = {ALL: list, EACH: each, HOTTEST: hottest}[which](interpreted.variants)
@@ -144,13 +144,13 @@ def test_kernels_compile_within_the_limits_of_each_generation(interpreted, kerne
 
 
 def each(variants: list[Variant]) -> list[Variant]:
-    """One variant of every kernel, and all of the hottest."""
+    """Return one variant of every kernel, and all of the hottest ones."""
     first = {variant.kernel: variant for variant in reversed(variants)}
     return [*first.values(), *(variant for variant in hottest(variants) if variant not in first.values())]
 
 
 def hottest(variants: list[Variant]) -> list[Variant]:
-    """The kernels that take most of a step, once each, for networks of the default width."""
+    """Return the kernels that take most of a step, one variant each, for networks of the default width."""
     chosen: dict[tuple[str, str], Variant] = {}
     for variant in variants:
         module, name = variant.kernel.fn.__module__.rpartition(".")[2], variant.kernel.fn.__name__
@@ -161,7 +161,7 @@ def hottest(variants: list[Variant]) -> list[Variant]:
 
 
 def parameter_bytes(path: Path) -> int:
-    """Size of the parameters, by the machine code."""
+    """Return the size of the parameters that the machine code states."""
     text = subprocess.run([CUOBJDUMP, "-elf", path], capture_output=True, text=True, check=True).stdout
     found = re.search(r"EIATTR_CBANK_PARAM_SIZE\s+Format:\s+EIFMT_HVAL\s+Value:\s+(0x[0-9a-f]+)", text)
     assert found, text[:500]
@@ -169,7 +169,7 @@ def parameter_bytes(path: Path) -> int:
 
 
 class FakeDriver:
-    """The driver library: it keeps what it is called with, and fails on request."""
+    """A fake driver library, which records its calls and fails on request."""
 
     def __init__(self, failing: str = "", error: int = 0):
         self.calls: list[str] = []
@@ -205,7 +205,7 @@ class FakeDriver:
 
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch) -> Callable[[FakeDriver], torch.device]:
-    """Have torch say that there is a GPU, and the driver be a fake. Tensors are on the CPU."""
+    """Make torch report a GPU and replace the driver by a fake; tensors are on the CPU."""
 
     def install(fake: FakeDriver, capability: tuple[int, int] = (9, 0)) -> torch.device:
         monkeypatch.setattr(driver, "library", lambda: fake)
@@ -232,7 +232,7 @@ def test_a_launch_gives_the_driver_what_the_kernel_expects(device, kernel_cache)
     assert (seen["grid"], seen["threads"], seen["stream"]) == ((3, 2, 1), (128, 1, 1), 4711)
     # Pointer, 7, 0.5, 90, and the two pointers that Triton adds.
     assert struct.unpack("@QifiQQ", seen["buffer"]) == (out.data_ptr(), 7, 0.5, 90, 0, 0)
-    # Loaded once, in the context that torch uses, which this thread may not have had.
+    # Loaded once, in the context of torch, which this thread may not have had yet.
     once = ["cuDeviceGet", "cuDevicePrimaryCtxRetain", "cuCtxSetCurrent", "cuModuleLoadData", "cuModuleGetFunction"]
     assert fake.calls == [*once, "cuLaunchKernel", "cuLaunchKernel"]
 
@@ -281,7 +281,7 @@ def test_an_old_triton_is_refused(device, monkeypatch):
 
 
 def test_each_device_has_its_own_launcher(device, kernel_cache, monkeypatch):
-    """One that no launcher works on leaves the others as they are."""
+    """A device on which no launcher works does not affect the others."""
     here = device(FakeDriver())
     monkeypatch.setattr(launch, "_counts", lambda device: torch.cuda.current_device() == 1)
     assert launch.choose_launcher(here) is None
@@ -354,6 +354,6 @@ def test_the_cache_is_bounded_and_what_was_used_least_recently_goes_first(monkey
     "parameters", [".param .u64 a", ".param .u64 a, .param .u64 b, .param .u32 c", ".param .u32 a"]
 )
 def test_parameters_that_nobody_expects_are_refused(parameters):
-    """As a later Triton might add: then its own launcher is taken."""
+    """A later Triton might add parameters; then its own launcher is used."""
     with pytest.raises(UnexpectedCodeError, match="its parameters are"):
         cubin._formats(f".visible .entry kernel({parameters})", ("*fp32", "i64"))

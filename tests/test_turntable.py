@@ -1,4 +1,4 @@
-"""An object that turns before a still background: recognised, masked, solved; and what must not be taken for one."""
+"""An object turning before a still background: recognised, masked, solved; and captures not to be mistaken for it."""
 
 import json
 from dataclasses import replace
@@ -28,7 +28,7 @@ SIZE = (WIDE.width, WIDE.height)
 
 
 def matched(one: View, other: View, scene: Scene, *, seed: int, noise_px: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
-    """Where two views see the points that both see, with noise and a tenth of wrong matches."""
+    """Return where two views see their common points, with noise and a tenth of wrong matches."""
     rng = np.random.default_rng(seed)
     (first, x), (second, y) = synthetic.seen(one, scene), synthetic.seen(other, scene)
     _, a, b = np.intersect1d(first, second, return_indices=True)
@@ -41,7 +41,7 @@ def matched(one: View, other: View, scene: Scene, *, seed: int, noise_px: float 
 def staying(
     count: int, *, seed: int, box: tuple[float, float, float, float] = (0, 0, 1, 1)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Matches that stay in their place within a box: left, top, right, bottom as shares of the picture."""
+    """Return matches that stay in place within a box: left, top, right, bottom as fractions of the picture."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(np.array(box[:2]) * SIZE, np.array(box[2:]) * SIZE, size=(count, 2))
     return x + rng.normal(scale=0.3, size=x.shape), x + rng.normal(scale=0.3, size=x.shape)
@@ -52,7 +52,7 @@ def both(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray
 
 
 def ring_pairs(count: int = 24) -> list[tuple[int, int, tuple[np.ndarray, np.ndarray]]]:
-    """(i, j, matches) of a boulder that is photographed all around."""
+    """Return (i, j, matches) of a boulder photographed from all around."""
     scene = synthetic.boulder(1500, seed=3)
     views = synthetic.ring(count, [WIDE], seed=4)
     return [
@@ -70,7 +70,7 @@ class TestMotions:
             assert found.two
             assert not found.only_still
             assert not found.one
-            assert abs(found.still - still_count) <= 0.05 * still_count + 6  # the object passes through its axis
+            assert abs(found.still - still_count) <= 0.05 * still_count + 6  # some points of the object are on its axis
             assert found.moving > 0.6 * len(moving[0])
             assert found.agreeing < 0.6
 
@@ -78,7 +78,7 @@ class TestMotions:
         for _, _, moving in ring_pairs():
             found = motions(*moving, SIZE)
             assert found.one
-            assert found.still == 0  # that few matches are near the axis is no peak
+            assert found.still == 0  # the few matches near the axis are no peak
 
     def test_copies_of_a_photo_are_no_two_motions(self) -> None:
         found = motions(*staying(400, seed=0), SIZE)
@@ -99,17 +99,17 @@ class TestMotions:
         assert found.one
 
     def test_towards_the_middle_of_a_zoom_there_is_no_peak(self) -> None:
-        """A camera that goes forward leaves what it goes towards in its place, but around it all changes smoothly."""
+        """With a forward-moving camera, the point it heads for stays in place, but motion grows smoothly around it."""
         rng = np.random.default_rng(2)
         x = rng.uniform(0, SIZE, size=(20_000, 2))
         y = (x - np.array(SIZE) / 2) * 1.02 + np.array(SIZE) / 2
         within = still_px(SIZE)
-        assert (np.linalg.norm(y - x, axis=1) < within).sum() > 100  # which is more than what counts as still
+        assert (np.linalg.norm(y - x, axis=1) < within).sum() > 100  # enough to count as a still background
         assert motions(x, y, SIZE).still == 0
 
     @pytest.mark.parametrize("angle", np.linspace(0, 2 * np.pi, 5)[:4])
     def test_tripod_that_gives_way_leaves_two_motions(self, angle: float) -> None:
-        """The background is shifted as a whole, by more than its features are wrong, and less than the object moves."""
+        """The whole background is shifted by more than the errors of its features and less than the object moves."""
         shift = 2.5 * still_px(SIZE) * np.array([np.cos(angle), np.sin(angle)])
         two = 0
         for i, j, moving in ring_pairs():
@@ -172,7 +172,7 @@ def capture() -> Turntable:
 class TestMasks:
     @staticmethod
     def around(capture: Turntable) -> np.ndarray:
-        """Places of the background, as shares of the picture."""
+        """Return positions of the background, as fractions of the picture."""
         height, width = capture.masks.shape[1:]
         rows, columns = np.nonzero(~capture.masks.any(axis=0))
         return np.column_stack([columns / width, rows / height])
@@ -213,7 +213,7 @@ def solved(photos: Path, scene_dir: Path, **options: object) -> tuple[dict, list
 
 
 def errors(capture: Turntable, scene_dir: Path) -> tuple[float, float]:
-    """Largest error of a position as a share of the radius, and of a rotation in degrees, after the best similarity."""
+    """Return the largest position error (fraction of the radius) and rotation error (degrees) after alignment."""
     frames = scenes.load(scene_dir).frames
     truth = np.array([capture.object_from_cam[int(frame.name[5:8])] for frame in frames])
     found = np.array([frame.world_from_cam for frame in frames])
@@ -261,7 +261,7 @@ class TestPoses:
             assert (mask & ~truth).sum() < 0.03 * truth.size
 
     def test_masks_that_were_mended_by_hand_are_used(self, made: tuple[Path, dict, list[str]]) -> None:
-        """Masks that are there stay as they are when poses are made again."""
+        """Existing masks are kept when poses are estimated again."""
         folder = made[0]
         mask = sorted((folder / "scene" / "masks").iterdir())[0]
         narrower = np.asarray(Image.open(mask)).copy()
@@ -273,7 +273,7 @@ class TestPoses:
         assert report["images"][0]["registered"]
 
     def test_object_in_a_room_that_turns_with_it_needs_no_masks(self, capture: Turntable, tmp_path: Path) -> None:
-        """A camera that goes around is left alone: the background is made of the truth's masks, grey."""
+        """Like a camera that moves around the object: the background outside the true masks is made grey."""
         photos = np.where(capture.masks[..., None], capture.photos, np.uint8(128))
         write(replace(capture, photos=photos), tmp_path)
         report, notes = solved(tmp_path / "images", tmp_path / "scene")
@@ -290,7 +290,7 @@ class TestDoctor:
         return examine(subject, threads=1, progress=lambda done, what: None)
 
     def test_turntable_is_named_and_nothing_is_said_of_the_camera(self, capture: Turntable, tmp_path: Path) -> None:
-        """The camera stood still: that it "only turned, or hardly moved" would be the wrong advice."""
+        """The camera stood still, so "only turned, or hardly moved" would be the wrong advice."""
         write(capture, tmp_path)
         diagnosis = self.examined(tmp_path / "images")
         found = {finding.check: finding for finding in diagnosis.findings}

@@ -1,4 +1,4 @@
-"""benchmarks/uncertainty.py: who sees what on spheres by closed form, its statistics against closed forms and loops."""
+"""benchmarks/uncertainty.py: visibility on spheres in closed form, and statistics against closed forms and loops."""
 
 import csv
 import itertools
@@ -129,12 +129,12 @@ def test_sparsification_is_the_mean_of_what_is_left():
 
 
 def test_areas_have_their_closed_forms():
-    """The oracle has no AUSE, random order no AURG, and a constant uncertainty is a random order."""
+    """The oracle has an AUSE of 0, a random order an AURG of 0; a constant uncertainty counts as a random order."""
     error = np.linspace(0, 1, 20_000) ** 2
     rng = np.random.default_rng(0)
     assert statistics.ause(error, error) == 0
     assert statistics.ause(error, np.exp(error)) == 0
-    # Of errors x^2 the mean of the smallest fraction f is f^2 / 3; up to 99 % removed, random order keeps 1 / 3.
+    # For errors x^2, the smallest fraction f has the mean f^2 / 3; up to 99 % removed, a random order keeps 1 / 3.
     random = np.trapezoid(1 / 3 - (1 - statistics.RATIOS) ** 2 / 3, statistics.RATIOS)
     for values in (rng.random(len(error)), np.zeros(len(error))):
         assert statistics.ause(error, values) == pytest.approx(random, abs=0.01)
@@ -146,7 +146,7 @@ def test_ause_of_views_is_the_mean_over_views_of_normalised_areas():
     """Two views with errors of different size and the uncertainty in the opposite order have the same area."""
     error = np.concatenate([np.linspace(0, 1, 5000), 100 * np.linspace(0, 1, 5000)])
     views = np.repeat([0, 1], 5000)
-    # Of errors from 0 to 1 the smallest part f has the mean f / 2, the largest 1 - f / 2.
+    # For errors from 0 to 1, the smallest fraction f has the mean f / 2, the largest 1 - f / 2.
     left = 1 - statistics.RATIOS
     expected = np.trapezoid((1 - left / 2) - left / 2, statistics.RATIOS) / (1 - left.min() / 2)
     assert statistics.ause_of_views(error, -error, views) == pytest.approx(expected, rel=1e-3)
@@ -164,7 +164,7 @@ def test_intervals_widened_by_their_quantile_hold_their_level():
 
 @pytest.mark.parametrize("members", [2, 5, 8])
 def test_members_of_the_distribution_of_the_truth_hold_it_as_stated(members):
-    """The positive control: truth and members are draws of one Gaussian, for each pixel another one."""
+    """The positive control: truth and members are drawn from the same Gaussian, a different one per pixel."""
     rng, pixels = np.random.default_rng(members), 40_000
     middle, deviation = rng.normal(size=pixels), rng.exponential(size=pixels)
     drawn = middle + deviation * rng.normal(size=(members + 1, pixels))
@@ -172,7 +172,7 @@ def test_members_of_the_distribution_of_the_truth_hold_it_as_stated(members):
         assert statistics.held_by_interval(drawn[1:], drawn[0], level=level) == pytest.approx(level, abs=0.01)
     expected = members / (2 * members + 1)
     assert statistics.variance_fraction(drawn[1:], drawn[0]) == pytest.approx(expected, abs=0.02)
-    # Ten times as far off as the members are apart.
+    # The truth is off by ten times the deviation of the members.
     assert statistics.held_by_interval(drawn[1:], drawn[0] + 10 * deviation, level=0.5) < 0.1
     assert statistics.variance_fraction(drawn[1:], drawn[0] + 10 * deviation) < 0.02
 
@@ -283,9 +283,9 @@ def test_a_point_is_seen_up_to_two_millimetres_behind_the_surface():
 
 
 def write_replicate(folder: Path, *, seed: int, bias: float) -> None:
-    """Files as `train` leaves them, of four views: members and truth are draws of one Gaussian, and `bias` apart.
+    """Write the files of `train` for four views: members and truth are draws of one Gaussian, offset by `bias`.
 
-    Pixels of U0, where the Gaussian is ten times as wide, are as many as those of D; a fifth has no surface.
+    U0, where the Gaussian is ten times as wide, has as many pixels as D; a fifth of all pixels has no surface.
     """
     rng, pixels = np.random.default_rng(seed), 4 * uncertainty.PIXELS_PER_VIEW
     unseen = rng.random(pixels) < 0.5
@@ -305,7 +305,7 @@ def write_replicate(folder: Path, *, seed: int, bias: float) -> None:
 
 @pytest.mark.parametrize(("bias", "verdict"), [(0.0, "YES"), (1.0, "LABEL ONLY")])
 def test_ensembles_of_known_quality_get_their_verdicts(tmp_path, bias, verdict):
-    """The positive control through all files: YES for draws of the truth's Gaussian, not with a common error."""
+    """The positive control through all files: YES for draws of the truth's Gaussian, but not if they share an error."""
     for seed, one in enumerate(uncertainty.replicates()):
         write_replicate(tmp_path / one.name, seed=seed, bias=bias)
     uncertainty.judge(tmp_path)
@@ -319,7 +319,7 @@ def test_ensembles_of_known_quality_get_their_verdicts(tmp_path, bias, verdict):
         assert found["held"] == pytest.approx(0.9, abs=0.01)
         assert found["v_unseen"] == pytest.approx(5 / 11, abs=0.03)
         assert found["p_of_ause"] == pytest.approx(2.0**-12)
-    # Nothing is known of the scenes, and another replicate knows no more.
+    # Random maps know nothing of the errors, nor does another replicate.
     for row in rows:
         for name in ("random", "coverage", "another replicate"):
             assert abs(float(row[f"AURG {name}"])) < 0.1 * float(row["mean error"])
@@ -360,7 +360,7 @@ def test_squared_jacobians_are_those_of_a_grid_of_offsets():
 
 
 def test_what_no_ray_meets_has_the_deviation_of_the_prior():
-    """The inverse of lambda alone; where rays see a colour change, less."""
+    """The variance is the inverse of lambda, and less where the colour of rays depends on the grid."""
     side, model = 3, small_model()
     prior = laplace.PRIOR / side**3
     variance = torch.full(((side + 1) ** 3,), 1.0 / prior, dtype=torch.float64)
@@ -396,7 +396,7 @@ def test_predictors_are_combined_as_in_the_other_scenes():
 
 
 def test_a_depth_camera_sees_the_points_at_its_depth(tmp_path):
-    """A wall 2 m in front of the depth camera, with a hole; the colour camera stands beside it."""
+    """A wall 2 m in front of the depth camera, with a hole; the colour camera is beside it."""
     (tmp_path / "depth").mkdir()
     depth = np.full((480, 640), 2000, np.uint16)
     depth[:, 320:] = 0

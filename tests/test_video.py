@@ -89,7 +89,7 @@ def test_the_comment_is_in_the_file(tmp_path, kind):
 
 
 def test_the_same_frames_give_the_same_gif(tmp_path):
-    """Encoders of the other formats are faithful to their pictures only: x264 moves a few bits once in 1,000 files."""
+    """The other encoders reproduce pictures but not bytes: x264 changes a few bits in one of 1,000 files."""
     paths = [tmp_path / f"{name}.gif" for name in "ab"]
     for path in paths:
         write(path, smooth_frames(3, height=16, width=16), kind="gif", comment="of both")
@@ -110,7 +110,7 @@ def test_quality_follows_crf(tmp_path):
 
 @pytest.mark.parametrize(("plays", "told"), [(0, 0), (1, None), (3, 2)])
 def test_a_gif_tells_the_player_how_often_it_plays(tmp_path, plays, told):
-    """Pillow reads the extension of Netscape: the number of repetitions, 0 for ever, none for once."""
+    """Pillow reads the Netscape extension: the number of repetitions, 0 for ever, none for once."""
     write(tmp_path / "a.gif", smooth_frames(2, height=8, width=8), kind="gif", plays=plays)
     with Image.open(tmp_path / "a.gif") as image:
         assert image.info.get("loop") == told
@@ -142,7 +142,7 @@ def test_odd_sizes_are_padded_with_their_edge(tmp_path, height, width):
 
 
 def test_the_index_stands_before_the_frames(tmp_path):
-    """Fast start: a player on the web begins before the whole file is there."""
+    """Fast start: a web player begins before the whole file has arrived."""
     path = tmp_path / "a.mp4"
     write(path, [np.zeros((16, 16, 3), np.uint8)])
     content = path.read_bytes()
@@ -203,7 +203,7 @@ def test_a_place_that_cannot_be_written_is_told(tmp_path):
 
 @pytest.fixture
 def broken_ffmpeg(tmp_path, monkeypatch) -> Callable[[str], Path]:
-    """Puts a shell script in the place of ffmpeg."""
+    """Put a shell script in place of ffmpeg."""
 
     def put(script: str) -> Path:
         program = tmp_path / "ffmpeg"
@@ -218,7 +218,7 @@ def broken_ffmpeg(tmp_path, monkeypatch) -> Callable[[str], Path]:
 def test_an_encoder_that_fails_is_quoted(tmp_path, broken_ffmpeg):
     """ffmpeg cannot open its output; the error names the file that was asked for and the encoder's reason."""
     program = broken_ffmpeg("echo 'first line' >&2\necho 'No space left on device' >&2\nexit 1")
-    for side in (1024, 2):  # more than a pipe holds: writing meets the closed end; less: closing meets the status
+    for side in (1024, 2):  # more than a pipe holds: writing fails; less: closing finds the status
         with pytest.raises(UserError, match=r"cannot write .*a\.mp4: No space left on device"):
             write(tmp_path / "a.mp4", [np.zeros((side, side, 3), np.uint8)])
     assert list(tmp_path.iterdir()) == [program]
@@ -253,7 +253,7 @@ def test_a_missing_ffmpeg_is_told(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("command", [("info",), ("poses", "--frames", "4")])
 def test_a_video_is_not_called_damaged_where_ffmpeg_is_missing(command, tmp_path, monkeypatch):
-    """IMAGEIO_FFMPEG_EXE named a file that is not there: poses ended with a traceback, info missed the video."""
+    """Regression: if IMAGEIO_FFMPEG_EXE was a missing file, poses ended with a traceback and info missed the video."""
     video = tmp_path / "a.mp4"
     write(video, [np.zeros((16, 16, 3), np.uint8)] * 4)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))

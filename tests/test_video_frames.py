@@ -21,7 +21,7 @@ MOVING = [2.0 * number for number in range(40)]
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory) -> Path:
-    """A camera that moves steadily, its frames blurred but for one in each fifth of a second at 25 per second."""
+    """A steadily moving camera at 25 frames per second; in each fifth of a second, all frames but one are blurred."""
     blurred = [number for number in range(40) if number not in SHARP]
     return encode(tmp_path_factory.mktemp("clip") / "clip.mp4", pan(MOVING, blurred=blurred), fps=25)
 
@@ -84,7 +84,7 @@ def test_the_same_video_gives_the_same_bytes(clip, tmp_path):
 
 
 def test_a_camera_that_stands_still_gets_no_frames_for_it(tmp_path):
-    """2 s of motion, 4 s of standing with noise, 2 s of motion: nothing from the standing but its ends."""
+    """2 s of motion, 4 s of standing with noise, 2 s of motion: no frames of the standstill except at its ends."""
     offsets = [*np.arange(50), *np.full(100, 50.0), *range(50, 100)]
     noise = np.random.default_rng(0).normal(scale=3, size=(200, 120, 160, 1))
     frames = [np.clip(f + n, 0, 255).astype(np.uint8) for f, n in zip(pan(offsets), noise, strict=True)]
@@ -138,13 +138,13 @@ def test_a_folder_of_something_else_is_never_replaced(clip, tmp_path):
 def test_fewer_frames_than_asked(clip, tmp_path):
     notes = extract(clip, tmp_path / "frames", count=41)
     assert f"{clip.name} has only 40 frames, but --frames is 41: using all of them" in notes
-    extract(clip, tmp_path / "all")  # without a number: as many as there are that differ
+    extract(clip, tmp_path / "all")  # without a number: all frames that differ
     assert numbers_in(tmp_path / "frames") == numbers_in(tmp_path / "all") == list(range(40))
 
 
 @given(data=st.data(), total=st.integers(1, 40))
 def test_as_many_rising_numbers_as_asked_for(data, total):
-    """Whatever the measures, infinite motion and equal sharpness included."""
+    """For any measures, including infinite motion and equal sharpness."""
     moved = data.draw(st.lists(st.sampled_from([0.0, 0.004, 0.01, 0.3, np.inf]), min_size=total, max_size=total))
     sharp = data.draw(st.lists(st.integers(0, 3), min_size=total, max_size=total))
     steps = data.draw(st.lists(st.sampled_from([0.01, 0.04, 1.0]), min_size=total, max_size=total))
@@ -161,7 +161,7 @@ def test_a_meter_keeps_one_picture():
     meter = FrameMeter()
     moved = [meter.measure(frame[..., 0]).moved for frame in pan([0.0, 1.0, 2.0, 3.0, 4.0])]
     assert moved[0] == np.inf
-    # Against the anchor, which becomes the frame that has moved by 1 %, 1.6 of 160 pixels.
+    # Motion is from an anchor, which is replaced by the first frame that has moved by 1 %, 1.6 of 160 pixels.
     np.testing.assert_allclose(moved[1:], np.array([1, 2, 1, 2]) / 160, atol=0.1 / 160)
 
 

@@ -1,4 +1,4 @@
-"""nerfcli.media.video_input: frames come back upright, whole in number, at their times; what is no video is told."""
+"""nerfcli.media.video_input: frames come back upright, whole in number, at their times; other files are refused."""
 
 import io
 from pathlib import Path
@@ -22,7 +22,7 @@ def level_of(number: int) -> int:
 
 @pytest.fixture(scope="module")
 def frames() -> list[np.ndarray]:
-    """A red, a green, a blue and a grey quarter; the grey one tells the number of the frame."""
+    """A red, a green, a blue and a grey quarter; the grey level encodes the number of the frame."""
     frames = []
     for number in range(COUNT):
         frame = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
@@ -39,7 +39,7 @@ def clip(frames, tmp_path_factory) -> Path:
 
 
 def measured_levels(video: Video) -> tuple[np.ndarray, list[float]]:
-    """Times and mean grey of the fourth quarter, of each frame."""
+    """Return the time of each frame and the mean grey of its fourth quarter."""
     found = measure_frames(video, lambda f: float(f[26:-2, 34:-2].mean()), longer_side=999, progress=lambda share: None)
     assert found.errors == 0
     return found.seconds, found.values
@@ -68,7 +68,7 @@ def test_chosen_frames_are_those_that_were_measured(clip, frames):
 
 
 def test_times_of_a_variable_frame_rate(clip, tmp_path):
-    """Every third frame of the first half, all of the second: none is repeated or dropped, times stay."""
+    """Every third frame of the first half, all of the second: none is repeated or dropped, and times are kept."""
     path = tmp_path / "vfr.mp4"
     ffmpeg("-i", str(clip), "-vf", "select='if(lt(n,20),not(mod(n,3)),1)'", "-fps_mode", "vfr", *LOSSLESS, str(path))
     expected = [*range(0, 20, 3), *range(20, COUNT)]
@@ -152,7 +152,7 @@ def test_a_video_that_is_cut_short_is_told(clip, tmp_path, name):
 
 
 def test_what_a_thread_says_amid_the_line_of_another_is_heard():
-    """As ffmpeg printed it, in 74 of 2,000 runs with eight at once and 3 of 400 beside other work."""
+    """Seen from ffmpeg in 74 of 2,000 runs with eight at once, and in 3 of 400 beside other work."""
     torn = b"[Parsed_showinfo_0 @ 0x7f68] [info] n: 11 pts_time:0.366667 stream 0, offset 0x17d0: partial file\n"
     decoder = _Decoder(cast(Any, SimpleNamespace(stderr=io.BytesIO(torn), wait=lambda: 0)))
     decoder.finish()

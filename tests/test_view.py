@@ -166,14 +166,14 @@ def test_a_coarse_picture_has_the_rays_of_the_middles_of_its_pixels(spheres_run)
     np.testing.assert_allclose(coarse[3, 5, :4], one[0, 0, :4], atol=2e-4)
 
 
-# The second is just enough for a whole first picture, were it not for the pixels at its border.
+# The second rate would just allow a whole first picture, but for the pixels at its border.
 @pytest.mark.parametrize("rate", [1e-8, 0.03 * 64 / (301 * 177), 1e-4, 1e-2])
 def test_strides_end_with_every_pixel_and_tiles_cover_each_once_from_the_middle(spheres_run, rate):
     frame = frame_of(spheres_run, width=301, height=177)
     strides = strides_of(301, 177, rate)
     assert strides[-1] == 1
     assert strides == sorted(set(strides), reverse=True)
-    assert len(tiles_of(View(frame, 0.5), strides[0], rate)) == 1  # a motion is seen whole
+    assert len(tiles_of(View(frame, 0.5), strides[0], rate)) == 1  # while moving, the picture is one tile
     for stride in strides:
         tiles = tiles_of(View(frame, 0.5), stride, rate)
         width, height = -(-301 // stride), -(-177 // stride)
@@ -186,7 +186,7 @@ def test_strides_end_with_every_pixel_and_tiles_cover_each_once_from_the_middle(
 
 
 def test_a_newer_view_of_a_client_ends_the_one_before_between_two_tiles(monkeypatch, spheres_run):
-    """Counted in tiles, as no assertion may depend on how fast the machine is."""
+    """Counted in tiles, so that no assertion depends on the speed of the machine."""
     first, second = (View(frame_of(spheres_run, width=size, height=size), 0.5) for size in (640, 320))
     done: list[int] = []
     going, held = threading.Event(), threading.Event()
@@ -428,7 +428,7 @@ def fit(run: Path, *, on_step: Any = lambda progress: None) -> None:
 
 
 class Watched:
-    """A run that somebody looks at from its first step on."""
+    """A run with a viewer from its first step on."""
 
     def __init__(self, run: Path):
         self.run, self.show = run, RunShow(run, threads=1)
@@ -463,7 +463,7 @@ def test_who_looks_sees_each_field_and_changes_nothing(capture, at_once):
 
     fit(run, on_step=on_step)
     assert watched.states[3:] == ["training"] * 9
-    assert len(seen) >= 6  # the last steps of so short a training meet nothing, and leave the field as it is
+    assert len(seen) >= 6  # the last steps of such a short training hit nothing and do not change the field
     assert (run / FIELD).read_bytes() == (alone / FIELD).read_bytes()
     watched.server.clients = 0
     watched.show.tick(watched.server)  # type: ignore[arg-type]
@@ -480,7 +480,7 @@ def test_pause_and_stop_reach_the_training(capture, at_once):
     last = 0
 
     def elsewhere() -> None:
-        """The server's thread while the training waits."""
+        """Act as the server's thread while the training waits."""
         deadline = time.monotonic() + 60
         while (status := read_status(run)) is None or not status.paused:
             assert time.monotonic() < deadline

@@ -37,7 +37,7 @@ LENS = Camera("OPENCV", 160, 120, (150.0, 148.0, 83.0, 58.0, -0.1, 0.02, 0.001, 
 
 
 def distance_to_balls(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Distance of the first hit of rays (N, 3), unit; NaN where there is none."""
+    """Return the distance to the first hit of unit rays (N, 3), NaN where there is none."""
     nearest = np.full(len(directions), np.inf)
     for centre, radius in zip(CENTRES, RADII, strict=True):
         off = origins - centre
@@ -49,7 +49,7 @@ def distance_to_balls(origins: np.ndarray, directions: np.ndarray) -> np.ndarray
 
 
 def ball_map(place: np.ndarray, target: np.ndarray) -> DepthMap:
-    """What a camera with a distorting lens sees of the balls."""
+    """Return the depth map of the balls seen by a camera with a distorting lens."""
     frame = Frame("a", LENS, look_at(place, target, np.array([0.1, 0.2, 1.0])))
     rays, _ = LENS.pixel_bearings()
     distances = distance_to_balls(np.broadcast_to(place, rays.shape), rays @ frame.world_from_cam[:3, :3].T)
@@ -75,10 +75,10 @@ def surface_points(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def truly_seen(view: DepthMap, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """In closed form: in the picture, nothing in front, incidence below 80 degrees; and where all that is clear.
+    """Return which points are seen in closed form, and for which of them this is clear.
 
-    A point is not clear within three pixels of a border between seen and unseen, nor on the rim of a ball, from 68 to
-    96 degrees.
+    Seen: in the picture, nothing in front, incidence below 80 degrees. Not clear: within three pixels of a border
+    between seen and unseen, or on the rim of a ball, at an incidence from 68 to 96 degrees.
     """
     place = view.frame.centre
     reach = 3 * np.linalg.norm(points - place, axis=1, keepdims=True) / LENS.focal_px
@@ -94,7 +94,7 @@ def truly_seen(view: DepthMap, points: np.ndarray, normals: np.ndarray) -> tuple
         pixels, valid = LENS.project((moved - place) @ view.frame.world_from_cam[:3, :3])
         inside = valid & (pixels >= 0).all(1) & (pixels <= (LENS.width, LENS.height)).all(1)
         facing = -(rays * normals).sum(1) / distance
-        hidden = first < distance - 0.2  # the other ball, not the bulge of its own
+        hidden = first < distance - 0.2  # by the other ball, not by the bulge of its own
         answers.append(inside & ~hidden & (facing > np.cos(np.radians(80))))
     clear = np.all(np.array(answers) == answers[0], axis=0)
     steepness = np.degrees(np.arccos(-((points - place) * normals).sum(1) / np.linalg.norm(points - place, axis=1)))
@@ -152,7 +152,7 @@ def test_the_largest_angle_is_between_any_two_cameras():
 
 
 def plane_map(incidence_deg: float) -> DepthMap:
-    """A pinhole camera that sees nothing but a plane, at distance 2 in the middle."""
+    """Return the depth map of a pinhole camera that sees only a plane, at distance 2 in the middle."""
     camera = Camera.pinhole(80, 60, 400.0)
     rays, _ = camera.pixel_bearings()
     tilt = np.radians(incidence_deg)
@@ -267,7 +267,7 @@ def test_depths_of_photos_are_kept_for_the_field_they_belong_to(run, monkeypatch
 
 
 def test_a_photo_sees_nothing_where_its_mask_covers_it(run, tmp_path):
-    """The left half of a photo is masked: of the points there it sees none, and the others see as many as before."""
+    """A photo with a masked left half sees no points there; the other photos see as many as before."""
     trained, masked = Run(run), Run(run)
     train = list(trained.cameras.train)
     first = train[0]
@@ -278,7 +278,7 @@ def test_a_photo_sees_nothing_where_its_mask_covers_it(run, tmp_path):
     train[0] = replace(first, image=tmp_path / "photo.png", mask=tmp_path / "mask.png")
     masked.__dict__["cameras"] = RunCameras(tuple(train), trained.cameras.test)
     whole, *others = photo_depths(trained, trained.model(), on_progress=lambda share: None, notify=pytest.fail)
-    (run / PHOTO_DEPTHS).unlink()  # kept for the photos of the run, whose masks do not change
+    (run / PHOTO_DEPTHS).unlink()  # cached for the photos of the run, whose masks do not change
     part, *same = photo_depths(masked, masked.model(), on_progress=lambda share: None, notify=pytest.fail)
     half = whole.distances.shape[1] // 2
     assert np.isfinite(whole.distances[:, :half]).any()

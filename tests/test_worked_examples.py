@@ -69,7 +69,7 @@ def test_weights_are_differences_of_transmittance(slabs, dtype):
 
 
 def test_depths_of_slabs_at_points(slabs, dtype):
-    # Depths 1, 2, 3 as given places: the conventions differ, and each is its own number.
+    # Depths 1, 2, 3 are given: each convention gives a different number.
     density, _, lengths = slabs
     weights, transmittance = parts_for(dtype).interval_weights(density, lengths, OFFSETS)
     places = torch.tensor([1.0, 2.0, 3.0], dtype=dtype)

@@ -1,4 +1,4 @@
-"""Another world frame: what a similarity changes of a capture and what not; up, origin, and the smallest rotation."""
+"""Another world frame: what a similarity changes in a capture and what it keeps; up, origin, smallest rotation."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.cameras.world import WORLD_AXES, moved_to_origin, smallest_rotation, transformed, turned_up
+from nerfcli.cameras.world import WORLD_AXES, moved_to_origin, smallest_rotation, transformed, up_aligned
 from nerfcli.errors import UserError
 
 few = examples(30)
@@ -87,12 +87,12 @@ def test_a_capture_without_frames_or_bounds_keeps_none():
 def test_up_points_along_the_axis_and_nothing_else_changes_size(seed, axis):
     rng = np.random.default_rng(seed)
     capture = transformed(capture_of(rng), random_similarity(rng, 2.0))
-    turn = turned_up(capture.frames, axis)
+    turn = up_aligned(capture.frames, axis)
     assert turn.scale == 1
     np.testing.assert_array_equal(turn.translation, 0)
     np.testing.assert_allclose(up_direction(transformed(capture, turn).frames), WORLD_AXES[axis], rtol=0, atol=1e-9)
     known = rng.normal(size=3)
-    turn = turned_up([], axis, up=known)
+    turn = up_aligned([], axis, up=known)
     np.testing.assert_allclose(turn.rotation @ known, np.linalg.norm(known) * WORLD_AXES[axis], rtol=0, atol=1e-14)
 
 
@@ -101,7 +101,7 @@ def test_axes_by_hand():
     np.testing.assert_array_equal(WORLD_AXES["z"], [0, 0, 1])
     # y up becomes z up by a quarter turn about x: z goes to -y.
     np.testing.assert_allclose(
-        turned_up([], "z", up=np.array([0.0, 3, 0])).rotation @ [0, 0, 1], [0, -1, 0], atol=1e-15
+        up_aligned([], "z", up=np.array([0.0, 3, 0])).rotation @ [0, 0, 1], [0, -1, 0], atol=1e-15
     )
 
 
@@ -137,10 +137,10 @@ def test_origins():
 @pytest.mark.parametrize(
     ("make", "what"),
     [
-        (lambda: turned_up([], "up", up=np.ones(3)), "unknown axis 'up'"),
-        (lambda: turned_up([], "z"), "no cameras to estimate the up direction from"),
-        (lambda: turned_up([], "z", up=np.zeros(3)), "is not a direction"),
-        (lambda: turned_up([], "z", up=np.array([np.nan, 0, 1])), "is not a direction"),
+        (lambda: up_aligned([], "up", up=np.ones(3)), "unknown axis 'up'"),
+        (lambda: up_aligned([], "z"), "no cameras to estimate the up direction from"),
+        (lambda: up_aligned([], "z", up=np.zeros(3)), "is not a direction"),
+        (lambda: up_aligned([], "z", up=np.array([np.nan, 0, 1])), "is not a direction"),
         (lambda: moved_to_origin([], "focus"), "no cameras to compute the focus from"),
         (lambda: moved_to_origin([], "middle"), "'middle' is not a point"),
         (lambda: moved_to_origin([], "1,2"), "not a point of three finite numbers"),

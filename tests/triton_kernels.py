@@ -1,10 +1,10 @@
-"""The GPU kernels against the reference in float64: value and gradient, on odd sizes, in every branch.
+"""The GPU kernels against the reference in float64: values and gradients, on odd sizes, in every branch.
 
-`test_triton_kernels` runs this in a process of its own: in Triton's interpreter on the CPU, or on a GPU.
+`test_triton_kernels` runs this file in a separate process: in Triton's interpreter on the CPU, or on a GPU.
 """
 
 # pyright: reportCallIssue=false
-# It does not know how many tensors `on_device` gives.
+# Pyright does not know how many tensors `on_device` returns.
 
 import inspect
 import json
@@ -33,19 +33,19 @@ from nerfcli.selftest.table import OF_GPU, checks, row_of
 
 DEVICE = torch.device("cpu" if INTERPRETED else "cuda")
 SIZES = [0, 1, 5, 123]
-# Of float32, and of what passes through float16: 11 bits, and sums of such.
+# Relative tolerances: of float32, and of values that pass through float16 (11 bits) and sums of them.
 SINGLE, HALF = 1e-5, 6e-3
 
 
 @cache
 def first_builtin(language: Any) -> str | None:
-    """Name of the first operation of Triton's language that its interpreter replaces."""
+    """Return the name of the first operation of Triton's language that its interpreter replaces, or None."""
     return next((name for name, member in inspect.getmembers(language) if interpreter.tl.core.is_builtin(member)), None)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _patched_once() -> Iterator[None]:
-    """The interpreter goes through the whole language at each call of a function, though all is replaced already."""
+    """Patch Triton's language only if it is not patched yet; the interpreter would do so at each call of a function."""
     with pytest.MonkeyPatch.context() as patch:
         replace_all = interpreter._patch_builtin
 
@@ -81,7 +81,7 @@ def on_device(*tensors: Tensor) -> Any:
 
 
 def offsets_of(samples: int, generator: torch.Generator) -> Tensor:
-    """Rays of random sizes, empty ones among them, and one longer than what a program looks at together."""
+    """Return offsets of rays of random sizes: some are empty, and one is longer than a Triton program's block."""
     cuts = torch.randint(0, samples + 1, (max(1, samples // 9),), generator=generator).sort()[0]
     cuts = cuts[cuts <= samples // 3]
     return torch.cat([torch.tensor([0]), cuts, torch.tensor([samples // 3, samples, samples])])
@@ -157,7 +157,7 @@ def test_networks(samples, hidden, degree, generator):
 
 @pytest.mark.parametrize(("weights", "gradient"), [(300.0, 1e-6), (1.0, 1e-42), (1.0, 0.0)])
 def test_gradients_of_networks_stay_finite(weights, gradient, generator):
-    """Where layers multiply them beyond float16, and where they are too small to be scaled to it."""
+    """Layers that amplify the gradients beyond float16, and gradients too small to be scaled into it."""
     layers = layers_of(32, generator)
     for part in (layers[0], layers[1], layers[2][:, :16]):
         part *= weights
@@ -194,7 +194,7 @@ def rays_and_march(count: int, contraction: str, generator: torch.Generator) -> 
 
 
 def exactly(rays: Rays, march: March) -> tuple[Rays, March]:
-    """The same in float64 on the CPU."""
+    """Return the same rays and march in float64 on the CPU."""
     plain = Rays(*(None if x is None else x.detach().cpu().double() for x in rays))  # type: ignore[arg-type]
     return plain, march._replace(edges=march.edges.cpu().double(), occupied=march.occupied.cpu())
 
@@ -231,7 +231,7 @@ def test_visible_samples(count, room, faded, generator):
     fast = marching.visible_samples(
         rays, march, grid._replace(layers=on_device(*layers)), table=table.half().to(DEVICE), capacity=capacity
     )
-    assert torch.equal(fast.offsets.cpu(), exact.offsets)  # none is kept by one alone for these seeds
+    assert torch.equal(fast.offsets.cpu(), exact.offsets)  # for these seeds both keep the same samples
     assert fast.rays is not None
     assert torch.equal(fast.rays.cpu(), reference.ray_indices(exact.offsets))
     assert exact.encoded is not None
@@ -269,10 +269,10 @@ def test_sample_coordinates(samples, contraction, reach, generator):
 def samples_along(
     samples: int, magnitude: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Density, colours, starts, ends and offsets.
+    """Return density, colours, starts, ends and offsets.
 
-    The thinnest and the thickest have a sample here and there that is a million times as dense; the others absorb
-    all along their rays, behind what a program looks at together, too.
+    At the smallest and the largest magnitudes, every 11th sample is a million times denser. At the others, rays absorb
+    along their whole length, also beyond the first block of a Triton program.
     """
     offsets = offsets_of(samples, generator)
     density = torch.rand(samples, generator=generator) * magnitude
@@ -355,7 +355,7 @@ def test_light_ends(samples, magnitude, shares, generator):
 
 
 def test_a_far_thin_surface_has_its_spread():
-    """1e-4 wide at a distance of 1000, where float32 counts in steps of 6e-5."""
+    """1e-4 wide at a distance of 1000, where the spacing of float32 is 6e-5."""
     starts = torch.tensor([1000.0, 1000.25])
     ends, density = starts + 0.25, torch.tensor([1e4, 1.0])
     found = depth.light_ends(
@@ -373,7 +373,7 @@ def test_a_far_thin_surface_has_its_spread():
 @pytest.mark.parametrize("rows", SIZES)
 @pytest.mark.parametrize("decay", [0.0, 0.3])
 def test_adam_rows(rows, decay, generator):
-    """Also of rows of which one feature alone has a gradient, or none."""
+    """Including rows in which only one feature has a gradient, or none."""
     start = [torch.randn(1, rows, 4, generator=generator) for _ in range(4)]
     start[3].square_()
     start[1][:, 1::3] = 0.0
@@ -405,7 +405,7 @@ def test_pixel_rays(count, photos, channels, generator):
 def whole(
     backend: Backend, dtype: torch.dtype, count: int, *, hidden: int, targets: Targets, with_sink: bool
 ) -> dict[str, Tensor]:
-    """What a training gets of some rays, and the gradients of a random weighting of it."""
+    """Return the outputs of a training step for some rays, and the gradients of a randomly weighted sum of them."""
     g = torch.Generator().manual_seed(3)
     device = DEVICE if dtype == torch.float32 else torch.device("cpu")
     rays, march = rays_and_march(count, "l2", g)
@@ -472,7 +472,7 @@ def test_a_picture_is_what_the_reference_gives_in_float64(generator):
 
 
 def test_the_half_copy_follows_the_table(generator):
-    """After a step of Adam, which writes it, and after a change by others, such as a checkpoint that is read."""
+    """After a step of Adam, which writes the copy, and after other changes, such as loading a checkpoint."""
     backend = TritonBackend(DEVICE)
     table = torch.randn(1, 16, 4, generator=generator).to(DEVICE)
     gradient, first, second = torch.ones_like(table), torch.zeros_like(table), torch.zeros_like(table)
@@ -484,7 +484,7 @@ def test_the_half_copy_follows_the_table(generator):
 
 
 def test_far_points_contract_as_in_the_reference(generator):
-    """Up to where squares would overflow."""
+    """Out to distances whose squares overflow float32."""
     points = torch.randn(40, 3, generator=generator) * torch.logspace(-3, 36, 40)[:, None]
     rays = Rays(*on_device(points, torch.zeros(40, 3), torch.zeros(40)))
     march = March(*on_device(torch.tensor([0.0, 1.0, 2.0]), torch.ones(2, 2, 2, dtype=torch.bool)), "l2", 1.0)
@@ -497,7 +497,7 @@ OF_SELFTEST = Precision(OF_GPU, torch.float32, str(DEVICE), for_gpu=True)
 
 
 def hard_cases() -> Iterator[Any]:
-    """The rows of `nerfcli selftest --device cuda`; in the interpreter, rays of 4096 samples take seconds."""
+    """Yield the rows of `nerfcli selftest --device cuda`; rays of 4096 samples take seconds in the interpreter."""
     for check in checks():
         if check.is_for(OF_SELFTEST):
             takes_long = "1 to 4096" in check.case and "depth 1 per" not in check.case
@@ -513,7 +513,7 @@ def test_hard_cases_are_within_the_bounds_of_float32(check):
 
 @pytest.fixture(scope="session", autouse=True)
 def _variants() -> Iterator[None]:
-    """Write what has been launched into a file, for the test that compiles it."""
+    """Write the launched kernel variants to a file, for the test that compiles them."""
     yield
     if path := os.environ.get("NERFCLI_VARIANTS"):
         listed = [(variant.kernel.fn.__module__, variant.kernel.fn.__name__, *variant[1:]) for variant in seen]

@@ -1,4 +1,4 @@
-"""Captures made of numbers: cameras around a cloud of points, with exact observations."""
+"""Synthetic captures without photos: cameras around a cloud of points, with exact observations."""
 
 from collections.abc import Sequence
 
@@ -21,7 +21,10 @@ PANORAMA = Camera("EQUIRECTANGULAR", 640, 320, (640.0, 320.0))
 
 
 def capture_of(cameras: Sequence[Camera], *, count: int = 6, num_points: int = 60, seed: int = 0) -> Capture:
-    """Cameras in turn, 4 units from a cloud of points of radius 1, tilted at random, and where each sees the points."""
+    """Return frames about 4 units from a cloud of points of radius 1, randomly tilted, with exact observations.
+
+    Frames cycle through the cameras.
+    """
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.6, 0.6, (num_points, 3))
     frames, seen = [], []

@@ -19,7 +19,7 @@ K = np.array([[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, HEIGHT / 2], [0, 0, 1]])
 
 
 def texture(seed: int, side: int = 768) -> np.ndarray:
-    """A board's picture (side, side, 3): noise with as much in every octave, and shapes with sharp edges."""
+    """Return a board's picture (side, side, 3): noise of equal amplitude in every octave, and sharp-edged shapes."""
     rng = np.random.default_rng(seed)
     picture = np.full((side, side, 3), 120.0)
     for level in range(2, 10):
@@ -40,7 +40,7 @@ def view(
     boards: tuple[tuple[float, float, float, float], ...] = BOARDS,
     seed: int = 0,
 ) -> np.ndarray:
-    """What a camera at `centre`, turned by `pan_deg` about the vertical axis, sees of boards that face it."""
+    """Render boards parallel to z = 0, seen from `centre` by a camera turned by `pan_deg` about the vertical axis."""
     angle = np.radians(pan_deg)
     cam_from_world = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
     photo = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
@@ -50,7 +50,7 @@ def view(
         corner = np.array([x - width / 2, y - width / 2, z]) - centre
         # World point of a board's pixel (u, v): corner + step (u, v, 0).
         homography = K @ cam_from_world @ np.column_stack([(step, 0, 0), (0, step, 0), corner])
-        # Twice as large and halved, so that edges are as sharp as a lens makes them and not jagged.
+        # Drawn at twice the size and halved, so that edges are as smooth as a lens makes them and not jagged.
         large = np.diag([2.0, 2.0, 1.0]) @ homography
         size = (2 * WIDTH, 2 * HEIGHT)
         layer = cv2.warpPerspective(picture, large, size, flags=cv2.INTER_AREA)
@@ -62,13 +62,13 @@ def view(
 
 
 def walk(count: int = 7, *, seed: int = 0) -> list[np.ndarray]:
-    """Photos of a camera that steps sideways and turns a little."""
+    """Return photos of a camera that moves sideways and turns a little."""
     steps = np.linspace(-1, 1, count)
     return [view((0.9 * step, 0.1 * step**2, 0.0), pan_deg=-6 * step, seed=seed) for step in steps]
 
 
 def write(folder: Path, photos: list[np.ndarray]) -> Path:
-    """The photos as JPEG files 00.jpg, 01.jpg, ... of a new folder."""
+    """Write the photos as 00.jpg, 01.jpg, ... into a new folder and return it."""
     folder.mkdir(parents=True)
     for index, photo in enumerate(photos):
         Image.fromarray(photo).save(folder / f"{index:02d}.jpg", quality=93)

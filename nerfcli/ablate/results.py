@@ -1,4 +1,4 @@
-"""Results of an ablation: differences from the reference model with their intervals, and the files with them."""
+"""Results of an ablation: differences from the reference model with their intervals, and the files that hold them."""
 
 import csv
 import math
@@ -16,13 +16,13 @@ from nerfcli.errors import UserError
 
 RESULT, TABLE, RUNS = "ablation.json", "ablation.csv", "runs"
 FORMAT = "nerfcli ablation 2"
-# Of the intervals.
+# Confidence level of the intervals.
 CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class MeasuredTraining:
-    """One training: means over the held-out photos of PSNR and, on whole photos, SSIM; `protocol` says how."""
+    """One training: means over the held-out photos of PSNR and, on whole photos, SSIM, measured as in `protocol`."""
 
     variant: str
     seed: int
@@ -38,16 +38,16 @@ class ResultRow:
     """A variant against the chosen model.
 
     Args:
-        name: of the variant.
-        psnr: the mean over its seeds, dB.
-        ssim: likewise; None where it is not known.
-        difference_db: the mean over the seeds that both have, of the variant minus the chosen model; None for the
-            chosen model itself and where nothing can be compared.
-        interval_db: half of the width of the 95 % interval of that mean, by Student's t over seeds; None for one seed.
-        seconds, steps: of a training, means.
-        seeds: how many.
-        verdict: in words.
-        protocol: of the measurements.
+        name: name of the variant.
+        psnr: mean PSNR over its seeds, in dB.
+        ssim: mean SSIM over its seeds; None if it is not known.
+        difference_db: mean PSNR difference of the variant from the chosen model, over the seeds that both have; None
+            for the chosen model itself and if they have no seed in common.
+        interval_db: half the width of the 95 % interval of that mean, by Student's t over seeds; None for one seed.
+        seconds, steps: means per training.
+        seeds: number of seeds.
+        verdict: a short text such as "better"; empty where nothing can be compared.
+        protocol: protocol of the measurements.
     """
 
     name: str
@@ -93,9 +93,9 @@ def rows_of(measured: Sequence[MeasuredTraining], variants: Sequence[Variant]) -
 
 
 def half_interval(differences: Sequence[float]) -> float | None:
-    """Half of the 95 % interval of the mean of normal differences, by Student's t; None for a single one.
+    """Return half the width of the 95 % interval of the mean of normal differences; None for fewer than two.
 
-    t(0.975, n - 1) s / sqrt(n)
+    Formula: t(0.975, n - 1) s / sqrt(n), with Student's t.
     """
     if len(differences) < 2:
         return None
@@ -123,10 +123,10 @@ def write_results(
     """Write FOLDER/ablation.json and ablation.csv.
 
     Args:
-        folder: of the ablation.
-        rows: of the table.
+        folder: folder of the ablation.
+        rows: rows of the table.
         measured: every training.
-        about: what the ablation is of, plain values.
+        about: description of the ablation's subject, as plain values.
     """
     content = {
         "format": FORMAT,
@@ -148,7 +148,7 @@ def refuse_foreign(folder: Path) -> None:
 
 
 def table_of(rows: Sequence[ResultRow]) -> list[tuple[str, ...]]:
-    """Return the cells of a table for people, as `COLUMNS` names them."""
+    """Return the cells of the printed table, in the order of `COLUMNS`."""
 
     def difference(row: ResultRow) -> str:
         if row.difference_db is None:

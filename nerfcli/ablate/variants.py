@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from nerfcli.runs.components import CHOICES, Components, Value
 
 CHOSEN, AUTO = "chosen", "auto"
-# What these change is what a held-out photo is compared with: their numbers would say nothing beside the others.
+# Components that change what is compared of a held-out photo, so that their numbers are not comparable with others.
 NOT_COMPARABLE = ("masks",)
 
 
@@ -14,9 +14,9 @@ class Variant:
     """A model that is compared with the chosen one.
 
     Args:
-        name: of its row and of its folders.
-        components: what is in it.
-        adds: whether it has a component more than the chosen model, or one less; None for the chosen one itself.
+        name: name of its row and its folders.
+        components: its components.
+        adds: True if it has one component more than the chosen model, False for one less; None for the chosen model.
     """
 
     name: str
@@ -30,8 +30,8 @@ class CaptureTraits:
 
     Args:
         has_alpha: whether its photos have alpha: then nothing is behind the object.
-        has_points: whether it says where points of structure from motion were seen.
-        has_exif: whether EXIF tells different exposures.
+        has_points: whether it states where structure-from-motion points were observed.
+        has_exif: whether EXIF states different exposures.
     """
 
     has_alpha: bool
@@ -40,12 +40,12 @@ class CaptureTraits:
 
 
 def variants(chosen: Components, capture: CaptureTraits, *, only: tuple[str, ...] = ()) -> list[Variant]:
-    """Models with one component removed from the chosen one, or added to it, in the order of `CHOICES`.
+    """Return models with one component removed from the chosen one, or added to it, in the order of `CHOICES`.
 
     Args:
-        chosen: what all are compared with.
-        capture: decides what can be tried at all.
-        only: names of components; all where there are none.
+        chosen: the model that all are compared with.
+        capture: decides which components can be tried.
+        only: names of components; all if empty.
     """
     found = []
     for name in CHOICES:
@@ -60,16 +60,14 @@ def variants(chosen: Components, capture: CaptureTraits, *, only: tuple[str, ...
 
 
 def _off(name: str, chosen: Components) -> Value:
-    """Return the value of a model without the component;
-    what is behind the field is black where nothing else is said.
-    """
+    """Return the value of a component in a model without it; "auto" and "random" backgrounds stay as they are."""
     if name == "background" and chosen.background in ("auto", "random"):
         return chosen.background
     return CHOICES[name].off
 
 
 def _offers(name: str, chosen: Components, capture: CaptureTraits) -> list[Value]:
-    """Values with which the component may be added."""
+    """Return the values with which the component may be added."""
     if (name == "background" and capture.has_alpha) or (name == "points" and not capture.has_points):
         return []
     if name == "stereo" and not chosen.points:
@@ -82,5 +80,5 @@ def _offers(name: str, chosen: Components, capture: CaptureTraits) -> list[Value
 def _variant(chosen: Components, name: str, value: Value, *, adds: bool) -> Variant:
     changed = {name: value}
     if name == "points" and not value:
-        changed["stereo"] = False  # it has no effect without
+        changed["stereo"] = False  # stereo has no effect without points
     return Variant(f"{name}={str(value).lower()}", replace(chosen, **changed), adds)

@@ -1,4 +1,4 @@
-"""Smaller held-out photos, and how far the rendering of their pixels is from a converged one."""
+"""Downscaled held-out photos, and the distance of a rendering of their pixels from a converged one."""
 
 from copy import deepcopy
 from dataclasses import replace
@@ -14,9 +14,9 @@ from nerfcli.render.accuracy import TIGHT, refined
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import TOLERANCE, uniform_cuts
 
-# Every so many of the sampled pixels are rendered again with fine steps.
+# One in this many sampled pixels is rendered again with fine steps.
 QUADRATURE_EVERY = 16
-# Converged is what steps this many times as fine give, with next to nothing left out.
+# A rendering counts as converged with steps this many times as fine, and next to nothing left out by the early stop.
 FINER = 8
 
 
@@ -35,10 +35,10 @@ def quadrature(sample: SampledPixels, model: Model) -> float:
 
 @torch.no_grad()
 def distance_to_float64(model: Model, photo: HeldOutPhoto, *, seed: int, count: int) -> float:
-    """Root mean square of what float64 and steps twice as fine again change of the converged colours of some pixels.
+    """Return the rms change of converged colours, at some pixels, with float64 and steps twice as fine again.
 
-    Float64 goes through plain torch, which defines the operations: so much of the converged pictures is rounding,
-    steps that are still too long, and the compiled kernels together.
+    Float64 runs in plain torch, which defines the operations: the result is the total error of converged pictures from
+    rounding, steps that are still too long, and the compiled kernels.
     """
     total = photo.pixels.shape[0] * photo.pixels.shape[1]
     pixels = np.sort(np.random.default_rng(seed).choice(total, size=min(count, total), replace=False))
@@ -51,7 +51,7 @@ def distance_to_float64(model: Model, photo: HeldOutPhoto, *, seed: int, count: 
 
 
 def smaller(photo: HeldOutPhoto, factor: float) -> HeldOutPhoto:
-    """Return the photo with its sides divided by a factor; as it is where that is 1 or less."""
+    """Return the photo with its sides divided by a factor; unchanged if the factor is 1 or less."""
     if factor <= 1.0:
         return photo
     used = None if photo.used is None else downscale(photo.used.astype(np.uint8) * 255, factor) == 255

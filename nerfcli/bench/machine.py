@@ -1,4 +1,4 @@
-"""The machine that numbers are measured on, how busy it is, and how much memory a piece of work takes."""
+"""The machine that measurements run on, its load, and the peak memory of a piece of work."""
 
 import os
 import platform
@@ -10,7 +10,7 @@ import torch
 
 _CPU_INFO = Path("/proc/cpuinfo")
 _STATUS, _CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-# Others that take more than this share of the processors show in the times.
+# If other programs use more than this fraction of the processors, measured times suffer.
 BUSY_SHARE = 0.25
 
 
@@ -37,30 +37,30 @@ def processor_name() -> str:
 
 
 def load_average() -> float | None:
-    """Processes that wanted to run over the last minute, ours among them; None where the system does not say."""
+    """Return the mean number of runnable processes over the last minute, ours included; None if not reported."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 
 def is_busy(load: float | None) -> bool:
-    """Return whether a load average from before the start means that other programs use the processors."""
+    """Return whether a load average from before the start shows that other programs use the processors."""
     return load is not None and load > BUSY_SHARE * (os.cpu_count() or 1)
 
 
 @dataclass(frozen=True)
 class PeakMemory:
-    """The largest memory in use since `begin`: of this process, or of the GPU where that does the work."""
+    """Peak memory since `begin`, of this process or, if the device is a GPU, of the GPU."""
 
     device: str
 
     def begin(self) -> None:
-        """Count from here."""
+        """Reset the peak."""
         if self.device != "cpu":
             torch.cuda.reset_peak_memory_stats(self.device)
         elif _CLEAR_REFS.exists():
             _CLEAR_REFS.write_text("5")  # resets the peak of the resident size: Linux, proc(5)
 
     def read(self) -> int | None:
-        """Bytes; None where the system has no such count."""
+        """Return the peak in bytes; None if the system does not report it."""
         if self.device != "cpu":
             return torch.cuda.max_memory_allocated(self.device)
         if not (_CLEAR_REFS.exists() and _STATUS.exists()):

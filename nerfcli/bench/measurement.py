@@ -1,4 +1,4 @@
-"""A bench from beginning to end: the budget over rendering and training, each going on with what is there."""
+"""Run a bench from beginning to end: split the budget between rendering and training, and continue earlier calls."""
 
 import shutil
 from collections.abc import Callable
@@ -23,11 +23,11 @@ from nerfcli.render.model import Model, load_model
 from nerfcli.runs.files import FIELD
 
 SWEEPS = ("both", "render", "train")
-# Of the budget where both are measured: renderings are short, trainings are not.
+# Fraction of the budget for rendering where training is measured as well: renderings are short, trainings are not.
 _RENDERING_SHARE = 0.4
-# The last part of the budget writes the report.
+# Fraction of the budget that is reserved for the report.
 _KEPT_BACK = 0.03
-# What rendering gets of the budget even where training took longer than planned.
+# Fraction of the budget that rendering gets even if training took longer than planned.
 _LEAST_SHARE = 0.1
 COMPLETE = "complete"
 THIS_RUN = "this run"
@@ -38,9 +38,9 @@ class BenchOptions:
     """Options of a bench.
 
     Args:
-        budget_seconds: for everything.
+        budget_seconds: time limit for everything.
         sweep: one of `SWEEPS`.
-        seed: of the trainings.
+        seed: seed of the trainings.
     """
 
     budget_seconds: float
@@ -49,7 +49,7 @@ class BenchOptions:
 
 
 def open_bench(subject: BenchedRun, folder: Path, wanted: BenchOptions) -> Records:
-    """Return the records of this bench in a folder, new or to go on with.
+    """Open the records of this bench in a folder, new or to be continued.
 
     Raises:
         UserError: the folder holds something else.
@@ -73,17 +73,17 @@ def measure(
     tell: Callable[[float, str], None],
     notify: Callable[[str], None],
 ) -> None:
-    """Measure what is not measured yet; what is measured is in the records when this ends, however it ends.
+    """Measure what is still missing; every finished measurement is in the records, even if this is interrupted.
 
     Args:
         subject: a run or a scene.
-        records: of `open_bench`.
-        wanted: what to measure.
-        tell: called with (share of the budget used, what is done now).
-        notify: takes lines for the user.
+        records: from `open_bench`.
+        wanted: options of the bench.
+        tell: called with (fraction of the budget used, current work).
+        notify: called with lines for the user.
 
     Raises:
-        UserError: a photo cannot be read, or the results not be written.
+        UserError: a photo cannot be read, or the results cannot be written.
     """
     if records.last(COMPLETE) is not None:
         return
@@ -137,7 +137,7 @@ def _measure_scene(subject: BenchedRun, wanted: BenchOptions, session: Session) 
     settings = train_settings()
     fraction = {"both": 1.0 - _RENDERING_SHARE, "train": 1.0, "render": _RENDERING_SHARE}[wanted.sweep]
     if wanted.sweep == "render":
-        settings = settings[:1]  # there must be a field to look at
+        settings = settings[:1]  # rendering needs one trained field
     trainings = Trainings(subject.scene, subject.base, subject.shown, kept=settings[0].name)
     measure_trainings(trainings, settings, session=session, seconds=fraction * ends - session.spent)
     field = session.folder / KEPT_FIELD
@@ -151,11 +151,11 @@ def _render(subject: BenchedRun, model: Model, session: Session, *, ends: float)
 
 
 def _title(path: Path) -> str:
-    """Return the folder's name, with that of its parent where it says little."""
+    """Return the folder's name, with that of its parent if the name is only "run" or "scene"."""
     return f"{path.parent.name}/{path.name}" if path.name in ("run", "scene") else path.name
 
 
 def _ways_to_render(subject: BenchedRun) -> list[RenderSetting]:
-    """Return all that make a difference on this device: the number of CPU threads is none to a GPU."""
+    """Return the settings that matter on this device: on a GPU, the number of CPU threads makes no difference."""
     base = subject.base
     return [way for way in render_settings(base.threads) if base.device == "cpu" or way.threads == base.threads]

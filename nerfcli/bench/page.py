@@ -1,4 +1,4 @@
-"""The page of a bench: what to use, two plots with the pictures behind each point, all numbers, how they were made."""
+"""HTML page of a bench: recommendations, two plots with pictures of each point, all numbers and how they were made."""
 
 from collections.abc import Mapping
 from html import escape
@@ -26,9 +26,9 @@ def bench_page(content: Mapping[str, Any], pictures: Mapping[str, str], folder: 
     """Return the page's text.
 
     Args:
-        content: what `summary.summarised` gave.
-        pictures: those behind the points, as data, by name.
-        folder: of the bench, whose page it is.
+        content: the output of `summary.summarised`.
+        pictures: pictures of the points as data URIs, by name.
+        folder: folder of the bench.
     """
     machine = content["machine"]
     here = Path(__file__)

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-# Times within this factor of each other are the same: a training ends with the step during which its time is over.
+# Times within this factor of each other count as equal: a training ends after the step in which its time runs out.
 SAME_TIME = 1.02
 NEAR_BEST_DB = 0.1
 
 
 @dataclass(frozen=True)
 class TimeSpread:
-    """Times of repeats, in seconds: their median and the quartiles around it."""
+    """Median and quartiles of the times of repeats, in seconds."""
 
     low: float
     median: float
@@ -28,13 +28,13 @@ class TimeSpread:
         return TimeSpread(float(low), float(median), float(high), len(values))
 
     def clearly_below(self, other: "TimeSpread") -> bool:
-        """Return whether even the slower repeats were faster than the other's faster ones."""
+        """Return whether the upper quartile is below the other's lower quartile, by more than `SAME_TIME`."""
         return self.high * SAME_TIME < other.low
 
 
 @dataclass(frozen=True)
 class SettingResult:
-    """Cost and error of a setting; the smaller the error, the better, in any unit."""
+    """Time and error of a setting; the error may have any unit, and smaller is better."""
 
     name: str
     seconds: TimeSpread
@@ -42,15 +42,15 @@ class SettingResult:
 
 
 def dominators(points: Sequence[SettingResult], *, noise: float) -> dict[str, str | None]:
-    """For each point the name of one that makes it pointless, or None for those worth their time: the Pareto set.
+    """Return for each point the name of a point that dominates it, or None for points of the Pareto set.
 
     B is dominated by A if A's median time is no longer, and either A is clearly faster and B's error is not smaller by
-    more than the noise, or A's error is smaller by more than the noise. Only points of the Pareto set dominate: what
-    is within the noise of something that is within the noise of the best need not be within the noise of the best.
+    more than the noise, or A's error is smaller by more than the noise. Only points of the Pareto set dominate others,
+    because being equal within the noise is not transitive.
 
     Args:
         points: with different names.
-        noise: differences of errors up to this mean nothing, >= 0.
+        noise: largest difference of errors that is not significant, >= 0.
     """
     worth: list[SettingResult] = []
     found: dict[str, str | None] = {}
@@ -68,16 +68,16 @@ def dominators(points: Sequence[SettingResult], *, noise: float) -> dict[str, st
 
 
 def least_difference(values: Sequence[float]) -> float | None:
-    """Return the difference between two single trainings that is significant at 95 %.
+    """Return the smallest difference between two single trainings that is significant at 95 %.
 
-    t * s * sqrt(2), with the standard deviation s of repeats that differ in their seed alone, and Student's t for as
-    many degrees of freedom.
+    Formula: t * s * sqrt(2), with the standard deviation s of n repeats that differ only in their seed, and Student's t
+    for n - 1 degrees of freedom.
 
     Args:
-        values: of the repeats.
+        values: results of the repeats.
 
     Returns:
-        None for fewer than two repeats, of which nothing can be said.
+        The difference; None for fewer than two repeats.
     """
     if len(values) < 2:
         return None
@@ -85,13 +85,13 @@ def least_difference(values: Sequence[float]) -> float | None:
 
 
 def near_best(points: Sequence[SettingResult]) -> SettingResult:
-    """Return the fastest of those whose error, in dB, is within `NEAR_BEST_DB` of the smallest; at least one point."""
+    """Return the fastest point whose error, in dB, is within `NEAR_BEST_DB` of the smallest; needs at least one."""
     smallest = min(point.error for point in points)
     near = [point for point in points if point.error <= smallest + NEAR_BEST_DB]
     return min(near, key=lambda point: (point.seconds.median, point.error))
 
 
 def at_most(points: Sequence[SettingResult], seconds: float) -> SettingResult | None:
-    """Return the one with the smallest error among those whose median takes at most some time; None where none does."""
+    """Return the point with the smallest error among those with a median time of at most `seconds`, or None."""
     fast = [point for point in points if point.seconds.median <= seconds * SAME_TIME]
     return min(fast, key=lambda point: (point.error, point.seconds.median), default=None)

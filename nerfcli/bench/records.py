@@ -1,4 +1,4 @@
-"""Records of measurements: a file of JSON lines that only grows, so that an interruption costs one measurement."""
+"""Records of measurements: an append-only file of JSON lines, so that an interruption costs at most one measurement."""
 
 import json
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ class Records:
     folder: Path
 
     def append(self, kind: str, **content: Any) -> None:
-        """Append one measurement, whole.
+        """Append one measurement.
 
         Raises:
             UserError: it cannot be written.
@@ -37,11 +37,11 @@ class Records:
         return (entry for entry in self.all() if entry["kind"] == kind)
 
     def last(self, kind: str) -> dict[str, Any] | None:
-        """Return the latest of a kind; None where there is none."""
+        """Return the latest measurement of a kind; None if there is none."""
         return next(reversed(list(self.of_kind(kind))), None)
 
     def all(self) -> list[dict[str, Any]]:
-        """Everything; a line that a kill cut short is left out."""
+        """Return all measurements; a line that a kill truncated is left out."""
         path = self.folder / MEASURED
         entries = []
         for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
@@ -56,8 +56,8 @@ def opened(folder: Path, plan: dict[str, Any]) -> Records:
     """Open the records of a bench in a folder, new or existing.
 
     Args:
-        folder: made if it is not there.
-        plan: what the bench is of and with which options; plain values.
+        folder: created if it does not exist.
+        plan: subject and options of the bench, as plain values.
 
     Raises:
         UserError: the folder holds another bench or something else, or cannot be written.
@@ -87,13 +87,13 @@ def opened(folder: Path, plan: dict[str, Any]) -> Records:
 
 
 def emptied(folder: Path) -> None:
-    """Leave a plan of nothing, which any bench may take over, and no measurements."""
+    """Delete the measurements, and write an empty plan, which any bench may take over."""
     write_json(folder / PLAN, {"format": FORMAT})
     (folder / MEASURED).unlink(missing_ok=True)
 
 
 def _end_with_whole_line(path: Path) -> None:
-    """End a line that a kill cut short, so that the next record begins a new one."""
+    """Terminate a line that a kill truncated, so that the next record begins a new line."""
     if path.exists() and (data := path.read_bytes()) and not data.endswith(b"\n"):
         with path.open("ab") as file:
             file.write(b"\n")

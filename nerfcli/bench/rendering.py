@@ -1,9 +1,9 @@
-"""Rendering settings of one trained field: interleaved times, distance to the photos and to the converged pictures.
+"""Measure rendering settings of one trained field: interleaved times, errors against photos and converged pictures.
 
-Every setting renders the same whole photos. A first round makes the pictures that errors are taken of, and warms up;
-its times do not count. The rounds after it take turns through all settings, each in another order, so that a machine
-that gets slower in the middle makes no setting look slow. A setting that another one shares its arithmetic with, as one
-with fewer threads, is measured like all others.
+Every setting renders the same whole photos. A first round renders the pictures from which errors are computed, and
+warms up; its times do not count. Every later round times all settings in a different order, so that a machine that gets
+slower in the middle does not make one setting look slow. A setting with the same arithmetic as another, such as one
+with fewer threads, is measured like any other.
 """
 
 import random
@@ -32,9 +32,9 @@ from nerfcli.render.pictures import RAYS_PER_TILE, Quality, RenderedPicture, ren
 
 MOST_PHOTOS = 3
 LEAST_ROUNDS, MOST_ROUNDS = 3, 9
-# Settings without which there is nothing to compare: they are measured however little time there is.
+# Number of settings that are measured even if time is short: with fewer, there is nothing to compare.
 _LEAST_SETTINGS = 7
-# Of the time of a default picture, measured on two captures: the converged one has FINER times the samples.
+# Time of a converged picture over that of a default one, measured on two captures: it has FINER times the samples.
 _CONVERGED_COST = 0.7 * FINER
 _FLOAT64_PIXELS = 64
 WORK = "work"
@@ -43,7 +43,7 @@ _DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch
 
 @dataclass(frozen=True)
 class _Subject:
-    """The field in every precision it is stored in, and the photos with their converged renderings."""
+    """The field in every storage precision, and the photos with their converged renderings."""
 
     models: dict[str, Model]
     photos: tuple[HeldOutPhoto, ...]
@@ -57,10 +57,10 @@ def measure_rendering(
 
     Args:
         model: the trained field.
-        photos: the held-out ones, at least one.
-        settings: the most telling first, the default at the very first.
-        session: takes the measurements: "rendering plan", "converged", "float64", "picture" and "time".
-        seconds: for everything here.
+        photos: the held-out photos, at least one.
+        settings: rendering settings, the default first, then the most informative ones first.
+        session: records the measurements: "rendering plan", "converged", "float64", "picture" and "time".
+        seconds: time limit for all of this.
     """
     ends = session.spent + seconds
     plan = session.records.last("rendering plan")
@@ -93,7 +93,7 @@ def measure_rendering(
 def _planned(
     model: Model, photos: Sequence[HeldOutPhoto], settings: Sequence[RenderSetting], *, session: Session, seconds: float
 ) -> dict[str, Any]:
-    """Return how many photos, settings and rounds fit, and in which size: by the time of one default picture."""
+    """Plan the photos, their size, settings and rounds by the time of one default picture, and record the plan."""
     session.say("rendering a first picture")
     _render(model, photos[0], settings[0])
     began = time.perf_counter()
@@ -125,13 +125,13 @@ def _planned(
 
 
 def _cost(setting: RenderSetting) -> float:
-    """About how many times as long as the default a setting takes."""
+    """Estimate the time of a setting relative to the default."""
     steps = 0.4 + 0.6 / setting.step
     return steps * (1.8 if setting.name.endswith(("thread", "threads")) else 1.0)
 
 
 def _converged(model: Model, photos: Sequence[HeldOutPhoto], *, session: Session) -> tuple[np.ndarray, ...]:
-    """Return the photos' views as the field says them: steps `FINER` times as fine, next to nothing left out."""
+    """Return converged renderings of the photos' views: steps `FINER` times as fine, next to nothing left out."""
     pictures, measured = [], {entry["photo"] for entry in session.records.of_kind("converged")}
     for photo in photos:
         path = session.folder / WORK / f"{slug(photo.frame.name)}.npy"
@@ -152,7 +152,7 @@ def _converged(model: Model, photos: Sequence[HeldOutPhoto], *, session: Session
 
 
 def _measure_picture(subject: _Subject, setting: RenderSetting, session: Session) -> dict[str, Any]:
-    """Errors of a setting's pictures; the first of them is kept to look at."""
+    """Return the errors of a setting's pictures; write the first picture to disk."""
     model, decibels, squares, bound = subject.models[setting.stored_in], [], [], 0.0
     for index, (photo, fine) in enumerate(zip(subject.photos, subject.converged, strict=True)):
         picture = _render(model, photo, setting)
@@ -177,7 +177,7 @@ def _measure_picture(subject: _Subject, setting: RenderSetting, session: Session
 def _measure_times(
     subject: _Subject, settings: Sequence[RenderSetting], *, rounds: int, session: Session, ends: float
 ) -> None:
-    """Rounds through all settings; the least number of them whatever it costs, the others while there is time."""
+    """Time all settings in rounds: `LEAST_ROUNDS` in any case, then more while there is time."""
     memory = PeakMemory(str(subject.models["float32"].device))
     measured = {(entry["round"], entry["point"]) for entry in session.records.of_kind("time")}
     for number in range(1, rounds + 1):
@@ -213,7 +213,7 @@ def _used(picture: RenderedPicture, photo: HeldOutPhoto) -> np.ndarray:
 
 
 def _stored_in(model: Model, precision: str) -> Model:
-    """Return the model as it comes back from a file of numbers of a precision."""
+    """Return the model with its field rounded to a storage precision."""
     field = deepcopy(model.field)
     with torch.no_grad():
         for parameter in field.parameters():

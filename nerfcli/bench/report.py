@@ -20,8 +20,9 @@ JSON, CSV, PAGE = "bench.json", "bench.csv", "bench.html"
 
 
 def write_report(records: Records) -> tuple[Path, dict[str, Any]]:
-    """Write bench.json, bench.csv and bench.html of the measurements so far; when all is measured, pictures that are
-    not on the page go, those of an earlier bench.
+    """Write bench.json, bench.csv and bench.html from the measurements so far.
+
+    Once the bench is complete, pictures that are not on the page, from an earlier bench, are deleted.
 
     Returns:
         The page's path, and the content of bench.json.
@@ -44,9 +45,9 @@ def write_report(records: Records) -> tuple[Path, dict[str, Any]]:
 
 
 def discard(folder: Path) -> None:
-    """Forget what a bench measured in a folder, and nothing else; a folder that is no bench stays as it is.
+    """Delete only the measurements, field and work files of a bench; a folder without a bench is not changed.
 
-    Its report and pictures stay until there are others: the disk may be full, or the new bench be given up.
+    Its report and pictures stay until they are replaced: the disk may be full, or the new bench may be given up.
     """
     if not (folder / PLAN).exists():
         return
@@ -56,7 +57,7 @@ def discard(folder: Path) -> None:
 
 
 def _embedded(content: dict[str, Any], folder: Path) -> dict[str, str]:
-    """Return the pictures that the points name, as data."""
+    """Return the pictures that the points refer to, as data URIs by name."""
     parts = [content[part] for part in ("rendering", "training") if content[part]]
     names = {name for part in parts for point in part["points"] for name in point["pictures"].values()}
     names |= {part["truth"] for part in parts if "truth" in part}

@@ -1,4 +1,4 @@
-"""The pictures behind a point: what was rendered, and where it is how far from the photo and from the converged one."""
+"""Pictures of a point: its rendering, and maps of the distance to the photo and to the converged rendering."""
 
 import hashlib
 from pathlib import Path
@@ -11,7 +11,7 @@ from nerfcli.pages.embedded_pictures import fitted, jpeg_bytes
 
 FOLDER = "pictures"
 LONGEST_PX = 480
-# The differences that have the last colour, the same on every page so that pictures of two benches can be compared.
+# Differences shown in the last colour, the same on every page so that pictures of two benches can be compared.
 MOST_ERROR, MOST_QUADRATURE = 64 / 255, 16 / 255
 _COLOURS = "viridis"
 
@@ -28,11 +28,10 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
 
 
 def write_difference(path: Path, one: np.ndarray, other: np.ndarray, *, most: float) -> None:
-    """Write a small JPEG of the largest difference of a channel of pictures (H, W, 3) in [0, 1].
+    """Write a small JPEG of the largest difference over channels between pictures (H, W, 3) in [0, 1].
 
-    `most` has the last colour.
-
-    Differences are averaged over the area of a small pixel, not taken between small pictures.
+    Differences of `most` or more have the last colour. They are averaged over the area of a small pixel, not taken
+    between small pictures.
     """
     difference = fitted(np.abs(one - other).max(-1).astype(np.float32), LONGEST_PX)
     level = np.rint(np.clip(difference / most, 0.0, 1.0) * 255).astype(np.uint8)

@@ -11,13 +11,13 @@ from nerfcli.bench.records import Records
 
 @dataclass
 class Session:
-    """Time is what was spent on measurements in all calls, not only in this one.
+    """State of one bench; its time includes measurements of earlier calls.
 
     Args:
-        records: what was measured, earlier calls included.
-        budget_seconds: for everything.
-        tell: called with (share of the budget used, what is done now).
-        notify: takes lines for the user.
+        records: the measurements, earlier calls included.
+        budget_seconds: time limit for the whole bench.
+        tell: called with (fraction of the budget used, current work).
+        notify: called with lines for the user.
     """
 
     records: Records
@@ -41,11 +41,11 @@ class Session:
 
     @property
     def left(self) -> float:
-        """Seconds of the budget that are left; negative where it was overdrawn."""
+        """Seconds of the budget that are left; negative if it was exceeded."""
         return self.budget_seconds - self.spent
 
     def record(self, kind: str, **content: Any) -> None:
-        """Keep a measurement, with the time since the one before it."""
+        """Record a measurement, with the time since the previous one."""
         now = time.monotonic()
         self.records.append(kind, took=round(now - self._lap, 3), **content)
         self._spent += now - self._lap

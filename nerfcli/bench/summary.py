@@ -13,16 +13,16 @@ from nerfcli.bench.records import Records
 from nerfcli.bench.sample_pictures import slug
 
 LEVELS = 255.0
-# Renderings whose distance to the converged one differs by less than this share are as good as each other.
+# Renderings whose distances to the converged one differ by less than this fraction count as equally good.
 SAME_QUADRATURE = 0.02
 
 
 def summarised(records: Records, plan: dict[str, Any]) -> dict[str, Any]:
-    """Return all numbers of a bench as plain values, complete or not.
+    """Return all numbers of a complete or interrupted bench as plain values.
 
     Args:
         records: the measurements.
-        plan: what the bench is of; the content of plan.json.
+        plan: subject and options of the bench; the content of plan.json.
     """
     begun = list(records.of_kind("begun"))
     rendering, training = _rendering(records), _training(records)
@@ -47,7 +47,7 @@ def _by_psnr(point: dict[str, Any]) -> SettingResult:
 
 
 def _by_quadrature(point: dict[str, Any]) -> SettingResult:
-    """Its logarithm, so that differences are shares."""
+    """Return time and quadrature error of a point, as a logarithm so that differences are relative."""
     return SettingResult(point["name"], TimeSpread(**point["seconds"]), math.log(max(point["quadrature_levels"], 1e-6)))
 
 
@@ -116,8 +116,10 @@ def _training(records: Records) -> dict[str, Any] | None:
 
 
 def longer_and_better(points: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the trainings that differ from shorter ones in their length alone, and are better than all of these. That
-    more steps help is known beforehand: it takes no significance to believe it."""
+    """Return the trainings that differ from shorter ones only in their length, and are better than all of those.
+
+    That more steps help is known beforehand, so the difference need not be significant.
+    """
     same = [point for point in points if point["group"] in ("default", "time", "run")]
     same.sort(key=lambda point: point["seconds"]["median"])
     best, longer = -math.inf, []
@@ -151,13 +153,13 @@ def _training_point(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def _rendering_advice(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    can_be_asked_for = [_by_psnr(point) for point in points if point["options"] is not None]
+    selectable = [_by_psnr(point) for point in points if point["options"] is not None]
     by_name = {point["name"]: point for point in points}
-    default = next((point for point in can_be_asked_for if point.name == "default"), None)
+    default = next((point for point in selectable if point.name == "default"), None)
     if default is None:
         return []
-    near = near_best(can_be_asked_for)
-    half = at_most(can_be_asked_for, default.seconds.median / 2)
+    near = near_best(selectable)
+    half = at_most(selectable, default.seconds.median / 2)
     return [
         _advice("rendering", "within 0.1 dB of the best", near, by_name, default),
         _advice("rendering", "half the time", half, by_name, default),
@@ -183,7 +185,7 @@ def _training_advice(training: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _default_unless_better(chosen: SettingResult, default: SettingResult, noise: float) -> SettingResult:
-    """Return the default where the chosen one takes as long and is not better by more than chance."""
+    """Return the default if the chosen setting takes as long and is not better by more than the noise."""
     same_time = not chosen.seconds.clearly_below(default.seconds) and not default.seconds.clearly_below(chosen.seconds)
     return default if same_time and default.error - chosen.error <= noise else chosen
 

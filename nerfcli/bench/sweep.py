@@ -1,4 +1,4 @@
-"""The settings that are tried, the most telling first: how many of them are is a matter of time."""
+"""The settings to try, the most informative first; how many are tried depends on the time."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -10,11 +10,11 @@ from nerfcli.render.pictures import RAYS_PER_TILE
 from nerfcli.render.tracing import TOLERANCE
 from nerfcli.runs.settings import TrainSettings
 
-# Steps and tolerances far beyond the defaults, on both sides: a curve shows where it bends only with its ends.
+# Steps and tolerances far from the defaults, on both sides: only with both ends does a curve show where it bends.
 _STEPS = (2.0, 4.0, 0.5, 8.0, 0.25)
 _TOLERANCES = (1 / 255, 1 / 64, 1 / 16, 1 / 4080, 1 / 4)
 _TILES = (1024, 65536)
-# Precisions of the numbers that the field is stored in; it is always rendered in float32.
+# Precisions in which the field is stored; it is always rendered in float32.
 STORED_IN = ("float32", "float16", "bfloat16")
 # A training shorter than this learns too little to tell settings apart.
 SHORTEST_TRAINING_SECONDS = 8.0
@@ -26,9 +26,9 @@ class RenderSetting:
 
     Args:
         threads: CPU threads.
-        step: length of the steps along rays, in those of the training.
+        step: length of the steps along rays, relative to those of the training.
         tolerance: see `render.pictures.Quality`.
-        rays_per_tile: rendered at a time; the default is what suits the device.
+        rays_per_tile: number of rays rendered at a time; the default suits the device.
         stored_in: one of `STORED_IN`.
     """
 
@@ -57,7 +57,7 @@ class RenderSetting:
 
     @property
     def options(self) -> str | None:
-        """The options of `nerfcli render` that choose this; None where there are none."""
+        """Options of `nerfcli render` that select this setting; None if options cannot select it."""
         if self.rays_per_tile != RAYS_PER_TILE or self.stored_in != "float32":
             return None
         step = [f"--step {self.step:g}"] if self.step != 1.0 else []
@@ -70,7 +70,7 @@ class RenderSetting:
 
 @dataclass(frozen=True)
 class ThreadSetting(RenderSetting):
-    """Fewer threads than there are."""
+    """A setting with fewer threads than are available."""
 
     def _parts(self) -> list[str]:
         return [*super()._parts(), f"{self.threads} {'thread' if self.threads == 1 else 'threads'}"]
@@ -86,9 +86,9 @@ class TrainSetting:
     """One training.
 
     Args:
-        group: what is varied: "default", "seed", "time", "rows", "levels", "width" or "batch".
-        share: of the planned training time of one point.
-        changed: what is not as in the defaults of `TrainSettings`, by name.
+        group: the parameter that is varied: "default", "seed", "time", "rows", "levels", "width" or "batch".
+        share: training time relative to the planned time of one point.
+        changed: values that differ from the defaults of `TrainSettings`, by name.
     """
 
     group: str
@@ -127,14 +127,14 @@ class TrainSetting:
 
     @property
     def options(self) -> str:
-        """The options of `nerfcli train` that choose this, besides the budget."""
+        """Options of `nerfcli train` that select this setting, besides the budget."""
         names = {"log2_rows": "--log2-rows", "levels": "--levels", "width": "--width", "samples_per_step": "--batch"}
         seed = [f"--seed {self.seed}"] if self.seed else []
         return " ".join([*(f"{names[name]} {value}" for name, value in self.changed), *seed])
 
 
 def render_settings(threads: int) -> list[RenderSetting]:
-    """Ways to render, the most telling first: the default, one thing changed, then two."""
+    """List rendering settings, the most informative first: the default, then with one or two changes."""
     default = RenderSetting(threads)
     return [
         default,
@@ -181,12 +181,12 @@ def affordable(
     """Return as many of the first settings as time allows, and the time for one unit of training.
 
     Args:
-        settings: the most telling first; at least one.
-        seconds: for all.
-        overhead: of each besides its training, in seconds.
+        settings: the most informative first; at least one.
+        seconds: time limit for all.
+        overhead: seconds that each takes besides its training.
 
     Returns:
-        The settings, and seconds per share: at least `SHORTEST_TRAINING_SECONDS` where there are two or more of them.
+        The settings, and seconds for a share of 1: at least `SHORTEST_TRAINING_SECONDS` if there are two or more.
     """
     shares = accumulate(setting.share for setting in settings)
     units = [(seconds - overhead * count) / total for count, total in enumerate(shares, start=1)]
@@ -195,11 +195,11 @@ def affordable(
 
 
 def fraction(value: float) -> str:
-    """1/255 where a number is one over a whole one, else plain."""
+    """Format a number, as a fraction such as 1/255 if it is the reciprocal of a whole number."""
     fraction = Fraction(value).limit_denominator(10**6)
     return str(fraction) if fraction.numerator == 1 and value < 1 else f"{value:g}"
 
 
 def _fewer(threads: int) -> list[int]:
-    """Powers of two below a number of threads."""
+    """Return the powers of two below a number of threads, the largest first."""
     return [2**power for power in range(threads.bit_length()) if 2**power < threads][::-1]

@@ -1,4 +1,4 @@
-"""The numbers of a bench as rows for people, as sentences, and as CSV for spreadsheets."""
+"""The numbers of a bench as table rows, as sentences, and as CSV for spreadsheets."""
 
 import csv
 from collections.abc import Mapping
@@ -68,7 +68,7 @@ def training_rows(training: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def sentences(content: Mapping[str, Any]) -> list[str]:
-    """Return the recommendations, and the noise level of differences."""
+    """Return sentences with the recommendations and the smallest significant difference between trainings."""
     remarks = [_advice_in_words(advice) for advice in content["recommendations"]]
     training = content["training"]
     if training and training["noise_db"] is not None:
@@ -82,7 +82,7 @@ def sentences(content: Mapping[str, Any]) -> list[str]:
 
 
 def write_csv(content: Mapping[str, Any], path: Path) -> None:
-    """Write all points of both parts, a row each, numbers as they are.
+    """Write all points of both parts, one row each, without rounding.
 
     Raises:
         UserError: it cannot be written.
@@ -124,7 +124,7 @@ def command_of(advice: Mapping[str, Any]) -> str:
 
 
 def numbers_of(advice: Mapping[str, Any]) -> str:
-    """Return time and PSNR of a recommendation, with those of the setting that it is compared with."""
+    """Return time and PSNR of a recommendation, and those of the setting that it is compared with."""
     unit = "s per picture" if advice["part"] == "rendering" else "s of training"
     text = f"{advice['seconds']:.3g} {unit}, {advice['psnr']:.2f} dB"
     if advice["against"] == advice["point"]:
@@ -133,7 +133,7 @@ def numbers_of(advice: Mapping[str, Any]) -> str:
 
 
 def _advice_in_words(advice: Mapping[str, Any]) -> str:
-    """Return one sentence, with what to type."""
+    """Return a recommendation as one sentence with its command line."""
     head = f"{advice['part'].capitalize()}, {advice['question']}: "
     if advice["point"] is None:
         return f"{head}none of the measured settings is fast enough."

@@ -21,14 +21,14 @@ class BenchedRun:
     """A run, a scene, or both.
 
     Args:
-        path: what the user named.
+        path: the path that the user gave.
         run: the folder of a trained run; None for a scene.
-        scene: the folder of the scene; None where it cannot be found, and nothing be trained.
-        test_frames: the held-out ones.
-        base: settings of trainings where they are not varied, the resolution among them.
-        identity: changes when what is measured changes.
-        trained: what the run says of its training, keys as in the records; empty where it says nothing.
-        why_no_scene: where the scene cannot be found, in words.
+        scene: the folder of the scene; None if it cannot be used, so that nothing can be trained.
+        test_frames: the held-out frames.
+        base: training settings that are not varied, including the resolution.
+        identity: hash of the trained field or of the scene.
+        trained: the run's summary of its training, with the keys of the records; empty if there is none.
+        why_no_scene: the reason if the scene of a run cannot be used; else empty.
     """
 
     path: Path
@@ -46,7 +46,7 @@ class BenchedRun:
         return self.test_frames[len(self.test_frames) // 2].name
 
     def held_out(self, model: Model) -> list[HeldOutPhoto]:
-        """Return the held-out photos as `model` is compared with them.
+        """Return the held-out photos, prepared for comparison with `model`.
 
         Raises:
             UserError: a photo cannot be read.
@@ -86,7 +86,7 @@ def _run_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
         components=trained.components,
         **sizes_for(device),
     )
-    # As the training named it, which is relative to where the user then was; or beside the run, where both moved.
+    # The path that the training was given, possibly relative to another folder; or beside the run, if both were moved.
     places = (named, path.resolve().parent / named.name)
     scene = next((place for place in places if named.name and scenes.is_scene(place)), None)
     why = "" if scene is not None else f"its scene {named} is missing"
@@ -105,7 +105,7 @@ def _run_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
 
 
 def _trained(run: Run) -> dict[str, Any]:
-    """Return what the log says of the training, as records have it; nothing without a log."""
+    """Return the run's summary of its training, with the keys of the records; empty without a summary."""
     summary = {} if run.summary is None else run.summary.to_json()
     return {name: value for name, value in summary.items() if name != "rays_per_second"}
 

@@ -1,4 +1,4 @@
-"""Training settings: each is a training in a process of its own, within one plan of time."""
+"""Measure training settings: each is trained in a separate process, within a common time plan."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from nerfcli.bench.sweep import TrainSetting, affordable
 from nerfcli.runs.files import FIELD
 from nerfcli.runs.settings import TrainSettings
 
-# Of a process besides its training, until one has been measured: libraries, photos, kernels, held-out pixels.
+# Time of a process besides its training, for libraries, photos, kernels and held-out pixels, until one is measured.
 _FIRST_OVERHEAD_SECONDS = 12.0
 KEPT_FIELD = FIELD
 
@@ -26,9 +26,9 @@ class Trainings:
 
     Args:
         scene: the folder of the scene.
-        base: settings of all of them, where not varied.
+        base: settings that are not varied.
         shown: the name of the held-out photo that is rendered.
-        kept: the name of the setting whose field stays in the folder of the bench; None for none.
+        kept: the name of the setting whose field is kept in the folder of the bench; None for none.
     """
 
     scene: Path
@@ -43,10 +43,10 @@ def measure_trainings(
     """Train as many settings as time allows, continuing an earlier call.
 
     Args:
-        trainings: what they have in common.
-        settings: the most telling first.
-        session: takes the measurements: "training plan", "training" and "failed".
-        seconds: for everything here.
+        trainings: common data of the trainings.
+        settings: training settings, the most informative first.
+        session: records the measurements: "training plan", "training" and "failed".
+        seconds: time limit for all of this.
     """
     ends = session.spent + seconds
     plan = session.records.last("training plan")
@@ -74,7 +74,7 @@ def measure_trainings(
 
 
 def _overhead(session: Session) -> float:
-    """Seconds of a process besides its training: the mean of those that were, the slowest part of plain torch too."""
+    """Estimate the seconds of a process besides its training: the mean over measured ones, those in plain torch too."""
     measured = [entry["took"] - entry["seconds"] for entry in session.records.of_kind("training")]
     return sum(measured) / len(measured) if measured else _FIRST_OVERHEAD_SECONDS
 
@@ -82,7 +82,7 @@ def _overhead(session: Session) -> float:
 def _train(
     trainings: Trainings, setting: TrainSetting, unit_seconds: float, title: str, session: Session
 ) -> dict[str, Any]:
-    """Return the worker's last word: {"result"} or {"error"}."""
+    """Run one training in a worker, and return its last message: {"result"} or {"error"}."""
     prefix = slug(f"training {setting.name}")
     (session.folder / FOLDER).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=session.folder, prefix=".training-") as folder:
@@ -105,7 +105,7 @@ def _train(
 
 
 def _run_worker(job: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """Run `nerfcli.bench.worker`; it is dead when this returns or raises."""
+    """Run `nerfcli.bench.worker`; its process has ended when this returns or raises."""
     log = job.with_name("worker.log")
     last: dict[str, Any] = {}
     with log.open("wb") as stderr:

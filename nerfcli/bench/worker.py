@@ -1,8 +1,8 @@
 """The child process of one training: run as `python -m nerfcli.bench.worker JOB.json`.
 
-A process of its own, so that its peak memory is that of this training alone. It leaves pictures where the job says, and
-tells lines of JSON on stdout: {"share", "detail"} while it works, {"result"} at the end, {"error"} for what the
-user can fix.
+It is a separate process, so that its peak memory is that of this training alone. It writes pictures where the job says,
+and prints lines of JSON on stdout: {"share", "detail"} while it works, then {"result"}, or {"error"} for errors that
+the user can fix.
 """
 
 import json
@@ -30,9 +30,9 @@ from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.loop import Progress, train
 
-# Pictures are timed this often, unless one takes longer than the second number of seconds.
+# Number of timed renderings after the first one; they stop early if one takes longer than this many seconds.
 _REPEATS, _SLOW_SECONDS = 3, 3.0
-# The longer side of the picture: every training renders it, so that all of them together must not take long.
+# The longer side of the picture, which is small because every training renders it.
 _LONGEST_PX = 360
 
 
@@ -55,8 +55,8 @@ def measure_model(
     Args:
         model: the trained field.
         held_out: the held-out photos at the resolution of the training.
-        seed: of the choice of pixels.
-        folder: takes the pictures, under names that begin with `prefix`.
+        seed: seed for the choice of pixels.
+        folder: where the pictures are written, under names that begin with `prefix`.
         shown: the name of the photo that is rendered.
     """
     sample = SampledPixels.drawn(held_out, seed=seed)

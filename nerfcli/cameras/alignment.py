@@ -1,6 +1,6 @@
-"""The similarity that brings one set of points onto another: least squares, and least squares without outliers.
+"""Fit the similarity that maps one set of points to another: by least squares, or by least squares without outliers.
 
-Letters: x are the points of frame a and y those of frame b, with means mx and my; y = s R x + t + noise, and sigma is
+Notation: x are the points of frame a and y those of frame b, with means mx and my; y = s R x + t + noise, and sigma is
 the noise's standard deviation per coordinate.
 """
 
@@ -12,10 +12,10 @@ import numpy as np
 
 from nerfcli.cameras.rigid import Similarity
 
-# Hypotheses from three points each; even where half of the points are outliers, one in eight is free of them.
+# Number of hypotheses, from three points each; even with half of the points outliers, one in eight has none.
 _TRIPLES = 200
 
-# Squared length of noise in three dimensions, in sigma^2 (chi^2 of 3): its median and its 99.9 % quantile.
+# Squared length of noise in three dimensions, in sigma^2 (chi^2 with 3 degrees of freedom): median, 99.9 % quantile.
 _MEDIAN, _QUANTILE_999 = 2.366, 16.266
 
 _PARAMETERS = 7
@@ -23,7 +23,7 @@ _PARAMETERS = 7
 
 @dataclass(frozen=True)
 class Alignment:
-    """A robust alignment: b_from_a, which points follow it (N,) bool, and sigma in units of b (NaN below 4 points)."""
+    """A robust alignment: b_from_a, the mask (N,) bool of inliers, and sigma in units of b (NaN below 4 points)."""
 
     b_from_a: Similarity
     follows: np.ndarray
@@ -33,13 +33,13 @@ class Alignment:
 def align(x: np.ndarray, y: np.ndarray) -> Similarity:
     """Return the similarity b_from_a that minimises sum |y - (s R x + t)|^2.
 
-    With points on a line R is one of many, and with two points s is the ratio of their distances.
+    If the points are on a line, R is not unique; for two points, s is the ratio of their distances.
 
     Args:
         x, y: (N, 3), N >= 2.
 
     Raises:
-        ValueError: fewer than two points, or all x at one place.
+        ValueError: fewer than two points, or all x are equal.
 
     Source: Umeyama 1991, Least-squares estimation of transformation parameters between two point patterns.
     """
@@ -55,10 +55,10 @@ def align(x: np.ndarray, y: np.ndarray) -> Similarity:
 
 
 def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
-    """`align`, over the points that are within the 99.9 % quantile of the noise, which is estimated too.
+    """Return `align` of the inliers: the points within the 99.9 % quantile of the noise, which is estimated too.
 
-    It starts from the one of 200 alignments of three points each with the least median residual (Rousseeuw 1984), so
-    that up to half of the points may be wrong. Below 5 points outliers cannot be found, and all count. Deterministic.
+    It starts from the best of 200 alignments of three points each, by median residual (Rousseeuw 1984), so up to half
+    of the points may be wrong. Below 5 points, outliers cannot be found, and all points count. Deterministic.
 
     Args:
         x, y: (N, 3), N >= 2.
@@ -71,7 +71,7 @@ def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
     best = align(x, y)
     if count < 5:
         return Alignment(best, everywhere, _sigma(best, x, y))
-    half = (count + 4) // 2 - 1  # as many must agree: half of those that three points do not fix
+    half = (count + 4) // 2 - 1  # half of the points beyond the three that define an alignment must agree
     least = np.partition(_squared(best, x, y), half)[half]
     for triple in _triples(count):
         if np.ptp(x[triple], axis=0).max() == 0:
@@ -99,7 +99,7 @@ def _squared(b_from_a: Similarity, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _sigma(b_from_a: Similarity, x: np.ndarray, y: np.ndarray) -> float:
-    """From the residuals, for as many degrees of freedom as are left; NaN below 4 points."""
+    """Estimate sigma from the residuals and the remaining degrees of freedom; NaN below 4 points."""
     free = 3 * len(x) - _PARAMETERS
     return float(np.sqrt(_squared(b_from_a, x, y).sum() / free)) if len(x) >= 4 else float("nan")
 

@@ -17,13 +17,13 @@ _SIZES_SHOWN = 4
 
 @dataclass(frozen=True)
 class Calibration:
-    """The cameras of a file.
+    """The cameras of a calibration file.
 
     Args:
         path: the file, or the folder that was named.
-        cameras: the different ones, in the order of the file.
-        of_image: the number of each image's camera, by the image's name as the file lists it, with forward slashes.
-        upright: whether the cameras refer to pictures as they are shown; else to the stored pixels, see
+        cameras: the distinct cameras, in the order of the file.
+        of_image: index of each image's camera, by the image's name as the file lists it, with forward slashes.
+        upright: True if the cameras refer to upright pictures, False if to the stored pixels; see
             `cameras.orientation`.
     """
 
@@ -41,7 +41,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Picture:
-    """A photo as its calibration is looked up: its file, upright size and EXIF orientation."""
+    """The data by which a photo's calibration is looked up: its file, upright size and EXIF orientation."""
 
     path: Path
     width: int
@@ -61,11 +61,11 @@ class Calibrated:
 def calibrated(calibration: Calibration, pictures: Sequence[Picture]) -> tuple[Calibrated, ...]:
     """Return the camera of each photo, turned and rescaled to its upright picture.
 
-    An image of the file has the photo's name, folders left aside. A photo that is not listed gets the one camera
-    of its size, upright or as stored, or else the one camera of its shape.
+    Photos are matched to the file's images by name, without folders. A photo that is not listed gets the only camera
+    of its size, upright or as stored, or else the only camera of its aspect ratio.
 
     Raises:
-        UserError: a photo has no camera in the file, or several, or another shape than its camera.
+        UserError: a photo has no camera in the file, or several, or another aspect ratio than its camera.
     """
     numbers: dict[str, set[int]] = {}
     for name, number in calibration.of_image.items():
@@ -106,7 +106,7 @@ def _of_picture(calibration: Calibration, picture: Picture, numbers: Mapping[str
 
 
 def _fits(calibration: Calibration, number: int, picture: Picture) -> bool:
-    """Return whether a camera has the shape of a picture, lying or upright."""
+    """Return whether a camera has the aspect ratio of a picture, upright or as stored."""
     camera = calibration.cameras[number]
     shapes = [(picture.width, picture.height)]
     if not calibration.upright and picture.orientation >= 5:
@@ -115,7 +115,7 @@ def _fits(calibration: Calibration, number: int, picture: Picture) -> bool:
 
 
 def _is_shape(camera: Camera, width: int, height: int) -> bool:
-    """Return whether a picture of this size can be the camera's picture resized, to rounding."""
+    """Return whether this size has the camera's aspect ratio, up to rounding to whole pixels."""
     try:
         camera.resized(width, height)
     except UserError:

@@ -16,15 +16,15 @@ from nerfcli.cameras.lens import DISTORTIONS, Lens, lens_of
 from nerfcli.errors import UserError
 from nerfcli.interrupts import restore_sigterm
 
-# COLMAP warns through glog on stderr; what matters comes back as an exception or as NaN.
+# COLMAP warns through glog on stderr; real problems are reported as an exception or as NaN.
 pycolmap.logging.minloglevel = 2
-# Importing it has glog answer SIGTERM with a stack trace, as if it were a crash.
+# Importing pycolmap makes glog answer SIGTERM with a stack trace, as if it were a crash.
 restore_sigterm()
 
-# Rows that are worked on at a time.
+# Number of rows processed at a time.
 BLOCK_SIZE = 2**15
 
-# No lens comes near; beyond, powers of the coefficients overflow.
+# Far beyond any real lens; above this, powers of the coefficients overflow.
 LARGEST_PARAMETER = 1e30
 
 
@@ -38,7 +38,7 @@ class Camera:
         params: in COLMAP's order for the model, in pixels of this picture.
 
     Raises:
-        UserError: an unknown model, a wrong number of parameters, or numbers that make no camera.
+        UserError: an unknown model, a wrong number of parameters, or invalid values of parameters.
     """
 
     model: str
@@ -75,12 +75,12 @@ class Camera:
 
     @property
     def is_spherical(self) -> bool:
-        """Whether the picture covers the whole sphere (EQUIRECTANGULAR), in which case there is no focal length."""
+        """True if the picture covers the whole sphere (EQUIRECTANGULAR) and so has no focal length."""
         return _colmap_camera(self).is_spherical()
 
     @property
     def focal_px(self) -> float:
-        """Mean focal length in pixels; of a spherical picture the pixels per radian at its equator."""
+        """Mean focal length in pixels; for a spherical picture, pixels per radian at its equator."""
         return self.width / (2 * np.pi) if self.is_spherical else _colmap_camera(self).mean_focal_length()
 
     @property
@@ -93,7 +93,7 @@ class Camera:
     def fov_deg(self) -> tuple[float, float]:
         """Angles (horizontal, vertical) in degrees between the picture's opposite edges, lens distortion included.
 
-        They are measured through the principal point. An edge that the model cannot see counts as its last valid pixel.
+        They are measured through the principal point. If the model does not cover an edge, the last valid pixel counts.
         """
         if self.is_spherical:
             return 360.0, 180.0
@@ -103,19 +103,19 @@ class Camera:
         return self._opening_deg(across), self._opening_deg(down)
 
     def bearings(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the directions in which pixels see, through the true lens model.
+        """Return the viewing directions of pixels, through the exact lens model.
 
         Args:
             pixels: (N, 2) positions x, y in pixels.
 
         Returns:
-            directions (N, 3), unit, camera axes, behind the camera too where the lens sees there; valid (N,) bool.
+            directions (N, 3), unit, in camera axes, also behind the camera if the lens sees there; valid (N,) bool.
             Where the model has no direction for a pixel (beyond the radius at which its distortion turns back, or
-            beyond the angle at which the model ends), valid is False and the direction (0, 0, 1). It is never NaN and
-            never a wrong root.
+            beyond the angle at which the model ends), valid is False and the direction is (0, 0, 1). It is never
+            NaN and never a wrong root.
 
-        Accuracy: projecting a valid direction gives the pixel to 1e-9 px, or, where a lens puts more than 250,000 px on
-        a radian, to 4e-15 of that, which is the rounding of the direction.
+        Accuracy: projecting a valid direction gives the pixel to 1e-9 px, or, if a lens has more than 250,000 px per
+        radian, to 4e-15 of that, which is the rounding of the direction.
         """
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
         directions, valid = np.empty((len(pixels), 3)), np.empty(len(pixels), dtype=bool)
@@ -156,7 +156,7 @@ class Camera:
             d pixel / d point (N, 2, 3), pixels per unit of the points; d pixel / d parameters (N, 2, P) in the order of
             `params`; valid (N,) bool. Where `project` is not valid both are zero.
 
-        Accuracy: closed forms; relative error of a few 1e-13, of each column to its own size.
+        Accuracy: closed forms; error of a few 1e-13 relative to each column's own size.
         """
         directions, length = _towards(np.asarray(points_cam, dtype=np.float64).reshape(-1, 3))
         by_direction, by_parameters, valid = _lens(self).jacobians(directions)
@@ -174,9 +174,9 @@ class Camera:
 
         Returns:
             d direction / d pixel (N, 3, 2) in radians per pixel, whose columns are normal to the direction; valid (N,)
-            bool as of `bearings`. Zero where not valid.
+            bool as in `bearings`. Zero where not valid.
 
-        The inverse of d pixel / d direction on the plane normal to the direction: J^T (J J^T)^-1.
+        It is the inverse of d pixel / d direction on the plane normal to the direction: J^T (J J^T)^-1.
         """
         directions, valid = self.bearings(pixels)
         by_direction, _, smooth = self.project_jacobian(directions)
@@ -191,16 +191,16 @@ class Camera:
         return np.stack([by_x, by_y], axis=-1) * valid[:, None, None], valid
 
     def pixel_footprint(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the solid angle that a pixel covers, as large as at its centre:
-        1 / |a x b| with the rows of d pixel / d d.
+        """Return the solid angle that each pixel covers, evaluated at its centre.
 
-        A cone of the same solid angle has the radius sqrt(footprint / pi) at distance 1.
+        It is 1 / |a x b|, with a and b the rows of d pixel / d direction. A cone of the same solid angle has the radius
+        sqrt(footprint / pi) at distance 1.
 
         Args:
             pixels: (N, 2).
 
         Returns:
-            solid angles (N,) in steradians; valid (N,) bool as of `bearings`. Zero where not valid.
+            solid angles (N,) in steradians; valid (N,) bool as in `bearings`. Zero where not valid.
         """
         directions, valid = self.bearings(pixels)
         by_direction, _, smooth = self.project_jacobian(directions)
@@ -209,7 +209,7 @@ class Camera:
         return valid / np.linalg.norm(np.cross(by_direction[:, 0], by_direction[:, 1]), axis=1), valid
 
     def pixel_bearings(self) -> tuple[np.ndarray, np.ndarray]:
-        """`bearings` of all pixel centres, row by row: directions (height * width, 3), valid (height * width,)."""
+        """Return `bearings` of all pixel centres by rows: directions (height * width, 3), valid (height * width,)."""
         x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         return self.bearings(np.stack([x.ravel(), y.ravel()], axis=-1))
 
@@ -217,7 +217,7 @@ class Camera:
         """Return the camera of the same picture resampled to another size.
 
         Raises:
-            UserError: the new size is no resizing of the old one: its aspect differs by more than rounding to pixels.
+            UserError: the aspect ratio of the new size differs by more than rounding to whole pixels.
         """
         if (width, height) == (self.width, self.height):
             return self
@@ -238,7 +238,7 @@ class Camera:
         return Camera.pinhole(self.width, self.height, self.focal_px)
 
     def to_json(self) -> dict[str, Any]:
-        """{"model", "width", "height", "params"}; floats survive a round trip exactly."""
+        """Return {"model", "width", "height", "params"}; floats survive a round trip exactly."""
         return {
             "model": self.model,
             "width": self.width,
@@ -251,7 +251,7 @@ class Camera:
         """Return the camera that `to_json` described.
 
         Raises:
-            UserError: a key is missing or holds something else than the camera needs.
+            UserError: a key is missing or has an invalid value.
         """
         try:
             model, params = str(content["model"]), tuple(float(value) for value in content["params"])
@@ -267,7 +267,7 @@ class Camera:
         directions, valid = self.bearings(pixels)
         if not valid.any():
             return 0.0
-        # Step by step, so that more than a half turn is counted as such.
+        # Summed over small steps, so that angles above 180 degrees are counted in full.
         seen = directions[valid]
         sine = np.linalg.norm(np.cross(seen[:-1], seen[1:]), axis=1)
         return float(np.degrees(np.arctan2(sine, (seen[:-1] * seen[1:]).sum(axis=1)).sum()))
@@ -281,7 +281,7 @@ def parameter_names(model: str) -> tuple[str, ...]:
 
 
 def _complaint(model: str, values: dict[str, float]) -> str:
-    """Return what is expected of parameters that make no camera; empty where they make one."""
+    """Return a hint for invalid parameters of a model; empty if they are valid."""
     focal = [values[name] for name in ("f", "fx", "fy", "w", "h") if name in values]
     if not (np.abs(list(values.values())) < LARGEST_PARAMETER).all() or min(focal) <= 0:
         return "focal lengths must be positive and all parameters finite"
@@ -303,14 +303,14 @@ def _lens(camera: Camera) -> Lens:
 
 
 def _blocks(count: int) -> Iterator[slice]:
-    """Slices that cover `count` rows in pieces whose intermediate results stay in the processor's cache."""
+    """Return slices that cover `count` rows in blocks whose intermediate results stay in the processor's cache."""
     return (slice(first, first + BLOCK_SIZE) for first in range(0, count, BLOCK_SIZE))
 
 
 def _towards(points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions (3, N) of points (N, 3) and their distances (N,); (0, 0, 1) and 0 where there is no direction."""
+    """Return unit directions (3, N) and distances (N,) of points (N, 3); (0, 0, 1) and 0 if there is no direction."""
     points = np.ascontiguousarray(points_cam.T)
-    # Scaled first, so that no square overflows or vanishes.
+    # Scaled first, so that no square overflows or underflows.
     largest = np.abs(points).max(axis=0)
     there = (largest > 0) & (largest < np.inf)  # False at NaN
     if not there.all():

@@ -1,11 +1,11 @@
-"""Distortion of the plane: the polynomial displacement of COLMAP's and OpenCV's models, and its one true inverse.
+"""Distortion of the plane: the polynomial displacement of COLMAP's and OpenCV's models, and its inverse.
 
     F(q) = q A(s) / B(s) + 2 (p . q) q + s (p + u) + s^2 v,    s = |q|^2,
     A(s) = 1 + a_1 s + a_2 s^2 + ...,    B(s) = 1 + b_1 s + ...
 
 a is `radial`, b the `divisor`, p is `tangential` (OpenCV's p2, p1), u and v are the `prism` terms of second and fourth
-order. g(rho) = rho A / B is the radius that the radial part alone gives to the radius rho. Points are (2, N): the
-coordinates come first.
+order. g(rho) = rho A / B is the radius to which the radial part alone moves the radius rho. Points are (2, N), with
+the coordinates first.
 """
 
 import math
@@ -15,13 +15,13 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import polynomial
 
-# The radial part is inverted from a table of this many radii; Newton's method does the rest.
+# Number of radii in the table that starts the inversion of the radial part; Newton's method refines the result.
 TABLE_SIZE = 4096
-# Newton's steps shrink by squares: after one of this size, relative to the radius, what is left is rounding.
+# Newton's method converges quadratically: after a step of this size, relative to the radius, only rounding is left.
 LAST_STEP = 1e-8
-# Three steps do mostly; where a step fails, the interval or the step is halved, which takes no more than this.
+# Three steps are mostly enough; if a step fails, the interval or the step is halved, which takes at most this many.
 MOST_STEPS = 80
-# Of the largest: a coefficient below is taken for zero where roots are sought, so that no quotient overflows.
+# Coefficients below this fraction of the largest count as zero in root finding, so that no quotient overflows.
 NEGLIGIBLE = 1e-200
 
 
@@ -41,7 +41,7 @@ class Distortion:
 
         F is one to one on a disc where the symmetric part of its Jacobian is positive definite, for then
         (q2 - q1) . (F(q2) - F(q1)) > 0. The radial part has the eigenvalues g' and g / rho, and the other terms lower
-        them by no more than w = (6 |p| + 2 |u|) rho + 4 |v| rho^3 (Weyl's inequality). So the disc ends at the
+        them by at most w = (6 |p| + 2 |u|) rho + 4 |v| rho^3 (Weyl's inequality). So the disc ends at the
         smallest root of g' = w, of g / rho = w, or at the pole B = 0, whichever comes first. Without the other terms
         that is exactly where the radius turns back or becomes infinite.
         """
@@ -60,7 +60,7 @@ class Distortion:
         return min(_first_root(margin) for margin in margins)
 
     def apply(self, plane: np.ndarray) -> np.ndarray:
-        """F at points (2, N)."""
+        """Return F at points (2, N)."""
         square = plane[0] ** 2 + plane[1] ** 2
         moved = self._factor(square) * plane
         if self.tangential:
@@ -73,7 +73,7 @@ class Distortion:
         return moved
 
     def jacobian(self, plane: np.ndarray) -> np.ndarray:
-        """dF / dq at points (2, N); (2, 2, N)."""
+        """Return dF / dq at points (2, N); (2, 2, N)."""
         x, y = plane
         square = x * x + y * y
         bend = 2 * self._factor_slope(square)
@@ -94,7 +94,7 @@ class Distortion:
         return matrix
 
     def coefficient_jacobian(self, plane: np.ndarray) -> np.ndarray:
-        """dF / d coefficients at points (2, N), in the order of the fields; (2, coefficients, N)."""
+        """Return dF / d coefficients at points (2, N), in the order of the fields; (2, coefficients, N)."""
         square = plane[0] ** 2 + plane[1] ** 2
         bottom = polynomial.polyval(square, (1.0, *self.divisor))
         columns = [plane * square**i / bottom for i in range(1, len(self.radial) + 1)]
@@ -110,9 +110,9 @@ class Distortion:
         return np.stack(columns, axis=1) if columns else np.zeros((2, 0, plane.shape[1]))
 
     def invert(self, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the points (2, N) within `reach` that F moves to the targets, and whether there is one, (N,) bool.
+        """Return the points (2, N) within `reach` that F moves to the targets, and whether each exists, (N,) bool.
 
-        Where there is none, the point is some point within reach. Exact to rounding.
+        If a point does not exist, the returned one has no meaning. Exact to rounding.
         """
         goals = _radius(targets)
         radii, found, end = self._radii_from_table(goals)
@@ -123,7 +123,7 @@ class Distortion:
         return (plane, found) if radial_only else self._invert_all(targets, plane)
 
     def _factor(self, square: np.ndarray) -> np.ndarray:
-        """Return a / B."""
+        """Return A / B."""
         factor = polynomial.polyval(square, (1.0, *self.radial))
         return factor / polynomial.polyval(square, (1.0, *self.divisor)) if self.divisor else factor
 
@@ -136,9 +136,10 @@ class Distortion:
         return (slope - self._factor(square) * bottom_slope) / polynomial.polyval(square, (1.0, *self.divisor))
 
     def _radii_from_table(self, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Radii within reach with g close to the goals (N,); whether g comes so far (N,) bool; the table's last radius.
+        """Return radii (N,) within reach with g near the goals, whether g reaches them (N,) bool, and the last radius.
 
-        The table ends where g first exceeds all goals, or at the reach. Where g does not come so far, it is its end.
+        The table ends where g first exceeds all goals, or at the reach. If g does not reach a goal, its radius is the
+        last of the table.
         """
         ends = 2.0 ** np.arange(-100, 101)
         if self.reach < ends[-1]:
@@ -154,10 +155,10 @@ class Distortion:
         return np.interp(goals, heights[finite], knots[finite]), ~(goals >= heights[-1]), float(end)
 
     def _polished(self, radii: np.ndarray, goals: np.ndarray, end: float) -> np.ndarray:
-        """Return the radii in [0, end] with g = goals, from approximate ones; (N,).
+        """Return the radii (N,) in [0, end] with g = goals, refined from approximate ones.
 
-        Newton's method, which falls back on halving wherever it would leave the interval that holds the root: g grows
-        in it, so that the root is the only one.
+        Newton's method, with bisection wherever a step would leave the interval that holds the root. g increases in
+        this interval, so the root is unique.
         """
         active, polished = np.arange(len(radii)), np.empty_like(radii)
         here, goal, low, high = radii, goals, np.zeros_like(radii), np.full_like(radii, end)
@@ -178,10 +179,10 @@ class Distortion:
         return polished
 
     def _invert_all(self, targets: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the same as `invert` for all terms together, from the solution of the radial ones.
+        """Invert all terms together, starting from the solution of the radial ones; return the same as `invert`.
 
-        Three steps of Newton's method bring the weak tangential and prism terms of real lenses to rounding. What is
-        left then, near the reach or with strong terms, goes on by guarded steps from the start.
+        For the weak tangential and prism terms of real lenses, three steps of Newton's method are exact to rounding.
+        Points that have not converged then, near the reach or with strong terms, restart with guarded steps.
         """
         plane = start
         for _ in range(3):
@@ -197,14 +198,14 @@ class Distortion:
         """Return whether points lie within reach and F moves them to their targets; (N,) bool, False at NaN."""
         off = self.apply(plane) - targets
         close = _radius(off) <= 1e-13 * (1 + _radius(targets))
-        # Next to a pole F magnifies the rounding of the point itself: there, no step may be left that would count.
+        # Next to a pole F magnifies the point's own rounding; there, the next Newton step must be negligible instead.
         far = np.flatnonzero(~close)
         step = _solve(self.jacobian(plane[:, far]), off[:, far])
         close[far] = _radius(step) <= 1e-14 * _radius(plane[:, far])
         return close & (_radius(plane) < self.reach)
 
     def _by_guarded_steps(self, targets: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """Newton's method within reach, where a step that brings the image no closer to its target is halved."""
+        """Solve by Newton's method within reach, halving steps that do not bring the image closer to its target."""
         plane, active, target = start.copy(), np.arange(targets.shape[1]), targets
         here = self._pulled_back(start)
         error = self.apply(here) - target
@@ -225,7 +226,7 @@ class Distortion:
         return plane
 
     def _largest(self) -> float:
-        """No point within reach is moved farther from the centre than this."""
+        """Return an upper bound of |F(q)| for points q within reach."""
         if not np.isfinite(self.reach):
             return np.inf
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
@@ -235,7 +236,7 @@ class Distortion:
             return float((np.abs(radial) + others * square) * (1 + 1e-9))
 
     def _pulled_back(self, plane: np.ndarray) -> np.ndarray:
-        """Points beyond the reach, moved back along their radius to just within it."""
+        """Move points beyond the reach back along their radius to just within it."""
         if not np.isfinite(self.reach):
             return plane
         return plane * np.minimum(1.0, self.reach * (1 - 1e-12) / np.maximum(_radius(plane), 1e-300))
@@ -265,7 +266,7 @@ def _radius(plane: np.ndarray) -> np.ndarray:
 
 
 def _solve(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """matrices^-1 vectors for (2, 2, N) and (2, N)."""
+    """Return matrices^-1 vectors for (2, 2, N) and (2, N)."""
     (a, b), (c, d) = matrices
     determinant = a * d - b * c
     x, y = vectors

@@ -14,11 +14,11 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Frame:
-    """One view: its camera, where the camera stood, and the picture if there is one.
+    """One view: its camera and pose, and its picture if there is one.
 
     Args:
         name: unique in its capture, with forward slashes; the image's path as its capture lists it.
-        camera: refers to the picture as it is shown, EXIF orientation applied; see `Capture.pixels` for the exception.
+        camera: refers to the upright picture, EXIF orientation applied; see `Capture.pixels` for the exception.
         world_from_cam: (4, 4) rigid, OpenCV axes, float64.
         image: the picture's file; None for the frames of a camera path.
         mask: the mask's file: black where the picture is not to be used.
@@ -58,7 +58,7 @@ class Capture:
     """A capture as a file describes it.
 
     Args:
-        frames: the views, in the order of the file; from a reader for scenes only those whose picture is on disk.
+        frames: the views, in the order of the file; readers of scenes return only those whose picture is on disk.
         points: (N, 3) points of the surface in the world; N is 0 where the format has none.
         missing: names of images that the file lists and that are not on disk.
         depth_bounds: (frames, 2) nearest and farthest z of each view in scene units, or None.
@@ -66,10 +66,10 @@ class Capture:
         colours: (N, 3) uint8 sRGB of the points, or None.
         observations: where the points were seen, or None.
         unit: of length: "arbitrary" or "metre".
-        unit_source: how a metre is known, for people; None where unknown.
+        unit_source: how the metric scale was found, as text for people; None if unknown.
         pixels: which pixels of a photo with an EXIF orientation its camera refers to: "stored", as nearly all programs
-            read them, or "upright", as it is shown.
-        rescaled: for how many photos the intrinsics were given for another size: counts by that size and the photo's,
+            read them, or "upright", as the photo is displayed.
+        rescaled: number of photos whose intrinsics were given for another size, by (that size, the photo's size),
             each (width, height).
     """
 

@@ -1,4 +1,4 @@
-"""Frames by the names that people type."""
+"""Look-up of frames by the names that people type."""
 
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -8,13 +8,13 @@ from nerfcli.errors import UserError
 
 
 def frames_named(frames: Sequence[Frame], names: Sequence[str]) -> tuple[Frame, ...]:
-    """Return the frames with these names, in the order of the names; one may come twice.
+    """Return the frames with the given names, in the order of the names; a frame may be repeated.
 
-    A name is the frame's whole name, or its last parts where only one frame ends so: photo.jpg for images/photo.jpg,
-    or photo for images/photo.jpg.
+    A name is a frame's full name, or its last parts if they match only one frame: photo.jpg or photo for
+    images/photo.jpg.
 
     Raises:
-        UserError: no frame has the name, or several end so; the error lists the nearest names.
+        UserError: no frame matches a name (the error lists similar names), or several do.
     """
     whole = {frame.name: frame for frame in frames}
     endings: dict[str, list[Frame]] = {}

@@ -1,6 +1,6 @@
-"""Pictures of another size, part or lens than a camera's own: nothing is ever stretched.
+"""Change the size, crop or lens of a camera's picture, without ever stretching it.
 
-Letters: a camera of a picture w x h; the new picture W x H.
+Notation: the camera's picture is w x h; the new picture is W x H.
 """
 
 import math
@@ -11,7 +11,7 @@ from nerfcli.errors import UserError
 
 LENSES = ("pinhole", "fisheye", "equirectangular")
 
-# More on a side than any picture has.
+# Upper limit of a picture's width and height.
 MOST_PIXELS = 65536
 
 _FISHEYE_FOV_DEG = 180.0
@@ -19,7 +19,7 @@ _FISHEYE_FOV_DEG = 180.0
 
 @dataclass(frozen=True)
 class Window:
-    """A part of a picture in its pixels: the left and upper edge, width and height."""
+    """A crop of a picture in pixels: left and top edge, width and height."""
 
     x: int
     y: int
@@ -28,14 +28,14 @@ class Window:
 
 
 def sized(camera: Camera, width: int | None, height: int | None) -> Camera:
-    """Return the camera of the picture at another size;
-    with one of the two given, the other follows the picture's shape.
+    """Return the camera of the picture resized to another size.
 
-    Where the shape differs, the scaled picture covers the new one and is cut off evenly on two sides: scale
-    s = max(W / w, H / h), and the principal point moves by (s w - W) / 2 and (s h - H) / 2.
+    If only one of width and height is given, the other follows from the aspect ratio. Where the aspect ratio changes,
+    the scaled picture covers the new one and is cropped evenly on two sides: the scale is s = max(W / w, H / h), and
+    the principal point moves by (W - s w) / 2 and (H - s h) / 2.
 
     Raises:
-        UserError: an equirectangular picture that would not be twice as wide as high.
+        UserError: an equirectangular picture whose width would not be twice its height.
     """
     if width is None and height is None:
         return camera
@@ -52,10 +52,10 @@ def sized(camera: Camera, width: int | None, height: int | None) -> Camera:
 
 
 def cropped(camera: Camera, window: Window) -> Camera:
-    """Return the camera of a part of the picture.
+    """Return the camera of a crop of the picture.
 
     Raises:
-        UserError: the part is empty or reaches out of the picture, or the picture is equirectangular.
+        UserError: the crop is empty or extends beyond the picture, or the picture is equirectangular.
     """
     if camera.is_spherical:
         raise UserError("an equirectangular picture cannot be cropped", "remove --crop", exit_code=2)
@@ -73,19 +73,19 @@ def cropped(camera: Camera, window: Window) -> Camera:
 
 
 def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
-    """Return a camera of another lens for the picture's size, its axis through the middle.
+    """Return a camera with another lens for the picture's size, its axis through the picture's centre.
 
     pinhole: focal length (w / 2) / tan(fov / 2), or the camera's own. fisheye: equidistant, radius = focal length *
-    angle, focal length w / fov with fov in radians, 180 degrees if not given. equirectangular: the whole sphere, at the
-    picture's width where that is an even number twice its height, else at twice its height.
+    angle, focal length w / fov with fov in radians, 180 degrees if not given. equirectangular: the whole sphere, in
+    a picture of the same height, twice as wide.
 
     Args:
-        camera: of the picture.
+        camera: the picture's camera.
         lens: one of `LENSES`.
-        fov_deg: between the left and the right edge.
+        fov_deg: angle between the left and right edge in degrees; None for the default of the lens.
 
     Raises:
-        UserError: an angle that the lens cannot have.
+        UserError: the angle is out of range for the lens.
     """
     width, height = camera.width, camera.height
     if lens == "equirectangular":
@@ -112,10 +112,10 @@ def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
 
 
 def equirectangular(width: int, height: int) -> Camera:
-    """Return the camera of a picture of all directions.
+    """Return the camera of an equirectangular picture, which covers all directions.
 
     Raises:
-        UserError: it is not twice as wide as high, so that it would be stretched.
+        UserError: the width is not twice the height, which would stretch the picture.
     """
     if width != 2 * height:
         raise UserError(
@@ -127,7 +127,7 @@ def equirectangular(width: int, height: int) -> Camera:
 
 
 def _shifted(camera: Camera, x: float, y: float) -> Camera:
-    """Return the camera with its principal point moved, for a picture that was cut off at its left or upper edge."""
+    """Return the camera with its principal point moved, for a picture that was cropped at its left or top edge."""
     values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
     values["cx"] += x
     values["cy"] += y

@@ -1,6 +1,6 @@
 """Layout of the cameras of a capture: what they look at, which way is up, whether they surround something.
 
-Letters: a camera has centre c and unit viewing direction d.
+Notation: a camera has centre c and unit viewing direction d.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,25 +9,25 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 
-# Below this angle between the axes of typical cameras, the place where they meet is not known from the axes.
+# Below this typical angle between the optical axes, they do not determine where they meet.
 _PARALLEL_RAD = np.radians(3.0)
 
-# The mean of viewing directions is shorter than this where they point all around; it is 0.64 for half a circle.
+# The mean viewing direction is shorter than this if the cameras look all around; it is 0.64 for half a circle.
 _ALL_AROUND = 0.4
 
 _DEPTH_PER_SPREAD = 5.0
 
-# A capture goes around something if no gap between neighbouring directions of view is wider than this.
+# The cameras surround something if no gap between neighbouring headings is wider than this.
 _WIDEST_GAP_RAD = np.radians(150.0)
 
 
 def centres_of(frames: Sequence[Frame]) -> np.ndarray:
-    """Camera centres, (frames, 3)."""
+    """Return the camera centres, (frames, 3)."""
     return np.stack([frame.centre for frame in frames])
 
 
 def views_of(frames: Sequence[Frame]) -> np.ndarray:
-    """Viewing directions (the optical axes), (frames, 3), unit."""
+    """Return the unit viewing directions (optical axes), (frames, 3)."""
     return np.stack([frame.world_from_cam[:3, 2] for frame in frames])
 
 
@@ -35,9 +35,9 @@ def focus_point(frames: Sequence[Frame], *, depth_hint: float | None = None) -> 
     """Return the point that the cameras look at, (3,): the one nearest to their optical axes.
 
     It minimises the sum of its distances to the axes (not of their squares, so that a few cameras that look elsewhere
-    do not move it), by iteratively reweighted least squares. There is no such point where the axes are parallel, or
-    where they meet behind most cameras. Then it is the mean centre of cameras that look all around, and else lies
-    `depth_hint` in front of the mean camera: without a hint 5 times as far as the cameras are spread, since people who
+    do not move it), by iteratively reweighted least squares. There is no such point if the axes are parallel or
+    meet behind most cameras. The result is then the mean centre if the cameras look all around, else the point
+    `depth_hint` in front of the mean camera. Without a hint, the depth is 5 times the cameras' spread, since people who
     photograph a scene from the front step aside by a fraction of its depth.
 
     Raises:
@@ -46,7 +46,7 @@ def focus_point(frames: Sequence[Frame], *, depth_hint: float | None = None) -> 
     if not frames:
         raise ValueError("focus_point needs at least one frame")
     centres, views = centres_of(frames), views_of(frames)
-    across = np.eye(3) - views[:, :, None] * views[:, None, :]  # (frames, 3, 3), projects onto the plane across d
+    across = np.eye(3) - views[:, :, None] * views[:, None, :]  # (frames, 3, 3), projects onto the plane normal to d
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
     # The smallest eigenvalue is the mean squared sine between the axes and their common direction.
     if np.linalg.eigvalsh(across.mean(axis=0))[0] > np.sin(_PARALLEL_RAD) ** 2:
@@ -70,8 +70,8 @@ def nearest_to_rays(
 
     Args:
         origins, directions: (n, 3), unit directions, n >= 2, not all parallel.
-        weigh: gives the weights (n,) from the distances (n,) of the point to the rays, and from its offsets (n, 3) from
-            their origins.
+        weigh: returns the weights (n,), given the distances (n,) of the point from the rays and its offsets (n, 3)
+            from their origins.
     """
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     weights, point = np.ones(len(origins)), np.zeros(3)
@@ -87,9 +87,9 @@ def nearest_to_rays(
 def up_direction(frames: Sequence[Frame]) -> np.ndarray:
     """Estimate the up direction of the world, (3,), unit.
 
-    People hold a camera level but tilt it: the horizontal axes of the pictures lie in the ground plane whatever the
-    tilt, so where those span a plane clearly, up is its normal. Where they do not (all cameras look the same way),
-    or where the normal is far from the mean of the pictures' own up, up is that mean.
+    People tilt a camera up and down but not sideways, so the horizontal axes of the pictures are in the ground plane.
+    If they clearly span a plane, up is its normal. If they do not (all cameras look the same way), or if the normal is
+    more than 60 degrees from the mean of the pictures' own up directions, up is that mean.
     """
     mean_up = mean_direction(-np.stack([frame.world_from_cam[:3, 1] for frame in frames]))
     right = np.stack([frame.world_from_cam[:3, 0] for frame in frames])
@@ -104,7 +104,7 @@ def surrounds(frames: Sequence[Frame], up: np.ndarray) -> bool:
     east, north = horizontal_axes(up)
     views = views_of(frames)
     heading = np.stack([views @ east, views @ north], axis=-1)
-    level = np.linalg.norm(heading, axis=1) > 0.1  # straight down there is no heading
+    level = np.linalg.norm(heading, axis=1) > 0.1  # a camera that looks straight down has no heading
     if level.sum() < 3:
         return False
     angles = np.sort(np.arctan2(heading[level, 1], heading[level, 0]))
@@ -113,7 +113,7 @@ def surrounds(frames: Sequence[Frame], up: np.ndarray) -> bool:
 
 
 def horizontal_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors (3,) perpendicular to `up` and to each other; the three are right-handed with `up` last."""
+    """Return two unit vectors (3,) perpendicular to `up` and each other; with `up` last the three are right-handed."""
     east = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     east /= np.linalg.norm(east)
     return east, np.cross(up, east)
@@ -122,7 +122,7 @@ def horizontal_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def mean_direction(directions: np.ndarray) -> np.ndarray:
     """Return the normalised mean (3,) of unit vectors (N, 3), without those that are more than 60 degrees off it.
 
-    They are the photos taken with the camera on its side. Where the vectors cancel out it is the first of them.
+    Those excluded are photos taken with the camera on its side. If the vectors cancel out, return the first one.
     """
     kept = np.ones(len(directions), dtype=bool)
     mean = directions[0]

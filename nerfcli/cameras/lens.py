@@ -1,6 +1,6 @@
-"""A lens: a projection, then a distortion or two, then focal length and principal point, as COLMAP's models name them.
+"""A lens: a projection, then up to two distortions, then focal length and principal point, as in COLMAP's models.
 
-Coordinates come first here: directions are (3, N), pixels (2, N).
+Arrays have coordinates first here: directions are (3, N), pixels (2, N).
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from nerfcli.cameras.projections import (
     Projection,
 )
 
-# A direction counts as the pixel's own only if it projects back onto it.
+# A pixel's direction is valid only if it projects back to within this distance of the pixel.
 MAX_MISMATCH_PX = 1e-3
 
 # The parameters of each model's distortions, by the name of the term: one group for F(q), a second for F2(F1(q)).
@@ -57,8 +57,8 @@ class Lens:
         distortions: of the plane, the innermost first.
         focal_px: (2, 1).
         principal_point: (2, 1) in pixels.
-        spread: (inner, parameters), d inner / d parameters: the inner parameters are those of the projection, of the
-            distortions in their order, fx, fy, cx and cy.
+        spread: (inner, parameters), d inner / d parameters. The inner parameters are those of the projection, then
+            those of the distortions in their order, then fx, fy, cx and cy.
     """
 
     projection: Projection
@@ -68,9 +68,7 @@ class Lens:
     spread: np.ndarray
 
     def project(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project unit directions (3, N) to pixels (2, N), and return whether the lens sees them, (N,) bool; zeros
-        where not.
-        """
+        """Project unit directions (3, N) to pixels (2, N), zeros where the lens does not see; valid (N,) bool."""
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             valid = self.projection.sees(directions)
             plane = self.projection.plane(_where_seen(directions, valid))
@@ -83,9 +81,7 @@ class Lens:
         return pixels, valid
 
     def unproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Unproject finite pixels (2, N) to unit directions (3, N), and return whether there is one, (N,) bool; +z
-        where not.
-        """
+        """Unproject finite pixels (2, N) to unit directions (3, N), +z where there is none; valid (N,) bool."""
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             plane = (pixels - self.principal_point) / self.focal_px
             valid = np.ones(pixels.shape[1], dtype=bool)
@@ -94,18 +90,18 @@ class Lens:
                 valid &= found
             directions, found = self.projection.directions(plane)
             valid &= found & np.isfinite(directions).all(axis=0)
-            # The proof of the pudding, for the very edge of the domain and for parameters that no lens has.
+            # A round trip as a check, for the very edge of the domain and for parameters that no real lens has.
             again, seen = self.project(_where_seen(directions, valid))
             valid &= seen & (np.abs(again - pixels) < MAX_MISMATCH_PX).all(axis=0)
         directions[:, ~valid] = np.array([[0.0], [0.0], [1.0]])
         return directions, valid
 
     def jacobians(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Derivatives of `project` at unit directions (3, N).
+        """Return the derivatives of `project` at unit directions (3, N).
 
         Returns:
             d pixel / d direction (2, 3, N) and d pixel / d parameters (2, P, N), zeros where the lens does not see;
-            whether it does, (N,) bool.
+            valid (N,) bool.
         """
         _, valid = self.project(directions)
         directions = _where_seen(directions, valid)
@@ -150,7 +146,7 @@ def lens_of(model: str, values: dict[str, float]) -> Lens:
 
 
 def _projection(model: str, values: dict[str, float]) -> tuple[Projection, list[dict[str, float]]]:
-    """Return a model's projection, and of each of its parameters the share that each of the model's has in it."""
+    """Return a model's projection, and the derivatives of each of its parameters by the model's parameters."""
     if model == "EQUIRECTANGULAR":
         return Equirectangular(), []
     if model == "FOV":
@@ -163,7 +159,7 @@ def _projection(model: str, values: dict[str, float]) -> tuple[Projection, list[
 
 
 def _where_seen(directions: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the directions, with the optical axis in place of those that are not seen."""
+    """Return the directions, with those that are not seen replaced by the optical axis."""
     return np.where(seen, directions, np.array([[0.0], [0.0], [1.0]]))
 
 

@@ -1,6 +1,6 @@
 """Lens parameters that refinement can change: a factor of the focal length and the first two radial terms.
 
-Resolution does not enter: the same change suits the photo and the smaller picture that is trained on.
+Changes do not depend on the resolution: the same change applies to a photo and its downscaled version in training.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from nerfcli.cameras.lens import DISTORTIONS
 
 FOCAL = "focal"
 _FOCAL_NAMES = ("f", "fx", "fy")
-# Further terms tell little apart from the first two, and run away where few pixels look.
+# Further terms are hard to tell apart from the first two, and diverge where few pixels constrain them.
 _RADIAL_TERMS = 2
 
 
@@ -25,17 +25,17 @@ def changeable(camera: Camera) -> tuple[str, ...]:
 
 
 def changed(camera: Camera, names: Sequence[str], values: np.ndarray) -> Camera:
-    """Return the camera with a change.
+    """Return the camera with its parameters changed.
 
-    focal length exp(values[focal]) times as long;  k + values[k] for a radial term k
+    The focal length is multiplied by exp(values[focal]), and values[k] is added to a radial term k.
 
     Args:
-        camera: as it was.
-        names: of `changeable`.
+        camera: before the change.
+        names: some of `changeable`.
         values: one per name; zeros change nothing.
 
     Raises:
-        UserError: no camera is like that.
+        UserError: the changed parameters are not valid.
     """
     change = dict(zip(names, values, strict=True))
     factor = float(np.exp(change.get(FOCAL, 0.0)))
@@ -47,7 +47,7 @@ def changed(camera: Camera, names: Sequence[str], values: np.ndarray) -> Camera:
 
 
 def pixels_by_change(camera: Camera, names: Sequence[str], by_parameters: np.ndarray) -> np.ndarray:
-    """d pixel / d change (N, 2, K) of a camera, from its d pixel / d parameters (N, 2, P)."""
+    """Return d pixel / d change (N, 2, K) of a camera, from its d pixel / d parameters (N, 2, P)."""
     parameters = parameter_names(camera.model)
     focal = [index for index, name in enumerate(parameters) if name in _FOCAL_NAMES]
     columns = [
@@ -60,9 +60,9 @@ def pixels_by_change(camera: Camera, names: Sequence[str], by_parameters: np.nda
 
 
 def bearings_by_change(camera: Camera, names: Sequence[str], pixels: np.ndarray) -> np.ndarray:
-    """d direction / d change (N, 3, K) of pixels (N, 2) that stay where they are; zero where there is no direction.
+    """Return d direction / d change (N, 3, K) of fixed pixels (N, 2); zero where there is no direction.
 
-    The direction moves so that its pixel stays: d direction / d change = - d direction / d pixel  d pixel / d change.
+    The pixel is to stay fixed, so d direction / d change = - d direction / d pixel  d pixel / d change.
     """
     directions, _ = camera.bearings(pixels)
     by_pixel, _ = camera.bearing_jacobian(pixels)

@@ -15,11 +15,11 @@ from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.frame import Size
 from nerfcli.errors import UserError
 
-# Tells of an image file: width and height as it is shown, EXIF orientation applied, and that orientation (1 if none).
+# Returns an image file's width and height, EXIF orientation applied, and that orientation (1 if none).
 Measure = Callable[[Path], tuple[int, int, int]]
 
-# The turn of the picture, upright from stored, as a rotation of (x right, y down): EXIF 3 half a turn, 6 a quarter
-# clockwise, 8 a quarter counter-clockwise. Source: Exif 2.32, tag 0x0112.
+# Rotations upright_from_stored of the picture, in (x right, y down): EXIF 3 is half a turn, 6 a quarter clockwise,
+# 8 a quarter counter-clockwise. Source: Exif 2.32, tag 0x0112.
 _TURNS = {
     1: np.array([[1.0, 0.0], [0.0, 1.0]]),
     3: np.array([[-1.0, 0.0], [0.0, -1.0]]),
@@ -38,7 +38,7 @@ _VECTORS = {
 
 
 def stored_size(path: Path, measure: Measure) -> tuple[int, int]:
-    """Width and height of an image file before its EXIF orientation is applied."""
+    """Return the width and height of an image file before its EXIF orientation is applied."""
     width, height, orientation = measure(path)
     return (height, width) if orientation >= 5 else (width, height)
 
@@ -46,13 +46,13 @@ def stored_size(path: Path, measure: Measure) -> tuple[int, int]:
 def fit_to_picture(
     camera: Camera, world_from_cam: np.ndarray, *, path: Path, measure: Measure
 ) -> tuple[Camera, np.ndarray]:
-    """Camera and pose for the upright picture on disk.
+    """Return the camera and pose for the upright picture on disk.
 
-    The calibration is taken to be for the stored pixels, or for the upright ones where its shape fits those better, and
-    may be for another size of the same picture.
+    The calibration is taken to be for the stored pixels, or for the upright ones if its aspect ratio fits those better,
+    and may be for another size of the same picture.
 
     Raises:
-        UserError: neither shape fits, or the EXIF orientation mirrors the picture; both sizes are named.
+        UserError: neither aspect ratio fits (both sizes are named), or the EXIF orientation mirrors the picture.
     """
     orientation, size = turn_to_upright(camera, path=path, measure=measure)
     try:
@@ -63,8 +63,10 @@ def fit_to_picture(
 
 
 def turn_to_upright(camera: Camera, *, path: Path, measure: Measure) -> tuple[int, tuple[int, int]]:
-    """Return the EXIF orientation by which a camera's picture is to be turned upright, 1 if it is so already, and the
-    size of the picture on disk that the camera is for, which may be a resized one of the camera's.
+    """Return the EXIF orientation that turns a camera's picture upright, and the size of the picture on disk.
+
+    The orientation is 1 if the camera is for the upright picture already. The size is of the picture as the camera
+    sees it, before turning, and may differ from the camera's size if the picture was resized.
 
     Raises:
         UserError: the EXIF orientation mirrors the picture.
@@ -82,7 +84,7 @@ def turn_to_upright(camera: Camera, *, path: Path, measure: Measure) -> tuple[in
 
 
 def turned(camera: Camera, world_from_cam: np.ndarray, *, orientation: int) -> tuple[Camera, np.ndarray]:
-    """Camera and pose of the upright picture, given those of the stored one.
+    """Return the camera and pose of the upright picture, given those of the stored one.
 
     Args:
         camera: of the stored pixels.
@@ -117,7 +119,7 @@ def turned(camera: Camera, world_from_cam: np.ndarray, *, orientation: int) -> t
 
 
 def turned_pixels(pixels: np.ndarray, sizes: np.ndarray, *, orientation: int) -> np.ndarray:
-    """Positions (N, 2) in upright pictures, given those in the stored ones, which have sizes (N, 2): width, height."""
+    """Turn positions (N, 2) in stored pictures of `sizes` (N, 2), width and height, into those in upright pictures."""
     middles = sizes / 2
     return (pixels - middles) @ _TURNS[orientation].T + (middles[:, ::-1] if orientation in (6, 8) else middles)
 
@@ -128,8 +130,7 @@ def turn_back(orientation: int) -> int:
 
 
 def rescaling(calibrated: Camera, fitted: Camera) -> tuple[Size, Size] | None:
-    """Return the size that a calibration was for and that of the picture that it was fitted to, both upright; None
-    where they are the same."""
+    """Return the sizes of a calibration and of the picture it was fitted to, both upright; None if they are equal."""
     size, other = (fitted.width, fitted.height), (calibrated.width, calibrated.height)
     if size in (other, other[::-1]):
         return None
@@ -152,5 +153,5 @@ def describe_rescaling(rescaled: Mapping[tuple[Size, Size], int]) -> list[str]:
 
 
 def _shape_error(camera: Camera, size: tuple[int, int]) -> float:
-    """Return how many pixels a size is off the camera's aspect."""
+    """Return by how many pixels a size's height is off the camera's aspect ratio."""
     return abs(camera.height * size[0] / camera.width - size[1])

@@ -1,6 +1,6 @@
 """Camera paths for renders and videos: an orbit, an ellipse, a spiral, and a flight through the frames.
 
-All move at a constant speed and have the first frame's picture size and focal length, without its distortion.
+All move at constant speed and use the first frame's picture size and focal length, without its distortion.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,10 +23,10 @@ from nerfcli.errors import UserError
 
 __all__ = ["ellipse", "focus_point", "interpolate", "orbit", "spiral"]
 
-# Samples of a curve from which its arc length is measured; the speed is constant to about 1e-5.
+# Number of samples to measure a curve's arc length; the speed is then constant to about 1e-5.
 _CURVE_SAMPLES = 8192
 
-# How much of the cameras' spread a path uses where they stand on one side: beyond its rim nothing was seen.
+# Fraction of the cameras' spread that a path uses: nothing was observed from beyond its rim.
 _INSIDE = 0.8
 
 
@@ -35,8 +35,8 @@ def orbit(
 ) -> tuple[Frame, ...]:
     """Return a closed path around the focus point, looking at it.
 
-    Where the cameras surround the focus: once around, at their mean elevation, on an ellipse fitted to their distances.
-    Where they stand on one side: a small ellipse within the angles from which they look at the focus.
+    If the cameras surround the focus, the path goes around it once, at their mean elevation, on an ellipse fitted to
+    their distances. If they are on one side, it is a small ellipse within the angles from which they view the focus.
 
     Args:
         frames: the capture's frames, at least one.
@@ -46,7 +46,7 @@ def orbit(
 
     Raises:
         ValueError: no frame, or count below 1.
-        UserError: all cameras stand in one place.
+        UserError: all cameras are in one place.
     """
     _check(frames, count)
     focus = focus_point(frames, depth_hint=depth_hint)
@@ -62,7 +62,7 @@ def orbit(
     if surrounds(frames, up):
         curve = _ring(offsets, distances, up)
     else:
-        curve = _sway(offsets, distances, up)
+        curve = _frontal_ellipse(offsets, distances, up)
     centres = focus + _equal_steps(curve, count)
     return _looking_at(frames, centres, focus, up=up, name="orbit")
 
@@ -72,8 +72,8 @@ def ellipse(
 ) -> tuple[Frame, ...]:
     """Return a closed level ellipse about the focus point, at the cameras' mean height, looking at the focus.
 
-    Its axes are the principal axes of the cameras on the ground, and each reaches as far to both sides of the focus as
-    nine of ten cameras do. Unlike `orbit` it goes once around wherever the cameras stand: behind the scene too.
+    Its axes are the principal axes of the camera centres on the ground, and each half axis is the 90th percentile of
+    their distances from the focus along it. Unlike `orbit` it always goes all the way around, behind the scene too.
 
     Args:
         frames: the capture's frames, at least one.
@@ -83,9 +83,9 @@ def ellipse(
 
     Raises:
         ValueError: no frame, or count below 1.
-        UserError: the cameras stand on a line with the focus: there is no ellipse.
+        UserError: the cameras and the focus are on a line, so there is no ellipse.
 
-    Source: generate_ellipse_path of google-research/multinerf, internal/camera_utils.py (mip-NeRF 360, Zip-NeRF), whose
+    Source: generate_ellipse_path of google-research/multinerf, internal/camera_utils.py (mip-NeRF 360, Zip-NeRF), where
     up is the third principal axis of all centres; here it is the cameras' own.
     """
     _check(frames, count)
@@ -114,16 +114,15 @@ def ellipse(
 def spiral(
     frames: Sequence[Frame], *, count: int, turns: int = 2, depth_hint: float | None = None
 ) -> tuple[Frame, ...]:
-    """Return a closed spiral about the mean camera, in the box that the cameras fill,
-    looking at a point as deep as the focus.
+    """Return a closed spiral about the mean camera, within the cameras' bounding box.
 
-    For cameras that surround the scene, where the mean camera would stand amid it, the quarter of them
-    nearest to the middle one is used.
+    All views look at a point straight ahead of the mean camera, as deep as the focus or at least 2 |radii|. If the
+    cameras surround the scene, their mean would be inside it, so only the quarter nearest to the middle frame is used.
 
     Args:
         frames: the capture's frames, at least one.
         count: number of views; the last one is followed by the first.
-        turns: how often it goes around.
+        turns: number of turns.
         depth_hint: the distance to the focus, in scene units, for cameras with parallel axes.
 
     Raises:
@@ -143,7 +142,7 @@ def spiral(
     middle = centres.mean(axis=0)
     axes = rigid.look_at(middle, middle + mean_direction(views_of(near_frames)), up)[:3, :3]
     local = (centres - middle) @ axes
-    # The spiral goes as far to both sides: the narrower one counts.
+    # The spiral extends equally to both sides, so the narrower side limits it.
     radii = _INSIDE * np.minimum(local.max(axis=0), -local.min(axis=0)).clip(min=0.0)
 
     def curve(t: np.ndarray) -> np.ndarray:
@@ -156,8 +155,7 @@ def spiral(
 
 
 def interpolate(frames: Sequence[Frame], *, count: int) -> tuple[Frame, ...]:
-    """Return a smooth flight through the frames in their order, from the first to the last,
-    at constant speed: see `fly`.
+    """Return a smooth flight at constant speed through the frames in order, from the first to the last; see `fly`.
 
     Raises:
         ValueError: no frame, or count below 1.
@@ -173,7 +171,7 @@ def _check(frames: Sequence[Frame], count: int) -> None:
 
 
 def _ring(offsets: np.ndarray, distances: np.ndarray, up: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Once around at the mean elevation; the distance follows an ellipse over the azimuth."""
+    """Return a curve once around at the mean elevation, whose distance follows an ellipse over the azimuth."""
     east, north = horizontal_axes(up)
     elevation = float(np.mean(np.arcsin(np.clip(offsets @ up / distances, -1.0, 1.0))))
     azimuth = np.arctan2(offsets @ north, offsets @ east)
@@ -189,10 +187,10 @@ def _ring(offsets: np.ndarray, distances: np.ndarray, up: np.ndarray) -> Callabl
 
 
 def _ellipse(azimuth: np.ndarray, distances: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """1 / distance^2 over the azimuth, of the centred ellipse that fits best, or of the circle with the mean distance.
+    """Fit a centred ellipse, or else the circle of the mean distance; return 1 / distance^2 as a function of azimuth.
 
-    In polar form a centred ellipse is 1 / r^2 = a + b cos 2 phi + c sin 2 phi, linear in a, b and c. Few cameras, or
-    ones that stand at all distances, do not make an ellipse: beyond axes of 2 : 1 the circle is taken.
+    In polar form a centred ellipse is 1 / r^2 = a + b cos 2 phi + c sin 2 phi, linear in a, b and c. The circle is used
+    for fewer than 8 cameras, and where scattered distances give axes beyond 2 : 1 or an a far from 1 / mean^2.
     """
     mean = float(np.mean(distances))
     columns = np.stack([np.ones_like(azimuth), np.cos(2 * azimuth), np.sin(2 * azimuth)], axis=-1)
@@ -203,12 +201,10 @@ def _ellipse(azimuth: np.ndarray, distances: np.ndarray) -> Callable[[np.ndarray
     return lambda angle: (a + b * np.cos(2 * angle) + c * np.sin(2 * angle)) / mean**2
 
 
-def _sway(offsets: np.ndarray, distances: np.ndarray, up: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a small ellipse in azimuth and elevation about the focus, at the mean distance,
-    within the cameras' angles.
-    """
+def _frontal_ellipse(offsets: np.ndarray, distances: np.ndarray, up: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a small ellipse in angles about the focus, within those of the cameras and at their mean distance."""
     towards = mean_direction(offsets / distances[:, None])
-    # Azimuth and elevation are about `up`, unless the cameras look down so steeply that it is no axis.
+    # Azimuth and elevation are about `up`, unless the cameras look down too steeply for that.
     pole = up if abs(towards @ up) < 0.9 else np.cross(towards, horizontal_axes(towards)[0])
     front = towards - (towards @ pole) * pole
     front /= np.linalg.norm(front)
@@ -228,7 +224,7 @@ def _sway(offsets: np.ndarray, distances: np.ndarray, up: np.ndarray) -> Callabl
 
 
 def _equal_steps(curve: Callable[[np.ndarray], np.ndarray], count: int) -> np.ndarray:
-    """Return points (count, 3) at equal arc lengths along a closed curve over [0, 1], without its end."""
+    """Return points (count, 3) at equal arc lengths along a closed curve over [0, 1], excluding its end."""
     t = np.linspace(0.0, 1.0, _CURVE_SAMPLES + 1)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(t), axis=0), axis=1))])
     if length[-1] == 0:

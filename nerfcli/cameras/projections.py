@@ -2,7 +2,7 @@
 
 A projection maps directions d = (x, y, z) in camera axes to a plane q with unit focal length; rho = |(x, y)| and theta
 is the angle between d and the optical axis. Coordinates come first: directions are (3, N), points of the plane (2, N).
-Each class says which directions it `sees`; only of these are `plane` and the two Jacobians meant.
+Each class says which directions it `sees`; `plane` and the two Jacobians are defined only for those.
 """
 
 from dataclasses import dataclass
@@ -10,13 +10,13 @@ from typing import Protocol
 
 import numpy as np
 
-# Below this ratio of rho to z, differences of nearly equal terms give way to their series; its first missing term is
-# below 1e-13 of the sum.
+# Below this ratio of rho to z, differences of nearly equal terms are replaced by their series, whose first omitted term
+# is below 1e-13 of the sum.
 SERIES_BELOW = 0.05
 
 
 class Projection(Protocol):
-    """A map from directions to the plane, one to one where it sees."""
+    """A map from directions to the plane, one to one on the directions that it sees."""
 
     def sees(self, directions: np.ndarray) -> np.ndarray:
         """Return whether directions (3, N) of any length are in the domain; (N,) bool."""
@@ -27,15 +27,15 @@ class Projection(Protocol):
         ...
 
     def directions(self, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Invert `plane`: unit directions (3, N), and whether there is one, (N,) bool."""
+        """Invert `plane`: return unit directions (3, N), and whether each exists, (N,) bool."""
         ...
 
     def jacobian(self, directions: np.ndarray) -> np.ndarray:
-        """d plane / d direction at unit directions, (2, 3, N)."""
+        """Return d plane / d direction at unit directions, (2, 3, N)."""
         ...
 
     def parameter_jacobian(self, directions: np.ndarray) -> np.ndarray:
-        """d plane / d parameters in the order of the class's fields, (2, parameters, N)."""
+        """Return d plane / d parameters in the order of the class's fields, (2, parameters, N)."""
         ...
 
 
@@ -62,7 +62,7 @@ class Perspective:
 
 @dataclass(frozen=True)
 class Equidistant:
-    """q = theta (x, y) / rho: the plane's radius is the angle, all around but for the point straight behind.
+    """q = theta (x, y) / rho: the radius in the plane is the angle, for all directions except straight behind.
 
     Source: Kannala and Brandt 2006, A generic camera model for wide-angle lenses, eq. 6, which OpenCV's fisheye
     module follows.
@@ -92,10 +92,10 @@ class FieldOfView:
 
     It is the equidistant projection of the direction (t x, t y, z), divided by omega; at omega = 0 it is the
     perspective one. The model is published for perspective radii, so it ends at 90 degrees, where |q| = pi / (2 omega).
-    COLMAP's own formula takes a series with two wrong signs at |omega| < 0.01 and differs there by up to 1e-4 of q.
+    COLMAP's own formula uses a series with two wrong signs at |omega| < 0.01 and differs there by up to 1e-4 of q.
 
     Args:
-        omega: in radians, between -pi and pi; its sign says nothing.
+        omega: in radians, between -pi and pi; its sign has no effect.
 
     Source: Devernay and Faugeras 2001, Straight lines have to be straight, eq. 13.
     """
@@ -135,7 +135,7 @@ class FieldOfView:
         return 2 * float(np.tan(self.omega / 2))
 
     def _growth(self) -> float:
-        """t / omega, 1 at omega = 0: how much larger the plane is at its centre than the perspective one."""
+        """Return t / omega, 1 at omega = 0: the scale at the centre relative to the perspective projection."""
         return self._stretch() / self.omega if self.omega else 1.0
 
     def _stretched(self, directions: np.ndarray) -> np.ndarray:
@@ -146,8 +146,8 @@ class FieldOfView:
 class EnhancedUnified:
     """q = (x, y) / (alpha d + (1 - alpha) z) with d = sqrt(beta rho^2 + z^2).
 
-    It sees z > -w d with w = alpha / (1 - alpha), where the denominator ends, or, for alpha > 1/2, w = (1 - alpha) /
-    alpha, where the radius turns back.
+    It sees z > -w d. The limit is w = alpha / (1 - alpha), where the denominator becomes 0, or, for alpha > 1/2,
+    w = (1 - alpha) / alpha, where the radius turns back.
 
     Args:
         alpha: in [0, 1]; 0 is the perspective projection.
@@ -189,7 +189,7 @@ class EnhancedUnified:
         return np.sqrt(self.beta * (directions[0] ** 2 + directions[1] ** 2) + directions[2] ** 2)
 
     def _denominator(self, directions: np.ndarray) -> np.ndarray:
-        # For z < 0 the two terms cancel; d - |z| comes without cancellation from the difference of squares.
+        # For z < 0 the two terms cancel; the difference of squares gives d - |z| without cancellation.
         z, depth = directions[2], self._depth(directions)
         rest = self.beta * (directions[0] ** 2 + directions[1] ** 2) / (depth + np.abs(z))  # d - |z|
         return np.where(z > 0, self.alpha * depth + (1 - self.alpha) * z, self.alpha * rest - (1 - 2 * self.alpha) * -z)
@@ -202,8 +202,8 @@ class Division:
     With k < 0 (a barrel) the third component falls below zero at |q| = (-k)^-1/2, and the model goes on behind the
     camera; with k > 0 the radius turns back at |q| = k^-1/2.
 
-    Source: Fitzgibbon 2001, Simultaneous linear estimation of multiple view geometry and lens distortion, eq. 2, read
-    for omnidirectional cameras as in Micusik and Pajdla 2003.
+    Source: Fitzgibbon 2001, Simultaneous linear estimation of multiple view geometry and lens distortion, eq. 2,
+    extended to omnidirectional cameras as in Micusik and Pajdla 2003.
     """
 
     k: float
@@ -244,7 +244,7 @@ class Division:
 
 @dataclass(frozen=True)
 class Equirectangular:
-    """q = (atan2(x, z) / 2 pi, atan2(y, |(x, z)|) / pi): the whole sphere but its two poles on [-1/2, 1/2]^2."""
+    """q = (atan2(x, z) / 2 pi, atan2(y, |(x, z)|) / pi): the whole sphere except its two poles, on [-1/2, 1/2]^2."""
 
     def sees(self, directions: np.ndarray) -> np.ndarray:
         return (directions[0] != 0) | (directions[2] != 0)
@@ -271,13 +271,13 @@ class Equirectangular:
 
 
 def _unit(plane: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unit directions along (plane, z), and whether their length is a number."""
+    """Return the unit directions along (plane, z), and whether the length of (plane, z) is finite."""
     length = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + z * z)
     return np.stack([*(plane / length), z / length]), np.asarray(np.isfinite(length))
 
 
 def _jacobian(factor: np.ndarray, bend: np.ndarray, xy: np.ndarray, *, by_z: np.ndarray) -> np.ndarray:
-    """d q / d direction of q = factor (x, y), where d factor = bend (x dx + y dy) + by_z dz; (2, 3, N)."""
+    """Return d q / d direction of q = factor (x, y), where d factor = bend (x dx + y dy) + by_z dz; (2, 3, N)."""
     x, y = xy
     skew = bend * x * y
     return np.stack(
@@ -286,13 +286,13 @@ def _jacobian(factor: np.ndarray, bend: np.ndarray, xy: np.ndarray, *, by_z: np.
 
 
 def _sine_over(angle: np.ndarray) -> np.ndarray:
-    """sin(angle) / angle, 1 at 0."""
+    """Return sin(angle) / angle, 1 at 0."""
     safe = np.where(angle > 0, angle, 1.0)
     return np.where(angle > 0, np.sin(safe) / safe, 1.0)
 
 
 def _angle_over_rho(directions: np.ndarray) -> np.ndarray:
-    """theta / rho of directions of any length; 1 / z on the optical axis."""
+    """Return theta / rho of directions of any length; 1 / z on the optical axis."""
     rho = np.sqrt(directions[0] ** 2 + directions[1] ** 2)
     on_axis = rho == 0
     if not on_axis.any():
@@ -302,7 +302,7 @@ def _angle_over_rho(directions: np.ndarray) -> np.ndarray:
 
 
 def _angle_bend(directions: np.ndarray) -> np.ndarray:
-    """(d (theta / rho) / d rho) / rho = (z / (rho^2 + z^2) - theta / rho) / rho^2."""
+    """Return (d (theta / rho) / d rho) / rho = (z / (rho^2 + z^2) - theta / rho) / rho^2."""
     z, rho_square = directions[2], directions[0] ** 2 + directions[1] ** 2
     near = (z > 0) & (rho_square < (SERIES_BELOW * z) ** 2)
     safe_z = np.where(near, z, 1.0)

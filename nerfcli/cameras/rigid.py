@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.errors import UserError
 
-# Below this angle in radians, differences of nearly equal terms give way to their series; five terms are exact there.
+# Below this angle in radians, differences of nearly equal terms are replaced by series; five terms are exact there.
 SERIES_BELOW = 0.25
 
 
@@ -28,7 +28,7 @@ def inverse(b_from_a: np.ndarray) -> np.ndarray:
 
 
 def apply(b_from_a: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points of frame a in coordinates of frame b.
+    """Transform points of frame a to coordinates of frame b.
 
     Args:
         b_from_a: (4, 4), or (..., 4, 4) for one transform per set of points.
@@ -54,7 +54,7 @@ def from_parts(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
 
 
 def rotation_from_quaternion(wxyz: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in the order wxyz, of any length but zero.
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) in the order wxyz, of any non-zero length.
 
     Raises:
         ValueError: a quaternion has zero or non-finite length.
@@ -73,14 +73,14 @@ def rotation_from_quaternion(wxyz: np.ndarray) -> np.ndarray:
 
 
 def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3); exact to rounding near pi too."""
+    """Return unit quaternions (..., 4), wxyz with w >= 0, of rotations (..., 3, 3); exact to rounding near pi too."""
     rotation = np.asarray(rotation, dtype=np.float64)
     xyzw = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat(canonical=True)
     return xyzw[:, [3, 0, 1, 2]].reshape(*rotation.shape[:-2], 4)
 
 
 def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
-    """exp: rotations (..., 3, 3) about the axes of vectors (..., 3), by their lengths in radians.
+    """Return exp: the rotations (..., 3, 3) about vectors (..., 3), by their lengths in radians.
 
     Orthonormal to rounding at any length; near 0 each entry keeps its relative accuracy.
     """
@@ -90,11 +90,11 @@ def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
 
 
 def vector_from_rotation(rotation: np.ndarray) -> np.ndarray:
-    """log: the vector (..., 3) along the axis, as long as the angle in [0, pi], of rotations (..., 3, 3).
+    """Return log: the vectors (..., 3) along the axes of rotations (..., 3, 3), with the angle in [0, pi] as length.
 
-    It goes through the quaternion, whose parts w and |(x, y, z)| are cosine and sine of half the angle: one of them
-    always fixes the angle to rounding, at pi too. There the axis and its opposite are the same rotation, and rounding
-    chooses between them.
+    It is computed from the quaternion, whose parts w and |(x, y, z)| are the cosine and sine of half the angle, so the
+    angle is exact to rounding, at pi too. At pi, an axis and its opposite are the same rotation, and rounding chooses
+    between them.
     """
     wxyz = quaternion_from_rotation(rotation)
     sine = np.linalg.norm(wxyz[..., 1:], axis=-1, keepdims=True)
@@ -103,10 +103,10 @@ def vector_from_rotation(rotation: np.ndarray) -> np.ndarray:
 
 
 def transform_from_twist(twist: np.ndarray) -> np.ndarray:
-    """exp of SE(3): the rigid motions (..., 4, 4) of twists (..., 6), translational part u first, then rotational w.
+    """Return exp of SE(3): the rigid motions (..., 4, 4) of twists (..., 6) = (translational u, rotational w).
 
     The rotation is exp(w) and the translation V u with V = 1 + b W + c W^2, W = w x, b = (1 - cos a) / a^2,
-    c = (a - sin a) / a^3, a = |w|: a screw at constant speed, followed for a unit of time.
+    c = (a - sin a) / a^3, a = |w|: a screw motion at constant speed for a unit of time.
 
     Source: Murray, Li and Sastry 1994, A mathematical introduction to robotic manipulation, eq. 2.36.
     """
@@ -122,16 +122,16 @@ def transform_from_twist(twist: np.ndarray) -> np.ndarray:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation (..., 3, 3) nearest in the Frobenius norm to a matrix that rounding has bent a little."""
+    """Return the rotation (..., 3, 3) nearest in the Frobenius norm to a matrix that is nearly a rotation."""
     u, _, vt = np.linalg.svd(matrix)
     sign = np.sign(np.linalg.det(u @ vt))
     return (u * np.stack([np.ones_like(sign), np.ones_like(sign), sign], axis=-1)[..., None, :]) @ vt
 
 
 def look_at(centre: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """`world_from_cam` (4, 4) of a camera at `centre` that looks at `target`, OpenCV axes, `up` upwards in the picture.
+    """Return `world_from_cam` (4, 4) of a camera at `centre` that looks at `target`, with `up` upwards in the picture.
 
-    Where `up` is parallel to the view, the world axis farthest from the view takes its place.
+    The camera has OpenCV axes. If `up` is parallel to the view, the world axis farthest from the view is used instead.
 
     Raises:
         ValueError: centre and target coincide.
@@ -151,7 +151,7 @@ def look_at(centre: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
 
 @dataclass(frozen=True)
 class Similarity:
-    """The map b = scale * rotation @ a + translation, between frames that differ in size, direction and place."""
+    """The map b = scale * rotation @ a + translation, between frames that differ in scale, orientation and origin."""
 
     scale: float
     rotation: np.ndarray
@@ -163,11 +163,11 @@ class Similarity:
         return Similarity(1.0, np.eye(3), np.zeros(3))
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Points (..., 3) of frame a in frame b."""
+        """Map points (..., 3) of frame a to frame b."""
         return self.scale * (np.asarray(points, dtype=np.float64) @ self.rotation.T) + self.translation
 
     def apply_pose(self, world_from_cam: np.ndarray) -> np.ndarray:
-        """Camera poses (..., 4, 4) in frame b: centre and rotation are mapped, and the result is rigid: no scale."""
+        """Map camera poses (..., 4, 4) to frame b: centres and rotations are mapped, and the results stay rigid."""
         world_from_cam = np.asarray(world_from_cam, dtype=np.float64)
         return from_parts(self.rotation @ world_from_cam[..., :3, :3], self.apply(world_from_cam[..., :3, 3]))
 
@@ -177,7 +177,7 @@ class Similarity:
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
     def compose(self, inner: "Similarity") -> "Similarity":
-        """`self` after `inner`: c_from_b.compose(b_from_a) is c_from_a."""
+        """Return `self` after `inner`: c_from_b.compose(b_from_a) is c_from_a."""
         return Similarity(self.scale * inner.scale, self.rotation @ inner.rotation, self.apply(inner.translation))
 
     def matrix(self) -> np.ndarray:
@@ -185,7 +185,7 @@ class Similarity:
         return from_parts(self.scale * self.rotation, self.translation)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers: {"scale", "rotation" (3 rows), "translation"}; floats survive a round trip exactly."""
+        """Return plain numbers: {"scale", "rotation" (3 rows), "translation"}; floats survive a round trip exactly."""
         return {
             "scale": float(self.scale),
             "rotation": np.asarray(self.rotation, dtype=np.float64).tolist(),
@@ -197,7 +197,7 @@ class Similarity:
         """Return the similarity that `to_json` described.
 
         Raises:
-            UserError: a key is missing, a shape or number is wrong, or the rotation is none.
+            UserError: a key is missing, a shape or number is wrong, or the rotation is invalid.
         """
         try:
             scale = float(content["scale"])
@@ -216,7 +216,7 @@ class Similarity:
 
 
 def _series(angle: np.ndarray, divisors: tuple[int, ...]) -> np.ndarray:
-    """1 / divisors[0] + angle^2 / divisors[1] + angle^4 / divisors[2] + ..."""
+    """Return 1 / divisors[0] + angle^2 / divisors[1] + angle^4 / divisors[2] + ..."""
     return np.polynomial.polynomial.polyval(angle**2, 1 / np.array(divisors, dtype=np.float64))
 
 

@@ -1,6 +1,6 @@
-"""Another world frame for a capture: which way is up, where the origin is, and how long a unit is.
+"""Change a capture's world frame: its up direction, its origin and its unit of length.
 
-Each change is a `Similarity` new_from_old, which can be inverted and written down (`Similarity.to_json`).
+Each change is a `Similarity` new_from_old, which can be inverted and saved (`Similarity.to_json`).
 """
 
 from collections.abc import Sequence
@@ -18,17 +18,16 @@ ORIGINS = ("centre-of-cameras", "focus")
 
 
 def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
-    """Return the same capture in another world frame:
-    poses and points are mapped, depths along the cameras' axes scaled.
+    """Return the same capture in another world frame.
 
-    Pictures, observations and cameras stay as they are, since a similarity changes no angle. The unit stays what it is
-    under rotation and translation, and becomes "arbitrary" where lengths change.
+    Poses and points are mapped, and depths along the cameras' axes are scaled. Pictures, observations and cameras do
+    not change, since a similarity preserves angles. The unit is kept if the scale is 1, else it becomes "arbitrary".
     """
     poses = new_from_world.apply_pose(np.stack([frame.world_from_cam for frame in capture.frames] or [np.eye(4)]))
     bounds = capture.depth_bounds
     return replace(
         capture,
-        # No strict: of a capture without frames there is one pose too many.
+        # Not strict: for a capture without frames there is one pose too many.
         frames=tuple(replace(f, world_from_cam=pose) for f, pose in zip(capture.frames, poses, strict=False)),
         points=new_from_world.apply(capture.points),
         depth_bounds=None if bounds is None else new_from_world.scale * bounds,
@@ -37,13 +36,13 @@ def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
     )
 
 
-def turned_up(frames: Sequence[Frame], axis: str, *, up: np.ndarray | None = None) -> Similarity:
-    """Return the smallest rotation about the origin that turns what is up along an axis of the new frame.
+def up_aligned(frames: Sequence[Frame], axis: str, *, up: np.ndarray | None = None) -> Similarity:
+    """Return the smallest rotation about the origin that turns the up direction onto an axis of the new frame.
 
     Args:
-        frames: tell which way is up, by `up_direction`.
+        frames: give the up direction through `up_direction`, unless `up` is given.
         axis: x, y, z, -x, -y or -z.
-        up: (3,) of any length, where it is known better (against gravity).
+        up: (3,) of any length, if it is known better (such as from gravity).
 
     Raises:
         UserError: an unknown axis, an `up` of length 0, or neither frames nor `up`.
@@ -61,7 +60,7 @@ def turned_up(frames: Sequence[Frame], axis: str, *, up: np.ndarray | None = Non
 
 
 def moved_to_origin(frames: Sequence[Frame], origin: str, *, depth_hint: float | None = None) -> Similarity:
-    """Return the translation that brings a place of the old frame to the origin of the new one.
+    """Return the translation that moves a place of the old frame to the origin of the new one.
 
     Args:
         frames: the capture's cameras.
@@ -70,7 +69,7 @@ def moved_to_origin(frames: Sequence[Frame], origin: str, *, depth_hint: float |
         depth_hint: the distance to the focus in scene units, for cameras with parallel axes.
 
     Raises:
-        UserError: an unknown place, or no cameras that would tell it.
+        UserError: an unknown place, or no cameras to compute it from.
     """
     if origin not in ORIGINS:
         return Similarity(1.0, np.eye(3), -point_of(origin, f"choose {', '.join(ORIGINS)}, or x,y,z"))
@@ -81,10 +80,10 @@ def moved_to_origin(frames: Sequence[Frame], origin: str, *, depth_hint: float |
 
 
 def point_of(text: str, hint: str) -> np.ndarray:
-    """Return the point (3,) that "x,y,z" names.
+    """Parse a point (3,) from "x,y,z".
 
     Raises:
-        UserError: something else; `hint` tells what was expected.
+        UserError: the text is not a point; `hint` says what is expected.
     """
     try:
         point = np.array([float(part) for part in text.split(",")])
@@ -98,12 +97,12 @@ def point_of(text: str, hint: str) -> np.ndarray:
 def smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the rotation (3, 3) by the smallest angle that turns unit vector a into unit vector b; exact at any angle.
 
-    Two half turns, about a and about the bisector w, make it: (2 w w^T - 1)(2 a a^T - 1). Where a and b are nearly
-    opposite, w is lost to rounding; there the rotation goes by way of a vector between them.
+    It is the product of two half turns, about a and then about the bisector w: (2 w w^T - 1)(2 a a^T - 1). If a and b
+    are nearly opposite, w is lost to rounding, so the rotation is composed of two, through a vector between them.
     """
     if a @ b < -0.5:
         between = b - (b @ a) * a
-        if np.linalg.norm(between) < 1e-8:  # any way around is as short
+        if np.linalg.norm(between) < 1e-8:  # opposite: all ways around are equally short
             between = horizontal_axes(a)[0]
         between = between / np.linalg.norm(between)
         return smallest_rotation(between, b) @ smallest_rotation(a, between)

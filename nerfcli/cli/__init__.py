@@ -86,10 +86,9 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
 
 def main() -> None:
     """Run the console script."""
-    # OpenMP's threads wait for work in a busy loop, for long by default. Two commands of a pipeline on
-    # the same cores then wait for each other's waiting: 58 training steps in 10 s, where there are 245 with this.
-    # libgomp reads it when torch is loaded.
+    # By default, idle OpenMP threads wait in a busy loop for a long time, which blocks the cores for the other command
+    # of a pipeline: 58 training steps in 10 s, instead of 245 with this. libgomp reads it when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     keep_freed_memory()
     install_handlers()
-    app(prog_name="nerfcli")  # and not "python -m nerfcli", which no shell could complete
+    app(prog_name="nerfcli")  # not "python -m nerfcli", for which no shell has completion

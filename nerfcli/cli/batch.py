@@ -1,4 +1,4 @@
-"""One input, or as many as come on standard input."""
+"""Process one input, or several from standard input."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -16,14 +16,14 @@ _READ_SCENES, _READ_RUNS = ("train", "ablate"), ("evaluate", "render", "export",
 
 
 def for_each_input(source: str, work: Callable[[Path, bool], None], *, command: str) -> None:
-    """Call `work(path, one_of_many)` for the path, or for each line of standard input as it comes.
+    """Call `work(path, one_of_many)` for the path, or for each line of standard input as it arrives.
 
-    A path that fails is reported and the others go on; the exit code is then that of the first failure.
+    A path that fails is reported and the remaining ones are processed; the exit code is that of the first failure.
 
     Args:
         source: a path, or "-".
-        work: does the whole command for one input.
-        command: its name, for the hint.
+        work: runs the whole command on one input.
+        command: name of the command, for the hint.
 
     Raises:
         UserError: the only input failed, or standard input held no path.
@@ -54,13 +54,13 @@ def no_paths(command: str) -> UserError:
 
 
 def example_of_many(command: str) -> str:
-    """Return a command line that gives a command several inputs."""
+    """Return an example of a command line with several inputs."""
     inputs = "*-scene/" if command in _READ_SCENES else "*-run/" if command in _READ_RUNS else "captures/*/"
     return f"ls -d {inputs} | nerfcli {command} -"
 
 
 def stdin_paths() -> Iterator[Path]:
-    """Lines of standard input as paths, each as soon as it is complete; empty lines are passed over."""
+    """Yield the lines of standard input as paths, each as soon as it is complete; skip empty lines."""
     while line := sys.stdin.readline():
         if text := line.rstrip("\r\n"):
             yield Path(text)
@@ -69,11 +69,11 @@ def stdin_paths() -> Iterator[Path]:
 def result_path(source: Path, *, suffix: str, output: Path | None, one_of_many: bool) -> Path:
     """Return the output path for `source`.
 
-    Beside the source with `suffix` added to its name; at `output` where that is given; inside `output` where there
-    are many sources.
+    The default is beside the source, with `suffix` added to its name. If `output` is given, it is `output`, or a path
+    inside `output` if there are many sources.
 
     Raises:
-        UserError: the source is the root of the file system, beside which there is nothing.
+        UserError: the source is the root of the file system, beside which nothing can be written.
     """
     if source.name in ("", ".."):  # "." and ".." have a name only once they are resolved
         source = source.resolve()

@@ -98,11 +98,11 @@ def bench(
 def bench_one(
     path: Path, folder: Path, wanted: "BenchOptions", *, device: str, threads: int, overwrite: bool, console: Console
 ) -> tuple[Path, dict[str, Any]]:
-    """Measure one run or scene, or what is left of it, and write the report, of a part too when interrupted.
+    """Measure one run or scene, continue an earlier bench, and write the report, even if interrupted.
 
     Raises:
-        UserError: it cannot be measured, or something else stands at `folder`.
-        KeyboardInterrupt: passed on after the report of what was measured.
+        UserError: the input cannot be measured, or `folder` holds something else.
+        KeyboardInterrupt: passed on after the report of the measurements so far.
     """
     from nerfcli.bench.measurement import COMPLETE, measure, open_bench
     from nerfcli.bench.records import MEASURED

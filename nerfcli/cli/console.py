@@ -20,17 +20,17 @@ R = TypeVar("R")
 
 # Without a terminal, progress is a plain line at most this often.
 PLAIN_LINE_SECONDS = 10.0
-# A file or a pipe has no width of its own: that of tables of findings, and of numbers.
+# Widths of tables of findings and of numbers in a file or a pipe, which have no width of their own.
 PLAIN_TABLE_WIDTH = 140
 WIDE_TABLE_WIDTH = 200
 
 
 class Console:
-    """The command's voice.
+    """Output of a command.
 
     Args:
-        quiet: no notes and no progress; warnings and errors stay.
-        json_lines: results as JSON Lines instead of paths.
+        quiet: print no notes, tables for the user or progress; warnings and errors are still printed.
+        json_lines: print results as JSON Lines instead of paths.
     """
 
     def __init__(self, *, quiet: bool, json_lines: bool):
@@ -38,7 +38,7 @@ class Console:
         self.json_lines = json_lines
 
     def result(self, path: Path, content: dict[str, Any] | None = None) -> None:
-        """Print one result on stdout: its path, or with --json a line with the path and more."""
+        """Print one result on stdout: its path, or with --json a line of JSON with the path and `content`."""
         line = json.dumps({"path": str(path), **(content or {})}) if self.json_lines else str(path)
         print(line, flush=True)  # noqa: T201 - the one place that writes results
 
@@ -47,11 +47,11 @@ class Console:
         print(json.dumps({"url": url}) if self.json_lines else url, flush=True)  # noqa: T201 - a result, as above
 
     def fact(self, content: dict[str, Any]) -> None:
-        """Print one result that is no file: a line of JSON on stdout."""
+        """Print one result that is not a file, as a line of JSON on stdout."""
         print(json.dumps(content), flush=True)  # noqa: T201 - a result, as above
 
     def fact_table(self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, styles: Mapping[str, str]) -> None:
-        """Results that are no files as a table on stdout; a cell that is a key of `styles` is coloured so."""
+        """Print results that are not files as a table on stdout; `styles` gives the styles of cells by their text."""
         width = None if sys.stdout.isatty() else WIDE_TABLE_WIDTH
         _print_table(columns, rows, styles=styles, width=width, file=sys.stdout)
 
@@ -65,7 +65,7 @@ class Console:
         _stderr(f"Warning: {text}")
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, styles: Mapping[str, str]) -> None:
-        """Print a table for the user; a cell that is a key of `styles` is coloured so."""
+        """Print a table for the user; `styles` gives the styles of cells by their text."""
         if self.quiet:
             return
         width = None if sys.stderr.isatty() else PLAIN_TABLE_WIDTH
@@ -73,10 +73,10 @@ class Console:
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float, str], None]]:
-        """Show a bar on a terminal, a plain line now and then elsewhere, from the first update on.
+        """Show a progress bar on a terminal, or an occasional plain line elsewhere, from the first update on.
 
         Yields:
-            update(share in [0, 1], detail): to be called as often as one likes.
+            update(fraction in [0, 1], detail): to be called as often as desired.
         """
         with ExitStack() as stack:
             bar: Callable[[float, str], None] | None = None
@@ -140,14 +140,14 @@ def _stderr(text: str) -> None:
 
 
 def report_error(error: UserError, about: str | None = None) -> None:
-    """Print the two lines of an error, after the input it concerns where there are several."""
+    """Print the two lines of an error; `about` is the input that it concerns, if there are several."""
     prefix = "" if about is None or error.message.startswith(about) else f"{about}: "
     _stderr(f"Error: {prefix}{error.message}")
     _stderr(f"Hint:  {error.hint}")
 
 
 def command(function: Callable[P, R]) -> Callable[P, R]:
-    """Turn what a command raises into two lines and an exit code; bugs keep their traceback."""
+    """Turn the exceptions of a command into two lines and an exit code; bugs keep their traceback."""
 
     @functools.wraps(function)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -164,7 +164,7 @@ def command(function: Callable[P, R]) -> Callable[P, R]:
             _stderr("Interrupted; completed work is kept.")
             raise typer.Exit(INTERRUPTED) from error
         except BrokenPipeError as error:
-            # Whoever read our results has gone: end quietly, and let Python not complain while closing stdout.
+            # The reader of stdout has gone: end quietly, and keep Python from complaining when it closes stdout.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from error
 
@@ -173,9 +173,9 @@ def command(function: Callable[P, R]) -> Callable[P, R]:
 
 @contextmanager
 def out_of_memory_explained() -> Iterator[None]:
-    """Turn the ways in which memory runs out into a UserError.
+    """Turn out-of-memory errors into a UserError.
 
-    Torch says it in a RuntimeError's text on the CPU, and in a subclass of RuntimeError on a GPU.
+    Torch raises a RuntimeError that only its text identifies on the CPU, and a subclass of RuntimeError on a GPU.
     """
     try:
         yield

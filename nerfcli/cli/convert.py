@@ -28,11 +28,11 @@ FORMATS_WRITTEN = (
     "npz",
     "ply",
 )
-# Programs whose name people type for the format that they read.
+# Names of programs that are accepted for the format that they read.
 PROGRAMS = {"nerfstudio": "transforms", "instant-ngp": "transforms"}
-# Names of files that say nothing of the capture.
+# Names of files that do not identify the capture.
 COMMON_STEMS = ("transforms", "reconstruction", "bundle", "poses_bounds", "scene", "cameras", "images")
-# Hypotheses of a question in the table of --detect.
+# Number of best hypotheses per question in the table of --detect.
 SHOWN = 3
 PIXEL_CENTRES = {"0.5": 0.5, "0": 0.0}
 _AXES = "opencv (= rdf), opengl (= rub), llff (= drb), pytorch3d (= luf), ros (= flu), or three such letters"
@@ -259,7 +259,7 @@ def _print_verification(done: "Conversion", console: Console) -> None:
 
 
 def _table(found: "Detection") -> list[str]:
-    """Per question the hypotheses that matter: the best ones, and the one that the format prescribes."""
+    """Return the lines of a table: for each question, the best hypotheses and the one that the format prescribes."""
     from nerfcli.workflows.convert import options_of
 
     lines = [f"  {'hypothesis':<52}{'median error':>14}{'inliers':>9}  verdict"]
@@ -303,8 +303,10 @@ def _pixel_centre(text: str | None, option: str) -> float | None:
 
 
 def _named_for(path: Path) -> Path:
-    """Return the place that a result among many is named after: a file without its suffix, or its folder where its name
-    is one that all captures of its format have."""
+    """Return the path that one result of many is named after.
+
+    This is a file without its suffix, or the file's folder if its name does not identify the capture.
+    """
     if not path.is_file():
         return path
     return path.parent if path.stem in COMMON_STEMS else path.with_suffix("")

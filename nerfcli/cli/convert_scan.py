@@ -1,4 +1,4 @@
-"""The part of nerfcli convert that is about scans by transmission."""
+"""The part of nerfcli convert for X-ray scans."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -23,21 +23,21 @@ Mirrored = Annotated[
 CentreOfRotation = Annotated[
     float | None, typer.Option(help="Scans: the column of the axis of rotation; 0 is the middle of the first.")
 ]
-# Options that say something of scans, and those that both kinds of input have.
+# Options that only scans have, and those that both kinds of input have.
 OF_SCANS = ("photons", "unit", "mirrored", "centre_of_rotation", "holdout")
 OF_BOTH = ("source", "target", "to", "detect", "overwrite", "json", "quiet")
 
 
 def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console) -> Callable[[Path, bool], bool]:
-    """Return a function that does the command for a scan, and returns False for any other input.
+    """Return a function that runs the command on a scan, and returns False for any other input.
 
     Args:
-        values: of all parameters of the command, by name.
-        defaults: likewise, where nothing is given.
-        console: takes notes and results.
+        values: values of all parameters of the command, by name.
+        defaults: default values of the same parameters.
+        console: prints notes and results.
 
     Raises:
-        UserError: options of photos are given for a scan, or the other way round.
+        UserError: by the function, if options for photos are given for a scan, or vice versa.
     """
     given = [name for name, value in values.items() if value != defaults[name]]
     target, to = values["target"], values["to"]

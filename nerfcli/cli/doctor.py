@@ -94,13 +94,13 @@ def doctor(
         _print_table(diagnosis, console)
         console.result(page, content(diagnosis))
         if require is not None:
-            _hold_against(diagnosis, require)
+            _check_requirement(diagnosis, require)
 
     for_each_input(capture, work, command="doctor")
 
 
 def _examine_run(path: Path, folder: Path, console: Console, *, count: int, threads: int, overwrite: bool) -> None:
-    """Examine a run: what its photos have seen."""
+    """Examine how much of the surface the photos of a run see, and suggest further photos."""
     from nerfcli.workflows.next_views import examine_run
 
     with console.progress(f"doctor {path.name}") as update:
@@ -123,7 +123,7 @@ def _examine_run(path: Path, folder: Path, console: Console, *, count: int, thre
 
 
 def _examine_scan(path: Path, page: Path, console: Console, *, overwrite: bool, require: str | None) -> None:
-    """Examine a scan by transmission."""
+    """Examine an X-ray scan."""
     from nerfcli.workflows.scans import examine_scan_input, scan_diagnosis_record
 
     with console.progress(f"doctor {path.name}") as update:
@@ -131,7 +131,7 @@ def _examine_scan(path: Path, page: Path, console: Console, *, overwrite: bool, 
     _print_table(diagnosis, console)
     console.result(page, scan_diagnosis_record(diagnosis))
     if require is not None:
-        _hold_against(diagnosis, require)
+        _check_requirement(diagnosis, require)
 
 
 def _print_table(diagnosis: "Diagnosis | ScanDiagnosis", console: Console) -> None:
@@ -146,7 +146,7 @@ def _print_table(diagnosis: "Diagnosis | ScanDiagnosis", console: Console) -> No
         console.note(f"not checked: {check}: {reason}")
 
 
-def _hold_against(diagnosis: "Diagnosis | ScanDiagnosis", require: str) -> None:
+def _check_requirement(diagnosis: "Diagnosis | ScanDiagnosis", require: str) -> None:
     """Raise if a finding is worse than required."""
     from nerfcli.findings import VERDICTS
 

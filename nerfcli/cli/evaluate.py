@@ -1,4 +1,4 @@
-"""nerfcli evaluate: held-out numbers of a run, and how much they differ from seed to seed."""
+"""nerfcli evaluate: metrics of a run on its held-out photos, and their spread between seeds."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -213,10 +213,10 @@ def evaluate(
 
 
 def requirements_of(text: str | None) -> "tuple[Requirement, ...]":
-    """Return the requirements of --require.
+    """Parse the requirements of --require.
 
     Raises:
-        typer.BadParameter: they cannot be read.
+        typer.BadParameter: the text cannot be parsed.
     """
     from nerfcli.evaluate.requirements import parse_requirements
 
@@ -227,7 +227,7 @@ def requirements_of(text: str | None) -> "tuple[Requirement, ...]":
 
 
 def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None:
-    """Print what was measured in a few lines and a table, leaving out results of earlier calls."""
+    """Print new metrics in a few lines and a table; print nothing about metrics kept from an earlier call."""
     from nerfcli.evaluate.billboards import Shape
     from nerfcli.evaluate.ledger import Entry, summary_line
 

@@ -136,7 +136,7 @@ def export(
 
 
 def box_of(text: str) -> tuple[float, ...]:
-    """Six numbers with commas between them.
+    """Parse --box: six comma-separated numbers.
 
     Raises:
         typer.BadParameter: anything else, or a low corner that is not below the high one.

@@ -1,17 +1,17 @@
-"""Facts of scenes, runs, depth files, pictures and videos as lines for people."""
+"""Format the facts of scenes, runs, depth files, pictures and videos as lines of text."""
 
 import json
 import textwrap
 from collections.abc import Iterator
 from typing import Any
 
-# Of the table of costs.
+# Headings of the table of costs.
 HEADINGS = ("field", "weights", "optimiser", "step keeps", "ops/sample", "B/sample", "ops/picture", "B/picture")
 _UNITS = ("", "k", "M", "G", "T", "P")
-# Of maps that are no lengths.
+# Units of maps that are not lengths.
 _UNITS_OF_MAPS = {"coverage": " photos", "parallax": " degrees", "confidence": ""}
 _LENGTHS = ("depth", "spread", "disagreement", "lower", "upper", "depth_deviation")
-# Of facts whose name in JSON is not what people say.
+# Labels of facts whose names in JSON are not plain English.
 _LABELS = {
     "psnr": "PSNR",
     "ssim": "SSIM",
@@ -44,9 +44,9 @@ _LABELS = {
     "field_bytes": "size of the field",
     "occupied_share": "occupied cells",
 }
-# Settings of the training of members and blocks, as they are in any other.
+# Settings for members and blocks, with their values in any other training, which are not listed.
 _USUAL = {"photo_fraction": 1.0, "random_start": 0.0, "blocks": 0, "block": 0}
-# Letters in a line; what is longer goes on in the next one, further in.
+# Maximum number of characters per line; longer lines are wrapped, and their continuations indented.
 WIDTH = 110
 
 
@@ -80,9 +80,7 @@ def _listed(facts: dict[str, Any]) -> str:
 
 
 def words_of(facts: dict[str, Any]) -> list[str]:
-    """Format the facts of `media.facts.file_facts` or of a folder of renders, one per line; unknown values are
-    omitted.
-    """
+    """Format the facts of a file (`file_facts`) or of a folder of renders, one per line, without unknown values."""
     return [
         *_what(facts),
         *([facts["in_words"]] if facts["in_words"] else []),
@@ -209,8 +207,10 @@ def _number(value: Any) -> str:
 
 
 def cost_lines(costs: dict[str, dict[str, Any]]) -> list[str]:
-    """Return a table: a line per kind. Operations are multiplications and additions, forward; bytes are those of rows
-    and of layers' values."""
+    """Return a table of costs, one line per kind of field.
+
+    Operations are the multiplications and additions of the forward pass; bytes are those of rows and layers' values.
+    """
     rows: list[tuple[str, ...]] = [HEADINGS]
     for kind, cost in costs.items():
         held, sample, picture = cost["bytes"], cost["per_sample"], cost["per_picture"]
@@ -224,7 +224,7 @@ def cost_lines(costs: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def _short(number: float) -> str:
-    """Three digits and a letter: 8.4 M."""
+    """Format a number as three digits and a unit prefix: 8.4M."""
     unit = 0
     while number >= 999.5 and unit < len(_UNITS) - 1:
         number, unit = number / 1000, unit + 1

@@ -11,7 +11,7 @@ Word = TypeVar("Word", str, str | None)
 
 
 def split_at_commas(texts: list[str] | None) -> list[str]:
-    """Return the items of all comma-separated texts that a repeatable option was given."""
+    """Return the items of all comma-separated values of a repeatable option."""
     return [item.strip() for text in texts or () for item in text.split(",")]
 
 
@@ -99,7 +99,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print results as JSON Lines 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show only warnings and errors.")]
 
-# A shorter time has to come with its unit.
+# A shorter time must have a unit.
 FEWEST_PLAIN_SECONDS = 10.0
 _SECONDS_PER_UNIT = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
@@ -108,7 +108,7 @@ def one_of(value: Word, choices: Collection[str], option: str) -> Word:
     """Return an option's value if it is one of the choices; None if it is not given.
 
     Raises:
-        typer.BadParameter: it is none of the choices.
+        typer.BadParameter: the value is not one of the choices.
     """
     if value is not None and value not in choices:
         *others, last = choices
@@ -121,7 +121,7 @@ def some_of(text: str, choices: Collection[str], option: str) -> tuple[str, ...]
     """Return the items of a comma-separated list, without duplicates.
 
     Raises:
-        typer.BadParameter: one of them is none of the choices.
+        typer.BadParameter: an item is not one of the choices.
     """
     chosen = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
     if unknown := [name for name in chosen if name not in choices]:
@@ -133,7 +133,7 @@ def seconds_from_text(text: str, option: str = "--budget") -> float:
     """Parse 90s, 5m, 1.5h or plain seconds, the value of an option.
 
     Raises:
-        typer.BadParameter: anything else, zero, or a few seconds without a unit: who writes 2 means minutes.
+        typer.BadParameter: anything else, zero, or less than `FEWEST_PLAIN_SECONDS` without a unit: 2 may mean minutes.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text.strip())
     seconds = float(match[1]) * _SECONDS_PER_UNIT[match[2] or "s"] if match else 0.0
@@ -177,7 +177,7 @@ def bytes_from_text(text: str, option: str = "--memory") -> int:
     """Parse 4GB, 500MB or 1.5GiB, the value of an option; a plain number is bytes.
 
     Raises:
-        typer.BadParameter: anything else, or less than a kilobyte: a forgotten unit.
+        typer.BadParameter: anything else, or less than a kilobyte, which suggests a forgotten unit.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:([kmgt])(i?)b?|b)?", text.strip().lower())
     size = int(float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " ")) if match else 0
@@ -206,7 +206,7 @@ def holdout_rule(holdout: str | None) -> str | None:
     """Parse --holdout, with the path of a file made absolute; None if it is not given.
 
     Raises:
-        typer.BadParameter: it is no rule, and no file.
+        typer.BadParameter: neither a rule nor a file.
     """
     from nerfcli.holdout import check_holdout
 

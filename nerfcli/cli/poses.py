@@ -24,7 +24,7 @@ from nerfcli.cli.options import (
     thread_count,
 )
 
-# At least as many as structure from motion needs.
+# The minimum is the number of photos that structure from motion needs.
 Frames = Annotated[
     int | None,
     typer.Option(help="Number of frames to use from a video.  [default: 120, or all of a shorter one]", min=4),
@@ -195,10 +195,10 @@ def poses(
 
 
 def sizes_of(quality: str) -> tuple[int, int]:
-    """(max_image_size, max_features) of a quality.
+    """Return (max_image_size, max_features) of a quality.
 
     Raises:
-        typer.BadParameter: there is none of that name.
+        typer.BadParameter: there is no such quality.
     """
     from nerfcli.poses.input.settings import QUALITIES
 
@@ -209,7 +209,7 @@ def use_of(intrinsics: Path | None, intrinsics_as: str | None) -> str:
     """Return the use of intrinsics selected by --intrinsics-as.
 
     Raises:
-        typer.BadParameter: not a way to use them, or there are none.
+        typer.BadParameter: there is no such use, or --intrinsics is not given.
     """
     from nerfcli.poses.model.cameras import USES
 
@@ -220,7 +220,7 @@ def use_of(intrinsics: Path | None, intrinsics_as: str | None) -> str:
 
 
 def print_database(scene: Path, *, drop: bool, console: Console) -> None:
-    """Delete the database of features and matches, or say what it takes and what for."""
+    """Delete the database of features and matches, or print a note about its size and purpose."""
     from nerfcli.poses.workspace import database_bytes, drop_database
 
     if drop:

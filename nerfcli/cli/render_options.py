@@ -60,7 +60,7 @@ def depth_formats(text: str, *, outputs: tuple[str, ...], convention: str) -> tu
     """Return the formats in a comma-separated list.
 
     Raises:
-        typer.BadParameter: an unknown one, or one that cannot hold the requested outputs.
+        typer.BadParameter: a format is unknown, or cannot hold the requested outputs.
     """
     from nerfcli.export.settings import FORMATS
 
@@ -76,10 +76,10 @@ def depth_formats(text: str, *, outputs: tuple[str, ...], convention: str) -> tu
 
 
 def level_scale(text: str, *, formats: tuple[str, ...]) -> float | None:
-    """Scene units per level; None for auto.
+    """Parse --depth-scale: scene units per level; None for auto.
 
     Raises:
-        typer.BadParameter: not a positive number, or without 16-bit files.
+        typer.BadParameter: not a positive number, or png16 is not one of the formats.
     """
     if text == "auto":
         return None
@@ -95,17 +95,17 @@ def level_scale(text: str, *, formats: tuple[str, ...]) -> float | None:
 
 
 def finite(value: float | None, option: str) -> None:
-    """Refuse NaN and infinity, which the bounds of an option let through.
+    """Refuse NaN and infinity, which the bounds of an option do not exclude.
 
     Raises:
-        typer.BadParameter: it is one of them.
+        typer.BadParameter: the value is NaN or infinite.
     """
     if value is not None and not math.isfinite(value):
         raise typer.BadParameter(f"{value} is not a finite number", param_hint=option)
 
 
 def tolerance_of(text: str) -> float:
-    """Return a number or a fraction above 0 and at most 1.
+    """Parse --tolerance: a number or a fraction from 1e-9 to 1.
 
     Raises:
         typer.BadParameter: anything else.
@@ -127,7 +127,7 @@ def video_settings(
     """Return the videos selected by --video-format and related options.
 
     Raises:
-        typer.BadParameter: a value that does not exist, or does not fit the formats.
+        typer.BadParameter: a value is unknown, or does not fit the formats.
     """
     from nerfcli.export.settings import DIRECTIONS, LAYOUTS, VideoSettings
     from nerfcli.media.video import FORMATS, GIF_FASTEST_FPS
@@ -176,7 +176,7 @@ def colour_range_of(text: str | None, *, outputs: tuple[str, ...]) -> tuple[floa
 
 
 def frame_range(text: str) -> slice:
-    """Return the views of --frames: START:STOP or START:STOP:STEP, from 0 on, or K/N, every N-th from the K-th.
+    """Parse --frames: START:STOP or START:STOP:STEP, counted from 0, or K/N, every N-th view from the K-th.
 
     START and STOP may be left out; K counts from 1, as task numbers of array jobs do.
 
@@ -201,7 +201,7 @@ def look_of(
     """Return the picture geometry selected by --width, --height, --lens, --fov and --crop.
 
     Raises:
-        typer.BadParameter: a lens that does not exist, --fov without --lens, or a part that is none.
+        typer.BadParameter: the lens is unknown, --fov is given without --lens, or --crop cannot be parsed.
     """
     from nerfcli.cameras.framing import LENSES
     from nerfcli.workflows.views import Look

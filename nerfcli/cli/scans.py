@@ -34,7 +34,7 @@ def reconstruction_settings(
     """Build the settings of a reconstruction from the options of train.
 
     Raises:
-        UserError: a component of photos is named, or a field that scans do not have.
+        UserError: scans do not have such a component or type of field, or a component's value is not a number.
     """
     from nerfcli.tomography.result import FIELDS, ReconstructionSettings
 
@@ -63,10 +63,10 @@ def reconstruction_settings(
 
 
 def slices_of(texts: list[str]) -> tuple[tuple[str, float], ...]:
-    """Axes and positions of --slices.
+    """Parse the axes and positions of --slices.
 
     Raises:
-        typer.BadParameter: a text is not like z=0.3.
+        typer.BadParameter: a text does not have the form z=0.3.
     """
     found = []
     for text in texts:
@@ -82,10 +82,10 @@ def slices_of(texts: list[str]) -> tuple[tuple[str, float], ...]:
 
 
 def refuse_scan(path: Path, command: str) -> None:
-    """Refuse X-ray data, and a reconstruction of it, in a command that is for photos.
+    """Refuse an X-ray scan, or a reconstruction of one, in a command for photos.
 
     Raises:
-        UserError: the path holds either.
+        UserError: the path is a scan or a reconstruction.
     """
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.result import is_reconstruction
@@ -98,7 +98,7 @@ def refuse_scan(path: Path, command: str) -> None:
 
 
 def is_of_scan(run: str, *, outputs: str | None, slices: list[str] | None) -> bool:
-    """Return whether the options of render, or the only run it gets, are those of a scan."""
+    """Return whether the options given to render, or its only run, are for scans."""
     from nerfcli.tomography.result import OUTPUTS, is_reconstruction
 
     if slices or (outputs is not None and set(outputs.split(",")) & set(OUTPUTS)):
@@ -121,7 +121,7 @@ def scan_pictures(outputs: str | None, slices: list[str] | None, *, views: str) 
 
 
 def print_scan_numbers(run: Path, evaluation: "ScanEvaluation", console: Console) -> None:
-    """Print a table of the methods; nothing of what was kept."""
+    """Print a table of the methods; print nothing if the metrics were kept from an earlier call."""
     if evaluation.is_kept:
         return
     metrics = evaluation.metrics

@@ -189,7 +189,7 @@ def train(
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.scan import is_scan
-    from nerfcli.torchrun import is_first, is_one_of_several, place_on_machine
+    from nerfcli.torchrun import is_first, is_one_of_several, local_rank_and_size
     from nerfcli.workflows.blocks import block_settings, train_blocks
     from nerfcli.workflows.members import VARIED, member_settings, train_members
     from nerfcli.workflows.train import train_scene
@@ -269,7 +269,7 @@ def train(
     def memory_of_process() -> int | None:
         shared = limit or default_memory_limit(photo_settings().device)
         on_gpu = photo_settings().device != "cpu"
-        return shared if shared is None or on_gpu else shared // place_on_machine()[1]
+        return shared if shared is None or on_gpu else shared // local_rank_and_size()[1]
 
     def train_in_blocks(folder: Path, run: Path) -> Path:
         with console.progress(f"train {folder.name}") as update:
@@ -327,7 +327,7 @@ def train(
             )
 
     def plan_one_scene(folder: Path) -> None:
-        on_host = photo_settings().device == "cpu"  # --memory is the GPU's otherwise
+        on_host = photo_settings().device == "cpu"  # else --memory refers to the GPU
         resident = (limit or default_memory_limit()) if on_host else None
         for number in [only] if only else range(1, count + 1) if count else [0]:
             settings = block_settings(photo_settings(), number, count) if count else photo_settings()
@@ -361,7 +361,7 @@ def train(
             console.result(run)
 
     if scene == STDIN or not is_scan(Path(scene)):
-        # A wrong option is refused before anything is read.
+        # Refuse invalid options before reading anything.
         member_settings(photo_settings(), member_count, vary=vary)
         block_settings(photo_settings(), 0, count)
     for_each_input(scene, work, command="train")

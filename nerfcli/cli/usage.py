@@ -1,4 +1,4 @@
-"""Usage errors that say what would be right."""
+"""Usage errors that explain the correct usage."""
 
 from typing import Any
 
@@ -7,11 +7,11 @@ from typer.core import TyperCommand
 
 from nerfcli.cli.batch import example_of_many
 
-# Of click, or of typer's own copy of it, by typer's version.
+# The class of click, or of typer's own copy of click, depending on the version of typer.
 _UsageError: Any = typer.BadParameter.__bases__[0]
 
 
-# What is wrong with a value, by the name of pydantic's error, which typer has from 0.29 on.
+# Descriptions of invalid values by the name of pydantic's error, which typer provides from 0.29 on.
 _WRONG_VALUES = {
     "int_parsing": "is not a whole number",
     "int_parsing_size": "is too long for a whole number",
@@ -22,8 +22,11 @@ _WRONG_VALUES = {
 
 
 class Command(TyperCommand):
-    """A command whose usage errors also say which command has an unknown option, how to give several inputs, what a
-    missing one is, and what is wrong with a number."""
+    """A command with more helpful usage errors.
+
+    They also name the commands that have an unknown option, show how to give several inputs, describe a missing
+    argument, and explain what is wrong with a number.
+    """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; see `TyperCommand.parse_args`."""
@@ -40,7 +43,7 @@ class Command(TyperCommand):
                 error.message += f"; give one, or several on standard input: {example_of_many(str(self.name))}"
             elif text := _wrong_value(error):
                 error.message = text
-            elif not error.message and (help_text := getattr(error.param, "help", None)):  # a missing one
+            elif not error.message and (help_text := getattr(error.param, "help", None)):  # missing argument
                 error.message = help_text
             raise
 
@@ -49,7 +52,7 @@ class Command(TyperCommand):
 
 
 def _wrong_value(error: Any) -> str | None:
-    """Return what is wrong with a number; None for other errors."""
+    """Return a message about an invalid number; None for other errors."""
     problems = getattr(error.__cause__, "errors", list)()
     if not problems or problems[0]["type"] not in _WRONG_VALUES:
         return None

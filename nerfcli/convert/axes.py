@@ -1,6 +1,6 @@
 """Camera axes by name, and conventions that override those of a file format.
 
-Axes are written as three letters, of the directions in which +x, +y and +z of the camera point: r(ight) or l(eft),
+Axes are written as three letters for the directions in which the camera's +x, +y and +z point: r(ight) or l(eft),
 d(own) or u(p), f(orward) or b(ackward). OpenCV's are rdf. Some have names.
 """
 
@@ -23,13 +23,13 @@ _DIRECTIONS = {"r": (1, 0, 0), "l": (-1, 0, 0), "d": (0, 1, 0), "u": (0, -1, 0),
 
 
 def opencv_from_axes(axes: str) -> np.ndarray:
-    """Return the rotation (4, 4) whose columns say where the axes of a camera point in OpenCV's.
+    """Return the rotation (4, 4) whose columns are the axes of a camera, expressed in OpenCV's axes.
 
     Args:
         axes: a name ("opencv", "opengl", "llff", "pytorch3d", "ros") or three letters such as "rub".
 
     Raises:
-        UserError: no such name, letters that do not span space, or a left-handed camera.
+        UserError: the name is unknown, the letters do not span space, or the axes are left-handed.
     """
     letters = NAMED_AXES.get(axes, axes)
     columns = np.array([_DIRECTIONS.get(letter, (0, 0, 0)) for letter in letters], dtype=np.float64).T
@@ -59,10 +59,11 @@ class Convention:
     """Convention of the numbers in a file, where it may differ from that of the format.
 
     Args:
-        axes: of the camera in the file's poses.
+        axes: the camera axes of the file's poses.
         inverted: whether the file holds the inverse of the transform that its format prescribes.
-        pixel_centre: where cx, cy and pixel positions put the centre of the top-left pixel: 0.5, or 0 as in OpenCV.
-        intrinsics_scale: the size of the picture that the intrinsics are for, over the size that the file says.
+        pixel_centre: the coordinate of the top-left pixel's centre in cx, cy and pixel positions: 0.5, or 0 as in
+            OpenCV.
+        intrinsics_scale: the size of the picture that the intrinsics are for, over the size that the file states.
     """
 
     axes: str
@@ -72,15 +73,15 @@ class Convention:
 
 
 def reinterpreted(capture: Capture, meant: Convention, *, parsed_axes: str) -> Capture:
-    """Return the capture that a file describes if its numbers are meant in another convention than its format's.
+    """Return the capture that a file describes if its numbers are in another convention than its format's.
 
     Args:
         capture: as it was parsed, by the format's own convention.
-        meant: the convention that holds.
+        meant: the true convention.
         parsed_axes: the camera axes that the format prescribes.
 
     Raises:
-        UserError: axes that there are not.
+        UserError: the axes are unknown.
     """
     poses = reinterpreted_poses(poses_of(capture), meant, parsed_axes=parsed_axes)
     shift = 0.5 - meant.pixel_centre
@@ -92,7 +93,7 @@ def reinterpreted(capture: Capture, meant: Convention, *, parsed_axes: str) -> C
 
 
 def expressed(capture: Capture, wanted: Convention, *, written_axes: str) -> Capture:
-    """Return a capture whose numbers, written in the format's own convention, are in the requested one.
+    """Return a capture that is in the requested convention when it is written in the format's own.
 
     The inverse of `reinterpreted`.
     """
@@ -103,9 +104,7 @@ def expressed(capture: Capture, wanted: Convention, *, written_axes: str) -> Cap
 
 
 def reinterpreted_poses(world_from_cam: np.ndarray, meant: Convention, *, parsed_axes: str) -> np.ndarray:
-    """Return the poses (frames, 4, 4), OpenCV axes,
-    that a file holds if it is meant in another convention than parsed.
-    """
+    """Return the poses (frames, 4, 4), OpenCV axes, of a file in another convention than the one it was parsed in."""
     in_file = world_from_cam @ opencv_from_axes(parsed_axes)
     if meant.inverted:
         in_file = rigid.inverse(in_file)
@@ -113,14 +112,14 @@ def reinterpreted_poses(world_from_cam: np.ndarray, meant: Convention, *, parsed
 
 
 def poses_of(capture: Capture) -> np.ndarray:
-    """`world_from_cam` of all frames, (frames, 4, 4)."""
+    """Return `world_from_cam` of all frames, (frames, 4, 4)."""
     return np.stack([frame.world_from_cam for frame in capture.frames])
 
 
 def for_picture(camera: Camera, intrinsics_scale: float) -> Camera:
     """Return the camera for the stated picture size, if its parameters are for one `intrinsics_scale` times as large.
 
-    A principal point in the very middle stays there: it is one that the file did not give.
+    A principal point exactly in the middle stays there: the file did not give one.
     """
     if intrinsics_scale == 1 or camera.is_spherical:
         return camera

@@ -1,4 +1,4 @@
-"""Cameras out of a file: one, for captures whose format has none, or those of a whole capture, for its photos."""
+"""Cameras from a file: one, for captures whose format has none, or those of a whole capture, for its photos."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from nerfcli.convert.stored_pixels import UPRIGHT
 from nerfcli.errors import UserError
 from nerfcli.scene import MODEL_FOLDER, SCENE_FILE
 
-# Formats of poses alone: their cameras were given, or belong to views without a photo.
+# Formats that hold only poses: their cameras were given, or belong to views without a photo.
 _WITHOUT_CAMERAS = ("tum", "kitti", "camera-path")
 _CAMERAS_FILES = ("cameras.bin", "cameras.txt")
 
@@ -20,7 +20,7 @@ def read_intrinsics(path: Path) -> Camera:
     """Read the camera in a file, see `read_calibration`.
 
     Raises:
-        UserError: no camera, several different ones, or a damaged file.
+        UserError: there is no camera, there are several different ones, or the file is damaged.
     """
     cameras = read_calibration(path).cameras
     if len(cameras) != 1:
@@ -31,15 +31,16 @@ def read_intrinsics(path: Path) -> Camera:
 
 
 def read_calibration(path: Path, *, images: Path | None = None) -> Calibration:
-    """Read the cameras in a file: as JSON {"model", "width", "height", "params"}, COLMAP's cameras.txt or cameras.bin,
-    or of any capture, a file or a folder.
+    """Read the cameras in a file or folder.
+
+    It may be JSON {"model", "width", "height", "params"}, COLMAP's cameras.txt or cameras.bin, or any capture.
 
     Args:
         path: the file or folder.
-        images: the folder of the photos, for formats whose files do not say how large these are.
+        images: the folder of the photos, for formats whose files do not state the photos' sizes.
 
     Raises:
-        UserError: no camera, or a damaged file.
+        UserError: there is no camera, or the file is damaged.
     """
     if path.is_file() and path.suffix.lower() == ".json":
         content = read_json_object(path) if _is_object(path) else {}
@@ -73,12 +74,12 @@ def _no_cameras(path: Path) -> UserError:
 
 
 def _alone(folder: Path) -> Path | None:
-    """Return the cameras file of a folder that holds nothing else of a model."""
+    """Return COLMAP's cameras file in a folder; None if it has none."""
     return next((folder / name for name in _CAMERAS_FILES if (folder / name).is_file()), None)
 
 
 def _is_own(model_dir: Path) -> bool:
-    """Return whether a model is that of a scene as nerfcli poses writes it."""
+    """Return whether a model belongs to a scene that nerfcli wrote."""
     return (model_dir.resolve().parent.parent / SCENE_FILE).is_file() and model_dir.resolve().match(MODEL_FOLDER)
 
 

@@ -22,7 +22,7 @@ from nerfcli.errors import GATE_NOT_MET, UserError
 
 @dataclass(frozen=True)
 class Doubt:
-    """Corrections of the convention that the user gives; None where the format is right.
+    """The user's corrections of the convention; None or the default where the format is right.
 
     Args: see `Convention`.
     """
@@ -40,11 +40,11 @@ class TargetOptions:
     Args:
         form: its format.
         axes, pixel_centre: see `Convention`; None for the format's own.
-        allow_loss: whether what the format cannot hold may be left out; observations always may.
-        overwrite: whether a result that is there may be replaced.
+        allow_loss: whether content that the format cannot hold may be dropped; observations always may.
+        overwrite: whether an existing result may be replaced.
         verified: whether the file is read back and compared.
         tolerance_px: the largest residual that passes.
-        pixels: which pixels of EXIF-turned photos the cameras refer to; None for those that the format's readers see.
+        pixels: which pixels of EXIF-turned photos the cameras refer to; None for those that programs of the format use.
     """
 
     form: Format
@@ -62,13 +62,13 @@ class Conversion:
     """Result of a conversion.
 
     Args:
-        path: what was written.
+        path: the file or folder that was written.
         source_format: the format that was read.
-        capture: what was to be written.
-        losses: what of it the format cannot hold; left out.
-        loss_px: how far the lost terms of lenses move a pixel at most.
+        capture: the capture before losses.
+        losses: its contents that the format cannot hold, which were dropped.
+        loss_px: the largest shift of a pixel by the dropped lens terms.
         verification: of the written file; None if not requested.
-        notes: what else the user should know.
+        notes: further notes for the user.
     """
 
     path: Path
@@ -87,7 +87,7 @@ def load(source: Path, given: Given, doubt: Doubt) -> tuple[Format, Path, Captur
         The format, the file or folder that was parsed, the capture.
 
     Raises:
-        UserError: no capture, a damaged one, or a convention that the format does not leave open.
+        UserError: there is no capture, it is damaged, or the given axes are invalid.
     """
     form, found = recognise(source)
     assert form.parse is not None
@@ -106,19 +106,19 @@ def load(source: Path, given: Given, doubt: Doubt) -> tuple[Format, Path, Captur
 
 
 def convert(capture: Capture, target: Path, *, source_format: str, wanted: TargetOptions) -> Conversion:
-    """Write a capture in another format, and prove that nothing but the accepted losses was lost.
+    """Write a capture in another format, and verify that nothing but the accepted losses was lost.
 
-    The file is kept only if what was read back from it agrees; else what stood there before stands there again.
+    The file is kept only if the content read back from it agrees; otherwise the previous files are restored.
 
     Args:
         capture: to be written.
-        target: the file; or the folder, for formats that fill one, and where the file gets its usual name.
-        source_format: where the capture is from, for the report.
+        target: the file; or the folder, for formats that fill one and for a file with the format's usual name.
+        source_format: the format that the capture was read from, for the report.
         wanted: format, convention, and what is allowed.
 
     Raises:
-        UserError: losses without leave, an existing result, a place that cannot be written; or with exit code 7, a file
-            that does not hold what it should.
+        UserError: losses are not allowed, the result exists, or the target cannot be written; with exit code 7, the
+            written file does not agree with the capture.
     """
     form = wanted.form
     if form.write is None or form.losses is None:
@@ -134,7 +134,8 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Targe
     off = len(turned.masks_left_out)
     turned_masks = (f"{off} masks of photos with an EXIF orientation, which have the other orientation",) if off else ()
     losses = (*turned_masks, *form.losses(capture))
-    # 2D features are what structure from motion works with; who asks for another format does not expect them there.
+    # 2D features are data of structure from motion, which nobody expects in other formats: losing them is no reason to
+    # refuse.
     refused = (*turned_masks, *form.losses(replace(capture, observations=None)))
     if refused and not wanted.allow_loss:
         raise UserError(
@@ -158,7 +159,7 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Targe
 
 
 def _pixels(form: Format, wanted: TargetOptions, capture: Capture) -> str:
-    """Return the pixels that the cameras of the written file shall refer to."""
+    """Return which pixels of photos (stored or upright) the cameras of the written file refer to."""
     if form.name == "nerfcli" and wanted.pixels == STORED:
         raise UserError("the nerfcli format always uses upright photos", "remove --pixels", exit_code=2)
     return wanted.pixels or form.pixels or capture.pixels
@@ -180,7 +181,7 @@ def _convention(form: Format, wanted: TargetOptions) -> Convention:
     """Return the convention of the file to be written.
 
     Raises:
-        UserError: one that the format does not leave open.
+        UserError: the requested convention is not one that the format allows.
     """
     axes = form.axes if wanted.axes is None else wanted.axes
     if not np.array_equal(opencv_from_axes(axes), opencv_from_axes(form.axes)) and not form.open_axes:
@@ -225,8 +226,9 @@ def _does_not_hold(path: Path, verification: Verification) -> UserError:
 
 
 def _loss_px(capture: Capture, left: Capture) -> float:
-    """Return how far apart a capture and what is left of it show the same points, at most,
-    within the first one's pictures.
+    """Return the largest distance, in pixels, between projections of a point by a capture and by its reduced form.
+
+    Only points inside the pictures of the capture are compared.
     """
     if all(one.camera == other.camera for one, other in zip(capture.frames, left.frames, strict=True)):
         return 0.0
@@ -242,13 +244,13 @@ def _files(form: Format, path: Path) -> list[Path]:
 
 @contextmanager
 def _kept_on_success(path: Path, there: list[Path], files: list[Path]) -> Iterator[None]:
-    """Set existing files aside; on any exception remove what was written and put them back.
+    """Set existing files aside; on any exception remove the written files and put the old ones back.
 
-    Folders that were made on the way are removed with it.
+    Folders that were created meanwhile are also removed.
     """
     folders = {folder for file in files for folder in file.parents} | {path, *path.parents}
     missing = sorted((folder for folder in folders if not folder.exists()), key=lambda folder: -len(folder.parts))
-    place = path.with_name(f".{path.name}.aside-{os.getpid()}")  # not the name that atomic_folder takes
+    place = path.with_name(f".{path.name}.aside-{os.getpid()}")  # not the name that atomic_folder uses
     aside = {file: place / file.name for file in there}
     if there:
         place.mkdir()
@@ -259,14 +261,14 @@ def _kept_on_success(path: Path, there: list[Path], files: list[Path]) -> Iterat
     except BaseException:
         for file in files:
             if file not in aside or aside[file].exists():
-                with suppress(OSError):  # where nothing could be written, nothing can be removed
+                with suppress(OSError):  # a file that could not be written cannot be removed either
                     file.unlink(missing_ok=True)
         for file, other in aside.items():
             if other.exists():
                 file.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(other, file)
         for folder in missing:
-            with suppress(OSError):  # a folder that is not empty is someone else's
+            with suppress(OSError):  # a folder that is not empty has files of others
                 folder.rmdir()
         raise
     finally:

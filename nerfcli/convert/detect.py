@@ -1,8 +1,8 @@
-"""Detect the convention of a capture: hypotheses, each compared with the photos.
+"""Detect the convention of a capture by comparing hypotheses with its photos.
 
-Four questions: the axes of the cameras and the direction of the transforms (which are tested together, with the size
-for which the intrinsics are), then the size alone, then the half pixel. Each question's answers are compared with the
-other questions answered best.
+Four properties are tested: the camera axes and the direction of the transforms (together, for each picture size that
+the intrinsics may refer to), then this size alone, then the half pixel. The answers to each question are compared with
+the best answers to the others.
 """
 
 from collections.abc import Callable, Iterable
@@ -16,10 +16,10 @@ from nerfcli.convert.evidence import FrustumEvidence, Intrinsics, MatchEvidence,
 from nerfcli.convert.matches import match_neighbours
 from nerfcli.errors import UserError
 
-# Intrinsics for another size are for photos before or after a downscaling, by a power of two.
+# Intrinsics for another size belong to photos before or after downscaling by a power of two.
 SCALES = (1.0, 0.125, 0.25, 0.5, 2.0, 4.0, 8.0)
 
-# A hypothesis holds if at least this share of the items agrees with it, and if it is better than the next by this
+# A hypothesis holds if at least this fraction of the items agrees with it, and if it is better than the next by this
 # factor and by more than the noise: the 99 % interval of the difference under resampling of photos.
 LEAST_SHARE = 0.5
 LEAST_RATIO = 1.2
@@ -31,13 +31,13 @@ Evidence = ObservationEvidence | MatchEvidence | FrustumEvidence
 
 @dataclass(frozen=True)
 class Answer:
-    """One hypothesis and what speaks for it.
+    """One hypothesis and the evidence for it.
 
     Args:
-        convention: that the numbers of the file are meant in.
+        convention: the assumed convention of the file's numbers.
         as_format_says: whether it is what the format prescribes.
-        median_px: of the items' errors; infinite if most lie behind a camera.
-        inlier_share: the share of items whose error is small.
+        median_px: median error of the items; infinite if most are behind a camera.
+        inlier_share: the fraction of items with a small error.
     """
 
     convention: Convention
@@ -52,10 +52,10 @@ class Question:
 
     Args:
         name: "axes and direction", "image size" or "pixel centre".
-        answers: the hypotheses, best first, that of the format always among them.
+        answers: the hypotheses, best first, always including that of the format.
         verdict: "holds", "not decidable" or "none holds".
-        ratio: how many times better the best is than the next: of medians, or of shares where medians say nothing.
-        reason: why it is not decidable, or ""
+        ratio: how many times better the best is than the next: by medians, or by inlier ratios if medians cannot tell.
+        reason: why no hypothesis holds; "" if one does.
     """
 
     name: str
@@ -70,10 +70,10 @@ class Detection:
     """Result of detecting a convention.
 
     Args:
-        evidence: what it rests on, with numbers of items.
+        evidence: the kind of evidence, with numbers of items.
         questions: in the order in which they were answered.
-        convention: the answers that hold; the format's own where a question is not decidable.
-        declared: what the format says.
+        convention: the answers that hold; the format's own where no answer holds.
+        declared: the format's own convention.
     """
 
     evidence: str
@@ -83,25 +83,25 @@ class Detection:
 
     @property
     def as_format_says(self) -> bool:
-        """Whether nothing contradicts the format's own convention."""
+        """True if nothing contradicts the format's own convention."""
         return self.convention == self.declared and not any(
             question.verdict == "none holds" for question in self.questions
         )
 
 
 def detect(capture: Capture, *, axes: str, progress: Callable[[float, str], None]) -> Detection:
-    """Score hypotheses about a capture's convention by what its photos show.
+    """Score hypotheses about a capture's convention by the evidence of its photos.
 
-    By where its photos show the 3D points, if the capture says so; else by SIFT matches between its photos; else by
-    whether its points lie in its pictures.
+    The evidence is the observations of its 3D points, if it has them; else SIFT matches between its photos; else
+    the visibility of its points in its pictures.
 
     Args:
         capture: as it was parsed, by its format's own convention.
         axes: the camera axes that the format prescribes.
-        progress: called with the fraction of the work that is done.
+        progress: called with the fraction of the work that is done, and a short text.
 
     Raises:
-        UserError: there is nothing to judge by.
+        UserError: there is no evidence.
     """
     evidence = _evidence(capture, progress)
     declared = Convention(axes)
@@ -153,7 +153,7 @@ def _evidence(capture: Capture, progress: Callable[[float, str], None]) -> Evide
 
 
 def _different_axes(declared: str) -> Iterable[str]:
-    """Return all camera axes, the declared ones first and under the name that they have there."""
+    """Yield all camera axes, the declared ones first and as they were declared."""
     yield declared
     own = opencv_from_axes(declared)
     yield from (axes for axes in all_axes() if not np.array_equal(opencv_from_axes(axes), own))
@@ -165,7 +165,7 @@ def _axes_and_scale(
     conventions: list[Convention],
     declared: Convention,
 ) -> tuple[Convention, Question]:
-    """Return the best convention, its scale included, and the question for axes and direction at that scale."""
+    """Return the best convention, including its scale, and the question of axes and direction at that scale."""
     tried = []
     for scale in SCALES:
         directions = evidence.directions(Intrinsics(scale))
@@ -185,7 +185,7 @@ def _errors(
 
 
 def _rank(errors: np.ndarray, threshold_px: float) -> tuple[float, float]:
-    """Smaller is better: by the median, and where most items lie behind a camera by the share that fits."""
+    """Return a sort key, smaller is better: the median error; if most items are behind a camera, the inlier ratio."""
     return float(np.median(errors)), -float(np.mean(errors <= threshold_px))
 
 
@@ -232,15 +232,15 @@ def _same(name: str, convention: Convention, declared: Convention) -> bool:
 def _interval(
     best: np.ndarray, second: np.ndarray, groups: np.ndarray, statistic: Callable[[np.ndarray], float]
 ) -> tuple[float, float]:
-    """Return the 99 % interval of how much smaller the statistic of `best` is, when the photos are drawn again.
+    """Return the 99 % interval of the statistic of `second` minus that of `best`, under resampling of photos.
 
-    Where there are few photos, the items themselves are drawn.
+    With few photos, the items themselves are resampled.
     """
     rng = np.random.default_rng(0)
     members = [np.flatnonzero(groups == group) for group in np.unique(groups)]
     if len(members) < _LEAST_GROUPS:
         members = [np.array([index]) for index in range(len(groups))]
-    # Errors beyond any picture would make differences of infinities.
+    # Infinite errors are limited, because differences of infinities are undefined.
     best, second = np.minimum(best, 1e6), np.minimum(second, 1e6)
     differences = []
     for _ in range(_RESAMPLES):

@@ -1,7 +1,7 @@
-"""Evidence for a convention: how far, in pixels, photos and cameras contradict each other.
+"""Evidence for a convention: by how many pixels photos and cameras contradict each other.
 
-Each kind of evidence turns the directions in which pixels see (which depend on the intrinsics alone) and the poses into
-one error for every item. An item that lies behind a camera has an infinite error.
+Each kind of evidence computes one error for every item, from the poses and from the viewing directions of pixels, which
+depend only on the intrinsics. An item behind a camera has an infinite error.
 """
 
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ from nerfcli.convert.axes import for_picture, shifted
 from nerfcli.convert.probes import distinct, rows_of_each
 from nerfcli.multiview.features import Matches
 
-# Observations that are looked at: enough for a median, few enough to try hundreds of hypotheses.
+# Most observations used: enough for a median, few enough to try hundreds of hypotheses.
 _MOST_OBSERVATIONS = 20_000
 _MOST_FRAMES = 60
 
-# The rays of a match must be this far from parallel for its place along them to mean anything.
+# The rays of a match must be this far from parallel for their distances to the intersection to be meaningful.
 _LEAST_PARALLAX_PX = 3.0
 
 
@@ -33,9 +33,9 @@ class Intrinsics:
 
 
 class ObservationEvidence:
-    """Points in the world and where photos show them.
+    """Observations of world points in photos.
 
-    The error of an observation is the angle between the direction in which its pixel sees and the one to its point,
+    The error of an observation is the angle between the viewing direction of its pixel and the direction to its point,
     times the focal length.
     """
 
@@ -54,7 +54,7 @@ class ObservationEvidence:
         self.name = f"{len(rows)} observations of points in {len(np.unique(self.groups))} photos"
 
     def directions(self, intrinsics: Intrinsics) -> tuple[np.ndarray, ...]:
-        """Return what the pixels see: unit directions (M, 3), their validity and their pixels per radian."""
+        """Return the unit viewing directions of the pixels, (M, 3), their validity and their pixels per radian."""
         return _directions(self._cameras, self.groups, self._pixels, intrinsics)
 
     def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
@@ -63,12 +63,12 @@ class ObservationEvidence:
         cam_from_world = rigid.inverse(world_from_cam)[self.groups]
         towards = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], self._points) + cam_from_world[:, :3, 3]
         angle = np.arctan2(np.linalg.norm(np.cross(seen, towards), axis=1), np.einsum("mi,mi->m", seen, towards))
-        # Of a pinhole camera nothing lies behind it, and of a wider one nothing a right angle off what a pixel sees.
+        # A point 90 degrees or more off its pixel's direction counts as behind the camera, for wide cameras too.
         return np.where(valid & (angle < np.pi / 2), focal_px * angle, np.inf)
 
 
 class MatchEvidence:
-    """Places that two photos both show.
+    """Matches, points that two photos both show.
 
     The error of a match is its Sampson distance to the epipolar geometry of the two poses, as an angle times the focal
     length: |b2 E b1| / sqrt(|E b1|^2 + |E^T b2|^2) with unit directions b and E = [t]x R of cam2_from_cam1.
@@ -88,7 +88,7 @@ class MatchEvidence:
         self.name = f"{len(self.groups)} SIFT matches in {len(pairs)} pairs of photos"
 
     def directions(self, intrinsics: Intrinsics) -> tuple[np.ndarray, ...]:
-        """Return what both pixels of the matches see: unit directions (M, 3) twice, validity, pixels per radian."""
+        """Return unit viewing directions of both pixels of each match, (M, 3) twice, validity, pixels per radian."""
         first, valid1, focal1 = _directions(self._cameras, self._first, self._first_pixels, intrinsics)
         second, valid2, focal2 = _directions(self._cameras, self._second, self._second_pixels, intrinsics)
         return first, second, valid1 & valid2, (focal1 + focal2) / 2
@@ -113,9 +113,9 @@ class MatchEvidence:
 
 
 class FrustumEvidence:
-    """Points of the scene, of which each photo should show some: the error is 0 for a point that it shows.
+    """Visibility of scene points, of which each photo should show some: the error is 0 for a visible point.
 
-    It tells axes and directions, not intrinsics: the wider the pictures, the more points they show.
+    It determines axes and directions, but not intrinsics: the wider the pictures, the more points they show.
     """
 
     threshold_px = 0.0
@@ -130,7 +130,7 @@ class FrustumEvidence:
         self.name = f"the visibility of {len(chosen)} points in {len(frames)} photos"
 
     def errors_px(self, world_from_cam: np.ndarray) -> np.ndarray:
-        """0 or infinity for each pair of a photo and a point, (M,)."""
+        """Return 0 or infinity for each pair of a photo and a point, (M,)."""
         cam_from_world = rigid.inverse(world_from_cam)[self.groups]
         in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], self._points) + cam_from_world[:, :3, 3]
         cameras, camera_of_frame = distinct(self._cameras)
@@ -144,7 +144,7 @@ class FrustumEvidence:
 def _directions(
     cameras: Sequence[Camera], frame_index: np.ndarray, pixels: np.ndarray, intrinsics: Intrinsics
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit directions (M, 3) in which pixels of frames see, their validity, and pixels per radian."""
+    """Return the unit viewing directions (M, 3) of pixels of frames, their validity, and pixels per radian."""
     each, camera_of_frame = distinct(cameras)
     directions, valid = np.zeros((len(pixels), 3)), np.zeros(len(pixels), dtype=bool)
     focal_px = np.zeros(len(pixels))

@@ -1,6 +1,6 @@
-"""Locate the capture of a format in a path; each finder returns the place, or None.
+"""Locate the capture of a format at a path; each finder returns its file or folder, or None.
 
-A folder is known by the names of files in it, a file by its suffix and its beginning.
+A folder is recognised by the names of files in it, a file by its suffix and its beginning.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 
 
 def named(*names: str) -> Callable[[Path], Path | None]:
-    """Finds the first of these files in a folder."""
+    """Return a finder of the first of these files in a folder."""
 
     def find(path: Path) -> Path | None:
         return next((path / name for name in names if (path / name).is_file()), None)
@@ -28,7 +28,7 @@ def named(*names: str) -> Callable[[Path], Path | None]:
 
 
 def by_suffix(suffix: str, *names: str) -> Callable[[Path], Path | None]:
-    """Finds a file by its suffix, or by its name in a folder."""
+    """Return a finder of a file by its suffix, or of the first of these files in a folder."""
     in_folder = named(*names)
     return lambda path: path if path.is_file() and path.suffix.lower() == suffix else in_folder(path)
 
@@ -73,14 +73,14 @@ def find_camera_path(path: Path) -> Path | None:
     found = find_json(path, opening="{", name="camera_path.json")
     if found is None or path.is_dir():
         return found
-    # Looked for as text first, so that a large transforms.json is not parsed twice.
+    # First searched as text, so that a large transforms.json is not parsed twice.
     if b'"camera_path"' not in found.read_bytes():
         return None
     return found if is_camera_path(read_json_object(found)) else None
 
 
 def find_lines(path: Path, *, columns: int) -> Path | None:
-    """Find a text file whose first line that is no comment has so many words."""
+    """Find a text file whose first line that is neither empty nor a comment has `columns` words."""
     if not path.is_file() or path.suffix.lower() != ".txt":
         return None
     with path.open(encoding="utf-8-sig", errors="replace") as stream:

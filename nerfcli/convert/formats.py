@@ -61,8 +61,8 @@ class Given:
     """Additional input of the user besides the capture's own files.
 
     Args:
-        images: the folder of the photos, that names are relative to.
-        camera: of all frames, for formats without cameras.
+        images: the folder of the photos, to which names are relative.
+        camera: the camera of all frames, for formats without cameras.
     """
 
     images: Path | None = None
@@ -74,17 +74,17 @@ class Format:
     """A format of captures.
 
     Args:
-        name: as the user says it.
-        title: what it is.
-        looked_for: what it is recognised by, as short as can be, for people.
-        find: where in a path, a file or a folder, such a capture stands; None where there is none.
+        name: the user's name of the format.
+        title: a description.
+        looked_for: what it is recognised by, in a few words for people.
+        find: returns where such a capture is in a file or folder; None if there is none.
         parse: reads what `find` found; None for formats that are only written.
         axes: the camera axes of its poses, as three letters or a name.
         open_axes: whether poses with other axes are found in such files, so that --axes makes sense.
         open_centre: whether principal points with other pixel centres are found in such files.
-        default_name: the file that it writes if a folder is named; "" for formats that fill a folder.
+        default_name: the name of its file if the target is a folder; "" for formats that fill a folder.
         files: the names of all files that it may write, where "*" stands for that file's name without its suffix.
-        pixels: which pixels of EXIF-turned photos its cameras refer to, see `Capture`; None where the file says it.
+        pixels: which pixels of EXIF-turned photos its cameras refer to, see `Capture`; None if the file states it.
         write, losses: None for formats that are only read.
     """
 
@@ -104,10 +104,10 @@ class Format:
 
 
 def recognise(path: Path) -> tuple[Format, Path]:
-    """Return the format of the capture in a file or folder, and the file or folder in it that is to be parsed.
+    """Return the format of the capture in a file or folder, and the file or folder in it to parse.
 
     Raises:
-        UserError: nothing there, or nothing that is known; what was looked for is listed.
+        UserError: there is nothing, or nothing in a known format; the message lists what was looked for.
     """
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a file or folder of cameras")
@@ -122,7 +122,7 @@ def recognise(path: Path) -> tuple[Format, Path]:
 
 
 def format_named(name: str) -> Format:
-    """Return the format of that name.
+    """Return the format with this name.
 
     Raises:
         UserError: there is none.
@@ -136,16 +136,14 @@ def format_named(name: str) -> Format:
 
 
 def recording(form: Format, provenance: Mapping[str, Any]) -> Format:
-    """Return the format with the origin recorded in its files if they have a place for it, such as scene.json."""
+    """Return the format with `provenance` recorded in the files that it writes, if they have a place for it."""
     if form.write is not write_scene:
         return form
     return replace(form, write=lambda capture, folder: write_scene(capture, folder, provenance=provenance))
 
 
 def with_photos(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with its photos looked up in another folder:
-    under their names there, or under their file names.
-    """
+    """Return the capture with its photos looked up in another folder, by their names or by their file names alone."""
     frames = []
     for frame in capture.frames:
         candidates = (folder / frame.name, folder / Path(frame.name).name)
@@ -168,8 +166,10 @@ def _parse_scene(path: Path, given: Given) -> Capture:
 
 
 def _parse_model(path: Path, given: Given) -> Capture:
-    """Read a COLMAP model, with the photos where its names lead to one:
-    below images/ beside it, or below its project.
+    """Read a COLMAP model, with its photos in the first folder in which its names lead to one.
+
+    The folders tried are the given one; or images/ and the like in the model's folder or up to three folders above it,
+    then these folders themselves.
     """
     capture = parse_colmap(path)
     homes = (path, *path.resolve().parents[:3])

@@ -1,4 +1,4 @@
-"""Places that two photos both show, found without knowing anything of the cameras."""
+"""Feature matches between photos, found without any knowledge of the cameras."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,12 +12,12 @@ from nerfcli.errors import UserError
 from nerfcli.multiview.epipolar import fundamental_matrix
 from nerfcli.multiview.features import Features, Matches, find_features, mutual_matches
 
-# The longer side of the photos in which features are sought: more would find them better, and take longer.
+# The longer side of the photos in which features are detected: a larger one finds better features, but takes longer.
 LONGER_SIDE_PX = 1000
 MOST_FEATURES = 3000
 MOST_PAIRS = 24
 
-# Fewer matches than these agree on a common epipolar geometry by chance.
+# Fewer matches than this may agree on a common epipolar geometry by chance.
 _LEAST_MATCHES = 20
 _EPIPOLAR_PX = 2.0
 
@@ -25,17 +25,17 @@ _EPIPOLAR_PX = 2.0
 def match_neighbours(
     frames: tuple[Frame, ...], *, progress: Callable[[float, str], None]
 ) -> tuple[list[Matches], dict[int, Camera]]:
-    """Matches between photos that follow each other in the order of their names, and the cameras for the photos' sizes.
+    """Match photos that follow each other in the order of names; return matches and the cameras for the photos' sizes.
 
-    The matches of a pair agree on some epipolar geometry, whichever it is: no pose and no focal length was used. Pairs
-    with few such matches are left out, as are frames whose photo is not on disk.
+    The matches of a pair agree on a common epipolar geometry, estimated without poses or focal lengths. Pairs with few
+    such matches are left out, as are frames whose photo is not on disk.
 
     Raises:
         UserError: a photo cannot be read or has another shape than its camera.
     """
     present = [i for i, frame in enumerate(frames) if frame.image is not None and frame.image.is_file()]
     present.sort(key=lambda index: frames[index].name)
-    steps = [(place, place + 1 + place % 2) for place in range(len(present) - 1)]  # next, next but one, in turn
+    steps = [(place, place + 1 + place % 2) for place in range(len(present) - 1)]  # next and next but one, in turn
     steps = [(present[a], present[b]) for a, b in steps if b < len(present)]
     chosen = (
         [steps[k] for k in np.unique(np.linspace(0, len(steps) - 1, MOST_PAIRS).round().astype(int))] if steps else []
@@ -75,15 +75,15 @@ def _stored_or_shown(camera: Camera, path: Path) -> tuple[np.ndarray, Camera]:
 
 
 def _matched(first: tuple[Camera, Features], second: tuple[Camera, Features]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Positions (M, 2) of matches in both photos, or None where too few agree with each other."""
+    """Return the positions (M, 2) of matches in both photos, or None if too few agree with each other."""
     (camera, one), (other_camera, other) = first, second
     a, b = mutual_matches(one.descriptors, other.descriptors)
     if len(a) < _LEAST_MATCHES:
         return None
     pixels = one.pixels[a], other.pixels[b]
-    if camera.is_spherical or "FISHEYE" in camera.model:  # no fundamental matrix is common to all of them
+    if camera.is_spherical or "FISHEYE" in camera.model:  # their matches do not fit a fundamental matrix
         return pixels
-    # In units of the size in which features were sought, so that the threshold means the same for every photo.
+    # In pixels of the size at which features were detected, so that the threshold means the same for every photo.
     scales = [min(1.0, LONGER_SIDE_PX / max(each.width, each.height)) for each in (camera, other_camera)]
     _, agree = fundamental_matrix(
         pixels[0] * scales[0], pixels[1] * scales[1], within_px=_EPIPOLAR_PX, trials=5000, least=_LEAST_MATCHES

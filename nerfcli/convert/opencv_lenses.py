@@ -1,7 +1,7 @@
-"""Projection through lenses without nerfcli's cameras: by OpenCV, and by pycolmap where OpenCV has no such lens.
+"""Projection through lenses without nerfcli's cameras: by OpenCV, or by pycolmap if OpenCV has no such lens.
 
-It stands on the other side when a conversion is checked, so it shares no code with `cameras`. Pixel positions are those
-of nerfcli: the centre of the top-left pixel is (0.5, 0.5); the formulas do not depend on it.
+It is the independent side in the verification of a conversion, so it shares no code with `cameras`. Pixel positions are
+those of nerfcli: the centre of the top-left pixel is (0.5, 0.5); the formulas do not depend on it.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pycolmap
 
-# Behind the principal point they have the first of OpenCV's distortion terms k1 k2 p1 p2 k3 k4 k5 k6.
+# After the principal point, their parameters are the first of OpenCV's distortion terms k1 k2 p1 p2 k3 k4 k5 k6.
 # Source: docs.opencv.org calib3d, "Detailed Description"; colmap src/colmap/sensor/models.h.
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
@@ -34,9 +34,7 @@ class FileLens:
 
 
 def project(lens: FileLens, points_cam: np.ndarray) -> np.ndarray:
-    """Return pixels (N, 2) of points (N, 3) in OpenCV camera axes;
-    meaningless for points that the lens does not see.
-    """
+    """Return pixels (N, 2) of points (N, 3) in OpenCV camera axes; meaningless for points that the lens cannot see."""
     if not len(points_cam):
         return np.zeros((0, 2))
     points = np.ascontiguousarray(points_cam, dtype=np.float64)[:, None]
@@ -54,16 +52,16 @@ def project(lens: FileLens, points_cam: np.ndarray) -> np.ndarray:
 
 
 def _matrix_and_terms(lens: FileLens) -> tuple[np.ndarray, tuple[float, ...]]:
-    """OpenCV's camera matrix (3, 3) and distortion terms."""
+    """Return OpenCV's camera matrix (3, 3) and distortion terms."""
     fx, fy, cx, cy = lens.params[:1] * 2 + lens.params[1:3] if lens.model in _ONE_FOCAL else lens.params[:4]
     terms = lens.params[3:] if lens.model in _ONE_FOCAL else lens.params[4:]
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), terms
 
 
 def _fisheye_pixels(lens: FileLens, points: np.ndarray) -> np.ndarray:
-    """Return the equidistant fisheye, theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8), which may see behind itself.
+    """Return pixels of the equidistant fisheye, theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8), at any angle.
 
-    cv2.fisheye.projectPoints has the same formula, but divides by z and so ends at 90 degrees.
+    cv2.fisheye.projectPoints has the same formula, but divides by z and therefore ends at 90 degrees.
     """
     matrix, terms = _matrix_and_terms(lens)
     across = np.hypot(points[:, 0], points[:, 1])

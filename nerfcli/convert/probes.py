@@ -9,7 +9,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import poses_of
 
-# Pairs of a view and a point that are tried; where there are more, each view gets a random choice of the points.
+# Most pairs of a view and a point that are tried; if there are more, each view gets a random subset of the points.
 MOST_PAIRS = 500_000
 
 # Synthetic points per view that are tried, at distances from half to twice the capture's own.
@@ -21,11 +21,11 @@ class Probes:
     """Points used for verification.
 
     Args:
-        frame_index: (M,) of the view.
-        point_index: (M,) of the capture's point; -1 for a synthetic one.
+        frame_index: (M,) index of the view.
+        point_index: (M,) index of the capture's point; -1 for a synthetic one.
         points: (M, 3) in the world.
-        pixels: (M, 2) where the view sees the point.
-        distances: (M,) of the point from the camera's centre.
+        pixels: (M, 2) position of the point in the view.
+        distances: (M,) distance of the point from the camera's centre.
     """
 
     frame_index: np.ndarray
@@ -36,11 +36,10 @@ class Probes:
 
 
 def probes_of(capture: Capture) -> Probes:
-    """Return the capture's points that lie in front of its cameras and inside their pictures,
-    and synthetic ones besides.
+    """Return the capture's points that are visible inside the pictures of its cameras, and synthetic points.
 
     All pairs of a view and a point are tried, or `MOST_PAIRS` random ones, equally many for each view. The choice is
-    the same at every call.
+    the same in every call.
     """
     rng = np.random.default_rng(0)
     num_frames, num_points = len(capture.frames), len(capture.points)
@@ -58,14 +57,14 @@ def probes_of(capture: Capture) -> Probes:
 
 
 def distinct(items: Sequence[Hashable]) -> tuple[list, np.ndarray]:
-    """Return the different items in the order of their first appearance, and which of them each item is."""
+    """Return the distinct items in the order of their first appearance, and the index of each item among them."""
     places: dict[Hashable, int] = {}
     index = np.array([places.setdefault(item, len(places)) for item in items], dtype=np.int64)
     return list(places), index
 
 
 def rows_of_each(labels: np.ndarray, count: int) -> list[np.ndarray]:
-    """For each label 0 ... count - 1 the rows that have it."""
+    """Return, for each label 0 ... count - 1, the rows that have it."""
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.searchsorted(labels[order], np.arange(1, count)))
 
@@ -83,11 +82,11 @@ def scene_distance(capture: Capture) -> float:
 
 
 def _synthetic(capture: Capture, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Frame indices (M,) and points (M, 3) in the world, in directions that reach beyond the picture of each view.
+    """Return frame indices (M,) and world points (M, 3) in directions that extend beyond the picture of each view.
 
-    They are those of an equidistant lens of the camera's focal length, theta = radius / focal: of a perspective picture
-    they are the wider ones, and of a panorama all around. No lens needs to be inverted for that, which is slow where
-    every photo has its own.
+    The directions are those of an equidistant lens with the camera's focal length, theta = radius / focal: wider than a
+    perspective picture, and all around for a panorama. This avoids inverting lenses, which is slow if every photo has
+    its own.
     """
     cameras = [frame.camera for frame in capture.frames]
     size = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
@@ -112,7 +111,7 @@ def _seen(capture: Capture, frame_index: np.ndarray, point_index: np.ndarray, po
 
 
 def projected(capture: Capture, probes: Probes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project points into the views of a capture: pixels (M, 2), whether visible (M,) bool, distances (M,)."""
+    """Project points into the views of a capture: pixels (M, 2), their validity (M,) bool, distances (M,)."""
     cam_from_world = rigid.inverse(poses_of(capture))[probes.frame_index]
     in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], probes.points) + cam_from_world[:, :3, 3]
     cameras, camera_of_frame = distinct([frame.camera for frame in capture.frames])

@@ -1,8 +1,8 @@
 """Read a written file back with code other than the writer's and the parser's.
 
 Nothing here comes from `cameras`: COLMAP models are read by pycolmap, JSON field by field, quaternions by SciPy. It
-reads only what nerfcli writes, so it is short and checks nothing: whatever is wrong shows as a residual or as an
-`Unreadable`.
+reads only what nerfcli writes, so it is short and checks nothing: any error shows as a residual or as an
+`UnreadableError`.
 """
 
 import json
@@ -47,15 +47,15 @@ class ReadBack:
     """The views in a file.
 
     Args:
-        labels: what the file says which photo a view is of; None where its order says it.
+        labels: the photo of each view, as the file names it; None if the order of views determines it.
         cam_from_world: (views, 3, 3) rotations, OpenCV axes.
         centres: (views, 3) camera centres in the world.
-        lenses: one per view; None where the format has no intrinsics.
-        points: (N, 3), or None where the format has no points.
-        colours: (N, 3), 0...255; None where the format has none.
-        features: gives of a view the positions (F, 2) and points (F,), -1: none, of its features; None where the
-            format has no observations.
-        beside: what else the file says of its views and of the whole, under the names of `Beside`.
+        lenses: one per view; None if the format has no intrinsics.
+        points: (N, 3), or None if the format has no points.
+        colours: (N, 3), 0...255; None if the format has none.
+        features: returns the positions (F, 2) of a view's features and the indices of their points (F,), -1 for none;
+            None if the format has no observations.
+        beside: optional content of the file.
     """
 
     labels: tuple[str, ...] | None
@@ -70,8 +70,8 @@ class ReadBack:
 
 @dataclass(frozen=True)
 class Meant:
-    """What a file leaves open: the axes of its cameras as three letters, where its pixel positions put the first
-    pixel's centre, and the widths and heights of its views' pictures in the file's order."""
+    """Facts that a file does not state: its camera axes as three letters, the coordinate of the first pixel's centre,
+    and the widths and heights of its views' pictures in the file's order."""
 
     axes: str
     pixel_centre: float
@@ -120,14 +120,14 @@ def read_scene(path: Path, meant: Meant) -> ReadBack:
 
 
 def _features(image: Any, places: dict[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (F, 2) of an image's features, and where their points stand in the list of points (F,), -1: none."""
+    """Return positions (F, 2) of an image's features, and indices (F,) of their points in the list, -1 for none."""
     features = list(image.points2D)
     points = [places[feature.point3D_id] if feature.has_point3D() else -1 for feature in features]
     return np.array([feature.xy for feature in features]).reshape(-1, 2), np.array(points, dtype=np.int64)
 
 
 def read_transforms(path: Path, meant: Meant) -> ReadBack:
-    """transforms.json, by the json module, and the PLY file of points that it names."""
+    """Read transforms.json, by the json module, and the PLY file of points that it names."""
     content = json.loads(path.read_text(encoding="utf-8"))
     cloud = content.get("ply_file_path")
     points, colours = (np.zeros((0, 3)), None) if cloud is None else read_ply(path.parent / cloud)
@@ -144,7 +144,7 @@ def read_transforms(path: Path, meant: Meant) -> ReadBack:
 
 
 def read_blender(path: Path, meant: Meant) -> ReadBack:
-    """transforms_train.json, transforms_val.json and transforms_test.json of a folder: only the angle of view."""
+    """Read transforms_{train,val,test}.json of a folder, whose only intrinsic is the angle of view."""
     files = [path / f"transforms_{split}.json" for split in ("train", "val", "test")]
     contents = [json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()]
     named = [file.stem.removeprefix("transforms_") for file in files if file.exists()]
@@ -155,7 +155,7 @@ def read_blender(path: Path, meant: Meant) -> ReadBack:
 
 
 def read_llff(path: Path, meant: Meant) -> ReadBack:
-    """poses_bounds.npy, by NumPy: 17 numbers a view, of which the fifth column of 3 x 5 is height, width, focal."""
+    """Read poses_bounds.npy, by NumPy: 17 numbers per view; the fifth column of its 3 x 5 is height, width, focal."""
     rows = np.load(path / "poses_bounds.npy")
     matrices = rows[:, :15].reshape(-1, 3, 5)
     rotations, centres = _views_from_world_from_cam(matrices[:, :, :4], meant.axes)
@@ -180,7 +180,7 @@ def read_kitti(path: Path, meant: Meant) -> ReadBack:
 
 
 def read_opensfm(path: Path, meant: Meant) -> ReadBack:
-    """reconstruction.json, by the json module and SciPy: angle-axis and translation of cam_from_world."""
+    """Read reconstruction.json, by the json module and SciPy: angle-axis and translation of cam_from_world."""
     (content,) = json.loads(path.read_text(encoding="utf-8"))
     shots = content["shots"]
     rotations = Rotation.from_rotvec(np.array([shot["rotation"] for shot in shots.values()])).as_matrix()
@@ -238,8 +238,8 @@ def _features_of_arrays(arrays: Any, shift: float) -> Callable[[int], tuple[np.n
 
 
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read the vertices (N, 3) of a binary PLY file whose first three properties are doubles, and the colours (N, 3)
-    that follow as bytes, if they do."""
+    """Read vertices (N, 3) of a binary PLY file, its first three properties as doubles, and colours (N, 3) from the
+    bytes that follow, if there are any."""
     header, _, body = path.read_bytes().partition(b"end_header\n")
     lines = header.decode("ascii").splitlines()
     count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
@@ -251,7 +251,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _opensfm_lens(record: dict[str, Any]) -> FileLens:
-    """Return a lens from numbers in units of the picture's longer side, measured from its middle."""
+    """Return a lens from numbers in units of the picture's longer side, measured from its centre."""
     kind, width, height = record["projection_type"], record["width"], record["height"]
     if kind in ("spherical", "equirectangular"):
         return FileLens("EQUIRECTANGULAR", width, height, (width, height))
@@ -304,7 +304,7 @@ def _transforms_lens(record: dict[str, Any], shift: float, size: tuple[int, int]
 
 
 def _views_from_world_from_cam(matrices: Any, axes: str) -> tuple[np.ndarray, np.ndarray]:
-    """cam_from_world rotations and centres, from matrices whose columns are the camera's axes in the world.
+    """Return cam_from_world rotations and centres from matrices whose columns are the camera's axes in the world.
 
     The columns are put in OpenCV's order one by one: right, down, forward.
     """
@@ -314,9 +314,7 @@ def _views_from_world_from_cam(matrices: Any, axes: str) -> tuple[np.ndarray, np
 
 
 def _pointing(poses: np.ndarray, axes: str, along: str, against: str) -> np.ndarray:
-    """Return where in the world (views, 3) a direction of the camera points,
-    of which the axes have it or its opposite.
-    """
+    """Return a direction of the cameras in world coordinates, (views, 3); `axes` names it or its opposite."""
     if along in axes:
         return poses[:, :3, axes.index(along)]
     return -poses[:, :3, axes.index(against)]

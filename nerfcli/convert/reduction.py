@@ -1,7 +1,7 @@
 """Reduce a capture to what a format can hold: cameras without the lost terms, and names as other programs read them.
 
-A written file is compared with this when losses were accepted. It says in its own words what a writer keeps, so that a
-writer that loses something else is found out.
+A written file is compared with the reduced capture when losses were accepted. This module states independently what
+each writer keeps, so that a writer that loses anything else is detected.
 """
 
 import math
@@ -13,14 +13,14 @@ from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.scene_folder import named_for_scene
 
-# Models that transforms.json holds whole.
+# Camera models that transforms.json can hold completely.
 _HELD = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"),
 )
 
 
-# What each format holds beside cameras, poses and points.
+# Contents that each format holds besides cameras, poses and points.
 _PARTS = {
     "nerfcli": ("masks", "split", "colours", "observations", "depth bounds", "unit"),
     "npz": ("masks", "split", "colours", "observations", "depth bounds", "unit"),
@@ -36,7 +36,7 @@ _PARTS = {
 
 def reduced(capture: Capture, format_name: str) -> Capture:
     """Return the capture with the cameras, names and other parts that a format can hold."""
-    return _with_parts(_with_words(capture, format_name), _PARTS.get(format_name, ()))
+    return _with_parts(_with_expressible_cameras(capture, format_name), _PARTS.get(format_name, ()))
 
 
 def _with_parts(capture: Capture, held: Collection[str]) -> Capture:
@@ -54,8 +54,8 @@ def _with_parts(capture: Capture, held: Collection[str]) -> Capture:
     )
 
 
-def _with_words(capture: Capture, format_name: str) -> Capture:
-    """Return the capture with the cameras and names that a format has words for."""
+def _with_expressible_cameras(capture: Capture, format_name: str) -> Capture:
+    """Return the capture with the cameras and names that a format can express."""
     if format_name == "nerfcli":
         return named_for_scene(capture)
     if format_name == "colmap-text":
@@ -72,7 +72,7 @@ def _with_cameras(capture: Capture, change: Callable[[Camera], Camera]) -> Captu
 
 
 def _with_one_angle(capture: Capture) -> Capture:
-    """Return every split's views with the angle that most of them have: its file holds one."""
+    """Give all views of a split the angle of view that most of them have, because its file holds only one."""
     angles: dict[str, Counter[float]] = {}
     for frame in capture.frames:
         angle = 2 * math.atan(frame.camera.width / 2 / frame.camera.params[0])
@@ -87,14 +87,14 @@ def _with_one_angle(capture: Capture) -> Capture:
 
 
 def _pinhole(camera: Camera) -> Camera:
-    """Return the horizontal focal length alone; the principal point is the picture's middle."""
+    """Keep only the horizontal focal length; the principal point is the picture's centre."""
     if camera.is_spherical:
         return camera
     return Camera.pinhole(camera.width, camera.height, camera.params[0])
 
 
 def _to_transforms(camera: Camera) -> Camera:
-    """OpenCV's k1, k2, p1, p2, k3, or its fisheye's k1 to k4; a camera that has no other terms is left as it is."""
+    """Keep OpenCV's k1, k2, p1, p2, k3, or its fisheye's k1 to k4; a camera without other terms is unchanged."""
     value = dict(zip(parameter_names(camera.model), camera.params, strict=True))
     if camera.is_spherical or camera.model in _HELD:
         return camera
@@ -109,7 +109,7 @@ def _to_transforms(camera: Camera) -> Camera:
 
 
 def _to_opensfm(camera: Camera) -> Camera:
-    """Brown's terms without the denominator's, or six radial ones of the fisheye."""
+    """Keep Brown's terms without those of the denominator, or the six radial terms of the fisheye."""
     if camera.model == "FULL_OPENCV":
         return _without(camera, ("k4", "k5", "k6"))
     if camera.model == "RAD_TAN_THIN_PRISM_FISHEYE":
@@ -118,7 +118,7 @@ def _to_opensfm(camera: Camera) -> Camera:
 
 
 def _without(camera: Camera, lost: Collection[str]) -> Camera:
-    """Return the camera with some terms 0."""
+    """Return the camera with some terms set to 0."""
     values = zip(parameter_names(camera.model), camera.params, strict=True)
     params = tuple(0.0 if name in lost else value for name, value in values)
     return Camera(camera.model, camera.width, camera.height, params)

@@ -1,4 +1,4 @@
-"""Writing a capture as a scene of nerfcli's own: sparse/0 and scene.json, as `nerfcli poses` leaves them."""
+"""Writing a capture as a nerfcli scene: sparse/0 and scene.json, as `nerfcli poses` writes them."""
 
 import os
 from collections.abc import Mapping
@@ -15,10 +15,10 @@ SCENE_FILES = (scene.SCENE_FILE, *(f"{scene.MODEL_FOLDER}/{name}.bin" for name i
 
 
 def losses_scene(capture: Capture) -> tuple[str, ...]:
-    """List what a scene folder cannot hold of a capture.
+    """List the contents of a capture that a scene folder cannot hold.
 
-    The names of photos lead to them from one folder; where they do not, photos get other names. Photos that the capture
-    lists and that have no file are reported when the scene is loaded.
+    In a scene, the names of photos are paths relative to one folder; photos with other names are renamed. Listed photos
+    without a file are reported when the scene is loaded.
     """
     _, names = _named(capture)
     renamed = sum(frame.name != name for frame, name in zip(capture.frames, names, strict=True))
@@ -26,7 +26,7 @@ def losses_scene(capture: Capture) -> tuple[str, ...]:
 
 
 def named_for_scene(capture: Capture) -> Capture:
-    """Return the capture with the names that its photos get in a scene, and the split that a scene has."""
+    """Return the capture with the names and the split that its photos get in a scene."""
     _, names = _named(capture)
     split = _split(dict(zip(names, (frame.split for frame in capture.frames), strict=True)))
     frames = tuple(
@@ -38,15 +38,15 @@ def named_for_scene(capture: Capture) -> Capture:
 def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any] | None = None) -> None:
     """Write a capture, whose cameras are for upright photos, as a scene into a folder.
 
-    Masks are listed one by one. A split that the capture has is kept; else every 8th photo is held out.
+    Masks are listed one by one. A split in the capture is kept; otherwise every 8th photo is held out.
 
     Args:
         capture: to be written.
-        folder: of the scene.
-        provenance: goes into scene.json, besides the command and the version.
+        folder: the folder of the scene.
+        provenance: further entries of the provenance in scene.json, besides the command and the version.
 
     Raises:
-        UserError: a frame without a photo, no photo on disk, or a folder that cannot be written.
+        UserError: a frame has no photo, no photo is on disk, or the folder cannot be written.
     """
     image_folder, _ = _named(capture)
     if not any(frame.image is not None and frame.image.is_file() for frame in capture.frames):
@@ -73,7 +73,7 @@ def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any]
 
 
 def _split(splits: dict[str, str | None]) -> dict[str, str | None]:
-    """Return the split of each name: the capture's own where it holds some out, else every 8th name's."""
+    """Return the split of each name: the capture's own if it holds photos out, else every 8th name is held out."""
     if "test" in splits.values() or "val" in splits.values():
         return splits
     held_out = scene.default_split(splits)
@@ -81,12 +81,12 @@ def _split(splits: dict[str, str | None]) -> dict[str, str | None]:
 
 
 def _named(capture: Capture) -> tuple[Path, list[str]]:
-    """Return the folder that photos are in or below, and the name of each as seen from there.
+    """Return a common folder of the photos, and the name of each photo relative to it.
 
-    It is the folder from which the frames' own names lead to the photos, where there is one.
+    It is the folder from which the frames' own names lead to the photos, if there is one.
 
     Raises:
-        UserError: a frame without a photo, or photos that no folder has in common.
+        UserError: a frame has no photo, or the photos have no common folder.
     """
     images = []
     for frame in capture.frames:

@@ -1,7 +1,7 @@
 """Pixels that cameras refer to for photos with an EXIF orientation (stored or upright), and conversion between them.
 
-COLMAP, nerfstudio, instant-ngp and OpenSfM read pixels as they are stored. nerfcli shows photos upright, and its own
-scenes have cameras for that.
+COLMAP, nerfstudio, instant-ngp and OpenSfM read pixels as they are stored. nerfcli shows photos upright, and the
+cameras of its own scenes refer to upright photos.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ from nerfcli.media.images import image_size, read_exif
 
 STORED, UPRIGHT = "stored", "upright"
 
-# Photos whose size is looked at for a note, and no more: reading 10,000 headers takes longer than a conversion.
+# Most photos that are measured for a note: reading 10,000 headers takes longer than a conversion.
 _MOST_MEASURED = 200
 
 
@@ -36,9 +36,9 @@ class Turned:
 
     Args:
         capture: the capture.
-        num_turned: how many cameras were turned with their photos' EXIF orientation.
-        num_unknown: how many photos are not on disk, so that nothing is known of their orientation.
-        masks_left_out: names of frames whose mask does not lie as the turned camera does.
+        num_turned: number of cameras that were turned according to their photos' EXIF orientation.
+        num_unknown: number of photos that are not on disk, so that their orientation is unknown.
+        masks_left_out: names of frames whose mask was dropped, as its orientation differs from the turned camera's.
     """
 
     capture: Capture
@@ -48,18 +48,18 @@ class Turned:
 
 
 def measure(path: Path) -> tuple[int, int, int]:
-    """Width and height of a photo as it is shown, and its EXIF orientation."""
+    """Return the width and height of a photo shown upright, and its EXIF orientation."""
     exif = read_exif(path)
     return exif.width, exif.height, exif.orientation
 
 
 def measure_upright(path: Path) -> tuple[int, int, int]:
-    """Measure the same for cameras of upright photos: nothing is left to turn."""
+    """Return the same as `measure` for cameras of upright photos, with orientation 1: nothing is left to turn."""
     return (*image_size(path), 1)
 
 
 def measure_of(capture: Capture) -> Measure:
-    """Measures photos as the cameras of a capture need it, to be fitted to the upright photos."""
+    """Return the function that measures photos so that a capture's cameras can be fitted to the upright photos."""
     return measure_upright if capture.pixels == UPRIGHT else measure
 
 
@@ -69,8 +69,7 @@ def in_pixels(capture: Capture, pixels: str) -> Turned:
     Frames without a photo on disk are left as they are, and reported.
 
     Raises:
-        UserError: a photo that cannot be read, that is mirrored by its orientation, or that has another shape than its
-            camera.
+        UserError: a photo cannot be read, is mirrored by its orientation, or has another shape than its camera.
     """
     if capture.pixels == pixels:
         return Turned(capture)
@@ -97,16 +96,16 @@ def in_pixels(capture: Capture, pixels: str) -> Turned:
 
 
 def upright(frame: Frame, measure: Measure) -> Frame:
-    """Return the frame of the photo on disk as it is shown, of one whose photo may be of another size or lie."""
+    """Return a frame fitted to its upright photo on disk; its camera may be for another size or the stored pixels."""
     assert frame.image is not None
     camera, pose = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measure=measure)
     return replace(frame, camera=camera, world_from_cam=pose)
 
 
 def other_sizes(capture: Capture) -> dict[tuple[Size, Size], int]:
-    """For how many of the photos on disk the intrinsics are for another size, as `Capture.rescaled`.
+    """Count the photos on disk whose intrinsics are for another size, as in `Capture.rescaled`.
 
-    At most 200 photos, spread over the capture, are looked at; those that do not fit their camera are passed over.
+    At most 200 photos, spread over the capture, are measured; those that do not fit their camera are skipped.
     """
     chosen = np.unique(np.linspace(0, len(capture.frames) - 1, _MOST_MEASURED).round().astype(int))
     sizes = []
@@ -134,7 +133,7 @@ def _turned_observations(capture: Capture, turns: np.ndarray) -> Observations | 
 
 
 def _turn(frame: Frame, pixels: str) -> int:
-    """Return the EXIF orientation that turns the pixels of a frame's camera into the wanted ones."""
+    """Return the EXIF orientation that turns the pixels of a frame's camera into the requested ones."""
     assert frame.image is not None
     width, height, written = measure(frame.image)
     orientation, size = turn_to_upright(frame.camera, path=frame.image, measure=lambda _: (width, height, written))
@@ -148,13 +147,16 @@ def _turn(frame: Frame, pixels: str) -> int:
 
 
 def _fits(mask: Path, camera: Camera, before: Camera, pixels: str) -> bool:
-    """Return whether a mask serves after a camera was turned: it lies as the turned picture does, or it lies as the one
-    before where its shape shows that, since nerfcli then turns it (`media.masks.read_mask`)."""
-    return _lies_as(mask, camera, before) or (pixels == UPRIGHT and _lies_as(mask, before, camera))
+    """Return whether a mask can be used after a camera was turned.
+
+    Its shape has to be that of the turned picture, or, for upright pixels, of the one before: nerfcli then turns the
+    mask (`media.masks.read_mask`).
+    """
+    return _closer_in_shape(mask, camera, before) or (pixels == UPRIGHT and _closer_in_shape(mask, before, camera))
 
 
-def _lies_as(mask: Path, camera: Camera, before: Camera) -> bool:
-    """Return whether a mask has the shape of a camera's picture and not that of the one before it was turned."""
+def _closer_in_shape(mask: Path, camera: Camera, before: Camera) -> bool:
+    """Return whether the shape of a mask is closer to the picture of `camera` than to that of `before`."""
     if not mask.is_file():
         return False
     width, height = image_size(mask)

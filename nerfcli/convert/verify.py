@@ -1,7 +1,7 @@
-"""The proof of a conversion: the file that was written and the capture that it was written from see the same.
+"""Verification of a conversion: a written file and its source capture must project points to the same pixels.
 
 The capture projects its points with nerfcli's cameras; the file is read back (`readback`) and projects the same points
-with OpenCV's (`lenses`). The two sides share no code that knows a convention.
+with OpenCV's (`opencv_lenses`). The two sides share no code that depends on a convention.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from nerfcli.convert.verify_parts import compared_parts
 
 TOLERANCE_PX = 1e-6
 
-# Coordinates are rounded to 2^-53 of their size, some times over, on both sides.
+# Coordinates are rounded to 2^-53 of their size, several times, on both sides.
 _ROUNDINGS = 16 * 2.0**-53
 
 
@@ -31,13 +31,14 @@ class Verification:
         max_deg: the largest angle between the two rotations of a view.
         max_centre_shift: the largest distance between the two centres of a view, over the size of the scene.
         max_point_shift: the largest distance between the two positions of a point, over the size of the scene.
-        worst: the name of the view that has max_px, or of the one in error.
-        num_views, num_points, num_projections: compared. The poses of all views are, those without a point too.
-        tolerance_px: what max_px may be.
-        tolerance_rad: the same as an angle at the longest focal length; what rotations may differ by, and positions in
-            sizes of the scene.
-        fault: what is wrong with the file beside numbers, such as a view that is not there; "" if nothing.
-        parts: what else was compared and is the same, such as "colours of 40 points".
+        worst: the name of the view with max_px; "" if there is none.
+        num_views, num_points, num_projections: numbers of views, points and projections compared. Poses are compared
+            for all views, including those without a point.
+        tolerance_px: the largest max_px that passes.
+        tolerance_rad: the same as an angle at the longest focal length: the limit for differences of rotations, and of
+            positions over the size of the scene.
+        fault: a fault other than numerical differences, such as a missing view; "" if there is none.
+        parts: other contents that were compared and agree, such as "colours of 40 points".
     """
 
     max_px: float
@@ -55,21 +56,21 @@ class Verification:
 
     @property
     def holds(self) -> bool:
-        """Whether the file agrees with the capture."""
+        """True if the file agrees with the capture."""
         moved = max(np.radians(self.max_deg), self.max_centre_shift, self.max_point_shift)
         return not self.fault and self.max_px <= self.tolerance_px and moved <= self.tolerance_rad
 
 
 def verify(capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px: float = TOLERANCE_PX) -> Verification:
-    """Compare a capture with what was read back from the file that it was written to.
+    """Compare a capture with the content read back from the file that it was written to.
 
-    Every 3D point that a view sees is projected by both, or a random choice of them where pairs of views and points are
-    too many, and synthetic points besides. Where coordinates are so large that rounding alone moves projections by more
-    than the tolerance (a scene of metres in coordinates of the globe), the tolerance is that.
+    Both project every 3D point that a view sees, or a random subset if there are too many pairs of views and points,
+    and also synthetic points. If coordinates are so large that rounding alone moves projections by more than the
+    tolerance (a scene of metres in global coordinates), the tolerance is raised to that movement.
 
     Args:
-        capture: what the file should hold: after accepted losses, what was left.
-        back: what it does hold.
+        capture: the expected content, without accepted losses.
+        back: the content of the file.
         listed: (frames,) the indices of the capture's frames in the order in which the format lists them.
         tolerance_px: the largest residual that passes.
     """
@@ -131,7 +132,7 @@ def verify_points(
 
 
 def listed_order(capture: Capture, format_name: str) -> np.ndarray:
-    """Return the indices of the frames in the order of a file of the format, where names do not determine it."""
+    """Return the indices of the frames in the order in which a file of the format lists them, if not by name."""
     places = range(len(capture.frames))
     if format_name == "llff":
         return np.array(sorted(places, key=lambda index: PurePosixPath(capture.frames[index].name).name))
@@ -142,7 +143,7 @@ def listed_order(capture: Capture, format_name: str) -> np.ndarray:
 
 
 def _order(capture: Capture, back: ReadBack, listed: np.ndarray) -> np.ndarray:
-    """For each frame of the capture, the view that was read back; (frames,).
+    """Return the index of the read-back view of each frame of the capture, (frames,).
 
     Raises:
         UnreadableError: a view is missing, or belongs to another photo.
@@ -153,7 +154,7 @@ def _order(capture: Capture, back: ReadBack, listed: np.ndarray) -> np.ndarray:
     places = {label: index for index, label in enumerate(back.labels or ())}
     if len(places) == len(names) and set(places) == set(names):
         return np.array([places[name] for name in names])
-    if back.labels is not None:  # paths as seen from the file, or without a suffix
+    if back.labels is not None:  # paths relative to the file, or without a suffix
         for frame_index, label in zip(listed, back.labels, strict=True):
             name = PurePosixPath(names[frame_index])
             if PurePosixPath(label).name not in (name.name, name.stem):
@@ -162,7 +163,7 @@ def _order(capture: Capture, back: ReadBack, listed: np.ndarray) -> np.ndarray:
 
 
 def _projected(capture: Capture, probes: Probes, back: ReadBack, order: np.ndarray) -> np.ndarray:
-    """Return where the read-back views see the points, (M, 2); by the capture's lenses where the file has none."""
+    """Return the pixels (M, 2) of the points in the read-back views, with the capture's lenses if the file has none."""
     points = probes.points
     if back.points is not None and len(back.points):
         listed = probes.point_index >= 0
@@ -179,7 +180,7 @@ def _projected(capture: Capture, probes: Probes, back: ReadBack, order: np.ndarr
     pixels = np.zeros((len(points), 2))
     for lens, rows in zip(each, rows_of_each(lens_of_frame[probes.frame_index], len(each)), strict=True):
         pixels[rows] = opencv_lenses.project(lens, in_camera[rows])
-        if lens.model == "EQUIRECTANGULAR":  # the left edge and the right edge are one
+        if lens.model == "EQUIRECTANGULAR":  # the left edge and the right edge coincide
             turns = np.round((pixels[rows, 0] - probes.pixels[rows, 0]) / lens.width)
             pixels[rows, 0] -= turns * lens.width
     return pixels
@@ -192,9 +193,7 @@ def _size(capture: Capture) -> float:
 
 
 def _rounding_px(capture: Capture, probes: Probes) -> float:
-    """Return how far rounding alone may move a projection:
-    by that of coordinates, seen from where the point is nearest.
-    """
+    """Return the largest distance, in pixels, by which rounding of coordinates alone may move a projection."""
     if not len(probes.points):
         return 0.0
     focal_px = np.array([frame.camera.focal_px for frame in capture.frames])[probes.frame_index]

@@ -8,23 +8,23 @@ import numpy as np
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.readback import ReadBack
 
-# Observations that are compared, of whole views: pycolmap gives them one by one, 2 microseconds each.
+# About the most observations compared, of whole views: pycolmap returns them one by one, 2 microseconds each.
 _MOST_OBSERVATIONS = 300_000
 
 
 def compared_parts(
     capture: Capture, back: ReadBack, order: np.ndarray, *, tolerance_px: float
 ) -> tuple[str, tuple[str, ...]]:
-    """Compare all that a capture has beside cameras, poses and points with what was read back.
+    """Compare all contents of a capture besides cameras, poses and points with those read back.
 
     Args:
-        capture: what the file should hold.
-        back: what it does hold.
-        order: (frames,) for each frame of the capture the view that was read back.
-        tolerance_px: of observations.
+        capture: the expected content.
+        back: the content of the file.
+        order: (frames,) index of the read-back view of each frame of the capture.
+        tolerance_px: the largest difference of observations that passes.
 
     Returns:
-        What differs, in a clause, "" if nothing does; and what was compared, such as "157412 observations".
+        The first difference as a clause, "" if there is none; and the parts compared, such as "157412 observations".
     """
     checks: tuple[Callable[[], tuple[str, str]], ...] = (
         lambda: _colours(capture, back),
@@ -123,7 +123,7 @@ def _unit(capture: Capture, back: ReadBack) -> tuple[str, str]:
 
 
 class _Same:
-    """Whether two paths lead to one place, as the operating system follows them; folders are followed once."""
+    """Test of whether two paths lead to the same file, with links in folders resolved; each folder is resolved once."""
 
     def __init__(self) -> None:
         self._homes: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""Another world frame on the way: what is up, where the origin is, how long a unit is."""
+"""Change of the world frame during a conversion: up axis, origin, and unit of length."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.cameras.world import moved_to_origin, transformed, turned_up
+from nerfcli.cameras.world import moved_to_origin, transformed, up_aligned
 from nerfcli.convert.stored_pixels import measure_of, upright
 from nerfcli.errors import UserError
 from nerfcli.scale.boards import CharucoBoard, scale_from_charuco, scale_from_markers
@@ -20,16 +20,16 @@ GPS = "gps"
 
 @dataclass(frozen=True)
 class WorldFrame:
-    """The world frame that a capture shall be in; None where it shall stay.
+    """The requested world frame of a capture; None leaves a property unchanged.
 
     Args:
         up: the axis that points up: x, y, z, -x, -y or -z.
-        origin: centre-of-cameras, focus, or a place "x,y,z" of the old frame.
-        scale: a number that lengths are multiplied by, or "gps" for metres by the positions in the photos' EXIF.
+        origin: centre-of-cameras, focus, or a point "x,y,z" in the old frame.
+        scale: a factor for all lengths, or "gps" for metres from the positions in the photos' EXIF.
         markers: ArUco markers in the photos, "DICTIONARY:SIDE", or a ChArUco board,
-            "DICTIONARY:COLUMNSxROWS:SQUARE:MARKER", with sides in metres: lengths become metres. ":legacy" after it is
-            for boards with an even number of rows that were made with OpenCV before 4.6.
-        distances: known ones, "A B METRES" with names of images or points x,y,z: lengths become metres.
+            "DICTIONARY:COLUMNSxROWS:SQUARE:MARKER", with sides in metres: lengths become metres. Append ":legacy" for
+            boards with an even number of rows that were made with OpenCV before 4.6.
+        distances: known distances, "A B METRES", between images by name or points x,y,z: lengths become metres.
     """
 
     up: str | None = None
@@ -40,20 +40,20 @@ class WorldFrame:
 
 
 def in_world_frame(capture: Capture, wanted: WorldFrame) -> tuple[Capture, Similarity, ScaleEstimate | None]:
-    """Return the capture in another world frame: first its origin, then up, then the scale about the new origin.
+    """Move a capture to another world frame: first the origin, then the up axis, then the scale about the new origin.
 
     Returns:
-        The capture, the similarity new_from_old, and the estimate of the scale where lengths became metres.
+        The capture, the similarity new_from_old, and the estimate of the scale if lengths became metres.
 
     Raises:
-        UserError: a value that says nothing, or photos that do not tell the scale.
+        UserError: a value is invalid, or the photos do not determine the scale.
     """
     estimate = _estimate(capture, wanted)
     change = Similarity.identity()
     if wanted.origin is not None:
         change = moved_to_origin(capture.frames, wanted.origin)
     if wanted.up is not None:
-        change = turned_up(capture.frames, wanted.up).compose(change)
+        change = up_aligned(capture.frames, wanted.up).compose(change)
     factor = _factor(wanted.scale) if estimate is None else estimate.metres_per_unit
     if factor != 1:
         change = Similarity(factor, np.eye(3), np.zeros(3)).compose(change)
@@ -64,7 +64,7 @@ def in_world_frame(capture: Capture, wanted: WorldFrame) -> tuple[Capture, Simil
 
 
 def _source(estimate: ScaleEstimate) -> str:
-    """Return how the metre is known, for people."""
+    """Describe how the scale in metres was determined, with its relative error."""
     relative = None if estimate.standard_error is None else estimate.standard_error / estimate.metres_per_unit
     return estimate.source if relative is None else f"{estimate.source}, ± {100 * relative:.2g} %"
 

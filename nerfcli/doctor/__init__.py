@@ -1,1 +1,1 @@
-"""Checks of a capture before any long work: one file per topic."""
+"""Checks of a capture before any long computation: one module per topic."""

@@ -1,4 +1,4 @@
-"""Brightness of photos: clipped pixels, and local brightness, which matches compare between photos."""
+"""Brightness of photos: clipped pixels, and local brightness for comparing matched features between photos."""
 
 from dataclasses import dataclass
 
@@ -7,17 +7,17 @@ import numpy as np
 
 from nerfcli.media.srgb import linear_light
 
-# Levels of 255 from which on, and up to which, a channel shows no detail.
+# A channel shows no detail at or above the first level, or at or below the second, of 255.
 WHITE_LEVEL = 253
 BLACK_LEVEL = 3
 
-# Linear light of the levels of sRGB.
+# Linear light of each 8-bit sRGB level.
 _LINEAR = linear_light(np.arange(256) / 255).astype(np.float32)
 _WINDOW_PX = 4.0
 _CLIPPED_WINDOW_PX = 15
-# Linear light below which noise and black level decide.
+# Linear light below which noise and the black level dominate.
 _DARKEST = 4e-3
-# The weakest channel against the strongest: from here on a colour is pale.
+# A colour is pale if its weakest channel is at least this fraction of its strongest.
 _PALE = 0.3
 
 
@@ -27,7 +27,7 @@ class Brightness:
 
     Args:
         mean: of all channels, sRGB in [0, 1].
-        white, black: share of pixels in which all channels are clipped there.
+        white, black: fraction of the pixels with all channels clipped at that end.
     """
 
     mean: float
@@ -45,11 +45,11 @@ def measure(rgb: np.ndarray, used: np.ndarray) -> Brightness:
 
 
 def local_light(rgb: np.ndarray) -> np.ndarray:
-    """Light and colour around each pixel, (H, W, 2) float32; NaN where they are not known.
+    """Return brightness and colour around each pixel, (H, W, 2) float32; NaN where unknown.
 
-    First log2 of the linear luminance, to which a stop of exposure adds 1; NaN where it is clipped or nearly so.
-    Second log2 of red over blue, which white balance shifts; NaN also where the colour is strong, since a little shine
-    on it then shifts the ratio by more than white balances do.
+    First log2 of the linear luminance, to which a stop of exposure adds 1; NaN where it is clipped or too dark.
+    Second log2 of red over blue, which white balance shifts; NaN also where the colour is saturated, since a small
+    highlight on it shifts the ratio by more than the white balance does.
 
     Args:
         rgb: (H, W, 3) uint8 sRGB.

@@ -1,6 +1,7 @@
 """Camera motion between two photos: rotation only, in front of a plane, or with parallax at all depths.
 
-Letters: x and y are the pixels of a match, from the pictures' centres; H a homography, K diag(f, f, 1), R a rotation.
+Symbols: x and y are the pixels of a match, relative to the picture centres; H a homography, K = diag(f, f, 1),
+R a rotation.
 """
 
 from dataclasses import dataclass
@@ -9,9 +10,9 @@ import cv2
 import numpy as np
 
 WITHIN_PX = 2.5
-# A homography that explains this share of the matches that agree on a geometry explains the pair.
+# A homography explains a pair if it fits this fraction of the inliers.
 _EXPLAINS = 0.9
-# Focal lengths that are tried where EXIF may tell a wrong one, relative to it.
+# Focal lengths to try, relative to the given one, which may be wrong in EXIF.
 _FOCAL_TRIALS = np.geomspace(0.7, 1.45, 15)
 
 
@@ -20,10 +21,10 @@ class TwoViews:
     """Camera motion between two photos.
 
     Args:
-        homography_share: of the matches that one homography explains within `WITHIN_PX`: near 1 where the camera only
-            turned, or where all that it saw is flat.
-        rotation_deg: by how much it turned.
-        baseline_over_depth: how far it moved, by the distance of what it saw.
+        homography_share: fraction of the matches that one homography fits within `WITHIN_PX`: near 1 if the camera only
+            turned, or if everything it saw is flat.
+        rotation_deg: angle of the camera's rotation.
+        baseline_over_depth: distance between the camera positions, relative to the distance of the scene.
     """
 
     homography_share: float
@@ -32,19 +33,19 @@ class TwoViews:
 
     @property
     def flat(self) -> bool:
-        """Whether a homography explains the pair, so that it shows no depth."""
+        """True if a homography explains the pair, so that it shows no depth."""
         return self.homography_share >= _EXPLAINS
 
 
 def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float]) -> TwoViews | None:
-    """Estimate the motion between two photos from matches (N, 2) without outliers; None where they fix none.
+    """Estimate the motion between two photos from inlier matches (N, 2); None if they do not determine it.
 
-    Where a homography H explains the matches, K^-1 H K = R + t n^T / d, whose singular values are 1 about in the middle
-    and differ by |t| / d between the largest and the smallest; the focal length is the one, between 0.7 and 1.45 times
-    the given, that makes them differ least, so that |t| / d is at least this. Elsewhere R and t come from the essential
-    matrix, and the baseline is measured by the median distance of the points.
+    If a homography H explains the matches, K^-1 H K = R + t n^T / d: its middle singular value is about 1, and the
+    largest and smallest differ by |t| / d. The focal length, between 0.7 and 1.45 times the given one, is chosen to
+    minimize that difference, so the result is a lower bound of |t| / d. Otherwise R and t come from the essential
+    matrix, and the baseline is relative to the median depth of the triangulated points.
 
-    Accuracy: with focal lengths that are off by 20 %, so is the baseline over the depth, about.
+    Accuracy: if the focal lengths are off by 20 %, baseline over depth is off by about as much.
     """
     homography, inside = cv2.findHomography(x, y, cv2.USAC_MAGSAC, WITHIN_PX, None, 1000, 0.999)
     fraction = 0.0 if homography is None or inside is None else float(inside.mean())
@@ -64,7 +65,7 @@ def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float]) -> Tw
 
 
 def _of_homography(homography: np.ndarray, focals_px: tuple[float, float]) -> tuple[float, float]:
-    """Return the angle of the rotation in degrees, and |t| / d, of a homography between pixels from the centres."""
+    """Return the rotation angle in degrees and |t| / d of a homography between pixels relative to the centres."""
     found = []
     for trial in _FOCAL_TRIALS:
         first, second = (np.diag([focal * trial, focal * trial, 1.0]) for focal in focals_px)
@@ -77,7 +78,7 @@ def _of_homography(homography: np.ndarray, focals_px: tuple[float, float]) -> tu
 
 
 def _distances(one: np.ndarray, other: np.ndarray, *, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """Depths along the first camera's axis, in baselines, of points in front of both, from bearings (N, 2) at z = 1."""
+    """Triangulate bearings (N, 2) at z = 1: depths in the first camera, in baselines, of points in front of both."""
     first, second = np.eye(3, 4), np.hstack([rotation, translation[:, None]])
     points = cv2.triangulatePoints(first, second, one.T.astype(np.float64), other.T.astype(np.float64))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Small drawings for the page, without any library: bars as SVG, the matrix of matches as PNG."""
+"""Small charts for the page, without a plotting library: bars as SVG, the match matrix as PNG."""
 
 from collections.abc import Sequence
 from html import escape
@@ -13,7 +13,7 @@ _LEAST_RANGE = 1.0
 
 
 def bars(names: Sequence[str], values: np.ndarray, *, marked: np.ndarray, unit: str) -> str:
-    """Return a bar per photo up or down from 0, as SVG; marked ones are coloured, NaN is left out."""
+    """Return an SVG chart with a bar per photo, up or down from 0; marked bars are coloured, NaN is left out."""
     measured = values[~np.isnan(values)]
     low = min(-_LEAST_RANGE / 2, float(measured.min(initial=0.0)) * 1.1)
     high = max(_LEAST_RANGE / 2, float(measured.max(initial=0.0)) * 1.1)
@@ -38,7 +38,7 @@ def bars(names: Sequence[str], values: np.ndarray, *, marked: np.ndarray, unit: 
 
 
 def match_matrix(count: int, linked: Sequence[tuple[int, int, int]]) -> str:
-    """Draw a picture of count x count cells whose intensity shows the number of matches of (i, j, matches)."""
+    """Return an image of count x count cells, stronger for more matches, from `linked` tuples (i, j, matches)."""
     strength = np.zeros((count, count))
     for i, j, matches in linked:
         strength[i, j] = strength[j, i] = min(1.0, np.log2(matches / 16) / 5)

@@ -1,7 +1,7 @@
 """Compare two photos: matches, camera motion between them, moving objects.
 
-Everything is found at `photos.LONGER_SIDE_PX` without poses. Letters: x and y are the pixels of a match in the first
-and the second photo, F their fundamental matrix, H a homography between them, K the matrix of a camera.
+All of this works without poses, at the picture size `photo_facts.LONGER_SIDE_PX`. Symbols: x and y are the pixels of a
+match in the first and the second photo.
 """
 
 from dataclasses import dataclass
@@ -17,15 +17,15 @@ from nerfcli.multiview.epipolar import fundamental_matrix
 from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.stationary import Motions, in_place, motions
 
-# Of each photo so many features are compared at first; all of them where these link it to nothing.
+# Features of each photo that are compared at first; all of them if these do not connect the photo to the rest.
 QUICK_FEATURES = 1000
-# How far a match may be from what a geometry says, pixels.
+# Epipolar tolerance of an inlier, pixels.
 EPIPOLAR_PX = 2.0
-# Fewer matches than these agree on a common geometry by chance.
+# Fewer inliers than this may agree on a geometry by chance.
 LEAST_MATCHES = 20
-# The fewest whose geometry is looked into.
+# Fewest inliers for estimating camera motion and moving patches.
 _LEAST_FOR_GEOMETRY = 40
-# Light and detail are compared where both photos show a thing about as large: their ratio is within this many octaves.
+# Detail is compared at features of about the same size in both photos: their ratio is within this many octaves.
 _SAME_SIZE_OCTAVES = 0.4
 _LEAST_COMPARED = 12
 
@@ -35,17 +35,17 @@ class Pair:
     """Result of comparing two photos. Differences are second minus first.
 
     Args:
-        first, second: numbers of the photos, first < second.
-        matches: features that choose each other.
-        inliers: those of them that agree on one geometry of two views.
-        shift: median distance between x and y of the inliers, as a share of the picture's diagonal.
-        detail: median difference of log2 detail where both show a thing at the same size; NaN where too few tell.
-        stops: median difference of log2 light; NaN where too few tell.
-        stops_spread: median distance from that median: small where all that is seen became lighter alike.
-        redder: median difference of log2 red over blue; NaN where too few tell.
-        views: how the camera moved between the photos; None where too few inliers tell.
-        patches: what else moved.
-        motions: what the matches say of a background that stays in its place; None where none stay.
+        first, second: indices of the photos, first < second.
+        matches: number of mutual nearest neighbours among the features.
+        inliers: number of matches that agree on one two-view geometry.
+        shift: median distance between x and y of the inliers, as a fraction of the picture's diagonal.
+        detail: median difference of log2 detail, at features of about the same size in both; NaN with too few values.
+        stops: median difference of log2 light; NaN with too few values.
+        stops_spread: median deviation from that median: small if everything became brighter by the same amount.
+        redder: median difference of log2 red over blue; NaN with too few values.
+        views: camera motion between the photos; None with too few inliers.
+        patches: parts that moved independently.
+        motions: static and moving matches, see `stationary`; None if no match stays in place.
     """
 
     first: int
@@ -63,7 +63,7 @@ class Pair:
 
     @property
     def linked(self) -> bool:
-        """Whether the photos certainly show the same scene."""
+        """True if the photos certainly show the same scene."""
         return self.inliers >= LEAST_MATCHES
 
 
@@ -74,12 +74,12 @@ def compare(
     *,
     most_features: int = QUICK_FEATURES,
 ) -> Pair:
-    """Match two photos and look at what their matches say.
+    """Match two photos and analyse their matches.
 
     Args:
-        numbers: of the photos.
-        focals_px: at the size in which features were sought, as well as they are known.
-        most_features: of each photo, the clearest ones.
+        numbers: indices of the photos.
+        focals_px: best known focal lengths, at the size at which features were detected.
+        most_features: number of features of each photo to use, strongest first.
     """
     one, other = (photo.features for photo in photos)
     a, b = mutual_matches(one.descriptors[:most_features], other.descriptors[:most_features], ratio=LOOSE_RATIO)
@@ -116,7 +116,7 @@ def compare(
 
 
 def focal_px(features: PhotoFeatures, exif: Exif) -> float:
-    """Return the focal length at the size of the features: from EXIF, else a typical value."""
+    """Return the focal length at the feature-detection size: from EXIF, else a typical value."""
     longer = max(features.size)
     known_px = focal_evidence(exif).focal_px
     return longer * (1.0 if known_px is None else known_px / max(exif.width, exif.height))

@@ -1,4 +1,4 @@
-"""Choice of pairs to compare, and connectivity of the capture by matches."""
+"""Choice of photo pairs to compare, and connectivity of the capture through matches."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -11,22 +11,22 @@ from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, worst
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.retrieval import alike, likeness
 
-# Up to here every photo is compared with every other one.
+# Captures of up to this many photos are compared exhaustively.
 EXHAUSTIVE_UP_TO = 60
-# Beyond, each with some that follow by name and with the ones that look most like it. From one frame of a video to the
-# next the camera hardly moves, hence the wider steps.
+# In larger ones, each photo is compared with some later ones by name and with its most similar ones. The camera hardly
+# moves between consecutive frames of a video, so there are wide steps, too.
 STEPS_BY_NAME = (1, 2, 8, 20, 50)
 LOOK_ALIKES = 6
-# They are found by this many features of each photo, the largest ones; fewer miss some, more take longer.
+# Similar photos are found by this many features of each photo, the largest ones; fewer miss some, more take longer.
 _COARSEST = 96
 
-# A photo hangs on by little with less than this many matches in its best pair, or with a single partner.
+# A photo is weakly connected with fewer matches than this in its best pair, or with fewer partners than this.
 WEAK_MATCHES = 35
 _FEWEST_PARTNERS = 2
 
 
 def choose_pairs(photos: Sequence[PhotoFacts]) -> list[tuple[int, int]]:
-    """Return the pairs (i, j), i < j, of photos to compare: all of a small capture, about 11 a photo of a large one."""
+    """Return the pairs (i, j), i < j, to compare: all of a small capture, about 11 per photo of a large one."""
     count = len(photos)
     if count <= EXHAUSTIVE_UP_TO:
         return list(combinations(range(count), 2))
@@ -39,20 +39,20 @@ def choose_pairs(photos: Sequence[PhotoFacts]) -> list[tuple[int, int]]:
 
 
 def pair_count(count: int) -> int:
-    """About how many pairs `choose_pairs` chooses."""
+    """Estimate how many pairs `choose_pairs` chooses."""
     if count <= EXHAUSTIVE_UP_TO:
         return count * (count - 1) // 2
     return count * (len(STEPS_BY_NAME) + LOOK_ALIKES)
 
 
 def apart(count: int, pairs: Sequence[Pair]) -> set[int]:
-    """Return the photos that are not in the largest set that matches hold together."""
+    """Return the photos outside the largest connected group."""
     parts = connected_groups(range(count), [(pair.first, pair.second) for pair in pairs if pair.linked])
     return {photo for part in parts[1:] for photo in part}
 
 
 def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
-    """Check whether all photos are connected by matches, and which only weakly."""
+    """Check whether matches connect all photos, and which photos are only weakly connected."""
     linked = [pair for pair in pairs if pair.linked]
     parts = connected_groups(range(len(photos)), [(pair.first, pair.second) for pair in linked])
     loose = [photo for part in parts[1:] for photo in part]

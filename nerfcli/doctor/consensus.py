@@ -1,4 +1,4 @@
-"""One number per photo from differences between pairs of photos, as heights from a levelling survey."""
+"""Estimate one number per photo from differences between pairs, as heights are found in a levelling survey."""
 
 from collections.abc import Sequence
 
@@ -14,18 +14,18 @@ _TYPICAL_ERROR = 0.1
 def potentials(
     count: int, pairs: Sequence[tuple[int, int]], differences: np.ndarray, *, trust: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers v of the photos with v_j - v_i near the differences (weighted least absolute deviations).
+    """Estimate a number v per photo such that v_j - v_i fits the differences (weighted least absolute deviations).
 
-    They are fixed up to a constant for each set of connected photos: its median is 0.
+    In each connected group of photos v is determined up to a constant, which makes its median 0.
 
     Args:
-        count: of the photos.
-        pairs: (i, j) of the differences.
-        differences: (len(pairs),) second minus first; NaN where a pair tells nothing.
-        trust: (len(pairs),) positive, how much a pair counts.
+        count: number of photos.
+        pairs: (i, j) of each difference.
+        differences: (len(pairs),) second minus first; NaN where unknown.
+        trust: (len(pairs),) positive weights.
 
     Returns:
-        v (count,), NaN for photos without any pair that tells; and for each the number of pairs that tell.
+        v (count,), NaN for photos without a known difference; and the number of known differences of each photo.
     """
     measured = ~np.isnan(differences)
     i, j = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)[measured].T
@@ -41,7 +41,7 @@ def potentials(
         np.add.at(laplacian, (j, i), -weights)
         right = np.bincount(j, weights * differences, minlength=count)
         right -= np.bincount(i, weights * differences, minlength=count)
-        # A trace of pull to 0 fixes the constant of each connected set.
+        # A slight pull to 0 fixes the constant of each connected group.
         values = np.linalg.solve(laplacian + 1e-6 * np.eye(count), right)
         residuals = np.abs(values[j] - values[i] - differences)
         weights = trust / trust.mean() / np.maximum(residuals, _TYPICAL_ERROR) if len(trust) else trust

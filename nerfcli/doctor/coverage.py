@@ -14,20 +14,20 @@ from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, w
 from nerfcli.media.geodesy import east_north_up
 from nerfcli.scene import Scene, model_folder
 
-# Cameras that look at one thing go around it from this span on; below, they look at it from the front.
+# Inward-looking cameras surround the scene if they span at least this angle; otherwise they face its front.
 _AROUND_DEG = 180.0
 _GAP_LOOK, _GAP_BAD = 45.0, 100.0
 _SPAN_LOOK, _SPAN_BAD = 20.0, 6.0
-# So many times the median distance of the cameras from their middle is far off.
+# A camera is an outlier beyond this many times the median distance from the median camera position.
 _FAR_OFF = 8.0
 _POINTS_LOOK = 100
-# GPS of phones is off by 5 m under open sky and by tens indoors; a scale in metres needs a wider capture.
+# GPS of phones is off by 5 m under open sky and by tens of metres indoors; a metric scale needs a wider capture.
 _GPS_NOISE = 5.0
 _GPS_WIDE = 100.0
 
 
 def spread(scene: Scene) -> Finding:
-    """Check the spread of the cameras relative to scene depth, and cameras far from the others."""
+    """Check the spread of the cameras relative to scene depth, and find cameras far from the rest."""
     centres = centres_of(scene.frames)
     depths = _depths(scene)
     middle = np.median(centres, axis=0)
@@ -57,7 +57,7 @@ def spread(scene: Scene) -> Finding:
 
 
 def directions(scene: Scene) -> Finding:
-    """Check from which sides the cameras see the scene."""
+    """Check from which directions the cameras see the scene."""
     up = up_direction(scene.frames)
     east, north = horizontal_axes(up)
     centres, views = centres_of(scene.frames), views_of(scene.frames)
@@ -94,7 +94,7 @@ def directions(scene: Scene) -> Finding:
 
 
 def points(scene: Scene) -> Finding | None:
-    """Check the number of 3D points per photo; None where the format does not provide it."""
+    """Check the number of 3D points per photo; None if the format does not provide it."""
     model = model_folder(scene.root)
     if scene.kind not in ("nerfcli", "colmap") or model is None:
         return None
@@ -113,7 +113,7 @@ def points(scene: Scene) -> Finding | None:
 
 
 def intrinsics(scene: Scene) -> Finding | None:
-    """Check whether the photos determined the intrinsics, by the report of `nerfcli poses`; None without a report."""
+    """Check how well the photos determined the intrinsics, from the report of `nerfcli poses`; None without one."""
     path = scene.root / "poses_report.json"
     if scene.kind != "nerfcli" or not path.is_file():
         return None
@@ -136,7 +136,7 @@ def intrinsics(scene: Scene) -> Finding | None:
 
 
 def belongings(scene: Scene) -> list[Finding]:
-    """Photos that the scene lists and that are not there, masks, and the unit of length."""
+    """Check for listed photos that are missing and for incomplete masks, and report the unit of length."""
     missing = scene.missing
     total = len(missing) + len(scene.frames)
     masked = [frame.name for frame in scene.frames if frame.mask is not None]
@@ -173,7 +173,7 @@ def belongings(scene: Scene) -> list[Finding]:
 
 
 def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
-    """Report the GPS positions of the photos; None without."""
+    """Report the extent of the GPS positions of the photos; None if there are none."""
     positions = [photo.exif.gps for photo in photos if photo.exif.gps is not None and photo.exif.gps[:2] != (0.0, 0.0)]
     if not positions:
         return None
@@ -197,10 +197,10 @@ def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
 
 
 def _depths(scene: Scene) -> np.ndarray:
-    """Return the median distance along the axis of what each camera sees, (frames,)."""
+    """Return the median depth along the optical axis that each camera sees, (frames,)."""
     frames = scene.frames
     if scene.depth_bounds is not None:
-        # Half of the inverse depths lie nearer.
+        # The middle of the range of inverse depths.
         return 2 / (1 / scene.depth_bounds).sum(axis=1)
     if len(scene.points):
         depths = np.full(len(frames), np.nan)

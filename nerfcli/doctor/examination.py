@@ -1,4 +1,4 @@
-"""The whole examination of a folder of photos or of a scene."""
+"""Run the complete examination of a folder of photos or a scene."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +17,7 @@ from nerfcli.poses.judge.checks import Checks
 # Measured on one core of a 2-core server; within a factor of two on other CPUs.
 _SECONDS_PER_PHOTO = 0.45
 _SECONDS_PER_PAIR = 0.03
-# Photos that hang on nothing get a second look if there are this many at most, or a tenth of the capture.
+# Disconnected photos are compared again with all features if they are at most this many, or a tenth of the capture.
 _FEW_APART = 3
 
 
@@ -27,11 +27,11 @@ class Diagnosis:
 
     Args:
         subject: what was examined.
-        findings: of all checks that could be made, in their order.
-        not_checked: names of the others, with the reason.
+        findings: results of the checks that were made, in order.
+        not_checked: (name, reason) of the checks that were not made.
         photos: the readable photos.
-        lack: (photos,) log2 of the detail that each lacks against the others, NaN without texture.
-        lighter: (photos,) stops by which each shows the same places lighter than the median photo, NaN where unknown.
+        lack: (photos,) log2 of the detail that each photo lacks relative to the others; NaN without texture.
+        lighter: (photos,) stops by which each shows the same points brighter than the median photo; NaN where unknown.
         pairs: the pairs that were compared.
     """
 
@@ -45,12 +45,12 @@ class Diagnosis:
 
     @property
     def verdict(self) -> str:
-        """The worst of the findings' verdicts."""
+        """The worst verdict of the findings."""
         return worst(finding.verdict for finding in self.findings)
 
 
 def estimated_seconds(count: int, threads: int) -> float:
-    """About how long the examination of so many photos takes."""
+    """Estimate how many seconds the examination of `count` photos takes."""
     return (count * _SECONDS_PER_PHOTO + connectivity.pair_count(count) * _SECONDS_PER_PAIR) / threads
 
 
@@ -61,12 +61,12 @@ def examine(
     progress: Callable[[float, str], None],
     calibration: Calibration | None = None,
 ) -> Diagnosis:
-    """Examine a capture: read every photo once, compare pairs, and run all checks; with intrinsics if given.
+    """Examine a capture: read every photo once, compare pairs, and run all checks, with the given intrinsics if any.
 
     Deterministic: the same photos give the same findings.
 
     Raises:
-        UserError: the intrinsics are not those of a photo.
+        UserError: the intrinsics do not fit a photo.
     """
     count = len(subject.sources)
     reading = count * _SECONDS_PER_PHOTO
@@ -99,7 +99,7 @@ def compare_all(
     threads: int,
     progress: Callable[[int], None],
 ) -> list[Pair]:
-    """Compare the photos of each pair (i, j), in this order; `progress` receives the number done."""
+    """Compare the photos of each pair (i, j), in order; `progress` receives the number of pairs done."""
 
     def work(place: tuple[int, int]) -> Pair:
         i, j = place
@@ -114,7 +114,7 @@ def compare_all(
 
 
 def _second_look(photos: Sequence[PhotoFacts], pairs: list[Pair], focals_px: Sequence[float]) -> list[Pair]:
-    """Return the pairs with those of a few photos that hang on nothing compared once more, by all of their features."""
+    """Return the pairs after comparing a few disconnected photos with the rest again, using all features."""
     apart = connectivity.apart(len(photos), pairs)
     if not 0 < len(apart) <= max(_FEW_APART, len(photos) // 10):
         return pairs
@@ -131,9 +131,9 @@ def _second_look(photos: Sequence[PhotoFacts], pairs: list[Pair], focals_px: Seq
 def judged(
     subject: ExaminedCapture, photos: list[PhotoFacts], pairs: list[Pair], *, unreadable: dict[str, str]
 ) -> Diagnosis:
-    """Run all checks on photos that were read and compared; `unreadable` gives the reasons for the others, by name.
+    """Run all checks on the photos and pairs; `unreadable` maps names of unreadable photos to the reasons.
 
-    A check that raises is listed among those that were not made, and the others go on.
+    A check that raises is listed as not made; the other checks still run.
     """
     checks = Checks()
     unknown = np.full(len(photos), np.nan)
@@ -197,7 +197,7 @@ def _or_not_checked(
 
 
 def _focals(subject: ExaminedCapture, photos: Sequence[PhotoFacts]) -> list[float]:
-    """Focal lengths at the features' size: of the scene's cameras, of EXIF, or a usual one."""
+    """Return focal lengths at the feature-detection size, from the scene's cameras, EXIF, or a typical value."""
     cameras = {} if subject.scene is None else {frame.name: frame.camera for frame in subject.scene.frames}
     focals = []
     for photo in photos:
@@ -210,7 +210,7 @@ def _focals(subject: ExaminedCapture, photos: Sequence[PhotoFacts]) -> list[floa
 
 
 def _known_focals(subject: ExaminedCapture, photos: Sequence[PhotoFacts], calibration: Calibration) -> list[float]:
-    """Focal lengths at the features' size, by the intrinsics of a file."""
+    """Return focal lengths at the feature-detection size, from an intrinsics file."""
     paths = {source.name: source.path for source in subject.sources}
     pictures = [
         Picture(paths[photo.name], photo.exif.width, photo.exif.height, photo.exif.orientation or 1) for photo in photos

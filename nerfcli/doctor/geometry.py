@@ -1,4 +1,4 @@
-"""Check from pairs, without poses, whether the camera moved enough for depth, and whether the scene has depth."""
+"""Check from pairs, without poses: does the camera move enough for depth, is the scene flat, does anything move?"""
 
 from collections.abc import Sequence
 
@@ -9,32 +9,32 @@ from nerfcli.doctor.moving import Patch
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, worst
 
-# Baseline over depth: 0.1 is an angle of 6 degrees between the rays that meet in a point.
+# Baseline over depth: 0.1 is an angle of 6 degrees between two rays to the same point.
 BASELINE_LOOK, BASELINE_BAD = 0.08, 0.03
-# Pairs that moved at least this far must show depth, or what they show is flat.
+# Pairs with at least this baseline over depth show depth, unless the scene is flat.
 _MOVED = 0.1
 _FLAT_LOOK = 0.8
 _LEAST_PAIRS = 3
-# A patch counts where so many pairs find it at the same place of a photo.
+# A patch counts if this many pairs find it at the same place in a photo.
 _PAIRS_FOR_PATCH = 3
 
 
 def baselines(count: int, pairs: Sequence[Pair]) -> np.ndarray:
-    """For each photo the largest baseline over depth to another one, the very largest left out where there are three.
+    """Return the largest baseline over depth of each photo to another, or the second largest of three or more.
 
-    (count,); NaN for photos of which no pair tells.
+    (count,); NaN for photos without a usable pair.
     """
     found: list[list[float]] = [[] for _ in range(count)]
     for pair in pairs:
         if pair.views is not None:
             for photo in (pair.first, pair.second):
                 found[photo].append(pair.views.baseline_over_depth)
-    # One wrong pair must not speak for a photo.
+    # One wrong pair must not decide for a photo.
     return np.array([sorted(values)[-min(2, 1 + len(values) // 3)] if values else np.nan for values in found])
 
 
 def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | None:
-    """Check whether the camera moved sideways between photos, or only turned; None without usable pairs."""
+    """Check whether the camera moved between photos, or only turned; None without usable pairs."""
     largest = baselines(len(photos), pairs)
     measured = ~np.isnan(largest)
     if not measured.any():
@@ -62,7 +62,7 @@ def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | N
 
 
 def flatness(pairs: Sequence[Pair]) -> Finding | None:
-    """Check whether the scene is flat; None where too few pairs moved far enough."""
+    """Check whether the scene is flat; None if too few pairs have a large enough baseline."""
     moved = [pair.views for pair in pairs if pair.views is not None and pair.views.baseline_over_depth > _MOVED]
     if len(moved) < _LEAST_PAIRS:
         return None
@@ -81,7 +81,7 @@ def flatness(pairs: Sequence[Pair]) -> Finding | None:
 
 
 def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
-    """Photos in which something moved by itself: in the same place for several of their pairs."""
+    """Find photos with independent motion, which several of their pairs see at the same place."""
     seen: dict[int, list[tuple[tuple[float, float, float, float], Patch]]] = {}
     for pair in pairs:
         for patch in pair.patches:

@@ -1,4 +1,4 @@
-"""Checks of the files: readability, number, size, cameras, duplicates."""
+"""Check the files: readability, number, size, cameras, orientation, duplicates."""
 
 import math
 from collections import Counter
@@ -17,17 +17,17 @@ SMALL_PX = 640
 _TINY_PX = 320
 # Focal lengths that differ by less belong to one lens: autofocus moves them a little.
 _SAME_FOCAL = 0.02
-# Two pictures that are this alike when tiny, and whose matches moved by less than this share of the diagonal, show the
-# same from the same place.
+# Two pictures show the same view if their thumbnails are at least this similar (cosine) and their matches moved by less
+# than this fraction of the diagonal.
 _ALIKE = 0.985
 _SAME_PLACE = 0.004
-# The same picture stored once more, in another format or quality.
+# Likewise for the same picture stored again in another format or quality.
 _SAME_PICTURE = 0.999
 _SAME_PIXELS = 0.0003
 
 
 def readable(unreadable: Mapping[str, str], count: int) -> Finding:
-    """Check whether the files can be read; `count` is the number of those that can."""
+    """Check whether all files can be read; `count` is the number of readable ones."""
     bad = len(unreadable)
     total = max(bad + count, 1)
     return Finding(
@@ -42,7 +42,7 @@ def readable(unreadable: Mapping[str, str], count: int) -> Finding:
 
 
 def enough(count: int) -> Finding:
-    """Check whether there are enough photos for a reconstruction that can be checked."""
+    """Check whether there are enough photos for a reconstruction with held-out photos."""
     verdict = verdict_below(count, look=ENOUGH_PHOTOS, bad=FEWEST_PHOTOS)
     advice = {
         GOOD: "",
@@ -104,7 +104,7 @@ def cameras(photos: Sequence[PhotoFacts]) -> Finding:
 
 
 def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
-    """Check whether EXIF's focal length is that of the files, or of photos before cropping."""
+    """Check whether the focal lengths in EXIF fit the files; they do not after cropping."""
     found = [(photo, focal_evidence(photo.exif)) for photo in photos]
     doubtful = [(photo.name, evidence.doubt) for photo, evidence in found if evidence.doubt]
     shares = [
@@ -152,7 +152,7 @@ def orientation(photos: Sequence[PhotoFacts]) -> Finding:
 
 
 def duplicates(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
-    """Photos that are there twice, or were taken twice from one place."""
+    """Find photos that are stored twice, or were taken twice from the same place."""
     said: dict[str, str] = {}
     exact = 0
     first_of: dict[str, str] = {}
@@ -186,7 +186,7 @@ def duplicates(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
 
 
 def _camera_groups(photos: Sequence[PhotoFacts]) -> dict[str, list[str]]:
-    """Names by camera, lens, focal length and shape, held upright or not."""
+    """Group names by camera, lens, focal length and image size, regardless of orientation."""
     groups: dict[str, list[str]] = {}
     focals: list[float] = []
     for photo in photos:
@@ -199,7 +199,7 @@ def _camera_groups(photos: Sequence[PhotoFacts]) -> dict[str, list[str]]:
             focal = next((other for other in focals if abs(math.log(focal / other)) < _SAME_FOCAL), focal)
             focals.append(focal)
             parts.append(f"{focal:.3g} mm")
-        if exif.focal_mm and exif.focal_35mm:  # also tells digital zoom
+        if exif.focal_mm and exif.focal_35mm:  # also shows digital zoom
             parts.append(f"({exif.focal_35mm:.3g} mm on film)")
         parts.append(f"{longer} x {shorter}")
         groups.setdefault(", ".join(dict.fromkeys(part for part in parts if part)), []).append(photo.name)

@@ -1,8 +1,8 @@
-"""Detect moving objects between two photos: a patch whose matches are consistent, but with no camera motion.
+"""Detect moving objects between two photos: patches whose matches move together, but not with the camera.
 
-Sought with care, since a false alarm costs more trust than a miss: a patch counts only if its matches move together,
-if hardly any match in it follows the camera, and if no single geometry of two views explains it together with the rest.
-What moves along the epipolar lines cannot be distinguished from something nearer, and is missed.
+The criteria are strict, since a false alarm costs more trust than a miss: the matches of a patch must move together,
+hardly any match in it may follow the camera, and no single two-view geometry may explain the patch and the rest.
+Motion along the epipolar lines cannot be distinguished from a nearer object, and is missed.
 """
 
 from dataclasses import dataclass
@@ -13,31 +13,31 @@ from scipy.sparse.csgraph import connected_components
 
 from nerfcli.multiview.epipolar import epipolar_px, fundamental_matrix
 
-# A match that is this many times the tolerance from its epipolar line does not follow the camera.
+# A match farther than this many tolerances from its epipolar line does not follow the camera.
 _FAR = 3.0
-# Matches of a patch are neighbours within this distance, and their motion differs by less than a share of it.
+# Matches are neighbours within this distance; their motions may differ by `_MOTION_PX` plus a fraction of it.
 _REACH_PX = 60.0
 _MOTION_PER_DISTANCE = 0.25
 _MOTION_PX = 3.0
 _LEAST_IN_PATCH = 10
-# Share of the matches in a patch that must not follow the camera.
+# Fraction of the matches in a patch that must not follow the camera.
 _DOMINANT = 0.7
-# Largest share of the picture's matches that one patch may hold: beyond, one cannot say which of the two moved.
+# Largest fraction of the picture's matches in one patch; beyond, it is unclear whether the patch or the rest moved.
 _LARGEST_SHARE = 0.35
-# A geometry that explains this share of the patch and of the rest makes it no patch.
+# A candidate is rejected if one geometry explains more than this fraction of both the patch and the rest.
 _EXPLAINED = 0.8
 _STILL_PX = 1.5
 
 
 @dataclass(frozen=True)
 class Patch:
-    """A part of the first photo that moved by itself.
+    """A part of the first photo that moved independently.
 
     Args:
-        box: left, top, right, bottom in the first photo, pixels at `photos.LONGER_SIDE_PX`.
+        box: left, top, right, bottom in the first photo, pixels at `photo_facts.LONGER_SIDE_PX`.
         other_box: the same in the second photo.
-        matches: in it.
-        still: whether it stays at its place in the picture, as a watermark or the background of a turntable does.
+        matches: number of matches in the patch.
+        still: True if it is fixed in the image, like a watermark or the background of a turntable.
     """
 
     box: tuple[float, float, float, float]
@@ -47,7 +47,7 @@ class Patch:
 
 
 def moving_patches(x: np.ndarray, y: np.ndarray, agree: np.ndarray, *, within_px: float) -> tuple[Patch, ...]:
-    """Return the patches of matches (N, 2) that moved by themselves, where `agree` (N,) follow the camera."""
+    """Return patches of matches (N, 2) that moved independently; `agree` (N,) marks inliers of the camera motion."""
     fundamental, _ = cv2.findFundamentalMat(x[agree], y[agree], cv2.FM_8POINT)
     if fundamental is None or fundamental.shape != (3, 3):
         return ()
@@ -62,7 +62,7 @@ def moving_patches(x: np.ndarray, y: np.ndarray, agree: np.ndarray, *, within_px
 
 
 def _moving_together(x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
-    """Groups of matches, connected by neighbours that move alike; the small ones are left out."""
+    """Group matches that are connected by neighbours with similar motion; small groups are left out."""
     count = len(x)
     if count < _LEAST_IN_PATCH:
         return []
@@ -72,7 +72,7 @@ def _moving_together(x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
     alike = (apart < _REACH_PX) & (differs < _MOTION_PX + _MOTION_PER_DISTANCE * apart)
     label = connected_components(alike, directed=False)[1]
     groups = [np.flatnonzero(label == which) for which in np.unique(label)]
-    # A feature may have been found several times in one place, with several orientations.
+    # A feature may be detected several times at one place, with several orientations.
     return [group for group in groups if len(np.unique(np.rint(x[group]), axis=0)) >= _LEAST_IN_PATCH]
 
 
@@ -81,7 +81,7 @@ def _is_patch(x: np.ndarray, y: np.ndarray, agree: np.ndarray, *, members: np.nd
     inside = (x[:, 0] >= left) & (x[:, 0] <= right) & (x[:, 1] >= top) & (x[:, 1] <= bottom)
     if len(members) < _DOMINANT * (len(members) + (inside & agree).sum()):
         return False
-    # As many of the rest as of the patch, so that neither outvotes the other.
+    # Limit the rest to three times the patch or 40 matches, so that it does not outvote the patch.
     rest = np.flatnonzero(agree)
     chosen = rest[np.linspace(0, len(rest) - 1, min(len(rest), max(3 * len(members), 40))).astype(int)]
     both = np.concatenate([members, chosen])

@@ -1,4 +1,4 @@
-"""The diagnosis as one HTML page that needs nothing else: findings, thumbnails, charts, and which photos match."""
+"""The diagnosis as one self-contained HTML page: findings, thumbnails, charts, and the match matrix."""
 
 import re
 from html import escape
@@ -16,9 +16,9 @@ from nerfcli.findings import BAD, GOOD, LOOK, VERDICTS, Finding, several, worst
 from nerfcli.pages import page
 from nerfcli.pages.embedded_pictures import data_uri, jpeg_bytes, picture_rule
 
-# Thumbnails of large captures are smaller, so that a page of a thousand photos has about 5 MB.
+# Thumbnails are smaller in captures of more photos than this, so that a page of a thousand photos has about 5 MB.
 _SMALL_THUMBNAILS_FROM, _SMALL_THUMBNAIL_PX = 200, 120
-# Photos shown beside a finding; the others are named only.
+# Photos shown with a finding; further ones are only named.
 _SHOWN_PER_FINDING = 12
 _WORDS = {GOOD: "good", LOOK: "worth a look", BAD: "fix this first"}
 
@@ -33,10 +33,10 @@ def write_page(diagnosis: Diagnosis, path: Path) -> None:
 
 
 def refuse_foreign(path: Path, capture: Path) -> None:
-    """Raise unless a page of this capture may be written at a path: it is free, or holds an earlier such page.
+    """Raise unless the path is free or holds an earlier page of this capture.
 
     Raises:
-        UserError: something else stands there.
+        UserError: there is something else at the path.
     """
     page.refuse_foreign(path, _mark(capture), about="capture")
 
@@ -81,7 +81,7 @@ def _title(capture: Path) -> str:
 
 
 def _thumbnail_rule(index: int, photo: PhotoFacts, count: int) -> str:
-    """Return a CSS rule with the picture in it, so that a photo that is shown twice is stored once."""
+    """Return a CSS rule that contains the picture, so that a photo shown twice is stored once."""
     data = photo.thumbnail
     if count > _SMALL_THUMBNAILS_FROM:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)

@@ -1,4 +1,4 @@
-"""Measurements of a single photo. It is read once, and little of it is kept: a thousand fit into memory."""
+"""Measurements of a single photo, which is read once. They are small: those of a thousand photos fit into memory."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -14,30 +14,30 @@ from nerfcli.errors import UserError
 from nerfcli.media.images import Exif, downscale, read_exif, read_image
 from nerfcli.multiview.features import find_features
 
-# The longer side of the pictures in which features are sought; every threshold in pixels is meant at this size.
+# Longer side of the pictures in which features are detected; all thresholds in pixels refer to this size.
 LONGER_SIDE_PX = 800
 MOST_FEATURES = 2000
-# Of a capture of many photos fewer are kept, so that all fit into memory.
+# With more photos than this, fewer features of each are kept, so that all fit into memory.
 MANY_PHOTOS = 200
 _FEATURES_OF_MANY = 1000
 
 _THUMBNAIL_PX = 240
 _THUMBNAIL_QUALITY = 72
-# The side of the tiny grey picture by which duplicates are found.
+# Side of the tiny grey picture for finding duplicates.
 _TINY_PX = 32
 
 
 @dataclass(frozen=True)
 class PhotoFeatures:
-    """Points of a photo that can be found again in another one, at `LONGER_SIDE_PX`, the clearest first.
+    """Features of a photo at `LONGER_SIDE_PX`, strongest first.
 
     Args:
-        size: (width, height) of the picture in which they were sought.
+        size: (width, height) of the picture in which they were detected.
         pixels: (N, 2) float32, pixel centres at 0.5.
-        scales: (N,) float32, how large what was found is, in pixels.
+        scales: (N,) float32, sizes of the features in pixels.
         descriptors: (N, 128) uint8.
         detail: (N,) float32, see `sharpness.measure`; NaN without texture.
-        light: (N, 2) float32, see `brightness.local_light`; NaN where not known.
+        light: (N, 2) float32, see `brightness.local_light`; NaN where unknown.
     """
 
     size: tuple[int, int]
@@ -53,11 +53,11 @@ class PhotoFacts:
     """Measurements of one photo.
 
     Args:
-        name: as the capture lists it.
+        name: its name in the capture.
         exif: with the upright size.
         digest: SHA-256 of the file.
         thumbnail: a small JPEG.
-        tiny: (32, 32) float32, grey, of mean 0 and norm 1; all 0 for an even picture.
+        tiny: (32, 32) float32 grey picture with mean 0 and norm 1; all 0 for a uniform one.
     """
 
     name: str
@@ -82,11 +82,11 @@ class Source:
 def read_all(
     sources: Sequence[Source], *, threads: int, progress: Callable[[int], None]
 ) -> tuple[list[PhotoFacts], dict[str, str]]:
-    """Measure all photos, in their order, and return the reasons for unreadable ones by name.
+    """Measure all photos, in order; also return the reasons for unreadable ones, by name.
 
     Args:
-        threads: photos that are held at full size at a time.
-        progress: called with how many have been read.
+        threads: photos read at a time, each at full size in memory.
+        progress: called with the number of photos read.
     """
     facts: list[PhotoFacts] = []
     unreadable: dict[str, str] = {}
@@ -102,7 +102,7 @@ def read_all(
 
 
 def read_photo(source: Source, most_features: int) -> PhotoFacts:
-    """Measure one photo, with at most so many features.
+    """Measure one photo, with at most `most_features` features.
 
     Raises:
         UserError: the photo or its mask cannot be read.
@@ -145,7 +145,7 @@ def _shrunk(image: np.ndarray, longer_side_px: int) -> np.ndarray:
 
 
 def _opaque(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the picture (H, W, 3) on white, and where it is opaque (H, W)."""
+    """Return the picture (H, W, 3) on white, and a mask (H, W) of its opaque pixels."""
     if image.shape[2] == 3:
         return image, np.ones(image.shape[:2], dtype=bool)
     alpha = image[..., 3:].astype(np.float32) / 255

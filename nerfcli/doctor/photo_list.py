@@ -15,9 +15,9 @@ class ExaminedCapture:
     """A capture to examine.
 
     Args:
-        path: as the user gave it.
+        path: as given by the user.
         sources: its photos.
-        scene: their poses, where there are any.
+        scene: the scene with their poses; None for a folder of photos.
     """
 
     path: Path
@@ -26,17 +26,17 @@ class ExaminedCapture:
 
     @property
     def kind(self) -> str:
-        """photos or scene."""
+        """Kind of capture, "photos" or "scene"."""
         return "photos" if self.scene is None else "scene"
 
 
 def find_subject(path: Path) -> ExaminedCapture:
-    """Find the photos of a folder, or those of a scene.
+    """Find the photos in a folder, or those of a scene.
 
-    A folder that holds photos and the poses of a scene is a scene.
+    A folder with photos and the files of a scene counts as a scene.
 
     Raises:
-        UserError: nothing there, no photos, or a scene whose files are malformed.
+        UserError: the path does not exist, has no photos, or is a scene with malformed files.
     """
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a folder of photos, or a scene folder")

@@ -9,30 +9,30 @@ from nerfcli.doctor.consensus import potentials
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_above, verdict_below, worst
 
-# log2 of detail that a photo lacks against the others: 0.3 is what a Gaussian blur of about 0.8 px takes from a sharp
-# photo of 1600 px, 0.7 one of 1.5 px.
+# log2 of the detail that a photo lacks relative to the others: a Gaussian blur of about 0.8 px takes 0.3 from a sharp
+# photo of 1600 px, one of 1.5 px takes 0.7.
 BLURRED, VERY_BLURRED = 0.3, 0.7
-# By itself, without neighbours that show the same, a photo must lack more, since what it shows plays a part.
+# A photo without enough neighbours that show the same must lack more, since its content also plays a part.
 _ALONE = 0.1
 _NEIGHBOURS_TELL = 3
-# Smeared in one direction: this many times the capture's median ratio of directions; it counts from a smaller lack on.
+# A photo is smeared if its direction ratio exceeds this multiple of the capture's median and it lacks this much detail.
 _SMEARED, _SMEARED_LACK = 1.25, 0.2
-# The whole capture: a Gaussian blur of about 2 px and of 4 px at 1600 px.
+# For the whole capture: detail after a Gaussian blur of about 2 px and of 4 px at 1600 px.
 SOFT, VERY_SOFT = -1.15, -1.75
 
-# Stops between photos.
+# Range of brightness over the photos, in stops.
 STOPS_LOOK, STOPS_BAD = 1.0, 2.5
-# Stops between red and blue.
+# Range of red over blue, in stops.
 _BALANCE_LOOK, _BALANCE_BAD = 0.5, 1.5
 CLIPPED_LOOK, CLIPPED_BAD = 0.1, 0.5
 _DARK, _VERY_DARK = 0.15, 0.05
 
 
 def lacking_detail(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> np.ndarray:
-    """log2 of the detail that each photo lacks against the rest of the capture, (photos,); NaN without texture.
+    """Return log2 of the detail that each photo lacks relative to the capture, (photos,); NaN without texture.
 
-    What a photo shows by itself, and what it shows of the same places as its neighbours, count alike where there are
-    enough neighbours.
+    With enough neighbours it is the mean of two estimates: from the photo's own detail, and from the detail at
+    points that it shares with its neighbours.
     """
     own = np.array([photo.sharpness.detail for photo in photos])
     reference = np.nanmedian(own) if not np.isnan(own).all() else 0.0
@@ -46,7 +46,7 @@ def lacking_detail(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> np.nd
 
 
 def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
-    """Check for photos that are blurred relative to the others, and whether all of them are."""
+    """Check for photos that are blurred relative to the others, and for softness of the whole capture."""
     own = np.array([photo.sharpness.detail for photo in photos])
     ratios = np.array([photo.sharpness.direction_ratio for photo in photos])
     usual = float(np.median(ratios))
@@ -109,14 +109,14 @@ def texture(photos: Sequence[PhotoFacts]) -> Finding:
 
 
 def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
-    """Compute how many stops brighter than the median each photo shows the same points, and how much redder.
+    """Compute by how many stops each photo is brighter, and redder, than the median photo at the same points.
 
     Returns:
-        stops (photos,) and stops of red over blue (photos,); NaN for photos without matches that tell.
+        stops (photos,) and stops of red over blue (photos,); NaN for photos without usable matches.
     """
     linked = [pair for pair in pairs if pair.linked]
     places = [(pair.first, pair.second) for pair in linked]
-    # A pair in which everything became lighter alike tells of the camera; shine and shade tell of the scene.
+    # A uniform change in brightness comes from the camera; highlights and shadows come from the scene.
     trust = np.array([pair.inliers / (0.05 + np.nan_to_num(pair.stops_spread)) for pair in linked])
     lighter, _ = potentials(len(photos), places, np.array([pair.stops for pair in linked]), trust=trust)
     redder, _ = potentials(len(photos), places, np.array([pair.redder for pair in linked]), trust=trust)
@@ -124,7 +124,7 @@ def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarr
 
 
 def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
-    """Check whether the same points are about equally bright in all photos; reports EXIF's exposures."""
+    """Check whether the same points are about equally bright in all photos; reports the exposures in EXIF."""
     measured = ~np.isnan(lighter)
     spread = float(np.ptp(lighter[measured])) if measured.any() else float("nan")
     settings = [
@@ -181,7 +181,7 @@ def white_balance(photos: Sequence[PhotoFacts], redder: np.ndarray) -> Finding:
 
 
 def clipping(photos: Sequence[PhotoFacts]) -> Finding:
-    """Photos with much pure white or pure black, or that are dark as a whole."""
+    """Find photos with large pure white or black areas, or that are dark as a whole."""
     said: list[tuple[float, str, str]] = []
     verdicts = [GOOD]
     for photo in photos:

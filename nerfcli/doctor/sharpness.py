@@ -1,9 +1,9 @@
 """Sharpness of a photo, nearly independent of its content.
 
-Natural pictures have about as much energy in every octave of detail, whatever they show; blur takes it from the finest
-octaves and leaves the coarse ones. So `detail` compares two neighbouring octaves: near 0 in a sharp photo of anything
-with texture, and one lower for every halving of the fine octave's amplitude against the coarse one's. Photos are judged
-at `LONGER_SIDE_PX`: blur that vanishes there is not seen.
+Natural pictures have about the same energy in every octave of detail; blur removes it from the finest octaves and
+leaves the coarse ones. So `detail` compares two neighbouring octaves: it is near 0 in a sharp photo with texture, and
+decreases by one for every halving of the fine octave's amplitude relative to the coarse one's. Photos are measured at
+`LONGER_SIDE_PX`: blur that vanishes at this size is not detected.
 """
 
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ import numpy as np
 
 LONGER_SIDE_PX = 1600
 
-# Standard deviations in pixels of the smoothings whose differences are the two octaves.
+# Standard deviations in pixels of the Gaussian blurs whose differences are the two octaves.
 _SMOOTHINGS = (0.8, 1.6, 3.2)
-# Tiles per side; the sharpest quarter of those with texture tells, since a photo may be out of focus in the background.
+# Tiles per side; the sharpest quarter of those with texture decides, since the background may be out of focus.
 _TILES = 12
 _SHARPEST_QUARTILE = 75
-# Root mean square of the coarse octave, in levels of 255, from which on a tile has texture to judge by.
+# A pixel has enough texture if the root mean square of the coarse octave around it exceeds this, in levels of 255.
 _TEXTURE_LEVELS = 1.2
 _LEAST_TEXTURED_TILES = 6
-# Noise of the sensor and of JPEG, in levels: it is fine detail that is none.
+# Noise of the sensor and of JPEG, in levels, which must not count as fine detail.
 _NOISE_LEVELS = 0.35
 _WINDOW_PX = 12.0
 
@@ -31,10 +31,10 @@ class Sharpness:
     """Sharpness measures of a photo.
 
     Args:
-        detail: log2 of fine against coarse amplitude in the sharpest quarter of the tiles; NaN without texture.
-        direction_ratio: of `detail`'s amplitudes along and across the direction in which they differ most, >= 1: it is
-            large where the photo is smeared in one direction.
-        textured: share of the tiles with enough texture to judge by.
+        detail: log2 of fine over coarse amplitude, the 75th percentile over the tiles; NaN without texture.
+        direction_ratio: ratio of fine over coarse amplitude between the directions where it is largest and smallest,
+            >= 1; large if the photo is smeared in one direction.
+        textured: fraction of the tiles with enough texture.
     """
 
     detail: float
@@ -43,16 +43,16 @@ class Sharpness:
 
 
 def octaves(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fine and the coarse octave of a grey picture (H, W) in levels of 255, float32."""
+    """Return the fine and coarse octaves of a grey picture (H, W) in levels of 255, float32."""
     fine, middle, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in _SMOOTHINGS)
     return fine - middle, middle - coarse
 
 
 def measure(grey: np.ndarray) -> tuple[Sharpness, np.ndarray]:
-    """Return the sharpness of a photo, and the same around each of its pixels.
+    """Measure the sharpness of a photo, and the detail around each of its pixels.
 
     Args:
-        grey: (H, W) float32 in levels of 255, of `LONGER_SIDE_PX` at most.
+        grey: (H, W) float32 in levels of 255, at most `LONGER_SIDE_PX` long.
 
     Returns:
         The photo's sharpness, and `detail` around each pixel, (H, W) float32, NaN where there is no texture.
@@ -76,11 +76,10 @@ def measure(grey: np.ndarray) -> tuple[Sharpness, np.ndarray]:
 
 
 def _direction_ratio(fine: np.ndarray, coarse: np.ndarray, textured: np.ndarray) -> float:
-    """Return how much more the fine octave has kept
-    of the coarse one's gradients in its best direction than in its worst.
+    """Return the ratio of fine over coarse gradient amplitude between its best and its worst direction.
 
-    The square root of the ratio of the generalised eigenvalues of the two octaves' summed structure tensors: what the
-    photo shows has its directions in both octaves alike, smear only in the fine one.
+    The square root of the ratio of the generalised eigenvalues of the two octaves' mean structure tensors: directions
+    in the photo's content appear in both octaves, smear only in the fine one.
     """
     tensors = []
     for band in (fine, coarse):

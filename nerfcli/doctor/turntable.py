@@ -1,4 +1,4 @@
-"""Check from pairs whether an object moves in front of a static background."""
+"""Check from pairs whether an object turns in front of a static background."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,9 +9,9 @@ from nerfcli.multiview.stationary import LEAST_SHARE, together
 
 
 def turning_object(pairs: Sequence[Pair]) -> Finding | None:
-    """Return what to say of a capture in which an object turns before a still background; None for all others.
+    """Return a finding if an object turns in front of a static background, else None.
 
-    Then nothing else that pairs say of movement holds, since the camera stood still.
+    In such a capture the camera stood still, so the other checks of movement between pairs do not apply.
     """
     said = together([(pair.first, pair.second, pair.motions) for pair in pairs if pair.motions is not None])
     others = sum(pair.linked and pair.motions is None for pair in pairs)

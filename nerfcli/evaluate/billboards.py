@@ -1,9 +1,9 @@
-"""A model without shape: each training photo hangs around its camera at one distance. What a field must beat.
+"""Baseline without geometry that a field must beat: each training photo on a sphere around its camera.
 
-Any shape explains any photos, if colour may depend on the direction as it likes (shape-radiance ambiguity: Zhang et al.
-2020, NeRF++, arXiv:2010.07492, section 3). Here the shape says nothing, the photos are the radiance, and one distance
-per camera is fitted. Photos that carry three-dimensional information lift a field above this on views that neither has
-seen; a camera that only turned, or two photos, do not.
+Any geometry explains any photos if colour may depend arbitrarily on direction (shape-radiance ambiguity: Zhang et al.
+2020, NeRF++, arXiv:2010.07492, section 3). Here the geometry carries no information, the photos are the radiance, and
+the distance, one per camera, is fitted. If the photos carry three-dimensional information, a field beats this baseline
+on views that neither has seen; photos from a camera that only rotated, or only two photos, do not.
 """
 
 import math
@@ -23,19 +23,19 @@ from nerfcli.evaluate.metrics import to_8_bit
 from nerfcli.media.images import downscale
 from nerfcli.photos.psnr import psnr_of
 
-# Sides of the photos on the billboards, at most; a model without shape is off by more than these pixels.
+# Largest side of the photos on the billboards; a model without geometry is off by more than one of these pixels.
 LONGER_SIDE_PX = 400
-# How each billboard is fitted: this many pixels of each of the nearest other photos, at distances from 1/50 to 100
-# times that of what the cameras look at.
+# Each billboard is fitted to this many pixels of each of this many nearest other photos, at distances from 1/50 to 100
+# times that of the cameras' focus point.
 FITTED_PIXELS, FITTED_PHOTOS = 400, 4
 DISTANCES = np.geomspace(0.02, 100.0, 64)
-# Distances are compared if so many rays hit the billboard there, as a share of those at the best distance for that.
+# A distance is considered only if it has at least this fraction of the largest number of rays that hit at any distance.
 ENOUGH_HITS = 0.5
 COMPARED_PIXELS = 4096
-# A ray's colour is a mean over the billboards of so many near cameras, weighted with 1 / (angle^2 + LEAST_ANGLE^2),
-# the angle at what is hit between the ray and the line of sight of the camera.
+# A ray's colour is a mean over the billboards of this many near cameras, weighted with 1 / (angle^2 + LEAST_ANGLE^2),
+# where angle is that between the ray and the camera's line of sight at the point that is hit.
 BLENDED, LEAST_ANGLE_RAD = 6, math.radians(0.5)
-# A gain is one if it is above this, and above this many standard errors over the held-out photos.
+# A gain is significant if it is above this, and above this many standard errors over the held-out photos.
 LEAST_GAIN_DB, STANDARD_ERRORS = 1.0, 2.0
 SEED = 7
 
@@ -45,12 +45,12 @@ class Shape:
     """Evidence for geometry, over all held-out photos.
 
     Args:
-        psnr: of the billboards, mean over the photos, dB.
-        field_psnr: of the field, on the same pixels.
-        gain_db: the difference.
+        psnr: PSNR of the billboards, mean over the photos, dB.
+        field_psnr: PSNR of the field on the same pixels.
+        gain_db: field_psnr minus psnr.
         error_db: its standard error; None with one photo.
-        shown: whether the gain is above the noise.
-        seconds: that it took.
+        shown: whether the gain is significant.
+        seconds: the time that fitting and comparing took.
     """
 
     psnr: float
@@ -80,10 +80,10 @@ class Shape:
 
 
 class Billboards:
-    """The model: photos, and a distance for each. Fitting takes about 0.02 s a photo.
+    """The baseline: photos, and a distance for each. Fitting takes about 0.02 s per photo.
 
     Args:
-        frames: the training views, one at least; their cameras are those of the photos.
+        frames: the training views, at least one; their cameras are those of the photos.
         photos: (H, W, 3) uint8, one per frame.
     """
 
@@ -91,7 +91,7 @@ class Billboards:
         began = time.perf_counter()
         self._frames, self._photos = frames, photos
         self._centres, self._axes = centres_of(frames), views_of(frames)
-        # Where all cameras stand in one place no length is known, and none is needed.
+        # If all cameras are in one place, no length is known, and none is needed.
         self._scale = float(np.median(np.linalg.norm(self._centres - focus_point(frames), axis=1))) or 1.0
         self._mean = np.mean([photo.mean(axis=(0, 1)) for photo in photos], axis=0) / 255.0
         generator = np.random.default_rng(SEED)
@@ -100,7 +100,7 @@ class Billboards:
         self.seconds = time.perf_counter() - began
 
     def colours(self, frame: Frame, pixels: np.ndarray) -> np.ndarray:
-        """(N, 3) sRGB in [0, 1] of a view's pixels (N, 2); the mean of all photos where no billboard is hit."""
+        """Return sRGB (N, 3) in [0, 1] of a view's pixels (N, 2); the mean of all photos where no billboard is hit."""
         bearings, _ = frame.camera.bearings(pixels)
         directions = bearings @ frame.world_from_cam[:3, :3].T
         total, weights = np.zeros((len(pixels), 3)), np.zeros((len(pixels), 1))
@@ -111,14 +111,14 @@ class Billboards:
         return np.where(weights > 0, total / np.maximum(weights, 1e-300), self._mean)
 
     def _nearest(self, frame: Frame) -> list[int]:
-        """Return the training views that look at the same, the most similar ones first, without `frame` itself."""
+        """Return the indices of the training views, the most similar to `frame` first, without `frame` itself."""
         away = np.linalg.norm(self._centres - frame.centre, axis=1) / self._scale
         turned = np.arccos(np.clip(self._axes @ frame.world_from_cam[:3, 2], -1.0, 1.0))
         order = np.argsort(away + turned, kind="stable").tolist()
         return [index for index in order if self._frames[index].name != frame.name]
 
     def _fit(self, index: int) -> float:
-        """Fit the distance at which a photo looks most like its neighbours, where enough of their rays hit it."""
+        """Fit the distance at which a photo is most similar to its neighbours and enough of their rays hit it."""
         others = self._nearest(self._frames[index])[:FITTED_PHOTOS]
         distances = self._scale * DISTANCES
         errors, hits = np.zeros(len(distances)), np.zeros(len(distances))
@@ -136,8 +136,8 @@ class Billboards:
     def _seen(
         self, index: int, origin: np.ndarray, directions: np.ndarray, distance: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what rays see of a photo that hangs around its camera: colours (N, 3), which rays hit it, and the
-        angles between them and the camera's lines of sight, in radians."""
+        """Return what rays see of a photo's billboard: colours (N, 3), which rays hit it, and the angles between the
+        rays and the camera's lines of sight, in radians."""
         frame = self._frames[index]
         # |from_camera + t * direction| = distance, from inside and on the far side.
         from_camera = origin - frame.centre
@@ -153,23 +153,23 @@ class Billboards:
 
 
 def _sample(frame: Frame, photo: np.ndarray, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """World directions and colours of some pixels of a photo."""
+    """Return world directions (N, 3) and colours (N, 3) of random pixels of a photo."""
     pixels = random_pixels(frame, np.ones(photo.shape[:2], dtype=bool), FITTED_PIXELS, generator)
     bearings, valid = frame.camera.bearings(pixels)
     return bearings[valid] @ frame.world_from_cam[:3, :3].T, _colours_at(photo, pixels[valid])
 
 
 def random_pixels(frame: Frame, used: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
-    """(N, 2) centres of some of the pixels that count, N = `count` or all that there are."""
+    """Return the centres (N, 2) of N random pixels that count, N = `count` or all if there are fewer."""
     numbers = np.flatnonzero(used)
     chosen = generator.choice(numbers, min(count, len(numbers)), replace=False)
     return np.stack([chosen % frame.camera.width, chosen // frame.camera.width], axis=-1) + 0.5
 
 
 def _colours_at(photo: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """(N, 3) in [0, 1] between the centres of pixels; the border goes on outside."""
+    """Return colours (N, 3) in [0, 1], interpolated between pixel centres; the border is extended outwards."""
     places = pixels.astype(np.float32) - 0.5
-    # OpenCV takes lists of places as pictures of at most 32767 rows.
+    # OpenCV treats lists of positions as pictures with at most 32767 rows.
     parts = [
         cv2.remap(photo, part[:, :1], part[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         for part in np.array_split(places, max(1, -(-len(places) // 2**14)))
@@ -185,7 +185,7 @@ def reduction(frame: Frame) -> float:
 class ShapeEvidence:
     """Compares a field with billboards, photo by photo.
 
-    A comparison that cannot be computed ends none of the evaluation: `failure` then says why, and there is no shape.
+    A comparison that fails does not stop the evaluation: `failure` then gives the reason, and there is no shape.
 
     Args:
         billboards: fitted to the training photos.
@@ -199,7 +199,7 @@ class ShapeEvidence:
         self.failure: str | None = None
 
     def add(self, frame: Frame, rendered: np.ndarray, photo: np.ndarray, used: np.ndarray) -> None:
-        """Compare on some pixels of one held-out photo, made as small as the billboards are.
+        """Compare random pixels of one held-out photo, reduced to the size of the billboards.
 
         Args:
             frame: the view.
@@ -210,7 +210,7 @@ class ShapeEvidence:
         if self.failure is None:
             try:
                 self._compare(frame, rendered, photo, used)
-            except Exception as error:  # it is auxiliary: the photo's own numbers are there
+            except Exception as error:  # it is auxiliary: the photo's metrics are already measured
                 self.failure = reason_of(error)
 
     def _compare(self, frame: Frame, rendered: np.ndarray, photo: np.ndarray, used: np.ndarray) -> None:
@@ -231,7 +231,7 @@ class ShapeEvidence:
         self._seconds += time.perf_counter() - began
 
     def shape(self) -> Shape | None:
-        """Return the evidence for geometry; None where no photo could be compared."""
+        """Return the evidence for geometry; None if no photo could be compared or a comparison failed."""
         if not self._pairs or self.failure is not None:
             return None
         pairs = np.array(self._pairs)

@@ -2,25 +2,25 @@
 
 import numpy as np
 
-# Values within half a grey level of 0 and 1 are saturated: they say nothing of the colour that was there.
+# Values within half a grey level of 0 and 1 are saturated: they do not determine the true colour.
 EDGE = 0.5 / 255
-# Which pixels are saturated changes with the correction: so it is found this many times.
+# The correction changes which pixels are saturated, so it is fitted this many times.
 ROUNDS = 5
 
 
 def colour_aligned(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np.ndarray:
-    """Return the picture with its colours warped onto the photo's, by least squares over the pixels that count.
+    """Return the picture with its colours fitted to the photo's, by least squares over the pixels that count.
 
-    Each channel becomes a quadratic polynomial of the three: products of two, the channels, and a constant, ten
-    coefficients. Pixels that are saturated in the channel at hand, in the picture, in its last correction, or in the
-    photo, do not enter. Applied five times over, then clipped to [0, 1].
+    Each channel becomes a quadratic polynomial of all three: products of two, the channels, and a constant, ten
+    coefficients. A pixel is excluded for a channel if it is saturated there in the picture, in its latest correction,
+    or in the photo. The fit is applied five times, each time clipped to [0, 1].
 
     Args:
         picture, photo: (H, W, 3) float in [0, 1].
         used: (H, W) bool.
 
     Returns:
-        (H, W, 3) float64 in [0, 1]. A channel with fewer than ten pixels to fit stays as it is.
+        (H, W, 3) float64 in [0, 1]. A channel with fewer than ten pixels to fit is unchanged.
 
     Source: color_correct in multinerf, internal/image.py (Barron et al. 2022, Mip-NeRF 360; the "cc" metrics of
     Zip-NeRF), here without masked pixels.
@@ -43,7 +43,7 @@ def colour_aligned(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) 
 
 
 def _quadratic(colours: np.ndarray) -> np.ndarray:
-    """(N, 10): products of two channels, the channels, 1."""
+    """Return the terms (N, 10): products of two channels, the channels, 1."""
     products = [colours[:, i : i + 1] * colours[:, i:] for i in range(3)]
     return np.concatenate([*products, colours, np.ones_like(colours[:, :1])], axis=1)
 

@@ -1,6 +1,6 @@
 """Colour alignment by halves: separate the error of a held-out photo's exposure from that of the field.
 
-The gains are fitted on the left half of the photo, with the field held, and the picture is measured on the right half,
+The gains are fitted on the left half of the photo, with the field fixed, and the picture is measured on the right half,
 which the fit did not see.
 """
 
@@ -8,27 +8,27 @@ import numpy as np
 
 from nerfcli.media.srgb import linear_light
 
-# Levels between which the ratio of two pixels tells their exposures; the others are noise or saturated.
+# Levels between which the ratio of two pixels determines the gain; other pixels are noisy or saturated.
 DARKEST, BRIGHTEST = 20 / 255, 240 / 255
-# Fewer pixels do not hold a gain against noise.
+# Fewer pixels do not determine a gain against noise.
 LEAST_PIXELS = 64
 
 
 def align_gains(
     picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray, log_gains: tuple[float, ...]
 ) -> tuple[float, ...]:
-    """Return the logarithms (3,) of the gains that take a picture to a photo.
+    """Return the logarithms (3,) of the gains that map a picture to a photo.
 
     median over pixels of log(linear(photo) / linear(picture)), channel by channel
 
-    A median, as a field has regions that are wrong altogether: least squares would make the picture brighter or darker
-    to hide them. Channels with fewer than 64 pixels from level 20 to 240 in both keep their given gain.
+    A median, because a field has regions that are entirely wrong: least squares would make the picture brighter or
+    darker to hide them. Channels with fewer than 64 pixels from level 20 to 240 in both keep their given gain.
 
     Args:
         picture: (H, W, 3) float sRGB >= 0, as the model shows it without gains.
         photo: (H, W, 3) float in [0, 1].
-        used: (H, W) bool, the pixels to look at.
-        log_gains: the photo's exposure, as of `protocol.HeldOutPhoto`.
+        used: (H, W) bool, the pixels to use.
+        log_gains: the photo's exposure, as in `protocol.HeldOutPhoto`.
     """
     shown, wanted = (colours[used].astype(np.float64) for colours in (picture, photo))
     told = ((shown >= DARKEST) & (shown <= BRIGHTEST) & (wanted >= DARKEST) & (wanted <= BRIGHTEST)).T

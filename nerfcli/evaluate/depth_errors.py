@@ -1,7 +1,7 @@
 """Errors of a field's depth without a true depth: stereo matching of held-out photos with the training photos.
 
-The field has not seen the held-out photos; what their pixels match in other photos is independent of its depth, except
-for the poses and for the range in which depth is sought. Where nothing can be matched, nothing is measured.
+The field has not seen the held-out photos, so the matches of their pixels in other photos are independent of its depth,
+except for the poses and for the range in which depth is searched. Pixels without a match are not measured.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,9 +20,9 @@ from nerfcli.render.pictures import render_picture
 from nerfcli.render.visibility import DepthMap, coverage_and_parallax, depth_maps, sees, small_frame
 from nerfcli.runs.run import Run
 
-# Points of the surface per photo, which say which photos look at the same and where depth is sought.
+# Surface points per photo, which determine which photos see the same surface and the range in which depth is searched.
 _POINTS = 200
-# Measured pixels of a photo that are compared, at most.
+# Most measured pixels of a photo that are compared.
 _PIXELS = 20_000
 
 
@@ -37,11 +37,11 @@ def measure_depth_errors(
     """Compare the median depth of held-out photos with stereo matching.
 
     Args:
-        run: with held-out photos on disk.
+        run: a run whose held-out photos are on disk.
         model: its field.
-        photo_depths: of its training photos, in their order.
-        threads: photos at a time.
-        on_progress: called with how much is done.
+        photo_depths: depth maps of its training photos, in their order.
+        threads: number of photos in progress.
+        on_progress: called with the fraction that is done.
 
     Raises:
         UserError: there are no held-out photos, or a photo cannot be read.
@@ -74,7 +74,7 @@ def measure_depth_errors(
 
 
 def surface_tracks(maps: Sequence[DepthMap]) -> Tracks:
-    """Return points of the surface as each camera sees them, evenly chosen from the maps."""
+    """Return surface points, evenly chosen from the depth maps, as tracks in the cameras that see them."""
     parts = []
     for view in maps:
         points = view.points()
@@ -89,8 +89,9 @@ def surface_tracks(maps: Sequence[DepthMap]) -> Tracks:
 
 
 def _median_points(model: Model, frame: Frame, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (N, 3) at the median distances (N,) of pixels (N, 2),
-    rendered at the size of the stereo matching.
+    """Return the points (N, 3) at the median distances of pixels (N, 2), and these distances (N,).
+
+    They are rendered at the size of the stereo matching.
     """
     small = small_frame(frame, LONGER_SIDE_PX)
     picture = render_picture(model, small, background=model.background, depth=DepthRequest("median", "ray"))

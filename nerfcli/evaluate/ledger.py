@@ -56,7 +56,7 @@ def summary_line(ledger: list[Entry]) -> str:
 
 
 def _exposure(config: RunConfig) -> Entry:
-    """No exposure is ever fitted to a held-out photo; what its EXIF says of it may be used."""
+    """Return the entry of the exposure, which is never fitted to a held-out photo; its EXIF may be used."""
     chosen = config.settings.components.exposure
     how = {
         "none": "no exposure is fitted",

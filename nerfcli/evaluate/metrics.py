@@ -1,7 +1,7 @@
 """Similarity of a rendered picture to a photo: PSNR, SSIM.
 
 Colours are sRGB in [0, 1], as float or rounded to 8 bits. Pixels that do not count (masked, or without a ray) are
-left out entirely: of PSNR pixel by pixel, of SSIM with every window that holds one.
+left out entirely: from PSNR pixel by pixel, from SSIM with every window that contains one.
 """
 
 import numpy as np
@@ -10,25 +10,25 @@ from skimage.metrics import structural_similarity
 
 from nerfcli.photos.psnr import psnr_of
 
-# Of Wang et al.: the Gaussian's standard deviation, and the width at which scikit-image cuts it off (3.5 sigma).
+# From Wang et al.: the Gaussian's standard deviation, and the width at which scikit-image cuts it off (3.5 sigma).
 SIGMA = 1.5
 WINDOW = 11
 
 
 def to_8_bit(picture: np.ndarray) -> np.ndarray:
-    """Convert colours in [0, 1] as in a PNG: clipped, rounded to the nearest of 256 levels."""
+    """Convert colours in [0, 1] to 8 bits as in a PNG: clipped, rounded to the nearest of 256 levels."""
     return np.round(np.clip(picture, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def as_float(picture: np.ndarray) -> np.ndarray:
-    """Colours in [0, 1] as float64: 8-bit levels divided by 255, floats clipped."""
+    """Return colours in [0, 1] as float64: 8-bit levels divided by 255, floats clipped."""
     if picture.dtype == np.uint8:
         return picture / 255.0
     return np.clip(picture, 0.0, 1.0).astype(np.float64)
 
 
 def mean_squared_error(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
-    """Mean over the pixels that count and their channels of the squared difference of colours in [0, 1].
+    """Return the mean squared difference of colours in [0, 1], over the pixels that count and their channels.
 
     Args:
         picture, photo: (H, W, 3) uint8, or float in [0, 1].
@@ -38,22 +38,22 @@ def mean_squared_error(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarr
 
 
 def psnr(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB; see `mean_squared_error` and `psnr_of`."""
+    """Return the peak signal-to-noise ratio in dB; see `mean_squared_error` and `psnr_of`."""
     return psnr_of(mean_squared_error(picture, photo, used=used))
 
 
 def whole_windows(used: np.ndarray) -> np.ndarray:
-    """(H, W) bool: the centres of the windows of `ssim` that lie in the picture and hold only pixels that count."""
+    """Return the centres (H, W), bool, of the `ssim` windows inside the picture with only pixels that count."""
     return minimum_filter(used, size=_window(used.shape), mode="constant", cval=False)
 
 
 def ssim(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float | None:
-    """Structural similarity, mean over `whole_windows`, in [-1, 1]; None where there is none.
+    """Return the structural similarity in [-1, 1], the mean over `whole_windows`; None if there are none.
 
     Gaussian window of sigma 1.5 (11 x 11), K1 0.01, K2 0.03, data range 1, population covariance, per channel. Without
-    a mask this is the mean that scikit-image and dm_pix give (so nerfbaselines); torchmetrics (so nerfstudio) has the
-    same map inside, but its mean takes in a border of windows that hang over. Pictures narrower than the
-    window get the largest odd window that fits, with equal weights.
+    a mask this is the mean of scikit-image and dm_pix (used by nerfbaselines); torchmetrics (used by nerfstudio) has
+    the same map inside, but its mean includes a border of windows that extend beyond the picture. Pictures narrower
+    than the window get the largest odd window that fits, with equal weights.
 
     Args:
         picture, photo: (H, W, 3) uint8, or float in [0, 1].

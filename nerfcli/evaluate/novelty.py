@@ -1,6 +1,6 @@
 """Novelty of held-out views: distance and angle to the nearest training view.
 
-A number measured between training views says how well a field fills gaps; one beyond them says what it knows.
+A metric measured between training views shows how well a field fills gaps; one beyond them, what the field knows.
 """
 
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import focus_point
 
-# A view is new if its nearest training view is farther than this many typical distances between training views...
+# A view is an extrapolation if its nearest training view is farther than this many typical distances between these...
 MOST_SPACINGS = 2.0
-# ...or is turned away by more than this share of the field of view, so that less than half of the picture is shared.
+# ...or differs in direction by more than this fraction of the field of view, so that less than half of it overlaps.
 MOST_TURN = 0.5
 
 
@@ -24,10 +24,10 @@ class Novelty:
 
     Args:
         nearest: name of the training view whose centre is nearest.
-        distance: to it, scene units.
-        distance_relative: the same over the scene's radius (median distance of training views from what they look at).
-        spacings: the same over the median distance of training views to their nearest one; None with only one of them.
-        angle_deg: between the optical axes of the two.
+        distance: distance to it, scene units.
+        distance_relative: the same over the scene's radius (median distance of training views from their focus point).
+        spacings: the same over the median distance of a training view to the nearest other one; None if there is none.
+        angle_deg: angle between the optical axes of the two.
         kind: "interpolation" or "extrapolation": see `MOST_SPACINGS` and `MOST_TURN`.
     """
 
@@ -50,7 +50,7 @@ def novelty(held_out: Sequence[Frame], training: Sequence[Frame]) -> list[Novelt
     found = []
     for frame in held_out:
         distances = np.linalg.norm(centres - frame.centre, axis=1)
-        # Of several in one place, the one that looks the same way.
+        # Of several views in one place, use the one with the most similar direction.
         near = np.flatnonzero(distances <= distances.min() * (1 + 1e-9)).tolist()
         angles = [_angle_deg(frame, training[index]) for index in near]
         index = near[int(np.argmin(angles))]
@@ -72,7 +72,7 @@ def novelty(held_out: Sequence[Frame], training: Sequence[Frame]) -> list[Novelt
 
 
 def _spacing(centres: np.ndarray) -> float | None:
-    """Median distance from a centre to the nearest other one; None for fewer than two."""
+    """Return the median distance from a centre to the nearest other one; None for fewer than two."""
     if len(centres) < 2:
         return None
     nearest = []

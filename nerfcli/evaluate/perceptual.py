@@ -1,7 +1,7 @@
-"""LPIPS: how different two pictures look to a network that was trained on people's judgements. It may not be there.
+"""LPIPS, if available: the distance of two pictures according to a network trained on human judgements.
 
-The network's weights are no part of any package: torchvision downloads AlexNet's (230 MB) on first use. Where
-torchmetrics, torchvision or the weights cannot be had, there is no LPIPS, and that is said once.
+The network's weights are not part of any package: torchvision downloads AlexNet's (230 MB) on first use. Without
+torchmetrics, torchvision or the weights there is no LPIPS, and the user is told once.
 """
 
 import importlib
@@ -12,12 +12,12 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
-# (picture, photo), both (H, W, 3) float in [0, 1], to their distance.
+# Returns the distance of (picture, photo), both (H, W, 3) float in [0, 1].
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
 
 NAME = "LPIPS AlexNet v0.1"
 INSTALL = "pip install 'nerfcli[lpips]'"
-# AlexNet halves a picture so often that nothing is left of smaller ones.
+# AlexNet halves a picture so often that nothing is left of a smaller one.
 SMALLEST = 32
 _ANSWER_SECONDS = 20.0
 
@@ -36,9 +36,9 @@ def find_perceptual(notify: Callable[[str], None]) -> Perceptual | None:
         notify(f"LPIPS is not available ({_first_line(error)}); install it with {INSTALL}")
         return None
     try:
-        with _impatient():
+        with _socket_timeout():
             network = metric(net_type="alex", normalize=True)
-    except (RuntimeError, OSError) as error:  # no network (URLError is an OSError), or a file that was cut off
+    except (RuntimeError, OSError) as error:  # no network (URLError is an OSError), or a truncated file
         notify(f"LPIPS is not available: its weights could not be loaded ({_first_line(error)})")
         return None
 
@@ -51,8 +51,8 @@ def find_perceptual(notify: Callable[[str], None]) -> Perceptual | None:
 
 
 @contextmanager
-def _impatient() -> Iterator[None]:
-    """Servers that do not answer are given up soon: torch waits for them for ever."""
+def _socket_timeout() -> Iterator[None]:
+    """Limit the wait for servers that do not answer, for which torch waits forever."""
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(_ANSWER_SECONDS)
     try:

@@ -1,6 +1,6 @@
 """Pose alignment: separate the error of a held-out photo's pose from that of the field.
 
-The pose is refined on the left half of the photo, with the field held, and the picture is measured on the right half,
+The pose is refined on the left half of the photo, with the field fixed, and the picture is measured on the right half,
 which the refinement did not see.
 """
 
@@ -20,10 +20,10 @@ from nerfcli.render.tracing import render_rays
 
 PIXELS = 2048
 SEED = 1
-# Fewer pixels do not hold six unknowns against noise.
+# Fewer pixels do not constrain six unknowns against noise.
 LEAST_PIXELS = 64
-# How far, in pixels, the camera is moved to see what changes: wide at first, to look across the field's own noise. At
-# first it is only turned: on half of a picture a move looks much like a turn, and a wrong one spoils the other half.
+# Steps of the finite differences, in pixels: large at first, to average over the field's own noise. First the camera is
+# only rotated: in half a picture a translation looks much like a rotation, and a wrong one spoils the other half.
 TURNS_PX = (2.0, 2.0, 1.0, 1.0, 0.5)
 STEPS_PX = (1.0, 1.0, 0.5, 0.5, 0.5, 0.5)
 _FIRST_DAMPING = 1e-3
@@ -33,7 +33,7 @@ _TRIES = 5
 @dataclass(frozen=True)
 class RefinedPose:
     """A refined frame, and how far it moved: rotation in degrees, translation of its centre in scene units, and the
-    mean squared errors of the pixels that were looked at, before and after."""
+    mean squared errors of the pixels used, before and after."""
 
     frame: Frame
     rotation_deg: float
@@ -42,7 +42,7 @@ class RefinedPose:
     error_after: float
 
     def to_json(self) -> dict[str, Any]:
-        """Return all but the frame, whose pose is spelled out."""
+        """Return rotation, translation and the refined pose as plain values."""
         return {
             "rotation_deg": self.rotation_deg,
             "translation": self.translation,
@@ -51,7 +51,7 @@ class RefinedPose:
 
 
 def halves(used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels that count of the left half of a picture and of the rest, both (H, W) bool."""
+    """Return the used pixels in the left half of a picture and those in the right half, both (H, W) bool."""
     left = np.zeros_like(used)
     left[:, : used.shape[1] // 2] = True
     return used & left, used & ~left
@@ -67,24 +67,23 @@ def align_pose(
     background: Background,
     log_gains: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> RefinedPose | None:
-    """Return the pose at which the model comes closest to a photo, from the photo's own pose on;
-    the model is not changed.
+    """Refine the pose of a photo so that the model's picture comes closest to the photo; the model is not changed.
 
-    Levenberg-Marquardt on the squared error of 2048 random pixels, with derivatives by differences of renders. The six
-    unknowns are counted in pixels: turns by one over the focal length, and moves that shift what is as far away as the
-    scene's radius by one pixel. A step is taken only where it brings the error down. It finds the way back from about a
-    pixel of the picture that is measured; from three it ends in the nearest valley.
+    Levenberg-Marquardt on the squared error of 2048 random pixels, with derivatives by finite differences of renders.
+    The six unknowns are in units of pixels: rotations by one over the focal length, and translations that shift a point
+    at the distance of the scene's radius by one pixel. A step is accepted only if it reduces the error. The search
+    recovers from an error of about one pixel of the measured picture; from three it ends in the nearest local minimum.
 
     Args:
         model: the trained model.
         frame: the photo's camera and pose.
         colours: (H, W, 3) the photo, float in [0, 1].
-        used: (H, W) bool, the pixels to look at.
-        background: behind everything.
-        log_gains: the photo's exposure, as of `protocol.HeldOutPhoto`.
+        used: (H, W) bool, the pixels to use.
+        background: the background of the renders.
+        log_gains: the photo's exposure, as in `protocol.HeldOutPhoto`.
 
     Returns:
-        None where too few pixels count.
+        The refined pose; None if too few pixels are used.
     """
     chosen = np.flatnonzero(used)
     if len(chosen) < LEAST_PIXELS:
@@ -113,7 +112,7 @@ def align_pose(
         columns = [(residuals(pose @ transform_from_twist(move)) - current) / step_px for move in moves]
         jacobian = np.stack(columns, axis=1)
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ current
-        damping = _FIRST_DAMPING  # anew: where wide differences led nowhere, narrow ones may
+        damping = _FIRST_DAMPING  # reset: small steps may succeed where large ones failed
         for _ in range(_TRIES):
             damped = normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(len(moves))
             step = np.zeros(6)

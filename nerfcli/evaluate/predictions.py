@@ -17,7 +17,7 @@ from nerfcli.media.images import write_png
 
 PREDICTIONS = "predictions"
 INFO = "info.json"
-# Choices: 8-bit pictures, or unrounded ones besides.
+# Choices: 8-bit pictures only, or unrounded ones, too.
 KINDS = ("png", "float")
 
 
@@ -26,7 +26,7 @@ def save_compared(folder: Path, stem: str, compared: Compared) -> None:
 
     Args:
         folder: the folder of predictions.
-        stem: the name of the files, without suffix; subfolders are made.
+        stem: the name of the files, without suffix; subfolders are created.
     """
     write_png(folder / "color" / f"{stem}.png", to_8_bit(compared.rendered))
     write_png(folder / "gt-color" / f"{stem}.png", compared.photo)

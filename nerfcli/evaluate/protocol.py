@@ -1,4 +1,4 @@
-"""The evaluation of a run on its held-out photos: numbers with the name of how they were made."""
+"""Evaluation of a run on its held-out photos: metrics, and the name of the protocol that produced them."""
 
 import hashlib
 import statistics
@@ -38,9 +38,9 @@ class HeldOutPhoto:
         frame: its camera and pose.
         pixels: (H, W, 3 or 4) uint8 sRGB, straight alpha.
         used: (H, W) bool; None for all pixels.
-        log_gains: logarithms of its gains relative to the model's pictures, as EXIF or the training photos around it
-            tell them, never the photo itself; see `field.exposure`.
-        gains_from: what tells them, one of `held_out_exposure.SOURCES`.
+        log_gains: logarithms of its gains relative to the model's pictures, from EXIF or from the training photos
+            around it, never from the photo itself; see `field.exposure`.
+        gains_from: the source of the gains, one of `held_out_exposure.SOURCES`.
     """
 
     frame: Frame
@@ -54,8 +54,8 @@ class HeldOutPhoto:
 class Compared:
     """A compared pair: rendered (H, W, 3) float sRGB, the photo (H, W, 3) uint8, and the mask of counted pixels (H, W).
 
-    on_white: whether the photo has alpha and stands on white. The colour correction leaves saturated pixels out and
-    would carry white anywhere, so there is none.
+    on_white: whether the photo has alpha and is composited on white. There is then no colour correction: it ignores
+    saturated pixels, so it could turn white into any colour.
     """
 
     frame: Frame
@@ -70,12 +70,12 @@ class Extras:
     """Optional measurements.
 
     Args:
-        training: the training views, to tell how new the held-out ones are.
-        perceptual: LPIPS, where it can be had.
-        billboards: a model without shape that the field is compared with.
-        align_poses: whether each held-out pose is refined, too; it costs a render and about 60 times 2048 pixels.
-        align_colours: whether gains are fitted to the left half of each held-out photo, too.
-        keep: takes what was compared, photo by photo.
+        training: the training views, to measure the novelty of the held-out ones.
+        perceptual: LPIPS, if available.
+        billboards: a model without geometry to compare the field with.
+        align_poses: whether each held-out pose is also refined; it costs a render and about 60 times 2048 pixels.
+        align_colours: whether gains are also fitted to the left half of each held-out photo.
+        keep: called with each compared pair.
     """
 
     training: Sequence[Frame] = ()
@@ -96,15 +96,15 @@ def evaluate_model(
     """Compare the model with every held-out photo: metrics per photo, means, and render time.
 
     Per photo: psnr, ssim and lpips of the 8-bit picture; psnr_float and ssim_float of the picture before rounding;
-    *_colour_aligned after `colour.colour_aligned`; with `align_poses`, *_pose_aligned and *_right_half: the right half
-    of the photo, from the pose that the left half asks for and from its own; with `align_colours`, *_gains_aligned:
-    the right half with the gains that the left half asks for. None is what is not known.
+    *_colour_aligned after `colour.colour_aligned`. With `align_poses` or `align_colours`, *_right_half are measured on
+    the right half of the photo; *_pose_aligned the same with the pose fitted to the left half, *_gains_aligned with
+    the gains fitted to it. Unknown values are None.
 
     Args:
         model: the trained model.
         held_out: the photos, at least one.
-        on_image: called with (rays done, rays in all).
-        extras: what is measured besides.
+        on_image: called with (rays done, total rays).
+        extras: optional measurements.
 
     Returns:
         The keys "protocol", "shape", "warnings", "mean", "images", "kinds" and "render" of metrics.json.
@@ -176,7 +176,7 @@ def _warnings(shape: Shape | None, evidence: ShapeEvidence | None) -> list[str]:
 
 
 def mean_of(images: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
-    """Mean over images of each measure; None where one of them does not have it."""
+    """Return the mean over images of each metric; None if an image does not have it."""
     means: dict[str, float | None] = {}
     for key in (key for key in images[0] if key.split("_")[0] in ("psnr", "ssim", "lpips")):
         values = [image[key] for image in images if image[key] is not None]
@@ -185,7 +185,7 @@ def mean_of(images: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
 
 
 def over_white(pixels: np.ndarray) -> np.ndarray:
-    """RGBA on white as 8-bit RGB, as the published tables have it; RGB as it is."""
+    """Return RGBA composited on white as 8-bit RGB, as in published tables; RGB unchanged."""
     if pixels.shape[-1] == 3:
         return pixels
     alpha = pixels[..., 3:].astype(np.float64) / 255.0
@@ -193,7 +193,7 @@ def over_white(pixels: np.ndarray) -> np.ndarray:
 
 
 def compare(photo: HeldOutPhoto, picture: RenderedPicture) -> Compared:
-    """Return a held-out photo beside the picture of it, as bright as the photo is.
+    """Return a held-out photo with its rendered picture, to which the photo's gains are applied.
 
     Raises:
         UserError: a mask hides the whole photo.
@@ -214,7 +214,7 @@ def compare(photo: HeldOutPhoto, picture: RenderedPicture) -> Compared:
 
 
 def as_exposed(rgb: np.ndarray, log_gains: tuple[float, ...]) -> np.ndarray:
-    """Return a picture as a photo with these gains shows it, clipped."""
+    """Return a picture with a photo's gains applied, clipped; unchanged if all gains are 1."""
     if not any(log_gains):
         return rgb
     return exposed(torch.from_numpy(rgb), torch.tensor(log_gains)).clamp(0.0, 1.0).numpy()
@@ -249,7 +249,7 @@ def _close(picture: np.ndarray, truth: np.ndarray, *, used: np.ndarray, suffix: 
 def _lpips(picture: np.ndarray, truth: np.ndarray, *, used: np.ndarray, perceptual: Perceptual | None) -> float | None:
     if perceptual is None or min(used.shape) < SMALLEST:
         return None
-    # A network sees whole pictures: where pixels do not count, both are given the photo's.
+    # The network needs whole pictures: both get the photo's colours where pixels do not count.
     return perceptual(as_float(np.where(used[..., None], picture, truth)), as_float(truth))
 
 
@@ -283,7 +283,7 @@ def _pose_aligned(
 
 
 def _gains_aligned(rgb: np.ndarray, compared: Compared, log_gains: tuple[float, ...]) -> dict[str, Any]:
-    """Measure the model's own colours (H, W, 3) with other gains than the photo's given ones."""
+    """Measure the model's own colours (H, W, 3) with gains fitted to the left half of the photo."""
     if compared.on_white:
         return dict.fromkeys(("psnr_gains_aligned", "ssim_gains_aligned", "gain_alignment"))
     left, _ = halves(compared.used)
@@ -295,7 +295,7 @@ def _gains_aligned(rgb: np.ndarray, compared: Compared, log_gains: tuple[float, 
 
 
 def _right_half(compared: Compared, rendered: np.ndarray, *, suffix: str) -> dict[str, float | None]:
-    """Measure a picture on the right half of the photo; None where no pixel of it counts."""
+    """Measure a picture on the right half of the photo; None if no pixel of it counts."""
     _, right = halves(compared.used)
     if not right.any():
         return {f"psnr{suffix}": None, f"ssim{suffix}": None}
@@ -303,7 +303,7 @@ def _right_half(compared: Compared, rendered: np.ndarray, *, suffix: str) -> dic
 
 
 def _kinds(images: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the means of the views between training views and of those beyond them."""
+    """Return the means over the views of each kind, interpolation and extrapolation."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for image in images:
         if "view" in image:

@@ -10,7 +10,7 @@ from nerfcli.runs.config import RunConfig
 
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 _ALIGNED = ("", "_colour_aligned", "_pose_aligned", "_gains_aligned")
-# What may be required: the means of metrics.json, the share of photos with a pose, and what the run cost.
+# Metrics that may be required: the means in metrics.json, the fraction of photos with a pose, and the run's times.
 NAMES = (
     *(f"{measure}{aligned}" for measure in ("psnr", "ssim") for aligned in (*_ALIGNED, "_float", "_right_half")),
     *("lpips", "lpips_colour_aligned", "registered", "training_seconds", "seconds_per_image"),
@@ -43,7 +43,7 @@ class Requirement:
 
 
 def parse_requirements(text: str) -> tuple[Requirement, ...]:
-    """Requirements with commas between them.
+    """Parse requirements separated by commas.
 
     Raises:
         ValueError: an unknown name, or no comparison with a number; the message says what was expected.
@@ -60,7 +60,7 @@ def parse_requirements(text: str) -> tuple[Requirement, ...]:
 
 
 def known_numbers(metrics: Mapping[str, Any], config: RunConfig) -> dict[str, float | None]:
-    """Return the numbers of a run that requirements are about, from metrics.json and config.json."""
+    """Return the numbers of a run that requirements can refer to, from metrics.json and config.json."""
     history = config.history or {}
     placed, photos = history.get("registered"), history.get("total")
     return {

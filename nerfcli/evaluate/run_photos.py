@@ -1,4 +1,4 @@
-"""The photos of a run as it was trained on: those held out, and the training photos on billboards."""
+"""Photos of a run, loaded as for its training: the held-out ones, and the training photos on billboards."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,14 +17,14 @@ from nerfcli.runs.run import Run
 def held_out_photos(
     frames: Sequence[Frame], model: Model, *, downscale: int, masks: str, threads: int
 ) -> list[HeldOutPhoto]:
-    """Load photos as a run was trained on, each as bright as EXIF or its neighbours say beside those of the model.
+    """Load photos as for training, each with its gains relative to the model, from EXIF or from its neighbours.
 
     Args:
         frames: with their images and masks.
-        model: that they are compared with.
-        downscale: of the training.
-        masks: what their black means, see `Components`.
-        threads: to read with.
+        model: the model that they are compared with.
+        downscale: the factor of the training.
+        masks: the meaning of black in masks, see `Components`.
+        threads: number of threads to read with.
 
     Raises:
         UserError: a photo cannot be read.
@@ -44,7 +44,7 @@ def held_out_photos_of(config: RunConfig, frames: Sequence[Frame], model: Model,
 
 
 def training_billboards(run: Run, *, notify: Callable[[str], None]) -> Billboards | None:
-    """Build the model without shape of a run's training photos; None, with a line, where these cannot be read."""
+    """Build the billboards of a run's training photos; None, with a line for the user, if a photo cannot be read."""
     factor, masks = run.config.downscale, run.components.masks
     small, cameras = [], []
     try:

@@ -20,11 +20,11 @@ _RAYS_AT_A_TIME = 4096
 
 @dataclass(frozen=True)
 class SampledPixels:
-    """The same random pixels of all held-out photos, as many of each, whatever field is looked at.
+    """Random pixels of all held-out photos, equally many of each, and the same for every field that is measured.
 
     Args:
         photos: the held-out photos.
-        pixels: for each, which of its pixels, counted row by row.
+        pixels: for each photo, the indices of its pixels, counted row by row.
     """
 
     photos: tuple[HeldOutPhoto, ...]
@@ -32,7 +32,7 @@ class SampledPixels:
 
     @staticmethod
     def drawn(photos: Sequence[HeldOutPhoto], *, seed: int) -> "SampledPixels":
-        """`SAMPLED_PIXELS` in all, or every pixel that counts where there are fewer."""
+        """Draw `SAMPLED_PIXELS` in total, equally many per photo, or all of a photo's usable pixels if it has fewer."""
         generator = np.random.default_rng(seed)
         wanted = -(-SAMPLED_PIXELS // len(photos))
         chosen = []
@@ -43,7 +43,7 @@ class SampledPixels:
         return SampledPixels(tuple(photos), tuple(chosen))
 
     def protocol(self) -> str:
-        """Description of the measurement."""
+        """Describe the measurement."""
         sizes = sorted({f"{photo.pixels.shape[1]}x{photo.pixels.shape[0]}" for photo in self.photos})
         return (
             f"{PROTOCOL}, sampled: {sum(map(len, self.pixels))} random pixels of {len(self.photos)} held-out photos at "
@@ -52,7 +52,7 @@ class SampledPixels:
 
     @torch.no_grad()
     def psnr(self, model: Model) -> float:
-        """Mean over the photos of the PSNR on their pixels, in dB, 8 bit as in `evaluate`: an estimate of its mean."""
+        """Return the mean over photos of the PSNR on their pixels, in dB, 8 bit, to estimate the mean of `evaluate`."""
         cuts = uniform_cuts(model.marching)
         values = []
         for photo, pixels in zip(self.photos, self.pixels, strict=True):
@@ -64,7 +64,7 @@ class SampledPixels:
 
 
 def background_of(model: Model, photo: HeldOutPhoto) -> Background:
-    """Return the background to compare with a photo."""
+    """Return the background of pictures that are compared with a photo: white if the photo has alpha."""
     return WHITE if photo.pixels.shape[-1] == 4 else model.background
 
 
@@ -77,7 +77,7 @@ def render_sampled(
     tolerance: float,
     at_a_time: int = _RAYS_AT_A_TIME,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (N, 3) in [0, 1] of the centres of pixels in the field's precision, and which of them have a ray."""
+    """Return colours (N, 3) in [0, 1] at pixel centres, in the field's precision, and which of them have a ray."""
     dtype = next(model.field.parameters()).dtype
     rays = pixel_rays(photo.frame, model.training_from_scene, pixels=pixels, places=CENTRES, device=model.device)
     directions, origin = rays.directions.to(dtype), rays.origin.to(dtype)

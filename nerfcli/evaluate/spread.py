@@ -8,15 +8,15 @@ from nerfcli.errors import UserError
 
 
 def spread(all_metrics: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, Any]:
-    """Mean and standard deviation over runs of every mean that all of them have.
+    """Return the mean and standard deviation over runs of every mean metric that all of them have.
 
     Args:
         all_metrics: the contents of metrics.json, at least two.
-        names: what the runs are called.
+        names: names of the runs.
 
     Returns:
-        {"runs": names, "psnr": {"mean", "standard_deviation", "lowest", "highest"}, ...}; the deviation is that of the
-        population of seeds, estimated from these (n - 1).
+        {"runs": names, "psnr": {"mean", "standard_deviation", "lowest", "highest"}, ...}; the deviation estimates that
+        of the population of seeds (divisor n - 1).
 
     Raises:
         UserError: the runs were measured by different protocols, on different photos, or at different sizes.

@@ -1,7 +1,7 @@
 """Depth, spread and disagreement of a picture in files of any format, each with its definition.
 
-TIFF, NPY and 16-bit PNG hold one map each; OpenEXR and NPZ hold all that was asked for of a picture, and its opacity.
-16-bit levels are made last, from the floats, because all frames share the length of a level.
+TIFF, NPY and 16-bit PNG hold one map each; OpenEXR and NPZ hold all requested maps of a picture, and its opacity.
+16-bit levels are computed last, from the floats, because all frames share the length of a level.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +23,7 @@ from nerfcli.media.levels import LARGEST_LEVEL, chosen_scale, write_png16
 from nerfcli.media.quantiles import quantiles
 from nerfcli.render.pictures import RenderedPicture
 
-# Of the depths of a clip, the share by which levels are chosen, and how much farther than these they reach.
+# Levels are chosen by this quantile of the depths of a clip, and reach up to this many times as far.
 _TYPICAL, _HEADROOM = 0.999, 2.0
 _AXES_OF_VIEW = "OpenCV: +x right, +y down, +z forward; the top-left pixel's centre is (0.5, 0.5)"
 
@@ -42,7 +42,7 @@ def map_path(folder: Path, output: str, name: str, file_format: str) -> Path:
 def frame_meta(
     meta: DepthMeta, frame: Frame, *, provenance: Mapping[str, Any], error_bounds: Mapping[str, Any]
 ) -> DepthMeta:
-    """Return the description of one frame's depth: `meta` with camera, origin and rendering error."""
+    """Return the definition of one frame's depth: `meta` with camera, provenance and rendering error."""
     view = {
         "name": frame.name,
         "camera": frame.camera.to_json(),
@@ -58,11 +58,11 @@ def write_maps(
     """Write the maps of a picture in the float formats of `settings`; each file atomically.
 
     Args:
-        picture: with depth.
-        folder: of the export.
-        name: without suffix, with "/" between folders.
+        picture: a picture with depth.
+        folder: the folder of the export.
+        name: file name without suffix, with "/" between folders.
         settings: the outputs and formats.
-        meta: of the depth of this frame, see `frame_meta`.
+        meta: the definition of the depth of this frame, see `frame_meta`.
 
     Returns:
         The files, complete.
@@ -93,15 +93,15 @@ def write_maps(
 
 
 def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
-    """Read the floats (height, width) that `write_maps` wrote, NaN where invalid, from whichever format is there.
+    """Read a map (height, width), NaN where invalid, from the first float format that `write_maps` wrote.
 
     Args:
-        folder: of the export.
-        name: of the frame's files.
-        meaning: of the map, as all frames of the clip have it.
+        folder: the folder of the export.
+        name: name of the frame's files.
+        meaning: the definition of the map, common to all frames of the clip.
 
     Raises:
-        UserError: there is none, it is damaged, or it means something else.
+        UserError: the file is missing or damaged, or has another definition.
     """
     path, output = _floats_of(folder, name, meaning.quantity), meaning.quantity
     found = depth_meta_of(path)
@@ -130,23 +130,23 @@ class Levels:
 
 
 def write_levels(folder: Path, names: Sequence[str], *, settings: ExportSettings, meaning: DepthMeta) -> Levels:
-    """Write the depth of all frames as 16-bit levels of one length, from the floats that are there.
+    """Write the depth of all frames as 16-bit levels of one length, computed from the float files.
 
-    A length that is chosen here holds twice as far as 99.9 % of all depths reach, or all of them if that is nearer:
-    a few rays that end far out would make levels coarse for everything else. What lies beyond has no depth in these
-    files.
+    If the length is chosen here, levels reach to twice the 99.9 % quantile of all depths, or to the largest depth if
+    that is less: otherwise a few rays that end far away would make all levels coarse. Depths beyond are left out of
+    these files.
 
     Args:
-        folder: of the export.
-        names: of the frames, all of which `write_maps` has written.
+        folder: the folder of the export.
+        names: names of the frames, all of which `write_maps` has written.
         settings: the length of a level, or None to choose it for all frames.
-        meaning: of the depth, as all frames have it.
+        meaning: the definition of the depth, common to all frames.
 
     Returns:
-        The length of a level in scene units, and what did not fit.
+        The length of a level in scene units, and the number of pixels that did not fit.
 
     Raises:
-        UserError: a depth does not fit into levels of a length that is given, or a file cannot be written.
+        UserError: a depth does not fit into levels of the given length, or a file cannot be written.
     """
 
     def depths() -> Iterator[np.ndarray]:
@@ -170,7 +170,7 @@ def write_levels(folder: Path, names: Sequence[str], *, settings: ExportSettings
 
 
 def _floats_of(folder: Path, name: str, output: str) -> Path:
-    """Return the file that holds the floats of a map; the TIFF's path where there is none."""
+    """Return the float file of a map; the TIFF's path if there is none."""
     paths = [map_path(folder, output, name, file_format) for file_format in FLOAT_FORMATS]
     return next((path for path in paths if path.exists()), paths[0])
 
@@ -183,7 +183,7 @@ def _map_of(picture: RenderedPicture, output: str) -> np.ndarray:
 
 
 def _meta_of_layers(metas: Mapping[str, DepthMeta]) -> DepthMeta:
-    """Return the meaning of the first map, with what the others in the same file are."""
+    """Return the definition of the first map, with the other maps in the same file as layers."""
     first, *others = metas.values()
     layers = {meta.quantity: {"convention": meta.convention, "opacity_floor": meta.opacity_floor} for meta in others}
     return replace(first, layers={**layers, "opacity": {"convention": "1 - transmittance"}})

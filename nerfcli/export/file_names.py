@@ -9,9 +9,9 @@ from nerfcli.cameras.frame import Frame
 
 
 def file_names(frames: Sequence[Frame]) -> list[str]:
-    """File names without suffix: the frames' own, subfolders kept; the suffix stays where names would be the same.
+    """Return the frames' names without suffix, with subfolders; the suffix stays where names would be the same.
 
-    A folder above the capture's ("../images") is called "up": nothing is written outside of the export.
+    ".." in a name ("../images") is replaced by "up", so that nothing is written outside the export.
     """
     names = ["/".join("up" if part == ".." else part for part in PurePosixPath(frame.name).parts) for frame in frames]
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]

@@ -1,4 +1,4 @@
-"""The walk over all frames of an order: what is missing is rendered, then what needs all of them is made."""
+"""Export of all frames of an order: render the missing ones, then write the outputs that need all of them."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -19,10 +19,10 @@ from nerfcli.media.levels import scale_in_words
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.model import Model
 
-# A process costs seconds to start: it has to have this many rays to render, about 20 s of work for a core.
+# A process takes seconds to start: it must have at least this many rays to render, about 20 s of work for a core.
 RAYS_PER_PROCESS = 2**22
-# Each process holds the model and a picture, and a few hundred megabytes of libraries. Of threads with a picture each,
-# more would wait for Python's lock.
+# Each process holds the model, a picture, and a few hundred megabytes of libraries. More threads with a picture each
+# would wait for Python's lock.
 MOST_PROCESSES = 4
 MOST_AT_A_TIME = 4
 
@@ -32,8 +32,8 @@ class Workers:
     """Number of processes and threads to render with.
 
     Args:
-        jobs: processes that each take a frame at a time; 1 renders in this process, on CPUs a frame per thread.
-        threads: of all of them together.
+        jobs: number of processes, each with one frame at a time; 1 renders in this process, on CPUs a frame per thread.
+        threads: number of threads of all processes together.
     """
 
     jobs: int = 1
@@ -41,14 +41,14 @@ class Workers:
 
 
 def automatic_workers(rays: int, *, threads: int, thread_safe: bool) -> Workers:
-    """Return one process; where its threads cannot render frames at the same time, several if there is enough to do.
+    """Return one process, or several if its threads cannot render different frames and there is enough work.
 
-    A picture per thread takes less time than threads per picture: some steps of a picture run on one of them.
+    One picture per thread is faster than several threads per picture, because some steps of a picture use one thread.
 
     Args:
-        rays: of all pictures together.
-        threads: to divide.
-        thread_safe: see `Model.thread_safe`; or a GPU, which is used by one process.
+        rays: number of rays of all pictures together.
+        threads: number of threads to distribute.
+        thread_safe: see `Model.thread_safe`; also True for a GPU, which is used by one process.
     """
     if thread_safe:
         return Workers(1, threads)
@@ -64,28 +64,28 @@ def export_frames(
     notify: Callable[[str], None],
     workers: Workers = Workers(),
 ) -> list[Path]:
-    """Render every frame and write what was ordered; the folder appears when it is complete.
+    """Render every frame and write the ordered outputs; the folder appears when it is complete.
 
     Layout: rgb/NAME.png, depth/NAME.tiff with depth/NAME.png to look at, opacity/NAME.png; exr/NAME.exr, npz/NAME.npz,
     depth16/NAME.png; rgb.mp4, depth.mp4, opacity.mp4 or rgb+depth+opacity.mp4; render.json. The colours of all depth
-    previews share one range, so that a video does not flicker. Until then everything gathers in a hidden folder beside
-    it, which stays when the command ends early: the same order then renders the missing frames alone. Of a
-    finished folder that differs in previews and videos alone, the frames are taken. Memory does not grow with the
+    previews share one range, so that a video does not flicker. Until the folder is complete, its files are in a hidden
+    folder beside it, which stays if the command ends early: the same order then renders only the missing frames. The
+    frames of a finished folder that differs only in previews and videos are reused. Memory does not grow with the
     number of frames.
 
     Args:
         model: the trained model.
-        order: what is to be rendered.
-        folder: the folder to write; a folder that stands there is replaced at the end.
-        on_rays: called with numbers of rays that are done; frames that are there already count.
-        notify: takes a line for the user.
-        workers: who renders; the files are the same for any number.
+        order: the rendering job.
+        folder: the folder to write; an existing folder is replaced at the end.
+        on_rays: called with numbers of finished rays, including those of frames that already exist.
+        notify: called with lines for the user.
+        workers: processes and threads to render with; the files do not depend on them.
 
     Returns:
         The paths to show, see `Order.results`.
 
     Raises:
-        UserError: the folder cannot be written, a video cannot be made, or processes die again and again.
+        UserError: the folder cannot be written, a video cannot be made, or processes die repeatedly.
     """
     order.check()
     unfinished = unfinished_of(order, folder)
@@ -134,10 +134,10 @@ def export_part(
     notify: Callable[[str], None],
     workers: Workers = Workers(),
 ) -> Path:
-    """Render some frames of an order, for `export_frames` to find them there; see there.
+    """Render some frames of an order, which `export_frames` then finds; the other arguments are the same.
 
     Args:
-        part: indices of frames; several machines that share a disk may render different ones at a time.
+        part: indices of frames; several machines that share a disk may render different ones at the same time.
 
     Returns:
         The unfinished folder.

@@ -19,12 +19,12 @@ def with_deviations(
     settings: ExportSettings,
     on_rays: Callable[[int], None],
 ) -> RenderedPicture:
-    """Return the picture with the deviations between members that see the same frame.
+    """Add the standard deviations of depth and colour between members that render the same frame to a picture.
 
     Args:
-        picture: of the run's own field, which is no member.
-        frame: that it shows.
-        members: two at least.
+        picture: picture of the run's own field, which is not a member.
+        frame: the frame that it shows.
+        members: at least two.
         settings: definition of depth, quality, background.
         on_rays: called with the number of rays after each tile.
     """

@@ -1,4 +1,4 @@
-"""One frame of an order: rendered, written, and noted as complete."""
+"""Render one frame of an order, write its files, and note it as complete."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,15 +19,15 @@ from nerfcli.render.pictures import render_picture, straight_rgba
 def render_frame(
     model: Model, order: Order, index: int, *, unfinished: Unfinished, on_rays: Callable[[int], None]
 ) -> None:
-    """Render a frame and leave its files in the unfinished folder.
+    """Render a frame and write its files to the unfinished folder.
 
-    The files depend on the model and the order alone: not on other frames, and not on which process renders them.
+    The files depend only on the model and the order, not on other frames or on the process that renders them.
 
     Args:
         model: the trained model.
-        order: what is to be rendered.
-        index: which of its frames.
-        unfinished: where the frames of the order gather.
+        order: the rendering job.
+        index: index of the frame.
+        unfinished: the folder that collects the frames of the order.
         on_rays: called with the number of rays after each tile.
 
     Raises:

@@ -28,12 +28,12 @@ class Order:
 
     Args:
         frames: cameras and poses in the scene's frame.
-        settings: what to write of them.
-        provenance: what else decides over the pictures, the run and the hash of its field first of all; plain values.
-        photo_depths: what each training photo sees of the surface, where `ExportSettings.needs_visibility`; the
-            provenance says which photos.
-        depth_errors: of the field, where `ExportSettings.needs_errors`.
-        members: of the run, where `ExportSettings.needs_members`; the provenance has their hashes.
+        settings: the outputs to write.
+        provenance: all else that determines the pictures, such as the run and the hash of its field; plain values.
+        photo_depths: depth maps of the training photos, if `ExportSettings.needs_visibility`; the provenance names the
+            photos.
+        depth_errors: measured depth errors of the field, if `ExportSettings.needs_errors`.
+        members: members of the run, if `ExportSettings.needs_members`; the provenance has their hashes.
     """
 
     frames: tuple[Frame, ...]
@@ -49,12 +49,12 @@ class Order:
         return file_names(self.frames)
 
     def rays(self, index: int) -> int:
-        """Return the number of rays of a frame, by all fields that are rendered for it."""
+        """Return the number of rays of a frame, over all fields that are rendered for it."""
         camera = self.frames[index].camera
         return (1 + len(self.members)) * camera.width * camera.height
 
     def of_pictures(self) -> dict[str, Any]:
-        """Plain values of all that decides over the rendered numbers."""
+        """Return everything that determines the rendered numbers, as plain values."""
         return {
             "nerfcli": __version__,
             "settings": self.settings.of_pictures(),
@@ -78,10 +78,10 @@ class Order:
         return [folder / f"{name}{FORMATS[form].suffix}" for form in video.formats for name in names]
 
     def check(self) -> None:
-        """Refuse what would fail only when the last picture is rendered.
+        """Refuse an order that would fail only after the last picture is rendered.
 
         Raises:
-            UserError: an encoder is missing, or a video shall be made of pictures of different sizes.
+            UserError: an encoder is missing, or a video would have pictures of different sizes.
         """
         if self.settings.video is None:
             return
@@ -95,12 +95,12 @@ class Order:
             )
 
     def is_held_by(self, folder: Path) -> bool:
-        """Return whether the finished folder holds this order, pictures and presentation.
+        """Return whether the finished folder already holds this order, pictures and presentation.
 
-        False, too, where it holds the same pictures and nothing that would be replaced: videos are added.
+        It is also False if the folder holds the same pictures and nothing would be replaced, as when videos are added.
 
         Raises:
-            UserError: it holds another one.
+            UserError: it holds another order.
         """
         made = _made(folder)
         if made is None:
@@ -133,7 +133,7 @@ class Order:
         """Return whether a finished folder holds the same pictures, with other previews, 16-bit files or videos."""
         try:
             made = _made(folder)
-        except UserError:  # a description that is damaged says nothing; all is rendered again
+        except UserError:  # a damaged description cannot be compared; everything is rendered again
             return False
         if made is None or "files" not in made:
             return False
@@ -144,10 +144,10 @@ class Order:
 
 
 def _made(folder: Path) -> dict[str, Any] | None:
-    """Return what a finished folder says of itself; None where there is none.
+    """Return the description of a finished folder; None if there is none.
 
     Raises:
-        UserError: that is damaged.
+        UserError: the description is damaged.
     """
     if not (folder / DESCRIPTION).exists():
         return None
@@ -156,10 +156,10 @@ def _made(folder: Path) -> dict[str, Any] | None:
 
 
 def refuse_foreign(folder: Path) -> None:
-    """Refuse a place that is taken by what is no export of ours.
+    """Refuse a path that is taken by something other than an export.
 
     Raises:
-        UserError: a file, or a folder of other things.
+        UserError: it is a file, or a folder with other contents.
     """
     if folder.is_file() or (folder.is_dir() and not (folder / DESCRIPTION).exists() and any(folder.iterdir())):
         raise UserError(f"{folder} exists and does not contain renders", "choose another folder with -o")

@@ -28,12 +28,12 @@ def write_picture(
     """Write the outputs of one picture; each file atomically.
 
     Args:
-        picture: what was rendered; rgb with straight alpha or without.
-        folder: of the export; the files are folder/OUTPUT/name.SUFFIX.
-        name: without suffix, with "/" between folders.
+        picture: the rendered picture; rgb with or without straight alpha.
+        folder: the folder of the export; the files are folder/OUTPUT/name.SUFFIX.
+        name: file name without suffix, with "/" between folders.
         settings: the outputs, and the formats of depth.
-        meta: what the depth of this frame means, see `depth_files.frame_meta`.
-        background: what the picture stands on.
+        meta: the definition of the depth of this frame, see `depth_files.frame_meta`.
+        background: the background of the picture.
 
     Returns:
         The files, complete.

@@ -19,23 +19,23 @@ from nerfcli.media.preview import beside, preview
 from nerfcli.media.quantiles import quantiles
 from nerfcli.media.video import FORMATS, write_video
 
-# The ends of a colour range: shares of all valid pixels of the clip, so that a single speck does not stretch it.
-RANGE_SHARES = (0.01, 0.99)
-# Maps are read three times; as many as fit are kept in memory meanwhile.
+# The ends of a colour range: quantiles of all valid pixels of the clip, so that a single speck does not stretch it.
+RANGE_QUANTILES = (0.01, 0.99)
+# Maps are read three times; as many as fit into this size are kept in memory.
 _KEPT_BYTES = 2**28
 
 
 def write_previews(folder: Path, order: Order, meta: DepthMeta, *, threads: int = 1) -> dict[str, tuple[float, float]]:
-    """Write a coloured PNG beside each measured file; all of an output on one range, or depth on the range given.
+    """Write a false-colour PNG beside each measured file, with one range per output (for depth, the given one if any).
 
     Args:
         folder: holds the complete files of every frame.
-        order: what was ordered.
-        meta: the meaning of the depth.
-        threads: previews that are written at the same time.
+        order: the rendering job.
+        meta: the definition of the depth.
+        threads: number of previews that are written at the same time.
 
     Returns:
-        The range of each output that is measured, in the unit of `meta`.
+        The range of each measured output, in the unit of `meta`.
 
     Raises:
         UserError: a file cannot be read or written.
@@ -50,7 +50,7 @@ def write_previews(folder: Path, order: Order, meta: DepthMeta, *, threads: int 
 def _write_previews_of(
     output: str, folder: Path, order: Order, meaning: DepthMeta, *, threads: int
 ) -> tuple[float, float]:
-    """`write_previews` of one output."""
+    """Write the previews of one output, and return its range."""
     kept: dict[str, np.ndarray] = {}
 
     def read(name: str) -> np.ndarray:
@@ -86,10 +86,10 @@ def write_videos(
 
     Args:
         folder: holds every picture and preview.
-        order: what was ordered; `order.check` has passed.
-        meta: the meaning of the depth.
-        ranges: of the colours, see `write_previews`; stand in the videos' comments.
-        notify: takes a line for the user.
+        order: the rendering job; `order.check` has passed.
+        meta: the definition of the depth.
+        ranges: colour ranges from `write_previews`, for the videos' comments.
+        notify: called with lines for the user.
 
     Raises:
         UserError: a video cannot be written.
@@ -115,11 +115,11 @@ def write_videos(
 
 
 def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> tuple[float, float]:
-    """Return the range of colours of a clip: the 1st to the 99th percentile; from 0 for what is not a distance.
+    """Return the range of colours of a clip: the 1st to the 99th percentile; from 0 for outputs that are not distances.
 
-    (0, 1) for confidence, and where no pixel has a value.
+    (0, 1) for confidence, and if no pixel has a value.
     """
-    found = None if output == "confidence" else quantiles(maps, RANGE_SHARES)
+    found = None if output == "confidence" else quantiles(maps, RANGE_QUANTILES)
     if not found:
         return 0.0, 1.0
     lo, hi = found
@@ -127,7 +127,7 @@ def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> tuple[
 
 
 def playing_order(count: int, direction: str) -> list[int]:
-    """Indices of the frames as they are shown; see `VideoSettings`."""
+    """Return the indices of the frames in playing order; see `VideoSettings`."""
     forward = list(range(count))
     match direction:
         case "reverse":
@@ -140,7 +140,7 @@ def playing_order(count: int, direction: str) -> list[int]:
 def _comment(
     order: Order, meta: DepthMeta, outputs: Sequence[str], ranges: dict[str, tuple[float, float]]
 ) -> dict[str, Any]:
-    """Return what a video's container says about it."""
+    """Return the description of a video for its container's comment."""
     description: dict[str, Any] = {"nerfcli": __version__, "outputs": list(outputs), **order.provenance}
     if any(output in MEASURED for output in outputs):
         description |= meta.to_json()
@@ -154,6 +154,6 @@ def _picture(folder: Path, output: str, name: str) -> Path:
 
 
 def _texts(meta: DepthMeta) -> dict[str, str]:
-    """Return the meaning for programs under one key, and its parts for people."""
+    """Return texts for a PNG: the definition for programs under one key, and its parts for people."""
     parts = {name: str(value) for name, value in asdict(meta).items() if not isinstance(value, dict) and value}
     return parts | {KEY: meta.to_text()}

@@ -21,11 +21,11 @@ from nerfcli.export.unfinished import Unfinished
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.render.model import Model
 
-# A frame at which processes died this often is not tried once more.
+# A frame at which processes died this many times is not retried.
 _MOST_DEATHS = 2
 
-# The exception by which a process leaves may be lost: Python drops those raised in callbacks and while freeing objects.
-# The process then ends with its frame, as the connection is closed; one that hangs is killed.
+# The exception that ends a process may be lost: Python drops those raised in callbacks and while freeing objects. The
+# process then ends after its frame, because the connection is closed; a process that hangs is killed.
 _SECONDS_TO_LEAVE = 60
 
 
@@ -51,17 +51,17 @@ def render_in_processes(
 
     Args:
         model: the trained model.
-        order: what is to be rendered.
-        indices: of the frames.
-        unfinished: where the frames of the order gather.
+        order: the rendering job.
+        indices: indices of the frames to render.
+        unfinished: the folder that collects the frames of the order.
         jobs: number of processes.
-        threads: of all processes together; each has one at least.
-        on_rays: called with the number of rays of each frame that is done.
-        notify: takes a line for the user.
+        threads: number of threads of all processes together; each process has at least one.
+        on_rays: called with the number of rays of each finished frame.
+        notify: called with lines for the user.
 
     Raises:
-        UserError: a file cannot be written, or memory runs out.
-        RuntimeError: what else went wrong in a process, with its traceback.
+        UserError: a file cannot be written, or processes keep dying at a frame.
+        RuntimeError: another failure in a process, with its traceback.
     """
     context = multiprocessing.get_context("spawn")  # torch's and numba's threads do not survive a fork
     left, deaths, workers = deque(indices), Counter[int](), list[_Worker]()
@@ -70,7 +70,7 @@ def render_in_processes(
         ours, theirs = context.Pipe()
         fraction = max(1, threads // jobs)
         process = context.Process(target=_serve, args=(theirs, model, order, unfinished, fraction), daemon=True)
-        with _interrupts_kept():  # an interrupt that was kept comes at the end, and has to find the process
+        with _interrupts_kept():  # a deferred interrupt is raised at the end, when the process is in the list
             process.start()
             workers.append(_Worker(process, ours))
         theirs.close()
@@ -78,7 +78,7 @@ def render_in_processes(
 
     def give(worker: _Worker) -> None:
         worker.index = left.popleft()
-        with suppress(ConnectionError):  # it died meanwhile: waiting for it tells
+        with suppress(ConnectionError):  # it died meanwhile: `wait` will report that
             worker.connection.send(worker.index)
 
     try:
@@ -89,7 +89,7 @@ def render_in_processes(
             for worker in [worker for worker in workers if worker.connection in ready]:
                 try:
                     failure = worker.connection.recv()
-                except (EOFError, ConnectionError):  # the latter where it never read what it was sent
+                except (EOFError, ConnectionError):  # the latter if it never read its index
                     workers.remove(worker)
                     deaths[worker.index] += 1
                     _tell_death(worker, order, notify, last=deaths[worker.index] == _MOST_DEATHS)
@@ -130,7 +130,7 @@ class _Failure:
 
 
 def _serve(connection: Any, model: Model, order: Order, unfinished: Unfinished, threads: int) -> None:
-    """Render the frames whose numbers come, until the other end closes."""
+    """Render the frames whose indices are received, until the connection is closed."""
     torch.set_num_threads(threads)
     signal.signal(signal.SIGTERM, _leave)
     if hasattr(signal, "pthread_sigmask"):
@@ -149,12 +149,12 @@ def _serve(connection: Any, model: Model, order: Order, unfinished: Unfinished, 
             report = _Failure(traceback.format_exc())
         try:
             connection.send(report)
-        except ConnectionError:  # nobody is there any more
+        except ConnectionError:  # the other process is gone
             return
 
 
 def _leave(number: int, _: object) -> None:
-    """End the process as an exception does, so that what is being written is removed first."""
+    """End the process by an exception, so that files in writing are removed first."""
     raise SystemExit(128 + number)
 
 
@@ -174,14 +174,14 @@ def _tell_death(worker: _Worker, order: Order, notify: Callable[[str], None], *,
 
 @contextmanager
 def _interrupts_kept() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C, and SIGTERM until they can answer: we end them.
+    """Start processes that ignore Ctrl-C, and SIGTERM until they are ready: this process ends them.
 
-    Starting takes seconds, as the new process reads the model only when it has come up. What comes to us meanwhile is
-    kept for afterwards: a process that is left amid its model complains.
+    Starting takes seconds, because the new process reads the model only after it is up. Interrupts of this process are
+    deferred meanwhile: a new process that is abandoned while it reads the model prints errors.
     """
     with deferred_interrupts() as interrupts:
         if hasattr(signal, "pthread_sigmask"):
-            resource_tracker.ensure_running()  # it would be started with the first process, and let signals in again
+            resource_tracker.ensure_running()  # otherwise it starts with the first process, and unblocks signals
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
             try:
                 yield

@@ -12,15 +12,15 @@ OUTPUTS = (
     *("rgb", "depth", "opacity", "spread", "disagreement", "coverage", "parallax", "lower", "upper"),
     *("confidence", "depth_deviation", "colour_deviation"),
 )
-# Those that are measured: floats on disk, and pictures in colours to look at.
+# Measured outputs, which are stored as floats, with previews in false colours.
 MEASURED = tuple(output for output in OUTPUTS if output not in ("rgb", "opacity"))
 FLOAT_FORMATS = ("tiff", "exr", "npy", "npz")
 FORMATS = (*FLOAT_FORMATS, "png16")
-# A file of these holds all that was asked for of a view, in a folder under the name of the format.
+# A file in one of these formats holds all requested outputs of a view; its folder has the name of the format.
 TOGETHER = ("exr", "npz")
 LEVELS_FOLDER = "depth16"
 LAYOUTS = ("separate", "side-by-side")
-# Behind pictures with alpha: their colours are then premultiplied, and nothing of a background is in them.
+# Background of pictures with alpha: their colours are then premultiplied and contain no background.
 BLACK = (0.0, 0.0, 0.0)
 DIRECTIONS = ("forward", "reverse", "ping-pong")
 
@@ -32,10 +32,10 @@ class VideoSettings:
     Args:
         formats: some of `media.video.FORMATS`; a video in each.
         layout: one of `LAYOUTS`: a video of each output, or all outputs in one.
-        direction: one of `DIRECTIONS`; "ping-pong" goes back without showing the ends twice, so that it loops evenly.
+        direction: one of `DIRECTIONS`; "ping-pong" runs back without repeating the ends, so that it loops evenly.
         fps: frames per second.
-        crf: constant quality, 0 is best; the format's own if None.
-        plays: times the clip is shown; 0 is for ever, in a gif only. None: for ever in a gif, else once.
+        crf: constant quality, 0 is best; the format's default if None.
+        plays: how many times the clip is shown; 0 means forever, in a gif only. None: forever in a gif, else once.
     """
 
     formats: tuple[str, ...] = ("mp4",)
@@ -52,14 +52,14 @@ class ExportSettings:
 
     Args:
         outputs: some of `OUTPUTS`.
-        depth: which depth, where "depth" is among the outputs.
-        formats: some of `FORMATS`, for what is measured. 16-bit levels are made from floats, which stay beside them.
+        depth: the definition of depth, if "depth" is among the outputs.
+        formats: some of `FORMATS`, for measured outputs. 16-bit levels are computed from float files, which are kept.
         depth_scale: scene units per level of 16-bit files; None chooses the same for all frames.
-        colour_map: of what is measured, one of `media.colour_maps.COLOUR_MAPS`.
-        colour_range: the depths with the first and the last colour, in scene units; None chooses by the views.
-        video: which videos; None for none.
-        quality: how much work goes into a picture.
-        rgba: colours without the background, the opacity as straight alpha.
+        colour_map: one of `media.colour_maps.COLOUR_MAPS`, for measured outputs.
+        colour_range: the depths with the first and the last colour, in scene units; None chooses them from the views.
+        video: settings of the videos; None for no videos.
+        quality: the rendering effort per picture.
+        rgba: colours without the background, with the opacity as straight alpha.
     """
 
     outputs: tuple[str, ...]
@@ -79,18 +79,18 @@ class ExportSettings:
 
     @property
     def needs_visibility(self) -> bool:
-        """Whether it must be known which photos see the surface."""
+        """True if coverage and parallax of the surface are needed."""
         wanted = {"coverage", "parallax"} & set(self.outputs)
         return bool(wanted or self.depth.min_views or self.depth.min_parallax_deg or self.needs_errors)
 
     @property
     def needs_errors(self) -> bool:
-        """Whether the errors of depth must be known."""
+        """True if the measured errors of depth are needed."""
         return bool({"lower", "upper", "confidence"} & set(self.outputs))
 
     @property
     def needs_members(self) -> bool:
-        """Whether the members of the run are rendered, too."""
+        """True if the members of the run must also be rendered."""
         return "depth_deviation" in self.outputs or "colour_deviation" in self.outputs
 
     @property
@@ -108,16 +108,16 @@ class ExportSettings:
 
     @property
     def in_levels(self) -> bool:
-        """Whether depth is also written as 16-bit levels."""
+        """True if depth is also written as 16-bit levels."""
         return "png16" in self.formats and "depth" in self.outputs
 
     def of_pictures(self) -> dict[str, Any]:
-        """Plain values of what decides over the rendered numbers and their files."""
+        """Return the settings that determine the rendered numbers and their files, as plain values."""
         settings = asdict(self)
         for name in ("colour_map", "colour_range", "video", "depth_scale"):
             del settings[name]
         for name in ("min_views", "min_parallax_deg"):
-            if not settings["depth"][name]:  # as in folders that were made before there was a choice
+            if not settings["depth"][name]:  # as in folders that were written before these settings existed
                 del settings["depth"][name]
         for name, outputs in (("level", {"lower", "upper"}), ("depth_tolerance", {"confidence"})):
             if not outputs & set(self.outputs):
@@ -125,7 +125,7 @@ class ExportSettings:
         return settings | {"outputs": list(self.outputs), "formats": list(self.float_formats)}
 
     def of_presentation(self) -> dict[str, Any]:
-        """Plain values of what decides over the previews and videos that are made of these files."""
+        """Return the settings that determine the previews and videos made from these files, as plain values."""
         video = None if self.video is None else asdict(self.video) | {"formats": list(self.video.formats)}
         levels = {"scale": self.depth_scale or "auto"} if self.in_levels else None
         colour_range = None if self.colour_range is None else list(self.colour_range)
@@ -133,7 +133,7 @@ class ExportSettings:
 
 
 def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
-    """Return the meaning of the depth files that `request` makes."""
+    """Return the definition of the depth that `request` asks for."""
     return DepthMeta(
         convention=request.convention,
         axis=request.axis,
@@ -147,14 +147,14 @@ def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
 
 
 def meaning_of(meta: DepthMeta, request: DepthRequest, output: str) -> DepthMeta:
-    """Return the meaning of an output that is measured, beside depth that means `meta`."""
+    """Return the definition of a measured output of a picture whose depth is defined by `meta`."""
     number = {"lower": request.level, "upper": request.level, "confidence": request.depth_tolerance}.get(output)
     convention = None if number is None else f"{output}:{number:g}"
     return meta.of(output, opacity_floor=floor_of(request, output), convention=convention)
 
 
 def floor_of(request: DepthRequest, output: str) -> float:
-    """Return the opacity below which a pixel has no value in an output that is measured."""
+    """Return the opacity below which a pixel has no value in a measured output."""
     match output:
         case "depth" | "depth_deviation":
             return effective_floor(request)

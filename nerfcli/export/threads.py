@@ -1,4 +1,4 @@
-"""Distribute frames over threads of this process, one frame at a time each: kernels run without Python's lock."""
+"""Distribute frames over threads of this process, one frame per thread at a time: kernels release Python's lock."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -24,15 +24,15 @@ def render_in_threads(
 ) -> None:
     """Render frames of an order, several at a time; see `render_frame`.
 
-    The first exception ends the others after their current tile; frames that are complete are kept.
+    The first exception stops all threads after their current tile; complete frames are kept.
 
     Args:
         model: the trained model, on the CPU.
-        order: what is to be rendered.
-        indices: of the frames.
-        unfinished: where the frames of the order gather.
+        order: the rendering job.
+        indices: indices of the frames to render.
+        unfinished: the folder that collects the frames of the order.
         at_a_time: number of frames in progress.
-        threads: of all frames together; each has one at least.
+        threads: number of threads of all frames together; each frame has at least one.
         on_rays: called with the number of rays of each tile, by one thread at a time.
     """
     stopped, lock, before = threading.Event(), threading.Lock(), torch.get_num_threads()

@@ -6,8 +6,8 @@
         .frames/done/NAME.json         one for each complete frame, written last: digests of its files, facts
         .frames/lock                   held by the one command that makes the folder complete
 
-A frame counts when its note is whole and its files are those that it was written for. Several commands may fill one
-folder, on one machine or on many that share a disk; one at a time finishes it.
+A frame counts as complete if its note is intact and its files match the note. Several commands may fill one folder, on
+one machine or on many that share a disk; one at a time finishes it.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ _NOTES = ".frames"
 
 @dataclass(frozen=True)
 class Unfinished:
-    """The place where the frames of an order gather."""
+    """The folder that collects the frames of an order."""
 
     folder: Path
 
@@ -35,9 +35,9 @@ class Unfinished:
         """Note that a frame is complete.
 
         Args:
-            name: of the frame's files, without suffix.
-            files: all of them, as they stand in the folder.
-            facts: what is known about the picture besides, plain values for render.json.
+            name: name of the frame's files, without suffix.
+            files: paths of all its files in the folder.
+            facts: further facts about the picture, plain values for render.json.
         """
         digests = {str(path.relative_to(self.folder)): _digest(path.read_bytes()) for path in files}
         write_json(self._path(name), {"files": digests, "facts": facts, "note": _digest_of_note(digests, facts)})
@@ -57,7 +57,7 @@ class Unfinished:
         return json.loads(self._path(name).read_text(encoding="utf-8"))["facts"]
 
     def files(self, name: str) -> dict[str, str]:
-        """Return the files of a frame, relative to the folder, with digests of what is in them."""
+        """Return the files of a frame, relative to the folder, with digests of their contents."""
         return json.loads(self._path(name).read_text(encoding="utf-8"))["files"]
 
     @property
@@ -89,10 +89,10 @@ def _digest_of_note(files: dict[str, str], facts: dict[str, Any]) -> str:
 
 
 def take_over(unfinished: Unfinished, order: Order, finished: Path) -> None:
-    """Give an unfinished folder the frames of a finished one that `Order.shares_pictures_with`, without copying them.
+    """Link the frames of a finished folder, for which `Order.shares_pictures_with` is True, into an unfinished one.
 
-    A frame with a file that is not as it was written is left out. Files are linked, so that the finished folder stays
-    whole whatever happens; previews and videos are not among them.
+    Frames with a missing or changed file are left out, as are previews and videos. Files are hard-linked, or copied if
+    the file system has no links, so that the finished folder always stays intact.
 
     Raises:
         UserError: the files cannot be linked or copied.
@@ -117,10 +117,10 @@ def _has_digest(path: Path, digest: str) -> bool:
 
 
 def unfinished_of(order: Order, folder: Path) -> Unfinished:
-    """Return the unfinished folder of an order that shall become `folder`; it is made if need be.
+    """Return the unfinished folder of an order that will become `folder`; it is created if needed.
 
     Raises:
-        UserError: it cannot be made.
+        UserError: it cannot be created.
     """
     unfinished = folder.with_name(f".{folder.name}.unfinished-{order.digest}")
     try:

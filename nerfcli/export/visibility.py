@@ -20,10 +20,10 @@ def with_visibility(
     """Return the picture with coverage and parallax of the points at its median depth.
 
     Args:
-        picture: with depth.
-        frame: that it shows.
-        axis: of its depth, "ray" or "z".
-        photo_depths: of all training photos.
+        picture: a picture with median depth.
+        frame: the frame that it shows.
+        axis: axis of its depth, "ray" or "z".
+        photo_depths: depth maps of all training photos.
     """
     assert picture.median is not None
     rays, _ = frame.camera.pixel_bearings()
@@ -38,7 +38,7 @@ def with_visibility(
 
 
 def with_measured_errors(picture: RenderedPicture, errors: DepthErrors, request: DepthRequest) -> RenderedPicture:
-    """Return the picture, with median and coverage, with an interval of depth and a confidence in each pixel."""
+    """Add an interval of depth and a confidence in each pixel to a picture that has median and coverage."""
     assert picture.median is not None
     assert picture.coverage is not None
     lower, upper = errors.bounds(picture.median, picture.coverage, level=request.level)
@@ -50,14 +50,14 @@ def without_unseen_depth(picture: RenderedPicture, request: DepthRequest) -> tup
     """Return the picture without depth where coverage or parallax is too small, and the numbers of pixels.
 
     Returns:
-        The picture; "pixels_with_depth" before and "pixels_removed", nothing where no limit is set.
+        The picture; "pixels_with_depth" before and "pixels_removed", or nothing if no limit is set.
     """
     if not (request.min_views or request.min_parallax_deg):
         return picture, {}
     assert picture.depth is not None
     assert picture.coverage is not None
     assert picture.parallax is not None
-    # NaN, where there is no surface, is not seen either.
+    # NaN, where there is no surface, counts as not seen.
     seen = (picture.coverage >= request.min_views) & (picture.parallax >= request.min_parallax_deg)
     had = np.isfinite(picture.depth)
     depth = np.where(seen, picture.depth, np.float32(np.nan))
@@ -68,7 +68,7 @@ def without_unseen_depth(picture: RenderedPicture, request: DepthRequest) -> tup
 
 
 def removed_in_words(request: DepthRequest, facts: Sequence[Mapping[str, Any]]) -> str:
-    """Return a line on how much depth was removed from pictures, by their facts; empty where no limit is set."""
+    """Describe how much depth was removed from pictures, by their facts; empty if no limit is set."""
     had = sum(of_picture.get("pixels_with_depth", 0) for of_picture in facts)
     if not had:
         return ""

@@ -10,8 +10,9 @@ SPHERE_SIDE = 32
 
 
 class SphereBackground(nn.Module):
-    """sRGB by direction: trilinear interpolation, at the direction's place on the unit sphere, of a grid over the cube
-    around it, then a sigmoid. There is no seam and no pole, and a grid of a single vertex is one learned colour.
+    """sRGB by direction: a grid over the cube around the unit sphere, interpolated at the direction, then a sigmoid.
+
+    Interpolation is trilinear, with no seam and no pole. A grid of a single vertex is one learned colour.
 
     Args:
         side: vertices per axis.
@@ -22,7 +23,7 @@ class SphereBackground(nn.Module):
         self.logits = nn.Parameter(torch.zeros(3, side, side, side))
 
     def forward(self, directions: Tensor) -> Tensor:
-        """(R, 3) in (0, 1) for unit directions (R, 3). Differentiable in the grid."""
+        """Return colours (R, 3) in (0, 1) for unit directions (R, 3). Differentiable in the grid."""
         places = directions[None, None, None]  # (1, 1, 1, R, 3)
         values = torch.nn.functional.grid_sample(
             self.logits[None], places, mode="bilinear", padding_mode="border", align_corners=True
@@ -41,7 +42,7 @@ Background = Colour | SphereBackground
 
 
 def colours_behind(background: Background, directions: Tensor) -> Tensor:
-    """(R, 3) sRGB behind the field along directions (R, 3)."""
+    """Return the sRGB colours (R, 3) behind the field along directions (R, 3)."""
     if isinstance(background, SphereBackground):
         return background(directions)
     return directions.new_tensor(background).expand(len(directions), 3)

@@ -1,6 +1,6 @@
 """A field of several blocks: cells of ground, each with a field of its own.
 
-Letters as in `kernels.interface`; blocks B; ground coordinates are distances along two horizontal directions.
+Letters as in `kernels.interface`; B blocks; ground coordinates are distances along two horizontal directions.
 """
 
 import math
@@ -23,7 +23,7 @@ class Block:
     Args:
         field: kind and size of its field.
         centre, radius: of its own training frame, whose points are (point - centre) / radius.
-        low, high: (2,) ground coordinates of its cell, which is half open; infinite at the edge of the scene.
+        low, high: (2,) bounds of its half-open cell in ground coordinates; infinite at the edge of the scene.
     """
 
     field: FieldSettings
@@ -33,13 +33,13 @@ class Block:
     high: tuple[float, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; where the cell has no end, None."""
+        """Return plain values, with None where the cell is unbounded."""
         ends = {name: [v if math.isfinite(v) else None for v in getattr(self, name)] for name in ("low", "high")}
         return {**asdict(self), **ends, "field": self.field.to_json()}
 
 
 def cell_end(values: Sequence[float | None], unbounded: float) -> tuple[float, ...]:
-    """Read `low` or `high` of `Block.to_json`; `unbounded` stands where there is no end."""
+    """Read `low` or `high` of `Block.to_json`, with `unbounded` where the cell is unbounded."""
     return tuple(unbounded if value is None else value for value in values)
 
 
@@ -50,7 +50,7 @@ class BlocksFieldSettings(FieldSettings):
     Args:
         ground: (2, 3) horizontal unit directions.
         occupancy_side: cells per axis of the occupancy grid of each block.
-        blocks: one at least.
+        blocks: at least one.
     """
 
     kind: ClassVar[str] = "blocks"
@@ -70,12 +70,12 @@ class BlocksFieldSettings(FieldSettings):
 class BlocksField(Field):
     """The fields of blocks side by side; each point is evaluated in the field of its cell.
 
-    It is not trained: its blocks are, each by itself. Pictures of it are made by `render.spans`.
+    It is not trained itself: each block is trained separately. `render.spans` renders pictures of it.
 
     Args:
         settings: of the blocks.
-        fields: of the blocks, in this order.
-        occupancy: (B, G, G, G) bool of each over its own cube; nothing is where it is False.
+        fields: of the blocks, in the order of the settings.
+        occupancy: (B, G, G, G) bool, each block's over its own cube; space is empty where it is False.
     """
 
     occupancy: Tensor
@@ -114,14 +114,14 @@ class BlocksField(Field):
         return density, rgb
 
     def is_occupied(self, coordinates: Tensor) -> Tensor:
-        """Return whether there is something at coordinates (N, 3), (N,) bool."""
+        """Return whether space is occupied at coordinates (N, 3), as (N,) bool."""
         found = torch.zeros(len(coordinates), dtype=torch.bool, device=coordinates.device)
         for _, _, own, _ in self._divided(coordinates):
             found[own] = True
         return found
 
     def block_numbers(self, points: Tensor) -> Tensor:
-        """Return the block, counted from 0, in whose cell each point (N, 3) of the training frame is: (N,) int64."""
+        """Return the index (N,) int64 of the block whose cell contains each point (N, 3) of the training frame."""
         places = self._places(points)
         numbers = torch.zeros_like(places[:, 0], dtype=torch.int64)
         for number, block in enumerate(self.settings.blocks):
@@ -130,12 +130,12 @@ class BlocksField(Field):
 
     def _places(self, points: Tensor) -> Tensor:
         """Return the ground coordinates (N, 2) of points (N, 3)."""
-        # Not a product of matrices, which rounds differently with the number of rows.
+        # Not a matrix product, whose rounding depends on the number of rows.
         return (points[:, None] * points.new_tensor(self.settings.ground)).sum(-1)
 
     def _divided(self, coordinates: Tensor) -> Iterator[tuple[Field, float, Tensor, Tensor]]:
-        """Yield, for each block, its field and radius, which of the points (N, 3) are in its cell and occupied (M,),
-        and their coordinates (M, 3) in its own unit cube.
+        """Yield each block's field and radius, the indices (M,) of the points (N, 3) that are in its cell and occupied,
+        and the coordinates (M, 3) of these points in its own unit cube.
         """
         settings, side = self.settings, self.settings.occupancy_side
         points = training_points(coordinates, settings.contraction)
@@ -151,5 +151,5 @@ class BlocksField(Field):
 
 
 def _in_cell(places: Tensor, block: Block) -> Tensor:
-    """Return whether ground coordinates (N, 2) are in the cell of a block, (N,) bool."""
+    """Return whether ground coordinates (N, 2) are in the cell of a block, as (N,) bool."""
     return ((places >= places.new_tensor(block.low)) & (places < places.new_tensor(block.high))).all(-1)

@@ -13,10 +13,10 @@ from torch import Tensor, uint8
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import NON_FINITE, UserError
 
-# Of the file's metadata. The format has no checksum: a bit that flips on a disk would be a slightly other field. Digest
-# and description are one entry, as safetensors writes several in any order, and the same field shall be the same file.
+# Entries of the file's metadata. The format has no checksum: a bit that flips on disk would silently change the field.
+# Digest and description share an entry, as safetensors writes several in any order, and equal fields give equal files.
 _ENTRY = "description"
-_DIGEST = "blake2b"  # an entry of its own in files of earlier versions; the first ones have none
+_DIGEST = "blake2b"  # a separate entry in files of earlier versions; those of the first versions have none
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
@@ -30,7 +30,7 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, 
         try:
             save_file(content, partial, metadata={_ENTRY: json.dumps([digest, description])})
             partial.chmod(0o644)  # safetensors makes files that only their owner can read
-        except SafetensorError as error:  # a full disk comes as this, not as OSError
+        except SafetensorError as error:  # a full disk raises this, not OSError
             raise OSError(str(error)) from error
 
 
@@ -44,7 +44,7 @@ def load_tensors(path: Path, device: str) -> tuple[dict[str, Tensor], dict[str, 
 
 
 def read_checkpoint(path: Path) -> bytes:
-    """Read all of a file at once: a training may put another one in its place meanwhile.
+    """Read a whole file at once, as a running training may replace it in the meantime.
 
     Raises:
         UserError: the file is missing or cannot be read.
@@ -58,7 +58,7 @@ def read_checkpoint(path: Path) -> bytes:
 
 
 def tensors_of(content: bytes, path: Path, device: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and their description from what a file holds; see `load_tensors`."""
+    """Return tensors and their description from the content of a file; see `load_tensors`."""
     try:
         tensors = load(content)
         (length,) = struct.unpack_from("<Q", content)
@@ -84,7 +84,7 @@ def _unreadable(path: Path, error: Exception) -> UserError:
 
 
 def refuse_non_finite(tensors: dict[str, Tensor], path: Path) -> None:
-    """Refuse weights that no picture can come from.
+    """Refuse weights from which no picture can be rendered.
 
     Raises:
         UserError: a tensor holds NaN or infinity; the message names the first one.
@@ -104,7 +104,7 @@ def _digest(tensors: dict[str, Tensor], description: str) -> str:
     for name in sorted(tensors):
         tensor = tensors[name]
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        # As bytes: NumPy has no bfloat16. A tensor without numbers has no view of another type.
+        # As bytes: NumPy has no bfloat16. An empty tensor cannot be viewed as another dtype.
         if tensor.numel():
             digest.update(tensor.reshape(-1).view(uint8).numpy().data)
     return digest.hexdigest()

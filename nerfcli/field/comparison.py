@@ -1,4 +1,4 @@
-"""The cost of a trained field, and of fields of the other kinds that would take the same storage."""
+"""Cost of a trained field, and settings of fields of other kinds with about the same storage."""
 
 from typing import Any
 
@@ -13,13 +13,13 @@ from nerfcli.field.sizes import chosen_size
 def described_cost(
     settings: FieldSettings, *, occupancy_side: int, batch: int, samples_per_ray: float, picture_px: int
 ) -> dict[str, Any]:
-    """Bytes, operations and memory traffic of a field; see `cost.Work` for what counts.
+    """Return bytes, operations and memory traffic of a field; see `cost.Work` for what is counted.
 
     Args:
         settings: kind and size.
         occupancy_side: cells per axis of the occupancy grid.
         batch: samples of a training step.
-        samples_per_ray: how many samples light got to along a ray.
+        samples_per_ray: mean number of samples along a ray that light reached.
         picture_px: pixels of a picture.
 
     Returns:
@@ -49,8 +49,8 @@ def described_cost(
     }
 
 
-def others_of_equal_storage(settings: FieldSettings, footprint: float) -> dict[str, FieldSettings]:
-    """Return, by type, the other fields closest in bytes to this one; none where all are larger."""
+def other_kinds_with_equal_storage(settings: FieldSettings, footprint: float) -> dict[str, FieldSettings]:
+    """Return, by kind, the largest other field within this storage; no entry for a kind whose fields are all larger."""
     memory = parameter_bytes(work(settings).parameters)
     template = HashFieldSettings(contraction=settings.contraction, view_degree=settings.view_degree)
     others = {}

@@ -1,8 +1,8 @@
-"""The way back from the field's grids to space."""
+"""Inverse of the contraction: from the field's grids back to space."""
 
 from torch import Tensor
 
-# Contracted radius 2 is infinity; cells of the grid's corners, beyond it, are put on this radius.
+# Contracted radius 2 is infinity; cells at the grid's corners, beyond it, are mapped to this radius.
 LARGEST_RADIUS = 1e6
 
 
@@ -28,10 +28,10 @@ def uncontract_from_cube(points: Tensor) -> Tensor:
     x = y for m <= 1, else y / m / (2 - m),  m = the largest of |y_1|, |y_2|, |y_3|
 
     Args:
-        points: (..., 3); where m is 2 or more it is infinitely far and becomes 1e6.
+        points: (..., 3); a point with m of 2 or more is infinitely far, and its m becomes 1e6.
 
     Returns:
-        (..., 3), with a relative error as that of `uncontract`.
+        (..., 3), with the same relative error as `uncontract`.
     """
     largest = points.abs().amax(-1, keepdim=True).clamp_min(1.0)
     return points / largest / (2.0 - largest).clamp_min(1.0 / LARGEST_RADIUS)

@@ -14,28 +14,28 @@ from nerfcli.field.voxel_field import FEATURES, VoxelFieldSettings
 
 FLOAT_BYTES = 4
 CORNERS = 8
-# A forward and a backward pass, in operations and in bytes of rows: gradients of a product are two more of its size,
-# and the gradient of a row is read and written.
+# Cost of a forward and a backward pass, in forward passes, for operations and for bytes of rows: the gradients of a
+# product are two more products of its size, and the gradient of a row is read and written.
 TRAINING = 3
 
 
 def parameter_bytes(count: int, *, bytes_per_value: int = FLOAT_BYTES) -> int:
-    """Bytes of `count` parameters, without activations and optimiser state."""
+    """Return the bytes of `count` parameters, without activations and optimiser state."""
     return count * bytes_per_value
 
 
 def optimiser_bytes(count: int) -> int:
-    """Bytes that training needs beside `count` parameters: their gradients and the two moments of Adam."""
+    """Return the bytes that training needs besides `count` parameters: their gradients and the two moments of Adam."""
     return 3 * parameter_bytes(count)
 
 
 def occupancy_bytes(side: int) -> int:
-    """Bytes of the occupancy grid that rendering needs: a flag per cell."""
+    """Return the bytes of the occupancy grid that rendering needs: a flag per cell."""
     return side**3
 
 
 def field_bytes(field: nn.Module) -> int:
-    """Bytes of a field's parameters."""
+    """Return the bytes of a field's parameters."""
     return sum(parameter_bytes(p.numel(), bytes_per_value=p.element_size()) for p in field.parameters())
 
 
@@ -70,12 +70,12 @@ class Work:
         return self.density_bytes + self.colour_bytes
 
     def activation_bytes(self, samples: int) -> int:
-        """Bytes that a training step over this many samples keeps."""
+        """Return the bytes that a training step over this many samples keeps for the backward pass."""
         return self.kept_values * samples * FLOAT_BYTES
 
 
 def work(settings: FieldSettings) -> Work:
-    """Return the counts of a field of these settings."""
+    """Return the storage and work of a field with these settings."""
     match settings:
         case HashFieldSettings():
             return _hash_grid(settings)
@@ -90,7 +90,7 @@ def work(settings: FieldSettings) -> Work:
             raise ValueError(f"the cost of {type(settings).__name__} is unknown")
 
 
-# Of a sample whatever the field: its place, its interval, density and colour, and the weight of its colour.
+# Values kept of a sample of any field: its position, interval, density and colour, and the weight of its colour.
 _OF_A_SAMPLE = 3 + 2 + 1 + 3 + 1
 
 
@@ -105,7 +105,7 @@ def _hash_grid(settings: HashFieldSettings) -> Work:
         colour_operations=2 * _products(colour),
         density_bytes=settings.levels * CORNERS * settings.features * FLOAT_BYTES,
         colour_bytes=0,
-        kept_values=encoded + _OF_A_SAMPLE,  # the compiled networks compute their layers again
+        kept_values=encoded + _OF_A_SAMPLE,  # the compiled networks recompute their layers
     )
 
 
@@ -136,7 +136,7 @@ def _network(settings: FourierFieldSettings) -> Work:
 
 
 def _products(sizes: Sequence[int]) -> int:
-    """Weights of layers one after the other, without biases: a multiplication and an addition each per sample."""
+    """Return the number of weights of consecutive layers, without biases: each multiplied and added once per sample."""
     return sum(inputs * outputs for inputs, outputs in pairwise(sizes))
 
 

@@ -1,4 +1,4 @@
-"""Functions that lift positions to what a small network can use."""
+"""Encodings of positions as inputs of small networks."""
 
 import math
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def fourier_features(x: Tensor, octaves: int) -> Tensor:
-    """Sines and cosines at octave frequencies.
+    """Return sines and cosines at octave frequencies.
 
     gamma(x) = [sin(pi x), cos(pi x), ..., sin(2^(octaves - 1) pi x), cos(2^(octaves - 1) pi x)]
 

@@ -1,13 +1,13 @@
-"""Exposure and white balance of single photos: a gain per channel, in linear light.
+"""Exposure and white balance of individual photos: a gain per channel, in linear light.
 
-The field holds the colours of a photo of mean exposure. A photo shows them brighter or darker by its gains, whose
-logarithms have the mean 0 over the photos: what all photos share is left to the field, and pictures of it need none.
+The field holds the colours at mean exposure; a photo shows them multiplied by its gains. The logarithms of the gains
+have mean 0 over the photos: what all photos have in common is left to the field, and rendered pictures need no gains.
 """
 
 import torch
 from torch import Tensor, nn
 
-# The borders of the straight piece of the sRGB curve, IEC 61966-2-1.
+# The end of the linear piece of the sRGB curve, in sRGB and in linear light, IEC 61966-2-1.
 _SRGB_BORDER, _LINEAR_BORDER = 0.04045, 0.0031308
 
 
@@ -18,19 +18,19 @@ def linear_from_srgb(levels: Tensor) -> Tensor:
 
 
 def srgb_from_linear(light: Tensor) -> Tensor:
-    """sRGB levels of linear light >= 0, not clipped. Differentiable."""
+    """Convert linear light >= 0 to sRGB levels, not clipped. Differentiable."""
     curved = 1.055 * light.clamp_min(_LINEAR_BORDER) ** (1 / 2.4) - 0.055
     return torch.where(light <= _LINEAR_BORDER, light * 12.92, curved)
 
 
 def exposed(rgb: Tensor, log_gains: Tensor) -> Tensor:
-    """sRGB colours as a photo with these gains shows them, not clipped.
+    """Return sRGB colours as a photo with these gains shows them, not clipped.
 
     srgb(exp(log_gain) * linear(rgb)), channel by channel
 
     Args:
         rgb: (..., 3) sRGB >= 0.
-        log_gains: broadcastable to rgb; 0 changes nothing but the last bits.
+        log_gains: broadcastable to rgb; 0 changes only the last bits.
 
     Differentiable in both.
     """
@@ -41,7 +41,7 @@ class Exposure(nn.Module):
     """The gains of the training photos.
 
     Args:
-        start: (P, 3) their logarithms to start from; only differences between photos matter.
+        start: (P, 3) initial logarithms of the gains; only differences between photos matter.
     """
 
     def __init__(self, start: Tensor):
@@ -49,9 +49,9 @@ class Exposure(nn.Module):
         self.free = nn.Parameter(start.clone())
 
     def log_gains(self) -> Tensor:
-        """(P, 3), their mean over the photos 0 in every channel."""
+        """Return the logarithms of the gains (P, 3), with mean 0 over the photos in every channel."""
         return self.free - self.free.mean(0)
 
     def forward(self, rgb: Tensor, photos: Tensor) -> Tensor:
-        """Colours (R, 3) as the photos (R,) show them."""
+        """Return colours (R, 3) as the photos (R,) show them."""
         return exposed(rgb, self.log_gains()[photos])

@@ -1,4 +1,4 @@
-"""The radiance field as one network: everything is in weights that take part in every sample."""
+"""The radiance field as one network, all of whose weights take part in every sample."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,7 +13,7 @@ from nerfcli.kernels import Medium, spherical_harmonics
 from nerfcli.kernels.activations import density_from_log
 
 HARMONICS = 16
-# Wide layers move further by the same step: the rate goes with 1 / width, and is this at this width.
+# Wide layers change more by the same step: the rate is proportional to 1 / width, and is RATE at RATE_WIDTH.
 # Source: Yang et al. 2022, Tensor programs V, arXiv:2203.03466, table 3.
 RATE, RATE_WIDTH = 0.3, 64
 
@@ -25,8 +25,8 @@ class FourierFieldSettings(FieldSettings):
     Args:
         octaves: frequencies of the Fourier features of each coordinate; the finest has a period of 2^(1 - octaves) of
             the cube's side.
-        width: neurons of the hidden layers; half of it in the colour's.
-        layers: hidden layers in front of the density.
+        width: neurons of the hidden layers; half as many in the colour's.
+        layers: hidden layers before the density.
     """
 
     kind: ClassVar[str] = "mlp"
@@ -80,7 +80,7 @@ class FourierField(Field):
     def radiance(
         self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """See `kernels.Medium`; there is no table, and nothing goes into the sink."""
+        """See `kernels.Medium`; there is no table, and the sink is not used."""
         hidden = self._hidden(coordinates)
         harmonics = spherical_harmonics(directions, self.settings.view_degree)[rays]
         rgb = torch.sigmoid(self.colour(torch.cat([hidden, harmonics], dim=-1)))

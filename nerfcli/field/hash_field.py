@@ -10,16 +10,16 @@ from torch import Tensor, nn
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.kernels import HashGrid, reference, spherical_harmonics
 
-# Outputs of the density network, the logarithm of the density first; all of them go on to the colour network.
+# Outputs of the density network, the log density first; all of them are inputs of the colour network.
 GEOMETRY = 16
 HARMONICS = 16
-# The levels that learn from the start, and the share of the budget from which on all do.
+# Number of levels that learn from the start, and fraction of the budget after which all levels do.
 FIRST_LEVELS, ALL_LEVELS_SHARE = 4, 0.5
-# The levels that are random in `HashField.start_randomly`: those with a row for each vertex.
+# Number of levels that `HashField.start_randomly` fills: those with a row for each vertex.
 RANDOM_LEVELS = 2
-# Trainings of smaller tables are too short to come to details.
+# Trainings of smaller tables are too short to learn the details.
 DETAILED_LOG2_ROWS = 17
-# Of the loss. Numbers in rows are about 0.1, their gradients 2e-8 to 5e-8 in the median, 1e-5 in the root mean square.
+# Weight decay. Values in rows are about 0.1; their gradients have a median of 2e-8 to 5e-8, a root mean square of 1e-5.
 ROW_DECAY = 1e-6
 
 
@@ -28,11 +28,11 @@ class HashFieldSettings(FieldSettings):
     """Size of the field.
 
     Args:
-        levels, features: grids from coarse to fine, and numbers per table row.
+        levels, features: number of grids, from coarse to fine, and of values per table row.
         log2_rows: rows per level as a power of two.
         coarsest, finest: cells per axis of the first and the last level; those between are in geometric progression.
         width: neurons of the hidden layers.
-        antialias: whether levels finer than a pixel fade out of what it sees.
+        antialias: whether levels finer than a pixel fade out.
     """
 
     kind: ClassVar[str] = "hash"
@@ -64,11 +64,11 @@ class HashFieldSettings(FieldSettings):
 class HashField(Field):
     """The field that backends compile: see `kernels.HashGrid`.
 
-    The table starts near zero and the networks have no biases, so a
-    fresh field is a grey fog of density 1: thin enough that every sample of a ray gets a gradient.
+    The table starts near zero and the networks have no biases, so a fresh field is a grey fog of density 1: thin enough
+    that every sample of a ray gets a gradient.
 
-    Weight decay keeps rows small that the photos determine poorly. Adam divides by the size of a row's gradients, so
-    decay counts more where these are small; it hardly changes rows of surfaces that many photos see.
+    Weight decay shrinks rows that the photos determine poorly. Adam divides by the size of a row's gradients, so decay
+    counts more where gradients are small; it hardly changes rows of surfaces that many photos see.
     Source: Barron et al. 2023, Zip-NeRF, arXiv:2304.06706, section 4, where it is normalised by level.
     """
 
@@ -94,8 +94,8 @@ class HashField(Field):
     def start_randomly(self, deviation: float) -> None:
         """Fill the coarsest levels with normal numbers of this standard deviation.
 
-        The log density is then a smooth random function, with details of a `RANDOM_LEVELS`-th level's cells. Where no
-        training ray passes it stays one: rows without a gradient are never changed.
+        The log density is then a smooth random function, with details as large as the cells of the finest of these
+        levels. Where no training ray passes it stays random: rows without a gradient never change.
         """
         self.table[:RANDOM_LEVELS].normal_(std=deviation)
 
@@ -122,19 +122,19 @@ class HashField(Field):
 
     @torch.no_grad()
     def forget_directions(self, degree: int) -> None:
-        """Give the harmonics above `degree` no weight. Where they were 0 so far, the field stays what it was."""
+        """Zero the weights of harmonics above `degree`. The field does not change if these harmonics were 0 so far."""
         self.weights[2][:, GEOMETRY + (degree + 1) ** 2 :] = 0.0
 
 
 def _resolutions_at(detail: float, resolutions: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the resolutions of the levels that learn at a fraction of the budget, 0 for the others."""
+    """Return the resolutions of the levels that learn at a fraction of the budget, and 0 for later levels."""
     first = min(FIRST_LEVELS, len(resolutions))
     learning = max(1, first + math.floor((len(resolutions) - first) * detail / ALL_LEVELS_SHARE))
     return tuple(side if level < learning else 0 for level, side in enumerate(resolutions))
 
 
 def _uniform_weights(outputs: int, inputs: int) -> nn.Parameter:
-    """Weights that keep the variance of rectified inputs: uniform within sqrt(6 / inputs).
+    """Return weights that keep the variance of rectified inputs: uniform within sqrt(6 / inputs).
 
     Source: He et al. 2015, arXiv:1502.01852, eq. 10.
     """

@@ -15,8 +15,8 @@ class FieldSettings(abc.ABC):
     """Settings that determine the shapes of a field: all that a checkpoint needs besides the tensors.
 
     Args:
-        contraction: how space becomes the unit cube, one of `kernels.CONTRACTIONS`.
-        view_degree: spherical harmonics of the direction that colours may depend on, 0 (not at all) to 3.
+        contraction: how space is mapped into the unit cube, one of `kernels.CONTRACTIONS`.
+        view_degree: highest degree of the direction's spherical harmonics that colours depend on, 0 (not at all) to 3.
     """
 
     kind: ClassVar[str]
@@ -26,7 +26,7 @@ class FieldSettings(abc.ABC):
 
     @property
     def detailed(self) -> bool:
-        """Whether the field shows more in rendering steps shorter than those of its training."""
+        """True if the field shows more when it is rendered in shorter steps than those of its training."""
         return False
 
     @property
@@ -35,16 +35,16 @@ class FieldSettings(abc.ABC):
         """Type and size for people, such as "129x129x129 voxels"."""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, the kind among them; see `kinds.settings_from_json`."""
+        """Return plain values, including the kind; see `kinds.settings_from_json`."""
         return {"kind": self.kind, **asdict(self)}
 
 
 class Field(nn.Module, abc.ABC):
     """Density by position, colour by position and direction, on the unit cube of `kernels.grid_coordinates`.
 
-    `medium` says what that is; `backend` computes with it. How this kind is trained best: `rate_factor` times the
-    learning rate, `row_decay` of rows, see `reference.adam_rows`, and `closing_steps` until rays pass over cells that
-    hold little.
+    `backend` renders `medium`. Each kind has its own settings for training: `rate_factor` multiplies the learning rate,
+    `row_decay` is the weight decay of rows, see `reference.adam_rows`, and after at most `closing_steps` steps, rays
+    skip all cells that hold little.
     """
 
     rate_factor: float = 1.0
@@ -57,7 +57,7 @@ class Field(nn.Module, abc.ABC):
 
     @property
     def backend(self) -> kernels.Backend:
-        """Backend of this field, chosen on first use and again after a move to another device or type."""
+        """Backend of this field, chosen on first use and again after a move to another device or dtype."""
         if self._backend is None:
             some = next(self.parameters())
             self._backend = kernels.backend_for(some.device, some.dtype)
@@ -78,19 +78,19 @@ class Field(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def rows(self) -> nn.Parameter | None:
-        """(..., F) those of the parameters of which a sample touches only some rows; None where there are none.
+        """Return the parameter (..., F) of which a sample touches only some rows; None if there is none.
 
-        Training changes rows that were touched and leaves the others alone, see `reference.adam_rows`. All other
+        Training changes rows that were touched and leaves the rest alone, see `reference.adam_rows`. All other
         parameters take part in every sample.
         """
 
     @abc.abstractmethod
     def medium(self, detail: float = 1.0) -> kernels.HashGrid | kernels.Medium:
-        """Medium that backends render.
+        """Return the medium that backends render.
 
         Args:
-            detail: the share of a training's budget whose details are in it; 1 for all, below 0 for fewer than at
-                first. Those that are not are as they were made: nothing that can be seen.
+            detail: fraction of the training budget at which a field has the details to include; 1 for all, below 0 for
+                fewer than at the start. Details left out are as in an untrained field: nothing visible.
         """
 
     @abc.abstractmethod

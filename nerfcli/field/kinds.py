@@ -1,4 +1,4 @@
-"""The kinds of fields, by the names that checkpoints and the command line give them."""
+"""The kinds of fields, by their names in checkpoints and on the command line."""
 
 import math
 from typing import Any
@@ -12,12 +12,12 @@ from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
 
-# That can be trained.
+# The kinds that can be trained.
 KINDS = (HashFieldSettings.kind, VoxelFieldSettings.kind, FourierFieldSettings.kind)
 
 
 def fresh_field(settings: FieldSettings) -> Field:
-    """Return a field that has learned nothing, from torch's random numbers."""
+    """Return an untrained field, initialised from torch's random numbers."""
     match settings:
         case HashFieldSettings():
             return HashField(settings)
@@ -34,7 +34,7 @@ def fresh_field(settings: FieldSettings) -> Field:
 
 
 def settings_from_json(content: dict[str, Any]) -> FieldSettings:
-    """Read settings from `FieldSettings.to_json`; without a type, they are of a hash grid.
+    """Read settings from `FieldSettings.to_json`; without a kind, they are those of a hash grid.
 
     Raises:
         UserError: the kind is not known here.

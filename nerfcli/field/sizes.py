@@ -13,12 +13,12 @@ from nerfcli.field.voxel_field import VoxelFieldSettings
 
 # A field may be larger than requested by this fraction: a hash grid of 2^20 bytes and its networks are 1 MB, too.
 SLACK = 0.07
-# What the kinds take when nothing is said.
+# Memory of a dense grid and of a network by default.
 VOXEL_BYTES, NETWORK_BYTES = 2**26, 2**18
 # Harmonics above this degree would make a vertex of a dense grid larger by three quarters.
 VOXEL_DEGREE = 2
 LOG2_ROWS = range(8, 25)
-# A detailed hash grid has cells as small as a pixel's footprint, but no more than so many along the side of its cube.
+# A detailed hash grid has cells as small as a pixel's footprint, but at most this many along the side of its cube.
 MOST_CELLS = 4096
 LOG2_VERTICES = range(6, 28)
 WIDTHS = range(16, 8193, 16)
@@ -28,20 +28,19 @@ OCTAVES = (4, 12)
 def chosen_size(
     kind: str, *, hash_grid: HashFieldSettings, footprint: float, memory_bytes: int | None
 ) -> FieldSettings:
-    """Return the field of a kind that fits a capture.
+    """Return the settings of a field of a kind, sized for a capture.
 
-    What is finer than a pixel, no photo shows: a dense grid has no cells smaller than a pixel's footprint, the finest
-    octave of Fourier features has no shorter period than two footprints, and a large hash grid's finest level, where
-    it does not have smaller cells anyway, has those of the footprint. How many numbers there are is the
-    memory's business.
+    No photo shows detail finer than a pixel: a dense grid has no cells smaller than a pixel's footprint, the finest
+    octave of Fourier features has a period of at least two footprints, and the cells of a large hash grid's finest
+    level are at most as large as the footprint, all within the limits above. The memory sets the number of parameters.
 
     Args:
         kind: one of `kinds.KINDS`.
-        hash_grid: a hash grid, whose `contraction` and `view_degree` hold for every kind; its rows are set where there
-            is a `memory_bytes`.
-        footprint: what a pixel covers at the centre of the scene, in units of the training frame; the median photo's.
-        memory_bytes: what the field's numbers may take; None for a hash grid as it is, 64 MiB in a dense grid, 1/4 MiB
-            in a network, whose every number costs time at every sample.
+        hash_grid: settings of a hash grid, whose `contraction` and `view_degree` hold for every kind; its `log2_rows`
+            is replaced if `memory_bytes` is given.
+        footprint: width of a pixel at the centre of the scene, in units of the training frame, in the median photo.
+        memory_bytes: limit for the field's parameters; None keeps the rows of a hash grid, and means 64 MiB for a
+            dense grid and 1/4 MiB for a network, each of whose parameters costs time at every sample.
 
     Raises:
         UserError: the smallest field is larger than the memory.
@@ -77,14 +76,12 @@ def chosen_size(
 
 
 def cells_of_footprint(footprint: float, contraction: str) -> float:
-    """Return the number of cells along the cube's side that are as wide as a pixel's footprint; see
-    `kernels.grid_coordinates`.
-    """
+    """Return how many cells as wide as a pixel's footprint fit along the cube's side, see `grid_coordinates`."""
     return (2.0 if contraction == "none" else 4.0) / footprint
 
 
 def largest_within(sizes: Sequence[int], settings: Callable[[int], FieldSettings], memory_bytes: int) -> FieldSettings:
-    """Return the last of increasing sizes whose numbers fit into the memory, give or take `SLACK`.
+    """Return the settings of the last of increasing sizes whose parameters fit into the memory, enlarged by `SLACK`.
 
     Raises:
         UserError: not even the first one does.

@@ -10,7 +10,7 @@ from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.kernels import Medium, spherical_harmonics
 from nerfcli.kernels.activations import density_from_log
 
-# Numbers that the compiled interpolation takes at a time.
+# Row width of the compiled interpolation.
 FEATURES = 4
 
 
@@ -19,7 +19,7 @@ class VoxelFieldSettings(FieldSettings):
     """Size of the field.
 
     Args:
-        log2_vertices: there is room for this power of two of vertices; the grid is the largest cube of them.
+        log2_vertices: there is room for 2^log2_vertices vertices; the grid is the largest cube that fits.
     """
 
     kind: ClassVar[str] = "voxels"
@@ -39,22 +39,22 @@ class VoxelFieldSettings(FieldSettings):
 
     @property
     def harmonics(self) -> int:
-        """Spherical harmonics of each channel."""
+        """Number of spherical harmonics of each channel."""
         return (self.view_degree + 1) ** 2
 
     @property
     def layers(self) -> int:
-        """Tables of `FEATURES` numbers that hold a log density and three times the harmonics."""
+        """Number of tables, of `FEATURES` values per vertex, that hold a log density and three times the harmonics."""
         return -(-(1 + 3 * self.harmonics) // FEATURES)
 
 
 class VoxelField(Field):
-    """log density and harmonics of the colour are interpolated; exponential and sigmoid come after.
+    """Log density and harmonics of the colour are interpolated; exponential and sigmoid are applied afterwards.
 
     density = exp(v_0),  rgb = sigmoid(sum_k Y_k(direction) (v_(1 + 3k), v_(2 + 3k), v_(3 + 3k)))
 
     A surface may then be sharper than a cell. The grid is a hash grid without collisions whose levels all have the same
-    resolution, and goes through the same kernels. It starts near zero: a grey fog of density 1.
+    resolution, and uses the same kernels. It starts near zero: a grey fog of density 1.
     Source: Yu et al. 2022, Plenoxels, arXiv:2112.05131, section 3.1; Sun et al. 2022, DVGO, arXiv:2111.11215,
     section 4.1 on activations after interpolation.
     """
@@ -79,7 +79,7 @@ class VoxelField(Field):
 
     def density(self, coordinates: Tensor) -> Tensor:
         """See `kernels.Medium`."""
-        # The log density stands in the first table; there is no need to look into the others.
+        # The log density is in the first table; the other tables are not needed.
         values = self.backend.hash_encode(coordinates, self.table[:1], (self.settings.resolution,))
         return density_from_log(values[:, 0])
 

@@ -1,1 +1,1 @@
-"""The training step and its parts: losses, optimizer, learned cameras, extent, point depth."""
+"""The training step and its parts: losses, optimiser, learned cameras, extent, point depth."""

@@ -1,4 +1,4 @@
-"""Adam on a few tensors, by torch's function instead of its class: to build one of those loads a compiler for 1.5 s."""
+"""Adam on a few tensors, with torch's function instead of its class, whose constructor loads a compiler for 1.5 s."""
 
 from collections.abc import Iterable
 
@@ -12,10 +12,10 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class Adam:
-    """The moments of some tensors.
+    """Adam and its moments for some tensors.
 
     Args:
-        parameters: that have a gradient when they are stepped; others stay as they are.
+        parameters: the tensors; a step leaves those without a gradient unchanged.
 
     Source: Kingma and Ba 2015, arXiv:1412.6980, algorithm 1.
     """
@@ -68,9 +68,9 @@ class Adam:
         return {f"{prefix}.{i}.{name}": value for i, entry in enumerate(self._state) for name, value in entry.items()}
 
     def restore(self, tensors: dict[str, Tensor], prefix: str) -> None:
-        """Restore the state from `state`; other tensors are ignored. Parameters without state have not been stepped."""
+        """Restore the state from `state`; ignore other tensors, and reset parameters that have no stored state."""
         for index, entry in enumerate(self._state):
             for name, value in entry.items():
                 stored = tensors.get(f"{prefix}.{index}.{name}")
-                # The number of steps stays on the host, where it is read.
+                # The step count stays on the host, where it is read.
                 entry[name] = torch.zeros_like(value) if stored is None else stored.to(value.device)

@@ -1,4 +1,4 @@
-"""What is learned besides the field: what is infinitely far, the exposures of the photos, and their cameras."""
+"""Parts that are learned besides the field: the background, the exposures of the photos, and their cameras."""
 
 from typing import Any
 
@@ -14,27 +14,27 @@ from nerfcli.fit.refinement import Refinement, rate_at
 from nerfcli.photos.pool import Drawn, Pool
 from nerfcli.runs.components import LEARNED_BACKGROUNDS, Components
 
-# Learning rates as multiples of the field's. After 300 steps at 0.3, gains of photos are a tenth of the way to the true
-# ones, at 2 half of it, at 5 no further.
+# Learning rates as multiples of the field's. After 300 steps at 0.3, the photos' gains have come a tenth of the way to
+# the true ones; at 2, half way; at 5, no further.
 BACKGROUND_RATE, EXPOSURE_RATE = 5.0, 2.0
-# Detail comes later to a field whose cameras learn: see `Appearance.share_of_detail`. Balls, photos turned by 0.5
-# degree, 800 steps: 31.1 dB with the usual shares, 31.2 with 0.7 of them, 31.9 and 32.0 with these.
+# A field whose cameras learn gets its detail later, see `Appearance.share_of_detail`. Balls, photos rotated by 0.5
+# degree, 800 steps: 31.1 dB with the usual fractions, 31.2 with 0.7 of them, 31.9 and 32.0 with these values.
 DETAIL_DELAY, DETAIL_SLOPE = 0.125, 0.875
-# From here on a photo's level says only that the light was at least that bright.
+# At or above this level, a photo tells only that the light was at least that bright.
 SATURATED = 254.5 / 255
-# A ray that meets less than this has no colour of its own to speak of.
+# A ray with less opacity has no meaningful colour of its own.
 LEAST_OPACITY = 1e-3
-# Levels of a background that a sigmoid reaches.
+# Initial background levels are kept this far from 0 and 1, which a sigmoid does not reach.
 LEAST_LEVEL = 0.02
 
 
 class Appearance(nn.Module):
-    """The parts that the components ask for, and how they enter the colour of a ray.
+    """The parts that the components require, and how they enter the colour of a ray.
 
     Args:
-        components: what is in the model.
+        components: of the model.
         pool: the training photos.
-        log_gains: (photos, 3) logarithms of their exposures to start from.
+        log_gains: (photos, 3) logarithms of their initial exposures.
         log_focal: see `Refinement`.
 
     Raises:
@@ -65,10 +65,10 @@ class Appearance(nn.Module):
 
     @torch.no_grad()
     def show_sky(self, sky: Tensor) -> None:
-        """Begin a learned background with the median colour of the sky: where no photo looks, it stays.
+        """Initialise a learned background with the median colour of the sky, which unseen directions keep.
 
         Args:
-            sky: (pixels,) bool, those of the pool that show it.
+            sky: (pixels,) bool, the pixels of the pool that show the sky.
         """
         colours = self._pool.colours[sky]
         if self.background is None or len(colours) == 0:
@@ -78,26 +78,28 @@ class Appearance(nn.Module):
         self.sky = sky
 
     def groups(self) -> list[dict[str, Any]]:
-        """Return what is to be optimised, with its learning rate as a multiple of the field's."""
+        """Return the parameters to optimise, with their learning rates as multiples of the field's."""
         rates = ((self.background, BACKGROUND_RATE), (self.exposure, EXPOSURE_RATE))
         learned = [(list(part.parameters()), rate) for part, rate in rates if part is not None]
         return [{"params": tensors, "multiple": rate} for tensors, rate in learned if tensors[0].requires_grad]
 
     def share_of_detail(self, fraction: float) -> float:
-        """Return the share of the budget whose detail the field may have: cameras find their places in a coarse field,
-        while a fine one learns to show each photo as it is, in its wrong place."""
+        """Return the fraction of the budget whose detail the field may have.
+
+        Cameras find their poses in a coarse field; a fine field learns to show each photo from its wrong pose.
+        """
         return fraction if self.cameras is None else DETAIL_SLOPE * fraction - DETAIL_DELAY
 
     def gradients(self) -> dict[str, Tensor]:
-        """Return the gradients that there are, by name."""
+        """Return by name the gradients of the parameters that have one."""
         return {name: tensor.grad for name, tensor in self.named_parameters() if tensor.grad is not None}
 
     def refined(self, drawn: Drawn) -> Drawn:
-        """Return the same pixels, with the rays of the cameras as they are now."""
+        """Return the same pixels, with the rays of the current cameras."""
         return drawn if self.cameras is None else self.cameras.refined(drawn)
 
     def with_learning_rays(self, drawn: Drawn, fraction: float) -> Drawn:
-        """`refined`, with rays that collect gradients while cameras learn."""
+        """Return the same as `refined`, with rays that collect gradients while cameras learn."""
         refined = self.refined(drawn)
         if self.cameras is None or rate_at(fraction) == 0.0:
             return refined
@@ -110,24 +112,24 @@ class Appearance(nn.Module):
 
         Args:
             drawn: those rays.
-            losses: (R,) of each of them.
+            losses: (R,) the loss of each ray.
             fraction: of the budget.
-            factor: of the rate.
-            ranks: each has rays of its own.
+            factor: of the learning rate.
+            ranks: the processes that share the step, each with its own rays.
         """
         if self.cameras is not None:
             self.cameras.step(drawn, losses, fraction, factor=factor, ranks=ranks)
 
     def forget_gradients(self) -> None:
-        """Drop those that a GPU has sent for the next step of the cameras."""
+        """Drop the gradients that a GPU has sent for the next step of the cameras."""
         if self.cameras is not None:
             self.cameras.sent.forget()
 
     def behind(self, count: int, generator: torch.Generator) -> Tensor:
-        """(count, 3) what rays are composited on: black or random colours.
+        """Return the colours (count, 3) that rays are composited on: black or random.
 
-        Photos with alpha are shown on random colours, so that only opacity explains them. Others fill the frame: behind
-        them is black, as random colours shining through the fog of the start would drown all else.
+        Photos with alpha are composited on random colours, so that only opacity explains them. Other photos fill the
+        frame and are put on black: random colours shining through the initial fog would drown everything else.
         """
         device = self._pool.colours.device
         if self.is_random:
@@ -137,13 +139,13 @@ class Appearance(nn.Module):
     def compared(
         self, rendered: Tensor, transmittance: Tensor, drawn: Drawn, *, behind: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return what the field and these parts say of pixels, and what the photos say, both (R, 3) sRGB.
+        """Return the predicted and the measured colours of pixels, both (R, 3) sRGB.
 
         Args:
             rendered: (R, 3) composited on `behind`.
-            transmittance: (R,) the share of light that passes the field.
+            transmittance: (R,) the fraction of light that passes through the field.
             drawn: the pixels.
-            behind: (R, 3).
+            behind: (R, 3) colours behind the field.
         """
         if self.background is not None:
             rendered = rendered + transmittance[:, None] * self.background(drawn.directions)
@@ -153,7 +155,7 @@ class Appearance(nn.Module):
         photos = self._pool.photo_of(drawn.numbers)
         if not self._pool.has_alpha:
             return _up_to_white(self.exposure(rendered, photos), drawn.colours), measured
-        # What is behind an object was put there by us: no photo exposed it.
+        # Exposures apply to the object only, not to the colour that was put behind it.
         opacity = 1.0 - transmittance[:, None]
         own = (rendered - transmittance[:, None] * behind).clamp_min(0.0) / opacity.clamp_min(LEAST_OPACITY)
         own = _up_to_white(self.exposure(own, photos), drawn.colours)
@@ -161,5 +163,5 @@ class Appearance(nn.Module):
 
 
 def _up_to_white(rendered: Tensor, colours: Tensor) -> Tensor:
-    """Return what a photo shows of colours (R, 3): no more than white where its own (R, 3 or 4) are white."""
+    """Clip rendered colours (R, 3) to white where those of the photo (R, 3 or 4) are white."""
     return torch.where(colours[:, :3] < SATURATED, rendered, rendered.clamp_max(1.0))

@@ -1,4 +1,4 @@
-"""Space that several photos look into, and space that one photo alone does."""
+"""Coverage: grid cells that the training photos may fill, as several of them see into the cell, or one from afar."""
 
 import math
 
@@ -10,23 +10,24 @@ from nerfcli.field.contraction import training_points
 from nerfcli.fit.point_depth import PointDepths
 from nerfcli.photos.pool import PixelPool
 
-# Photos that have to look into a cell. One alone may fill it only behind this part of the median distance of what it
-# shows: whatever stands there looks right to that photo, and no other one contradicts.
+# Photos that have to see into a cell. A single photo may fill it only beyond this fraction of the median distance of
+# what it shows: anything nearer would look right to that photo, and no other one contradicts it.
 LEAST_PHOTOS, OWN_SPACE = 2, 1.0
+# Margin on half the diagonal field of view.
 BEYOND_CORNER = 1.1
 
 
 def covered_cells(pool: PixelPool, side: int, contraction: str, depths: PointDepths | None) -> Tensor:
     """Return which cells of a grid over the unit cube photos may fill.
 
-    A cell is covered where the middle lies in the view of two photos, or in that of one and at least `OWN_SPACE` of the
-    median known distance away from it. What hides it from a photo is not considered.
+    A cell is covered if its centre is in the view of two photos, or in the view of one and at least `OWN_SPACE` times
+    that photo's median known distance away. Occlusion is not considered.
 
     Args:
         pool: the training photos.
         side: cells per axis.
         contraction: of the field.
-        depths: pixels at known distances; without any in a photo, the median of all holds for it.
+        depths: pixels at known distances; a photo without any takes the median over all photos.
 
     Returns:
         (side, side, side) bool, indexed [z, y, x].
@@ -40,7 +41,7 @@ def covered_cells(pool: PixelPool, side: int, contraction: str, depths: PointDep
         left = np.flatnonzero(count < LEAST_PHOTOS)
         away = points[left] - pose[:3, 3]
         distances = np.linalg.norm(away, axis=1)
-        # No pixel is farther from the axis than this; lenses project the rest only.
+        # No pixel is farther from the axis than this: only points within it are projected through the lens.
         widest = min(180.0, math.hypot(*camera.fov_deg))
         near_axis = away @ pose[:3, 2] >= distances * math.cos(math.radians(widest / 2 * BEYOND_CORNER))
         left, distances = left[near_axis], distances[near_axis]
@@ -52,7 +53,7 @@ def covered_cells(pool: PixelPool, side: int, contraction: str, depths: PointDep
 
 
 def _median_distances(pool: PixelPool, depths: PointDepths | None) -> np.ndarray:
-    """Return the median known distance of each photo; infinite where none is known at all."""
+    """Return the median known distance of each photo; infinite if no photo has any."""
     count = len(pool.cameras)
     if depths is None or len(depths.numbers) == 0:
         return np.full(count, np.inf)

@@ -1,4 +1,4 @@
-"""Transfers between host and device that neither waits for: what a step has computed is read one step later."""
+"""Transfers between host and device without waiting: the results of a step are read one step later."""
 
 import numpy as np
 import torch
@@ -6,15 +6,16 @@ from torch import Tensor
 
 
 class Delayed:
-    """Copies of tensors for the host. On a GPU they are those of the previous call, which have arrived meanwhile; on
-    the CPU nothing is copied or delayed.
+    """Copies of tensors for the host.
+
+    On a GPU they are those of the previous call, which have arrived meanwhile; on the CPU nothing is copied or delayed.
     """
 
     def __init__(self) -> None:
         self._sent: tuple[tuple[Tensor, ...], torch.cuda.Event] | None = None
 
     def exchange(self, *tensors: Tensor) -> tuple[Tensor, ...] | None:
-        """Send tensors of a device, and return those sent before; None if there are none."""
+        """Send tensors from their device, and return those sent before; None if there are none."""
         device = tensors[0].device
         if device.type == "cpu":
             return tensors
@@ -25,7 +26,7 @@ class Delayed:
         return before
 
     def take(self) -> tuple[Tensor, ...] | None:
-        """Wait for what was sent last, and return it once; None if there is nothing."""
+        """Wait for the tensors sent last and return them, once; None if there are none."""
         if self._sent is None:
             return None
         (copies, event), self._sent = self._sent, None
@@ -33,7 +34,7 @@ class Delayed:
         return copies
 
     def forget(self) -> None:
-        """Drop what was sent."""
+        """Drop the tensors sent last."""
         self._sent = None
 
 

@@ -6,23 +6,23 @@ from torch import Tensor
 from nerfcli.photos.pool import Drawn, PixelPool
 
 BLOCK_PX = 16
-# This part of a step's pixels is drawn in proportion to the error of their block, the others anywhere.
+# This fraction of a step's pixels is drawn in proportion to the error of their block, the others uniformly.
 GUIDED_SHARE = 0.5
-# What is left of a block's error when some of its pixels are seen again.
+# Weight of a block's previous error when some of its pixels are seen again.
 KEPT = 0.8
-# From this share of the budget on; before, photos are explained badly everywhere.
+# The fraction of the budget at which this begins; before, photos are explained badly everywhere.
 BEGINS = 0.2
 UNKNOWN = -1.0
 
 
 class ErrorMap:
-    """The error of each block of the photos, as far as it has been seen, and pixels drawn by it.
+    """The error of each block of the photos, as far as known, and pixels drawn in proportion to it.
 
-    A pixel p is drawn with density q(p) = (1 - g) / N + g error(p) / sum of errors, instead of 1 / N. In the loss it
-    counts 1 / (N q): the mean of the loss stays what it is, only its noise differs.
+    A pixel p is drawn with density q(p) = (1 - g) / N + g error(p) / sum of errors, instead of 1 / N. Its weight in the
+    loss is 1 / (N q): the expected loss stays the same, only its noise differs.
 
     Args:
-        pool: the photos. Pixels that are not usable are replaced by any others.
+        pool: the photos. Drawn pixels that are not usable are replaced by random usable ones.
     """
 
     def __init__(self, pool: PixelPool):
@@ -39,7 +39,7 @@ class ErrorMap:
         self._extent = (pool.sizes[self._photo] - self._corner).clamp_max(BLOCK_PX)
 
     def draw(self, count: int, generator: torch.Generator) -> Drawn:
-        """`count` pixels, with what each counts in the loss."""
+        """Draw `count` pixels, with the weight of each in the loss."""
         pool, device = self._pool, self.errors.device
         guided = round(GUIDED_SHARE * count)
         mass = self._known_errors() * self._extent.prod(-1)
@@ -62,7 +62,7 @@ class ErrorMap:
         return pool.rays_of(numbers)._replace(weights=1.0 / density)
 
     def learn(self, numbers: Tensor, errors: Tensor) -> None:
-        """Take note of the errors (N,) of pixels."""
+        """Update the errors of blocks from the errors (N,) of pixels."""
         before = torch.where(self.errors[0] == UNKNOWN, errors.mean(), self.errors)
         blocks = self._blocks_of(numbers)
         sums, counts = (torch.zeros_like(self.errors) for _ in range(2))
@@ -72,7 +72,7 @@ class ErrorMap:
         self.errors.copy_(torch.where(counts > 0, mixed, before))
 
     def _known_errors(self) -> Tensor:
-        """Return the same everywhere as long as nothing is known, and never 0."""
+        """Return the errors of all blocks, 1 where unknown and never 0."""
         return torch.where(self.errors == UNKNOWN, 1.0, self.errors.clamp_min(1e-9))
 
     def _blocks_of(self, numbers: Tensor) -> Tensor:
@@ -83,6 +83,6 @@ class ErrorMap:
 
 
 def _contains(numbers: Tensor, wanted: Tensor) -> Tensor:
-    """Return which of some numbers are among others that increase."""
+    """Return which of the `wanted` numbers are in `numbers`, which increase."""
     places = torch.searchsorted(numbers, wanted).clamp_max(len(numbers) - 1)
     return numbers[places] == wanted

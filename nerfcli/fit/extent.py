@@ -19,7 +19,7 @@ from nerfcli.runs.components import LEARNED_BACKGROUNDS
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 
-# What is infinitely far begins behind so many radii of the unit ball: what is nearer moves from photo to photo.
+# Radius, in unit balls, of the ball that a learned background surrounds: anything nearer shows parallax.
 BALLS_BEFORE_BACKGROUND = 1.5
 
 _IN_WORDS = {"none": "bounded scene", "l2": "unbounded scene", "linf": "unbounded scene (linf)"}
@@ -33,8 +33,8 @@ class Extent:
         contraction: one of `kernels.CONTRACTIONS`.
         training_from_scene: the similarity to the training frame.
         marching: the steps along rays there.
-        reach: the distance at which the last ray has left the ball that a background surrounds; None where the field
-            ends by itself.
+        reach: distance along rays at which the last ray has left the ball that a learned background surrounds; None if
+            the field is bounded.
     """
 
     contraction: str
@@ -46,7 +46,7 @@ class Extent:
         return _IN_WORDS[self.contraction]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; floats survive a round trip exactly."""
+        """Return plain values; floats survive a round trip exactly."""
         return {
             "contraction": self.contraction,
             "training_from_scene": self.training_from_scene.to_json(),
@@ -61,9 +61,9 @@ class Extent:
         return Extent(content["contraction"], similarity, Marching(**content["marching"]), content.get("reach"))
 
     def before(self, background: str) -> "Extent":
-        """Return the extent with a kind of background, see `Components`: the field ends where a learned one begins.
+        """Return the extent for a kind of background, see `Components`: the field ends where a learned one begins.
 
-        The fog of the start would hide it for good: the field would have to paint what is infinitely far.
+        Otherwise the initial fog would hide the background for good, and the field would have to paint distant things.
         """
         if background not in LEARNED_BACKGROUNDS or self.reach is None:
             return self
@@ -71,13 +71,12 @@ class Extent:
 
 
 def lacks_depth(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> bool:
-    """Return whether the scene gives no depth although these settings need it,
-    so that points must be triangulated first.
+    """Return whether the settings need a depth that the scene lacks, so that points must be triangulated first.
 
     Args:
-        scene: cameras, and points or depth bounds where it has them.
+        scene: cameras, and points or depth bounds if it has any.
         settings: of the training.
-        fills_frame: whether there is more in the photos than an object cut out by alpha.
+        fills_frame: whether the photos show more than an object cut out by alpha.
     """
     contraction = _contraction(settings, fills_frame)
     is_object = contraction == "none" and not fills_frame
@@ -90,10 +89,10 @@ def choose_extent(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -
     Args:
         scene: cameras, and points or depth bounds; see `lacks_depth`.
         settings: of the training.
-        fills_frame: whether there is more in the photos than an object cut out by alpha.
+        fills_frame: whether the photos show more than an object cut out by alpha.
 
     Raises:
-        UserError: "none" is requested as the contraction, and there are too few points to see where the scene ends.
+        UserError: the requested contraction is "none", and there are too few points to tell where the scene ends.
     """
     contraction = _contraction(settings, fills_frame)
     if contraction == "none" and not fills_frame:

@@ -28,25 +28,25 @@ from nerfcli.render.model import Marching
 from nerfcli.runs.settings import TrainSettings
 
 MOST_RAYS = 2**14
-# Rays of the training end where less than a thousandth of the light is left.
+# Optical depth at which training rays end: less than a thousandth of the light is left.
 DEEPEST = 7.0
 # Samples that absorb less of their ray's light than this have hardly any gradient: they are left out before their
-# colours are computed, and steps of as many samples have more rays.
+# colours are computed, so that steps with the same number of samples have more rays.
 LEAST_WEIGHT = 1e-3
-# Weight of the light that ends before the sky where this is seen.
+# Weight of the opacity of rays that see the sky.
 SKY_WEIGHT = 0.1
 # Weight of the roughness of a learned background. Directions that no photo shows take the colours of their neighbours;
-# without it, Adam makes large steps of the little light that leaks through surfaces, and they end in any colour.
+# without it, Adam makes large steps from the little light that leaks through surfaces, and their colours are arbitrary.
 ROUGHNESS_WEIGHT = 1e-6
-# The warm-up is over at this share of the budget at the latest, however few the steps.
+# The warm-up ends by this fraction of the budget at the latest, however few steps that is.
 WARMUP_SHARE = 0.1
-# Large tables, those of long trainings, have after so many steps all the detail that others have at the end.
+# After this many steps, fields of long trainings, with large tables, have the detail that other fields have at the end.
 LARGE_TABLE_STEPS = 400
 
 
 @dataclass(frozen=True)
 class StepResult:
-    """Result of one step: its loss, on a GPU that of the step before, and the number of samples and rays."""
+    """Result of one step: its loss (on a GPU, that of the previous step) and its numbers of samples and rays."""
 
     loss: float
     samples: int
@@ -54,23 +54,23 @@ class StepResult:
 
 
 class Fitting:
-    """The state of a training. On a CPU, same seed and threads give the same numbers, step for step.
+    """The state of a training. On a CPU, the same seed and thread count give the same numbers, step for step.
 
     Args:
         pool: the training photos.
         marching: the steps along rays.
         contraction: of the field.
         settings: of the training.
-        log_gains: (photos, 3) logarithms of their exposures to start from.
-        log_focal: logarithm of the factor of focal lengths to start from, where these learn.
-        cameras_from: the share of the budget from which on cameras learn.
+        log_gains: (photos, 3) logarithms of the photos' initial exposures.
+        log_focal: logarithm of the initial factor of focal lengths, if these are learned.
+        cameras_from: the fraction of the budget after which cameras learn.
         points: pixels whose distance is known.
-        error_map: where the error is, if pixels are drawn by it.
-        movers: where something moves, if that is left out.
+        error_map: error of blocks of pixels, if pixels are drawn by it.
+        movers: blocks in which something moves, if these are left out of the loss.
         covered: the cells that may be filled, see `coverage.covered_cells`; None for all.
-        sky: (pixels,) bool, those of the pool that show a sky that is learned; None where none are known.
-        size: of the field; else `sizes.chosen_size` gives one for the settings and the pool.
-        ranks: which train this field together, each in such a state.
+        sky: (pixels,) bool, the pixels of the pool that show a sky to be learned; None if none are known.
+        size: of the field; by default, `sizes.chosen_size` for the settings and the pool.
+        ranks: the processes that train this field together, each with its own copy of this state.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Fitting:
         self.settings = settings
         self.ranks = ranks
         self.step = 0
-        # The largest share of a budget so far: a training that goes on to a larger one has used less of that.
+        # The largest fraction of any budget so far: a training resumed with a larger budget begins at a smaller one.
         self.furthest = 0.0
         self.components = settings.components
         if size is None:
@@ -134,19 +134,19 @@ class Fitting:
         self.samples_per_ray = float(len(self.edges) - 2)
         self.rate_factor, self.rollbacks = 1.0, 0
         self.in_step = False
-        self.loss: float | None = None  # the last that has been read
+        self.loss: float | None = None  # the last one that was read
         self._losses = Delayed()
 
     def advance(self, share: float, watch: Watch = UNWATCHED) -> StepResult:
         """Take one optimiser step.
 
         Args:
-            share: how much of the budget is used, in [0, 1]; it drives the learning rate.
-            watch: is shown every tensor of the step, before and after it.
+            share: fraction of the budget that is used, in [0, 1]; it determines the learning rate.
+            watch: observes the tensors of the step, and the state before and after it.
 
         Raises:
-            NonFiniteError: the loss or a gradient of the weights is not finite; on a GPU, maybe of the step before. The
-                state is then that of no step.
+            NonFiniteError: the loss or a gradient of the weights is not finite; on a GPU, possibly that of the previous
+                step. The state is then incomplete.
         """
         self.in_step = True
         watch.state(self.state)
@@ -174,7 +174,7 @@ class Fitting:
         return StepResult(loss=value, samples=samples, rays=rays)
 
     def draw(self, fraction: float) -> Drawn:
-        """Return the pixels of the next step, after looking at what fills space if it is time."""
+        """Return the pixels of the next step; refresh the open cells first if it is time."""
         settings = self.settings
         self.cells.refresh(
             self.step,
@@ -192,12 +192,12 @@ class Fitting:
         return self.points.added_to(drawn, self.generator)
 
     def smaller_steps(self) -> None:
-        """Halve the learning rate from here on, as numbers became non-finite."""
+        """Halve the learning rate from now on, because numbers became non-finite."""
         self.rate_factor /= 2
         self.rollbacks += 1
 
     def learning_rate(self, fraction: float) -> float:
-        """Linear warm-up, then half a cosine from the first to the final rate over the budget."""
+        """Return the learning rate: linear warm-up, then half a cosine from the first to the final rate."""
         settings = self.settings
         left = 0.5 * (1.0 + math.cos(math.pi * min(1.0, fraction)))
         rate = settings.final_learning_rate + left * (settings.learning_rate - settings.final_learning_rate)
@@ -207,8 +207,8 @@ class Fitting:
     def _loss(
         self, drawn: Drawn, *, whole: Drawn, edges: Tensor, fraction: float, watch: Watch
     ) -> tuple[Tensor, Tensor, int]:
-        """Return the part of the loss that some rays of the whole step have, the loss of the colour of each, and the
-        number of samples it took.
+        """Return the loss contributed by this rank's rays of the whole step, the colour loss of each ray, and the
+        number of samples.
         """
         count, components, device = len(whole.origins), self.components, drawn.origins.device
         jitter = torch.rand(count, generator=self.generator, device=device)[self.ranks.own].contiguous()
@@ -259,14 +259,14 @@ class Fitting:
 
     @torch.no_grad()
     def light_from_beyond(self, drawn: Drawn, *, distance: float) -> Tensor:
-        """(N,) the shares of the light of pixels that come from farther away than a distance, as the field is now."""
+        """Return the fraction of each pixel's light, (N,), that comes from beyond a distance in the current field."""
         drawn = self.parts.refined(drawn)
         edges = self.edges[:: stride_at(self.furthest, self.step)].contiguous()
         near = edges[: max(2, int(torch.searchsorted(edges, distance, right=True)))]
         return self._seen(drawn, edges=near, behind=torch.zeros_like(drawn.origins))[1]
 
     def _seen(self, drawn: Drawn, *, edges: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 3) colours of rays that step from edge to edge, on what is behind, and (N,) what passes through."""
+        """Return the colours (N, 3) of rays stepping from edge to edge, over `behind`, and their transmittance (N,)."""
         jitter = torch.full_like(drawn.origins[:, 0], 0.5)
         seen = self.field.backend.render_rays(
             Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
@@ -278,7 +278,7 @@ class Fitting:
 
     @property
     def _detail(self) -> float:
-        """The share of the budget whose details the field has: late cameras meet a field that has its detail."""
+        """Fraction of the budget whose detail the field has; cameras that learn late do not delay it."""
         if self._cameras_from > 0.0:
             return self.furthest
         if self.parts.cameras is None and self.field.settings.detailed:
@@ -289,7 +289,7 @@ class Fitting:
         return March(edges, occupied, self.field.settings.contraction, DEEPEST)
 
     def _cones(self, drawn: Drawn) -> Tensor | None:
-        """Widths of pixels per distance, where they matter."""
+        """Return the pixel widths per unit of distance if the field is antialiased, else None."""
         return self.pool.cones[self.pool.photo_of(drawn.numbers)] if self.components.antialias else None
 
     def _add_up_gradients(self, drawn: Drawn, samples: int) -> int:
@@ -303,7 +303,7 @@ class Fitting:
         return samples
 
     def settle(self) -> None:
-        """Read the loss of the last step if a GPU still had to compute it.
+        """Read the loss of the last step if it is still pending on a GPU.
 
         Raises:
             NonFiniteError: as for `advance`.
@@ -318,13 +318,13 @@ class Fitting:
             self.loss = value
 
     def _finite_loss(self, loss: Tensor, drawn: Drawn, watch: Watch) -> float:
-        """Return the loss, if it and all gradients are finite; of the step before where the host would have to wait."""
+        """Return the loss if it and all gradients are finite; on a GPU usually that of the previous step."""
         total = loss.detach()
         rays = {"origins of rays": drawn.origins.grad, "directions of rays": drawn.directions.grad}
         of_rays = {name: gradient for name, gradient in rays.items() if gradient is not None}
         for name, gradient in {**self.optimiser.gradients(), **self.parts.gradients(), **of_rays}.items():
             watch.values(f"gradient of {name}", gradient)
-            total = total + gradient.sum()  # which is non-finite if any term is
+            total = total + gradient.sum()  # non-finite if any term is
         if self.optimiser.sink is not None:
             watch.values("gradient of rows", self.optimiser.sink)
         numbers = torch.stack([loss.detach(), total])
@@ -359,7 +359,7 @@ class Fitting:
         }
 
     def restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
-        """Take up what `state` gave."""
+        """Restore what `state` returned."""
         self._losses.forget()
         self.parts.forget_gradients()
         self.field.load_state_dict(
@@ -377,5 +377,5 @@ class Fitting:
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]
         self.rate_factor, self.rollbacks = description["rate_factor"], description["rollbacks"]
-        self.furthest = description.get("furthest", 1.0)  # all details used to learn from the start
+        self.furthest = description.get("furthest", 1.0)  # earlier versions learned all detail from the start
         self.in_step = False

@@ -1,33 +1,33 @@
 """Gauge freedom of refined cameras: keep their common rotation, translation and scale fixed.
 
-A field that turns with its cameras looks the same from all of them. Cameras that were not refined, those of held-out
-photos, would be left behind: the similarity that is in the mean of all corrections is taken out of them.
+A field that turns together with its cameras looks the same from all of them, but held-out cameras, which are not
+refined, would be left behind. The mean similarity of all corrections is therefore removed from them.
 """
 
 import numpy as np
 
 from nerfcli.cameras.rigid import Similarity, inverse, rotation_from_vector, vector_from_rotation
 
-# Cameras within such a distance stand in one place, and only turn together.
+# Cameras whose spread is below this distance are in one place: they have only a rotation and a translation in common.
 LEAST_REACH = 1e-9
-# Fewer cameras leave too little to tell turns from moves.
+# Fewer cameras leave too few residuals to weight rotations against translations.
 LEAST_TOLD = 6
 _ROUNDS, _MOST_WEIGHT = 10, 100.0
 
 
 def mean_similarity(before: np.ndarray, after: np.ndarray) -> Similarity:
-    """Return the similarity that is in the mean of the moves of cameras, to first order.
+    """Return the mean similarity of the motions of cameras, to first order.
 
-    With the turn w_i of camera i and the move t_i of its centre c_i, in the world, it is the turn w, the move u and the
-    growth s about the mean centre c that
+    With the rotation w_i of camera i and the translation t_i of its centre c_i, in the world, the rotation w, the
+    translation u and the logarithm of the scale s about the mean centre c minimise
 
         sum_i d^2 |w_i - w|^2 + |t_i - u - w x (c_i - c) - s (c_i - c)|^2
 
-    is least for. d is the root mean square distance of the cameras from c: a turn counts as much as the move that it
-    would be at that distance. What the cameras do not tell, such as the growth of one place, is none.
+    d is the root mean square distance of the cameras from c: a rotation counts as much as the translation that it
+    causes at that distance. Parameters that the cameras do not determine are 0, such as the scale of a single place.
 
-    With `LEAST_TOLD` cameras or more, turns and moves are weighted by one over what is left of each: where turns were
-    wrong and centres were right, the centres say where the cameras are, and the other way round.
+    With `LEAST_TOLD` cameras or more, rotations and translations are weighted by the inverse of their residuals: where
+    rotations were wrong and centres right, the centres determine the similarity, and vice versa.
 
     Args:
         before, after: (P, 4, 4) `world_from_cam`.
@@ -58,22 +58,22 @@ def mean_similarity(before: np.ndarray, after: np.ndarray) -> Similarity:
 
 
 def without_mean(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """`after` (P, 4, 4) without the mean similarity from `before`: as they stood to each other, but for the scale."""
+    """Return `after` (P, 4, 4) without the mean similarity from `before`; relative poses change only in scale."""
     return mean_similarity(before, after).inverse().apply_pose(after)
 
 
 def relative_motions(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """(P, 4, 4) `cam_before_from_cam_after`."""
+    """Return `cam_before_from_cam_after`, (P, 4, 4)."""
     return inverse(before) @ after
 
 
 def _least_squares(rows: np.ndarray, wanted: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(7,) for which rows (P, 6, 7) @ it is nearest to wanted (P, 6), by weights (6,)."""
+    """Return x (7,) that minimises the difference of rows (P, 6, 7) @ x and wanted (P, 6), weighted by (6,)."""
     return np.linalg.lstsq((weights[:, None] * rows).reshape(-1, 7), (weights * wanted).ravel(), rcond=1e-9)[0]
 
 
 def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) with matrix @ x = vector x x."""
+    """Return the matrices (N, 3, 3) with matrix @ x = vector x x."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]

@@ -7,20 +7,20 @@ HUBER_DELTA = 0.1
 
 
 def colour_losses(rendered: Tensor, measured: Tensor) -> Tensor:
-    """Huber loss of sRGB colours, delta 0.1: quadratic for noise, linear for what does not fit.
+    """Return the Huber loss of sRGB colours, delta 0.1: quadratic for noise, linear for outliers.
 
     Args:
         rendered, measured: (R, 3).
 
     Returns:
-        (R,) the mean of the channels, divided by delta so that its slope is at most 1.
+        (R,) the mean over channels, divided by delta so that its slope is at most 1.
     """
     losses = torch.nn.functional.huber_loss(rendered, measured, delta=HUBER_DELTA, reduction="none")
     return losses.mean(-1) / HUBER_DELTA
 
 
 def opacity_entropy(transmittance: Tensor) -> Tensor:
-    """Return how undecided rays are between opaque and clear, in nats.
+    """Return the entropy of rays between opaque and clear, in nats.
 
     -T log T - (1 - T) log(1 - T), with T kept inside [1e-4, 1 - 1e-4], where its gradient is at most 9.3
 
@@ -35,7 +35,7 @@ def opacity_entropy(transmittance: Tensor) -> Tensor:
 
 
 def over_background(colours: Tensor, background: Tensor) -> Tensor:
-    """Measured colours in front of `background` (R, 3): alpha * rgb + (1 - alpha) * background for RGBA.
+    """Return measured colours over `background` (R, 3): alpha * rgb + (1 - alpha) * background for RGBA.
 
     Args:
         colours: (R, 3) or (R, 4) with straight alpha.

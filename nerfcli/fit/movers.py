@@ -1,4 +1,4 @@
-"""People, cars, leaves: what one photo shows and the others do not, left out of the loss."""
+"""Moving things such as people, cars and leaves: leave out of the loss what one photo shows and others do not."""
 
 import torch
 from torch import Tensor
@@ -7,27 +7,27 @@ from torch.nn.functional import avg_pool2d
 from nerfcli.photos.pool import PixelPool
 
 BLOCK_PX = 16
-# What is left of the sums of a block after each step.
+# Factor by which the sums of a block decay in each step.
 KEPT = 0.997
-# From this share of the budget on; before, the field explains no photo. Then the blocks are looked at every few steps.
+# Fraction of the budget at which this begins, as the field explains no photo before, and steps between two refreshes.
 BEGINS = 0.2
 REFRESH_EVERY = 20
-# A block moves if its mean residual is larger than this, sRGB, and than so many times the median of all blocks.
+# A block moves if its mean residual is larger than this, in sRGB, and than this many times the median of all blocks.
 LEAST, FACTOR = 0.07, 4.0
-# A block and its neighbours say nothing while fewer of their pixels were seen.
+# A block is not judged while fewer pixels of it and its neighbours have been seen.
 FEWEST_PIXELS = 4.0
 
 
 class Movers:
-    """Which blocks of the training photos show something that moves.
+    """The blocks of the training photos that show something that moves.
 
     Detail that a field has not learned yet is too bright in some pixels of a block and too dark in others. Something
-    that other photos do not show is off in the same direction in all of them. So a block moves where the mean residual
-    of it and of its eight neighbours, without the median of the photo (its exposure), is large:
+    that other photos do not show is wrong in the same direction in all pixels. So a block moves if the mean residual of
+    it and its eight neighbours, minus the median over the photo (its exposure), is large:
 
         mean over channels of |mean residual - median of the photo|  >  max(LEAST, FACTOR * median of all blocks)
 
-    Means are over time, too, with weights that decay. Pixels of such a block are still rendered, but do not count in
+    Means are also over time, with weights that decay. Pixels of such a block are still rendered, but do not count in
     the loss; if the field comes to agree with them, they count again.
 
     Args:
@@ -43,8 +43,8 @@ class Movers:
         self.moving = torch.zeros(blocks, dtype=torch.bool, device=device)
 
     def learn(self, numbers: Tensor, residuals: Tensor, *, share: float, step: int) -> None:
-        """Take note of the residuals (N, 3), rendered - measured in sRGB, of pixels (N,) of one step, and decide which
-        blocks move if it is time.
+        """Record the residuals (N, 3), rendered - measured in sRGB, of one step's pixels (N,); if it is time, decide
+        which blocks move.
         """
         self.sums *= KEPT
         self.sums.index_add_(0, self._blocks_of(numbers), torch.cat([residuals, torch.ones_like(residuals[:, :1])], -1))
@@ -63,7 +63,7 @@ class Movers:
         self.moving = (off > limit).flatten()  # NaN is not larger
 
     def weights(self, numbers: Tensor) -> Tensor:
-        """Return what pixels (N,) count in the loss: 0 where something moves, else 1."""
+        """Return the weights of pixels (N,) in the loss: 0 where something moves, else 1."""
         return (~self.moving[self._blocks_of(numbers)]).float()
 
     def mask(self, photo: int) -> Tensor:

@@ -1,28 +1,28 @@
-"""Steps of poses as Gauss and Newton take them: rays say how far they are from their photos, and how sure that is."""
+"""Gauss-Newton steps of poses: each ray gives a gradient, and a curvature estimated from gradient and loss."""
 
 import torch
 from torch import Tensor, nn
 
 from nerfcli.fit.ranks import ALONE, Alone
 
-# Of what rays say of curvature, what is left a step later: a photo has few rays in one step.
+# Decay of the running mean of the curvature per step: a photo has few rays in one step.
 MEMORY = 0.95
-# A loss of less than this, as of a level of 255, says nothing of a slope.
+# Added to losses: smaller ones, those of about one level of 255, give no reliable curvature.
 _LEAST_LOSS = 3e-5
 _FLOOR = 1e-12
-# Square pixels. Where all photos have moved by less, they are held no tighter.
+# In square pixels. Photos are held no tighter when their mean motion is below this.
 _LEAST_SPREAD = 0.05
 
 
 class NewtonSteps(nn.Module):
-    """Steps of P poses; in each 6 numbers that change them, moves and turns.
+    """Steps of P poses, each with 6 parameters: translation and rotation.
 
-    A ray whose loss is k r^2 / 2 has the gradient g = k r J, and the curvature k J J^T = g g^T / (2 loss): known
-    without a second derivative. Three channels that err alike are as one.
+    A ray whose loss is k r^2 / 2 has the gradient g = k r J and the curvature k J J^T = g g^T / (2 loss), which needs
+    no second derivative. Three channels with the same error count as one.
 
     Args:
         count: P.
-        picture_px: (P, 6) square pixels that the picture moves by, on average, with a unit of each number squared.
+        picture_px: (P, 6) mean squared motion of the picture, in square pixels, per squared unit of each parameter.
     """
 
     def __init__(self, count: int, picture_px: Tensor):
@@ -34,13 +34,13 @@ class NewtonSteps(nn.Module):
         self.register_buffer("weight", torch.zeros((), dtype=torch.float64))
 
     def learn(self, gradients: Tensor, losses: Tensor, photos: Tensor, ranks: Alone = ALONE) -> Tensor:
-        """Take in what some rays say; gives the sum (P, 6) of their gradients.
+        """Update the curvature from some rays, and return the sum (P, 6) of their gradients.
 
         Args:
             gradients: (R, 6) of each ray's own loss.
-            losses: (R,).
-            photos: (R,) whose rays they are.
-            ranks: each has rays of its own.
+            losses: (R,) the loss of each ray.
+            photos: (R,) the photo index of each ray.
+            ranks: the processes that share the step, each with its own rays.
         """
         of_ray = gradients[:, :, None] * gradients[:, None, :] / (2.0 * losses + _LEAST_LOSS)[:, None, None]
         curvature = torch.zeros_like(self.curvature).index_add_(0, photos, of_ray)
@@ -51,19 +51,19 @@ class NewtonSteps(nn.Module):
         return slope
 
     def change(self, slope: Tensor, so_far: Tensor, *, damping: float, holding: float) -> Tensor:
-        """(P, 6) what to add to the numbers for the least loss, were it quadratic and the field as it is.
+        """Return the parameter change (P, 6) that minimises the loss, assumed quadratic in them, for the current field.
 
-            (H + damping diag(H) + L)^-1 (slope + L so_far),  L = holding diag(mean H) / spread^2, in square pixels
+            -(H + damping diag(H) + L)^-1 (slope + L so_far),  L = holding diag(mean H) / spread^2, in square pixels
 
-        L holds moves and turns back, each as one kind, by how little all photos have moved or turned so far: errors
-        of the cameras show in directions that the photos determine, and that kind of change is preferred in those that
-        they do not. Centres that were right stay so, and so do cameras.
+        L holds back translations and rotations, each as one kind, the more the less all photos have moved in that way
+        so far. Errors of the cameras show in directions that the photos determine; the same kind of change is then
+        preferred in directions that they do not. Centres that were right stay right, and so do whole cameras.
 
         Args:
             slope: (P, 6) the sum of the gradients of a step's rays.
-            so_far: (P, 6) how far the poses are from the given ones.
-            damping: of each number by itself; poorly determined ones move slowly.
-            holding: how strongly what is less than a pixel is held.
+            so_far: (P, 6) the current poses relative to the given ones.
+            damping: of each parameter by itself; poorly determined ones move slowly.
+            holding: strength with which changes of less than a pixel are held back.
         """
         curvature = self.curvature / self.weight.clamp_min(_FLOOR)
         diagonal = torch.diagonal(curvature, dim1=-2, dim2=-1)

@@ -1,7 +1,7 @@
 """The training frame: an invertible similarity that brings what the cameras look at into the unit ball.
 
-float32 has 7 digits; a scene in a frame of size 1 near the origin never loses a ray step to rounding, wherever the
-capture lies in the world. Nothing on disk is moved by this.
+float32 has 7 digits; in a frame of size 1 near the origin, no ray step is lost to rounding, wherever the capture is in
+the world. Files keep the scene's own frame.
 """
 
 import math
@@ -15,38 +15,38 @@ from nerfcli.errors import UserError
 from nerfcli.render.model import Marching
 from nerfcli.scene import Scene
 
-# Contracted space ends at infinity; nothing is resolved beyond this many ball radii.
+# Rays end at this many ball radii: contracted space reaches to infinity, but resolves nothing beyond.
 FARTHEST = 300.0
 NEAREST = 0.02
-# Rays begin at this part of the nearest depth: points miss what has no features, bounds that come with a capture are
-# meant to hold everything. Before it, fog would stay that no other photo contradicts. In a box, points reach up to the
-# cameras. Source for bounds: load_llff.py of the code of NeRF, Mildenhall et al. 2020.
+# Rays begin at this fraction of the nearest depth: points miss surfaces without features, bounds that come with a
+# capture are meant to include everything. Nearer, fog that no other photo contradicts would remain. In a box, points
+# reach up to the cameras. Source for bounds: load_llff.py of the code of NeRF, Mildenhall et al. 2020.
 NEAR_PER_POINT, NEAR_PER_BOUND, NEAR_IN_BOX = 0.7, 0.9, 0.5
-# Where depths are larger than the unit ball, they do not say how near something may stand.
+# Rays begin at most this far away: depths larger than the unit ball do not tell how near a surface may be.
 MOST_NEAR = 0.5
-# The unit ball reaches at least as far as this share of the depth of a typical pixel. Around an object both are about
-# alike, and the cameras decide; a ball that held most points of a desk in a room cost 0.4 dB.
+# The radius of the unit ball is at least this fraction of the depth of a typical pixel. Around an object, camera
+# distance and depth are similar, and the cameras decide; a ball around most points of a desk in a room cost 0.4 dB.
 BALL_PER_DEPTH = 0.75
-# Cameras that are closer to their middle than this share of the nearest depth see a scene from one side, or all around
-# from one place.
+# Cameras that are all closer to their mean than this fraction of the nearest depth see a scene from one side, or all
+# around from one place.
 NARROW_SPREAD = 0.5
-# Of the typical depth of such captures: behind it begins what is infinitely far.
+# In such captures, the background begins at this multiple of the typical depth.
 NARROW_BACKGROUND = 2.5
 # Fewer points do not tell where a scene ends.
 LEAST_POINTS = 50
-# A box holds all points but these per cent at either end, where wrong ones are, and reaches beyond by this share.
+# A box is trimmed by this percentile at each end, where wrong points are, and then enlarged by this fraction.
 BOX_PERCENTILE = 0.5
 BOX_MARGIN = 0.1
-# The points of a block at the edge of the scene reach as far as one can see: its ball leaves so many per cent out.
+# Percentile for the ball of a block: at the edge of a scene, the points of a block reach as far as one can see.
 BLOCK_PERCENTILE = 5.0
 
 
 def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
-    """Return the similarity from the scene's frame, and the steps along rays, where space beyond is contracted.
+    """Return the similarity to the training frame and the steps along rays, for contracted space beyond the unit ball.
 
-    The unit ball is centred where the cameras look. It reaches to the median camera, or to three quarters of the median
-    depth if that is farther: in a room the walls are behind the cameras, and nearly all that the photos show would lie
-    in contracted space, with steps that grow as the square of the distance.
+    The unit ball is centred where the cameras look. Its radius is the distance of the median camera, or three quarters
+    of the median depth if that is larger: in a room the walls are behind the cameras, and nearly all that the photos
+    show would be in contracted space, with steps that grow as the square of the distance.
 
     Raises:
         UserError: no camera (see `Scene`).
@@ -60,9 +60,9 @@ def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
 
 
 def has_narrow_baseline(scene: Scene) -> bool:
-    """Return whether the cameras are close together, measured by the nearest depth: see `narrow_frame`.
+    """Return whether the cameras are close together relative to the nearest depth: see `narrow_frame`.
 
-    False where the scene does not tell depths, or only that something may touch a camera.
+    False if the scene has no depths, or if its nearest depth is 0.
     """
     depths = _typical_depths(scene)
     nearest = 0.0 if depths is None else float(depths[:, 0].min())
@@ -70,14 +70,14 @@ def has_narrow_baseline(scene: Scene) -> bool:
 
 
 def narrow_frame(scene: Scene) -> tuple[Similarity, Marching, float]:
-    """Return the same for forward-facing captures and panoramas, and the distance behind which a background begins.
+    """Return similarity and steps for forward-facing captures and panoramas, and the distance of the background.
 
-    The unit ball is centred between the cameras and reaches to the nearest depth. All that is seen lies in contracted
-    space, where a place is a direction and an inverse distance: cells are as deep as the small parallax of these
-    captures tells depths apart. NeRF has NDC for this, Mildenhall et al. 2020, appendix C.
+    The unit ball is centred between the cameras and reaches to the nearest depth. Everything visible is in contracted
+    space, where a position is a direction and an inverse distance: the depth of cells matches the depth resolution of
+    the small parallax of these captures. NeRF uses NDC for this, Mildenhall et al. 2020, appendix C.
 
     Raises:
-        ValueError: the scene does not tell depths, see `has_narrow_baseline`.
+        ValueError: the scene has no depths, see `has_narrow_baseline`.
     """
     depths = _typical_depths(scene)
     if depths is None:
@@ -89,17 +89,17 @@ def narrow_frame(scene: Scene) -> tuple[Similarity, Marching, float]:
 
 
 def block_frame(scene: Scene) -> tuple[Similarity, Marching]:
-    """Return the same for a block: the unit ball is in the middle of its points and as wide as the box around them.
+    """Return similarity and steps for a block: the unit ball is centred in its points and as wide as their box.
 
-    Cameras may stand outside, and space beyond the ball is contracted: there is the rest of the scene.
+    Cameras may be outside. Space beyond the ball is contracted and holds the rest of the scene.
     """
     return _ball(scene, *_box(scene, BLOCK_PERCENTILE), _typical_depths(scene))
 
 
 def object_frame(scene: Scene) -> tuple[Similarity, Marching]:
-    """Return the same for photos with alpha: an object in the middle, and nothing else.
+    """Return similarity and steps for photos with alpha: an object in the middle, and nothing else.
 
-    The unit ball is the smallest that reaches out of every camera's view, and the cube around it is all there is.
+    The unit ball is the smallest that fills every camera's view, and the cube around it is the whole field.
 
     Raises:
         UserError: no camera (see `Scene`).
@@ -115,7 +115,7 @@ def object_frame(scene: Scene) -> tuple[Similarity, Marching]:
 
 
 def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
-    """Return the same for a scene that ends, without alpha: the cube [-1, 1]^3 is the smallest around its points.
+    """Return similarity and steps for a bounded scene without alpha: [-1, 1]^3 is the smallest cube around its points.
 
     Raises:
         UserError: the scene has too few points to tell where it ends.
@@ -135,7 +135,7 @@ def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
 
 
 def _ball(scene: Scene, centre: np.ndarray, radius: float, depths: np.ndarray | None) -> tuple[Similarity, Marching]:
-    """Return the frame of a unit ball with contracted space around it, and its steps; `depths` of `_typical_depths`."""
+    """Return similarity and steps for a unit ball in contracted space; `depths` as from `_typical_depths`."""
     near = NEAREST * 5 if depths is None else _near_part(scene) * float(depths[:, 0].min()) / radius
     near = min(max(near, NEAREST), MOST_NEAR)
     similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
@@ -143,15 +143,15 @@ def _ball(scene: Scene, centre: np.ndarray, radius: float, depths: np.ndarray | 
 
 
 def _box(scene: Scene, percentile: float) -> tuple[np.ndarray, float]:
-    """Return the middle of the box around the scene's points, without so many per cent of them at either end, and half
-    of its longest side with the margin.
+    """Return the centre of the box around the scene's points, trimmed by a percentile at each end, and half of its
+    longest side with the margin.
     """
     low, high = np.percentile(scene.points, (percentile, 100 - percentile), axis=0)
     return (low + high) / 2, max(float((high - low).max()) / 2 * (1 + BOX_MARGIN), 1e-12)
 
 
 def _near_part(scene: Scene) -> float:
-    """Return the part of the nearest depth at which rays begin."""
+    """Return the fraction of the nearest depth at which rays begin."""
     return NEAR_PER_POINT if scene.depth_bounds is None else NEAR_PER_BOUND
 
 
@@ -161,7 +161,7 @@ def _middle(scene: Scene) -> np.ndarray:
 
 
 def _focus(scene: Scene, depths: np.ndarray | None) -> np.ndarray:
-    """Return where the cameras look, with what `_typical_depths` says."""
+    """Return the point that the cameras look at; `depths` as from `_typical_depths`."""
     return focus_point(scene.frames, depth_hint=None if depths is None else float(np.median(depths[:, 1])))
 
 
@@ -171,18 +171,18 @@ def _distances(scene: Scene, centre: np.ndarray) -> np.ndarray:
 
 
 def _half_fov(frame: Frame) -> float:
-    """Half of the wider field of view, in radians; at most 70 degrees, as what lenses see to the side is no object."""
+    """Return half of the wider field of view, in radians, at most 70 degrees: objects are not seen farther off-axis."""
     return math.radians(min(max(frame.camera.fov_deg) / 2, 70.0))
 
 
 def _typical_depths(scene: Scene) -> np.ndarray | None:
-    """(n, 2) nearest and median depth of what each camera sees, from the capture's own bounds or from SfM points.
+    """Return the nearest and median depth that each camera sees, (n, 2), from the capture's own bounds or SfM points.
 
-    Nearest is the first percentile: a few wrong points are always closer. None when the scene tells neither.
+    The nearest depth is the first percentile, as a few wrong points are always closer. None if the scene has neither.
     """
     if scene.depth_bounds is not None:
         near, far = scene.depth_bounds[:, 0], scene.depth_bounds[:, 1]
-        # The harmonic mean is where LLFF puts its focus: half of the disparities lie on either side.
+        # The harmonic mean is where LLFF puts its focus: half of the disparities are on either side.
         return np.stack([near, 2.0 * near * far / (near + far)], axis=1)
     rows = []
     for frame in scene.frames:

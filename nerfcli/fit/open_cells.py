@@ -1,4 +1,4 @@
-"""The cells that training rays look into."""
+"""The grid cells that training rays sample."""
 
 import torch
 from torch import Tensor
@@ -11,14 +11,14 @@ from nerfcli.render.occupancy import Occupancy
 OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8
 REFRESH_TURNS = 8
-# Rays pass over cells where a step takes away less light than this: hardly any at first, when all of space is thin fog
-# and nothing tells yet where the surfaces are; then ever more, so that surfaces have to become compact.
+# Rays skip cells whose optical depth per step is below this threshold: hardly any at first, when all of space is thin
+# fog and surfaces are not known; then more and more, so that surfaces have to become compact.
 FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
-# The cells are closed by this share of the budget at the latest, however few the steps.
+# The final threshold is reached by this fraction of the budget at the latest, however few steps that is.
 CLOSING_SHARE = 0.3
-# Detailed fields also have a fine grid. At a refresh, a cell in which samples were thinner than before keeps this part
-# of its optical depth. Every few steps, rays look into all cells that the coarse grid leaves open, so that closed fine
-# cells can open again.
+# Detailed fields also have a fine grid. At a refresh, the optical depth of a visited cell decays by this factor, unless
+# the samples there were larger. Every few steps, rays sample all cells that the coarse grid leaves open, so that closed
+# fine cells can open again.
 FINE_SIDE = 128
 DECAY = 0.8
 LOOK_AROUND_EVERY = 8
@@ -26,11 +26,11 @@ UNVISITED = -1.0
 
 
 class OpenCells:
-    """The cells that rays look into, of a coarse grid and, for detailed fields, of a fine one.
+    """The cells that rays sample, of a coarse grid and, for detailed fields, of a fine one.
 
-    Random points of the field fill the coarse grid, see `Occupancy`. Surfaces are much thinner than its cells. The fine
-    grid holds the optical depths of the samples that the training takes anyway, and closes the cells that these found
-    empty.
+    The coarse grid is filled from random points of the field, see `Occupancy`. Surfaces are much thinner than its
+    cells. The fine grid holds the optical depths of the samples that the training takes anyway, and closes the cells in
+    which these samples were empty.
 
     Args:
         field: the field being trained.
@@ -40,7 +40,7 @@ class OpenCells:
     def __init__(self, field: Field, device: torch.device, *, covered: Tensor | None):
         self._field, self._covered = field, covered
         self._occupancy = Occupancy(OCCUPANCY_SIDE, device)
-        # Fine cells: the largest optical depth of the samples since the last refresh, and what was known before.
+        # Fine cells: the largest optical depth of the samples since the last refresh, and the value up to then.
         self.visits: Tensor | None = None
         if field.settings.detailed:
             self.visits = torch.full((FINE_SIDE, FINE_SIDE, FINE_SIDE), UNVISITED, device=device)
@@ -48,7 +48,7 @@ class OpenCells:
         self._open(FIRST_THRESHOLD)
 
     def at(self, step: int) -> Tensor:
-        """Return the open cells (G, G, G) of one step, of the fine grid in most steps."""
+        """Return the open cells (G, G, G) for one step: those of the fine grid, if there is one, in most steps."""
         return self.coarse if self.visits is None or step % LOOK_AROUND_EVERY == 0 else self._fine
 
     def refresh(
@@ -61,15 +61,15 @@ class OpenCells:
         generator: torch.Generator,
         ranks: Alone,
     ) -> None:
-        """Look at what fills space, every few steps.
+        """Update the open cells from the field, every few steps.
 
         Args:
-            share: how much of the budget is used, in [0, 1].
+            share: fraction of the budget that is used, in [0, 1].
             detail: of the field, see `Field.medium`.
             generator: source of the random points of the coarse grid.
-            ranks: whose samples count.
+            ranks: the processes whose samples are combined.
         """
-        # The whole coarse grid once, after a warm-up in which everything is open; then a share at a time.
+        # The whole coarse grid once, after a warm-up in which everything is open; then a fraction of it at a time.
         if step == 0 or step % REFRESH_EVERY:
             return
         turn = step // REFRESH_EVERY
@@ -83,7 +83,7 @@ class OpenCells:
         )
         if self.visits is not None:
             ranks.keep_largest(self.visits)
-            # The host waits for a GPU to count these; to compute all cells instead takes a CPU 1.6 times as long.
+            # The host waits for a GPU to count these; computing all cells instead takes a CPU 1.6 times as long.
             visits, depths = self.visits.view(-1), self._depths.view(-1)
             visited = (visits >= 0).nonzero()[:, 0]
             before = depths[visited]
@@ -99,7 +99,7 @@ class OpenCells:
         if self.visits is not None:
             fine = self._depths > self._occupancy.least(threshold)
             parts = FINE_SIDE // OCCUPANCY_SIDE
-            # Only the two outer axes are spread out by strides: whole rows of fine cells are fast, pairs are not.
+            # Only the two outer axes are expanded by broadcasting: whole rows of fine cells are fast, pairs are not.
             rows = self.coarse.repeat_interleave(parts, dim=2)[:, None, :, None]
             fine.view(OCCUPANCY_SIDE, parts, OCCUPANCY_SIDE, parts, FINE_SIDE).logical_and_(rows)
             self._fine = fine
@@ -112,10 +112,10 @@ class OpenCells:
         return tensors
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Take up what `state` gave."""
+        """Restore what `state` returned."""
         self._occupancy.restore(tensors)
-        # Not opened anew: the threshold moves between two refreshes, the open cells do not.
+        # Not recomputed: the threshold changes between two refreshes, the open cells do not.
         self.coarse = tensors["occupied"]
-        if self.visits is not None and "fine_depth" in tensors:  # checkpoints used to have no fine cells
+        if self.visits is not None and "fine_depth" in tensors:  # earlier checkpoints have no fine cells
             self._depths, self.visits = tensors["fine_depth"], tensors["fine_visits"]
             self._fine = tensors["fine_occupied"]

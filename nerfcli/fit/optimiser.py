@@ -1,4 +1,4 @@
-"""Adam for a field: on all parameters that take part in every sample, and on the rows that a step has touched."""
+"""Adam for a field: on the weights, which every sample uses, and on the rows that a step has touched."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ from nerfcli.fit.adam import BETAS, EPS, Adam
 class FieldOptimiser:
     """Adam's moments for a field's rows and weights.
 
-    `sink` collects the gradient of the rows: it is made once, given to `Backend.render_rays`, and empty again
+    `sink` accumulates the gradient of the rows: it is allocated once, passed to `Backend.render_rays`, and zero again
     after each step. None for a field without rows.
     """
 
@@ -27,7 +27,7 @@ class FieldOptimiser:
             self.sink, self._first, self._second = (torch.zeros_like(rows, requires_grad=False) for _ in range(3))
 
     def zero_grad(self) -> None:
-        """Forget the gradients of the weights; those of the rows went with the step that used them."""
+        """Clear the gradients of the weights; the step that used those of the rows has cleared them already."""
         self._adam.zero_grad()
 
     def weights(self) -> list[Tensor]:
@@ -35,13 +35,13 @@ class FieldOptimiser:
         return list(self._weights.values())
 
     def gradients(self) -> dict[str, Tensor]:
-        """Return by name the gradients that anything non-finite reaches: those of rows only without weights."""
+        """Return by name the gradients that any non-finite number reaches: those of the weights, or of rows alone."""
         if not self._weights and self.sink is not None:
             return {"rows": self.sink}
         return {name: weight.grad for name, weight in self._weights.items() if weight.grad is not None}
 
     def step(self, number: int, rate: float) -> None:
-        """Step `number`, from 1, at a learning rate."""
+        """Take step `number`, counted from 1, at a learning rate."""
         rate = rate * self._field.rate_factor
         self._adam.step(rate)
         rows = self._field.rows()
@@ -70,15 +70,15 @@ class FieldOptimiser:
         if self._first is not None:
             self._first, self._second = tensors["table_first"], tensors["table_second"]
         if self.sink is not None:
-            self.sink.zero_()  # a step may have ended before it was used
+            self.sink.zero_()  # a step may have failed before using it
         self._adam.restore(tensors, "adam")
 
 
 class PartsOptimiser:
-    """Adam for what is learned besides the field.
+    """Adam for parameters learned besides the field.
 
     Args:
-        groups: "params" and, as "multiple", their learning rate as a multiple of the field's.
+        groups: each has "params" and "multiple", their learning rate as a multiple of the field's.
     """
 
     def __init__(self, groups: Sequence[dict[str, Any]]):

@@ -10,17 +10,17 @@ from torch import Tensor
 
 from nerfcli.cameras.rigid import Similarity, apply, inverse
 from nerfcli.multiview.stereo import DenseDepth
-from nerfcli.multiview.tracks import Tracks, places_of
+from nerfcli.multiview.tracks import Tracks, indices_by_value
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.pool import Drawn, PixelPool
 
-# Until this share of the budget the points count less and less; photos tell more than points once there are surfaces.
+# Fraction of the budget at which the weight of the points reaches 0: once there are surfaces, photos tell more.
 LAST_SHARE = 0.5
-# One keypoint is drawn for so many other pixels.
+# One pixel at a known distance is drawn per this many other pixels.
 PIXELS_PER_POINT = 8
-# Miss at which a point counts half, in pixels of the training photo.
+# Reprojection error at which a point has half the weight, in pixels of the training photo.
 HALF_ERROR_PX = 1.0
-# Expected error of a distance at which a pixel of stereo matching counts half, as a part of the distance.
+# Expected relative error of a stereo distance at which its pixel has half the weight.
 HALF_ERROR = 0.05
 
 
@@ -49,7 +49,7 @@ class PointDepths:
         return PointDepths(*(torch.cat(pair) for pair in pairs))
 
     def draw(self, count: int, generator: torch.Generator) -> "PointDepths":
-        """`count` of them at random, with replacement."""
+        """Draw `count` of these pixels at random, with replacement."""
         chosen = torch.randint(len(self.numbers), (count,), generator=generator, device=self.numbers.device)
         return PointDepths(self.numbers[chosen], self.distances[chosen], self.trust[chosen])
 
@@ -58,8 +58,8 @@ class PointRays:
     """Pixels at known distances that are added to each step.
 
     Args:
-        sets: pixels, one at least; as many are drawn from each, however large it is.
-        pool: what they are pixels of.
+        sets: of pixels; the same number is drawn from each set, whatever its size. Empty sets are dropped.
+        pool: the photos that these pixels belong to.
     """
 
     def __init__(self, sets: Sequence[PointDepths], pool: PixelPool):
@@ -67,7 +67,7 @@ class PointRays:
         self._pool = pool
 
     def added_to(self, drawn: Drawn, generator: torch.Generator) -> Drawn:
-        """Append pixels at known distances to the sampled ones. Their colours count like all others."""
+        """Append pixels at known distances to those in `drawn`. Their colours count like all others."""
         count = max(1, len(drawn.numbers) // PIXELS_PER_POINT // len(self.sets))
         chosen = reduce(PointDepths.joined, [depths.draw(count, generator) for depths in self.sets])
         both = self._pool.rays_of(torch.cat([drawn.numbers, chosen.numbers]))
@@ -78,19 +78,19 @@ class PointRays:
 
 
 def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
-    """Project triangulated points to usable pixels; empty if there are none.
+    """Return the usable pixels that see a triangulated point; empty if there are none.
 
-    trust = 1 / (1 + (miss / 1 px)^2), in pixels of the training photos
+    trust = 1 / (1 + (reprojection error / 1 px)^2), in pixels of the training photos
 
     Args:
-        tracks: what the pool's photos saw.
+        tracks: of features in the pool's photos.
         pool: the training photos.
         training_from_scene: the normalisation.
     """
     surface = triangulate(pool.frames, tracks)
     kept = np.flatnonzero(np.isfinite(surface.misses_px))
     numbers = np.full(len(kept), -1)
-    by_photo = places_of(tracks.photos[kept], len(pool.frames))
+    by_photo = indices_by_value(tracks.photos[kept], len(pool.frames))
     for photo, (frame, own) in enumerate(zip(pool.frames, by_photo, strict=True)):
         points = surface.points[tracks.points[kept[own]]]
         pixels, valid = frame.camera.project(apply(inverse(frame.world_from_cam), points))
@@ -112,12 +112,12 @@ def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarit
 
 
 def stereo_depths(dense: Sequence[DenseDepth], pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
-    """Return the usable pixels of a pool whose depth stereo matching tells.
+    """Return the usable pixels of a pool whose depth is known from stereo matching.
 
     trust = 1 / (1 + (error / 5 %)^2)
 
     Args:
-        dense: of each photo of the pool.
+        dense: the stereo depths of each photo of the pool.
         pool: the training photos.
         training_from_scene: the normalisation.
     """
@@ -135,7 +135,5 @@ def stereo_depths(dense: Sequence[DenseDepth], pool: PixelPool, training_from_sc
 
 
 def fading(fraction: float) -> float:
-    """Return the weight of the points at a fraction of the budget:
-    1 at the start, 0 from `LAST_SHARE` on, linear between.
-    """
+    """Return the weight of the points at a fraction of the budget: linear from 1 to 0 at `LAST_SHARE`, then 0."""
     return max(0.0, 1.0 - fraction / LAST_SHARE)

@@ -1,9 +1,8 @@
-"""The processes that train one field together, called ranks, from 0 on: what they add up in each step.
+"""The processes that train one field together, called ranks and numbered from 0, and the sums over all of them.
 
-All ranks draw the same pixels from the same random numbers. Each renders every `count`-th of them, from its own number
-on, and what comes of that is added up over the ranks: losses, gradients, numbers of samples, normal equations. So
-equal states stay equal, and are those of one process that renders all pixels, but for the order in which float32 sums
-are added up.
+All ranks draw the same pixels from the same random numbers. Each renders every `count`-th pixel, starting from its own
+rank, and the results are added up over the ranks: losses, gradients, sample counts, normal equations. Equal states
+therefore stay equal, and match those of one process that renders all pixels, except for the order of float32 sums.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,34 +17,34 @@ from nerfcli.errors import LOST_RANK, UserError
 
 
 class Alone:
-    """One process, alone: sums are its own, and nothing is sent."""
+    """A single process: sums are its own values, and nothing is sent."""
 
     rank, count = 0, 1
 
     @property
     def own(self) -> slice:
-        """Return which rows of what all ranks draw are those of this one."""
+        """The rows that belong to this rank, of those that all ranks draw."""
         return slice(self.rank, None, self.count)
 
     def add_up(self, *tensors: Tensor) -> None:
-        """Replace tensors of one type by their sums over all ranks, which are the same bits on each."""
+        """Replace tensors of one type by their sums over all ranks, identical to the bit on each."""
 
     def add_up_gradients(self, learned: Sequence[Tensor], *, rays: Sequence[Tensor], sink: Tensor | None) -> None:
-        """Add up the gradients of parameters, and of rows in a sink; rays only get one, 0 where they have no sample."""
+        """Add up gradients of parameters and of rows in a sink; rays keep their own, or get 0 if they have none."""
 
     def keep_largest(self, tensor: Tensor) -> None:
-        """Replace each number of a tensor by the largest over all ranks."""
+        """Replace each element of a tensor by its maximum over all ranks."""
 
     def total(self, number: int) -> int:
         """Return the sum of a number over all ranks."""
         return number
 
     def joined(self, rows: Tensor, count: int) -> Tensor:
-        """Return all `count` rows, of which each rank has its `own`."""
+        """Return all `count` rows; each rank passes its `own`."""
         return rows
 
     def gathered(self, value: Any) -> list[Any]:
-        """Return the values of all ranks, in their order."""
+        """Return the values of all ranks, in order of rank."""
         return [value]
 
     def from_first(self, value: Any) -> Any:
@@ -53,7 +52,7 @@ class Alone:
         return value
 
     def announce(self, fraction: float) -> float:
-        """Return what rank 0 says comes next."""
+        """Return the `fraction` of rank 0, which says what comes next; see `train.following`."""
         return fraction
 
     def copy_from_first(self, *tensors: Tensor) -> None:
@@ -67,8 +66,8 @@ class Ranks(Alone):
     """Several processes, of which this is one.
 
     Args:
-        rank, count: its number, and how many there are.
-        preparation: the group in which they may wait for long; the default group is for steps.
+        rank, count: the number of this process, and the number of processes.
+        preparation: the group with a long timeout, for preparation; the default group is for steps.
     """
 
     def __init__(self, rank: int, count: int, preparation: dist.ProcessGroup):
@@ -76,7 +75,7 @@ class Ranks(Alone):
         self._preparation = preparation
 
     def leave(self) -> None:
-        """Part from the other processes, at the end of this one: threads that still listen to them would abort it."""
+        """Disconnect from the other processes before this one exits: threads that still listen would abort it."""
         del self._preparation
         if dist.is_initialized():
             dist.destroy_process_group()
@@ -93,7 +92,7 @@ class Ranks(Alone):
 
     def add_up_gradients(self, learned: Sequence[Tensor], *, rays: Sequence[Tensor], sink: Tensor | None) -> None:
         for tensor in (*learned, *rays):
-            if tensor.requires_grad and tensor.grad is None:  # no ray of this rank has a sample
+            if tensor.requires_grad and tensor.grad is None:  # no ray of this rank has any sample
                 tensor.grad = torch.zeros_like(tensor)
         self.add_up(*(tensor.grad for tensor in learned if tensor.grad is not None))
         if sink is not None:

@@ -1,7 +1,7 @@
 """Cameras that learn with the field: the poses of the training photos, and the lenses that took them.
 
-The loss says how it would change with the origins and directions of a step's rays; from there it is a closed form to
-the turns and moves of the photos and to the lenses.
+Backpropagation gives the gradients of the loss with respect to the origins and directions of a step's rays; those with
+respect to poses and lenses follow in closed form.
 """
 
 from collections.abc import Sequence
@@ -22,23 +22,23 @@ from nerfcli.fit.ranks import ALONE, Alone
 from nerfcli.fit.whitening import WhitenedAdam, whitening
 from nerfcli.photos.pool import Drawn, Pool
 
-# Points that stand for what a camera sees: so many pixels along each side, at these multiples of the distance to the
-# middle of the training frame.
+# Points that represent what a camera sees: this many pixels along each side, at these multiples of the camera's
+# distance from the origin of the training frame.
 _PIXELS_A_SIDE = 6
 _DISTANCES = (2 / 3, 1.0, 2.0)
-# A camera in the middle sees what is at least so far away.
+# Least value of that distance, for cameras near the origin.
 _LEAST_DISTANCE = 0.2
-# Radians that a whitened step of a lens moves the picture by, at most.
+# Radians by which a whitened step of a lens moves the picture, at most.
 LENS_RATE = 3e-4
-# Radians that a step of a pose moves the picture by, at most.
+# Radians by which a step of a pose moves the picture, at most.
 _FARTHEST_STEP = 2e-3
-# Until the first share of the budget there is fog, from which cameras learn nothing; the rate rises up to the second.
-# From the third on it falls, down to a last rate, so that the steps' noise averages out and the field can settle.
+# Fractions of the budget. Until the first there is fog, from which cameras learn nothing; until the second, the rate
+# rises. From the third to the fourth it falls to the last rate: the steps' noise averages out and the field can settle.
 FIRST_SHARE, FULL_SHARE, FALLING_SHARE, LAST_SHARE, LAST_RATE = 0.1, 0.15, 0.5, 0.98, 0.03
-# A turn and a move look much alike, and a young field tells them apart wrongly: what a photo is not sure of is damped
-# at first, and less from share to share.
+# Rotations and translations look much alike, and an early field confuses them: poorly determined changes are damped
+# strongly at first, and less between these fractions of the budget.
 DAMPING_SHARES, DAMPINGS = (0.2, 0.8), (1.0, 0.1)
-# Then cameras are held, see `NewtonSteps.change`; not before it is known what was wrong with them.
+# Cameras are held from the first fraction on, see `NewtonSteps.change`; before, it is not clear which errors they have.
 HOLDING_SHARES, HOLDINGS = (0.2, 0.5), (1e-3, 0.05)
 
 
@@ -52,13 +52,15 @@ def rate_at(fraction: float) -> float:
 
 
 def _between(fraction: float, shares: tuple[float, float], values: tuple[float, float]) -> float:
-    """Return the first value up to the first share, the second from the second on, and an exponential in between."""
+    """Return the first value up to the first fraction, the second from the second on, exponential in between."""
     return float(np.exp(np.interp(fraction, shares, np.log(values))))
 
 
 class PoseRefinement(nn.Module):
-    """The poses of P photos: `motions` (P, 4, 4) is `given_from_refined`, in the axes of each camera; a small twist x
-    (6,) moves what a camera sees by sqrt(x^T `picture` x) radians, root mean square.
+    """The poses of P photos.
+
+    `motions` (P, 4, 4) is `given_from_refined`, in the axes of each camera. A small twist x (6,) moves what a camera
+    sees by sqrt(x^T `picture` x) radians, root mean square.
 
     Args:
         poses: (P, 4, 4) `world_from_cam` as given, training frame.
@@ -72,7 +74,7 @@ class PoseRefinement(nn.Module):
         self.register_buffer("motions", torch.eye(4, dtype=torch.float64).repeat(len(poses), 1, 1))
         at_one = {camera: _picture_by_twist(camera) for camera in dict.fromkeys(cameras)}
         distances = np.linalg.norm(poses[:, :3, 3], axis=1).clip(_LEAST_DISTANCE)
-        # What a move changes becomes less with the distance, what a turn changes does not.
+        # The effect of a translation on the picture decreases with the distance, that of a rotation does not.
         jacobians = [
             at_one[camera] * np.array([1 / distance] * 3 + [1.0] * 3)
             for camera, distance in zip(cameras, distances, strict=True)
@@ -84,11 +86,11 @@ class PoseRefinement(nn.Module):
         self.newton = NewtonSteps(len(poses), torch.from_numpy(picture_px))
 
     def poses(self) -> np.ndarray:
-        """(P, 4, 4) `world_from_cam` now."""
+        """Return the current `world_from_cam`, (P, 4, 4)."""
         return self._given @ self.motions.numpy()
 
     def moved(self, origins: Tensor, directions: Tensor, photos: Tensor) -> tuple[Tensor, Tensor]:
-        """Rays (R, 3) of the poses as given, as they are now; `photos` (R,) are theirs."""
+        """Move rays (R, 3) from the given poses to the current ones; `photos` (R,) are their photo indices."""
         now = self.poses()
         turns = now[:, :3, :3] @ np.swapaxes(self._given[:, :3, :3], -1, -2)
         turn = on_device_of(directions, turns)[photos]
@@ -97,10 +99,10 @@ class PoseRefinement(nn.Module):
         return origins + shift, (turn * directions[:, None, :]).sum(-1)
 
     def gradients(self, directions: Tensor, photos: Tensor, *, by_origin: Tensor, by_direction: Tensor) -> Tensor:
-        """(R, 6) by twists of the rays' cameras in their own axes, from gradients (R, 3) by rays as they are now, all
-        float64.
+        """Return gradients (R, 6) by twists of the rays' cameras, from those (R, 3) by the current rays; all float64.
 
-        A camera that moves by u and turns by w in its axes moves its rays by R u, and turns them by R w.
+        Twists are in the axes of each camera. A camera with rotation R that translates by u and rotates by w in its
+        axes translates its rays by R u, and rotates them by R w.
         """
         torque = torch.linalg.cross(directions, by_direction)
         cam_from_world = torch.from_numpy(self.poses()[:, :3, :3]).transpose(-1, -2)[photos]
@@ -112,11 +114,11 @@ class PoseRefinement(nn.Module):
         """Take a step against gradients (R, 6) of losses (R,) of rays, and remove the mean similarity of all moves.
 
         Args:
-            gradients, losses: of each ray by itself.
-            photos: (R,) whose rays they are.
+            gradients, losses: of each ray's own loss.
+            photos: (R,) the photo index of each ray.
             fraction: of the budget.
-            rate: in [0, 1], of the step that would be the whole way.
-            ranks: each has rays of its own.
+            rate: fraction of the full Newton step, in [0, 1].
+            ranks: the processes that share the step, each with its own rays.
         """
         so_far = self.motions.numpy()
         so_far = np.concatenate([so_far[:, :3, 3], vector_from_rotation(so_far[:, :3, :3])], axis=1)
@@ -133,12 +135,12 @@ class PoseRefinement(nn.Module):
 
 
 class LensRefinement(nn.Module):
-    """The lenses of some cameras: `values` (C, K) are changes by `names` (K,); what a camera has not stays 0.
+    """The lenses of C cameras: `values` (C, K) are the changes of K parameters; those a camera does not have stay 0.
 
     Args:
         pool: the photos, with their cameras as given.
-        names: what may change, of `lens_change.changeable`.
-        log_focal: what "focal" starts from.
+        names: (K,) parameters that may change, of `lens_change.changeable`.
+        log_focal: initial value of "focal".
     """
 
     def __init__(self, pool: Pool, names: tuple[str, ...], log_focal: float):
@@ -159,7 +161,7 @@ class LensRefinement(nn.Module):
         self.adam = WhitenedAdam(np.array([self._whitening(index) for index in range(len(self._cameras))]))
 
     def changed(self, camera: Camera, photo: int) -> Camera:
-        """Return the camera of a photo as it is now; the picture of `camera` may be of another size."""
+        """Return `camera`, that of a photo, with the current changes; its pictures may have another size."""
         return self._changed(camera, int(self._camera_of[photo]))
 
     def _now(self, index: int) -> Camera:
@@ -170,19 +172,22 @@ class LensRefinement(nn.Module):
         return changed(camera, self._own[index], self.values[index, own].numpy())
 
     def directions(self, drawn: Drawn, photos: Tensor) -> Tensor:
-        """(R, 3) those of the poses as given, through the lenses as they are now."""
-        numbers, photos = torch.stack([drawn.numbers, photos]).cpu()  # for a GPU, the host waits
+        """Return ray directions (R, 3) for the given poses and the current lenses."""
+        numbers, photos = torch.stack([drawn.numbers, photos]).cpu()  # with a GPU, the host waits for this
         changed = torch.full(drawn.directions.shape, torch.nan, dtype=drawn.directions.dtype)
         for index, rays, pixels in self._by_camera(numbers, photos):
             bearings, valid = self._now(index).bearings(pixels)
-            there = rays[torch.from_numpy(valid)]  # elsewhere the lens as given is better than none
+            there = rays[torch.from_numpy(valid)]  # elsewhere, the given lens is better than none
             turned = self._turns[photos[there]] @ torch.from_numpy(bearings[valid])[..., None]
             changed[there] = turned[..., 0].to(changed.dtype)
         now = on_device_of(drawn.directions, changed.numpy())
         return torch.where(now.isnan(), drawn.directions, now)
 
     def gradient(self, numbers: Tensor, photos: Tensor, *, turns: Tensor, by_direction: Tensor) -> Tensor:
-        """(C, K) by the changes, from gradients (R, 3) by directions; `turns` (P, 3, 3) are the photos' rotations."""
+        """Return the gradient (C, K) by the changes, from gradients (R, 3) by ray directions.
+
+        `turns` (P, 3, 3) are the photos' rotations.
+        """
         gradient = torch.zeros_like(self.values)
         for index, rays, pixels in self._by_camera(numbers, photos):
             names = self._own[index]
@@ -196,7 +201,7 @@ class LensRefinement(nn.Module):
         self.values += self.adam.change(gradient, rate)
 
     def _by_camera(self, numbers: Tensor, photos: Tensor) -> list[tuple[int, Tensor, np.ndarray]]:
-        """Return the cameras among the photos (R,) that can change: number, rays (N,) and their pixels (N, 2)."""
+        """Return index, rays (N,) and pixels (N, 2) for each camera of the rays' photos (R,) that can change."""
         of = self._camera_of[photos]
         found = []
         for index in of.unique().tolist():
@@ -220,12 +225,12 @@ class LensRefinement(nn.Module):
 
 
 class Refinement(nn.Module):
-    """The cameras of the training photos as they are now.
+    """The current cameras of the training photos.
 
     Args:
         kind: "poses", "focal", or "all": poses, focal lengths and distortion.
         pool: the training photos.
-        log_focal: logarithm of the factor of focal lengths to start from, where these learn.
+        log_focal: logarithm of the initial factor of focal lengths, if these are learned.
     """
 
     def __init__(self, kind: str, pool: Pool, log_focal: float = 0.0):
@@ -240,7 +245,7 @@ class Refinement(nn.Module):
 
     @torch.no_grad()
     def refined(self, drawn: Drawn) -> Drawn:
-        """Return the same pixels, with the rays of the cameras as they are now."""
+        """Return the same pixels, with the rays of the current cameras."""
         photos = self._pool.photo_of(drawn.numbers)
         origins, directions = drawn.origins, drawn.directions
         if self.lenses is not None:
@@ -251,16 +256,16 @@ class Refinement(nn.Module):
 
     @torch.no_grad()
     def step(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float, ranks: Alone = ALONE) -> None:
-        """Take one step against the gradients of the mean loss of the rays of all ranks.
+        """Take one step against the gradients of the mean loss over the rays of all ranks.
 
-        On a GPU, against those of the step before. `drawn`, which `refined` gave, are the rays of this rank.
+        On a GPU, the gradients are those of the previous step.
 
         Args:
-            drawn: rays that have gradients.
-            losses: (R,) of each.
+            drawn: the rays of this rank, from `refined`, with gradients.
+            losses: (R,) the loss of each ray.
             fraction: of the budget, for `rate_at`.
-            factor: of the rate.
-            ranks: each has rays of its own.
+            factor: of the learning rate.
+            ranks: the processes that share the step, each with its own rays.
         """
         by_origin, by_direction, rate = drawn.origins.grad, drawn.directions.grad, factor * rate_at(fraction)
         if rate == 0.0 or by_origin is None or by_direction is None:
@@ -273,7 +278,7 @@ class Refinement(nn.Module):
         losses, directions, by_origin, by_direction = (tensor.double() for tensor in rest)
         given = self._given if self.poses is None else self.poses.poses()
         turns = torch.from_numpy(given[:, :3, :3])
-        # Both gradients first: they are of the rays as they were.
+        # Compute both gradients before either step: they belong to the rays before the update.
         by_lens = None
         if self.lenses is not None:
             by_lens = self.lenses.gradient(numbers, photos, turns=turns, by_direction=by_direction)
@@ -288,14 +293,14 @@ class Refinement(nn.Module):
     def frames(
         self, training: Sequence[Frame], held_out: Sequence[Frame], *, scale: float
     ) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
-        """Both sets, refined: the poses of training photos, and the lenses of all photos that were taken with them.
+        """Return both sets of frames refined: the poses of training photos, and the lenses of all photos.
 
-        No held-out photo is used: it keeps its pose, and the lens estimated from the training photos.
+        No held-out photo is used: each keeps its pose and gets the lens estimated from the training photos.
 
         Args:
-            training: of the photos of the pool, in its order; their pictures may be of another size.
-            held_out: others, of the same size as `training`.
-            scale: of the training frame, in units of it per scene unit.
+            training: frames of the photos of the pool, in its order; their pictures may have another size.
+            held_out: further frames, of the same size as `training`.
+            scale: units of the training frame per scene unit.
         """
         lens_of = {frame.camera: self._lens(index, frame.camera) for index, frame in enumerate(training)}
 
@@ -317,7 +322,7 @@ class Refinement(nn.Module):
 
 
 def _picture_by_twist(camera: Camera) -> np.ndarray:
-    """(2 M, 6) how points at the usual distances move in a camera that moves by a twist, in radians, per point."""
+    """Return the derivatives (2 M, 6) of the image positions of M points by a twist, scaled by `_per_point`."""
     points = _points(camera)
     by_point, _, _ = camera.project_jacobian(points)
     # In the camera, a point x moves by -u - w x x, and a . (x x w) = w . (a x x).
@@ -326,12 +331,12 @@ def _picture_by_twist(camera: Camera) -> np.ndarray:
 
 
 def _points(camera: Camera) -> np.ndarray:
-    """(M, 3) in the camera's axes, where it has a direction."""
+    """Return points (M, 3) in the camera's axes, at pixels for which the lens has a direction."""
     x, y = ((np.arange(_PIXELS_A_SIDE) + 0.5) / _PIXELS_A_SIDE * side for side in (camera.width, camera.height))
     bearings, valid = camera.bearings(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     return np.concatenate([bearings[valid] * distance for distance in _DISTANCES])
 
 
 def _per_point(by_parameters: np.ndarray, camera: Camera) -> np.ndarray:
-    """(2 M, K) radians per root of the number of points, from (M, 2, K) pixels."""
+    """Convert (M, 2, K) pixels to (2 M, K) radians divided by the square root of the number of points."""
     return by_parameters.reshape(-1, by_parameters.shape[-1]) / (camera.focal_px * np.sqrt(len(by_parameters)))

@@ -25,7 +25,7 @@ class BadTensor:
 
 
 class NonFiniteError(Exception):
-    """A step met a number that is not finite. Whoever guards the training answers it; the user never sees it."""
+    """A step met a number that is not finite. `Sentinel` handles it; the user never sees it."""
 
 
 class Watch(Protocol):
@@ -42,7 +42,7 @@ class Watch(Protocol):
 
 
 class Unwatched:
-    """Null object: records nothing, costs nothing."""
+    """Null object: records nothing and costs nothing."""
 
     def state(self, give: Callable[[], tuple[dict[str, Tensor], Any]]) -> None:
         pass
@@ -69,7 +69,7 @@ class FirstBad:
             self.values(name.removeprefix("field."), tensor)
 
     def values(self, name: str, tensor: Tensor, rays: Tensor | None = None) -> None:
-        """Look at a tensor; `rays` (N,) are the rays of its rows."""
+        """Look at a tensor; `rays` (N,) are the rays that its rows belong to."""
         if self.found is not None or is_finite(tensor):
             return
         bad = ~tensor.detach().isfinite()

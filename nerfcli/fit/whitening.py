@@ -1,15 +1,15 @@
-"""Steps of camera parameters, all of which move the picture alike.
+"""Whitened camera parameters: a unit step in any of them moves the picture by the same amount.
 
-A turn of a thousandth moves a picture by a pixel, a move of a thousandth by less than one where the scene is far; a
-turn about one axis is nearly a move along another. One learning rate suits them all in coordinates in which a unit
-step along any axis moves what the camera sees by a unit, and no two axes do the same.
+A rotation by 0.001 moves a picture by a pixel, a translation by 0.001 by less if the scene is far; a rotation about one
+axis resembles a translation along another. One learning rate suits all of them in coordinates in which a unit step
+along any axis moves what the camera sees by one unit, and no two axes have the same effect.
 """
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-# Of the sums of squares, so that poorly determined parameters do not move far: CamP's choice.
+# Relative damping of the sums of squares, so that poorly determined parameters do not move far: CamP's value.
 DAMPING = 0.1
 _FLOOR = 1e-8
 BETAS = (0.9, 0.99)
@@ -17,10 +17,10 @@ EPS = 1e-15
 
 
 def whitening(jacobian: np.ndarray) -> np.ndarray:
-    """(K, K) symmetric, from whitened steps to those of the parameters: (S + 0.1 diag(S) + 1e-8)^(-1/2), S = J^T J.
+    """Return the symmetric (K, K) map from whitened to parameter steps: (S + 0.1 diag(S) + 1e-8)^(-1/2), S = J^T J.
 
     Args:
-        jacobian: (M, K), how what is seen moves with the parameters.
+        jacobian: (M, K) derivatives of the image positions by the parameters.
 
     Source: Park et al. 2023, CamP: camera preconditioning for neural radiance fields, arXiv:2308.10902, eq. 8.
     """
@@ -49,7 +49,7 @@ class WhitenedAdam(nn.Module):
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
     def change(self, gradient: Tensor, rate: float) -> Tensor:
-        """(N, K) what to add to the parameters whose gradient (N, K) this is."""
+        """Return the change (N, K) of the parameters for their gradient (N, K)."""
         white = (self._whitenings @ gradient[..., None])[..., 0]  # symmetric: its own transpose
         self.steps += 1
         self.first.lerp_(white, 1 - BETAS[0])

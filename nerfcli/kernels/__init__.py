@@ -1,6 +1,6 @@
 """The hot operations of the program behind one interface: `reference` defines them, faster backends agree with it.
 
-A backend is chosen once, for a training or a model, by the device and the precision of its field.
+A backend is chosen once per training or model, from the device and the precision of its field.
 """
 
 import functools
@@ -54,23 +54,23 @@ __all__ = [
     "spherical_harmonics",
     "sum_along_rays",
     "thread_safe",
-    "why_not_triton",
+    "triton_unavailable_reason",
 ]
 
 BACKENDS = ("auto", "reference", "numba_cpu", "triton_cuda")
 
 
 def backend_for(device: torch.device, dtype: torch.dtype, *, wanted: str = "auto") -> Backend:
-    """Choose who computes for a field.
+    """Choose the backend that computes a field.
 
     Args:
-        device, dtype: of its numbers.
-        wanted: one of `BACKENDS`; auto takes the fastest that fits, with one warning where it should work here and does
-            not.
+        device, dtype: of the field's parameters.
+        wanted: one of `BACKENDS`; auto takes the fastest one that supports the field, and warns once if the fast
+            backend of this device does not work.
 
     Raises:
         ValueError: there is no backend of this name.
-        UserError: the one that is wanted by name does not work here, or not on such numbers.
+        UserError: the backend wanted by name does not work on this machine, or not for this device and dtype.
     """
     if wanted not in BACKENDS:
         raise ValueError(f"backend must be one of {BACKENDS}, got {wanted!r}")
@@ -80,7 +80,7 @@ def backend_for(device: torch.device, dtype: torch.dtype, *, wanted: str = "auto
     return fast or ReferenceBackend(device)
 
 
-def why_not_triton(device: torch.device) -> str | None:
+def triton_unavailable_reason(device: torch.device) -> str | None:
     """Return why the GPU kernels do not work on a CUDA device; None if they do."""
     if device.type != "cuda":
         return "they are for CUDA devices"
@@ -90,7 +90,7 @@ def why_not_triton(device: torch.device) -> str | None:
 
 
 def gpu_launcher(device: torch.device) -> str:
-    """Return what starts the GPU kernels on a device where they work."""
+    """Return "CUDA driver" or "Triton": what launches the GPU kernels on a device where they work."""
     from nerfcli.kernels.triton_cuda.launch import launcher
 
     return launcher(device)
@@ -114,13 +114,13 @@ def has_compiled() -> bool:
 
 
 def thread_safe() -> bool:
-    """Return whether several threads may call the CPU kernels at the same time: not all of Numba's pools allow it."""
+    """Return whether several threads may call the CPU kernels at the same time; not every threading layer allows it."""
     numba_cpu = _numba_cpu()
     return numba_cpu is None or numba_cpu.thread_safe()
 
 
 def prepare(notify: Callable[[str], None], device: str = "cpu") -> None:
-    """Compile what has to be compiled for a device, so that no clock runs meanwhile; once per machine."""
+    """Compile the kernels for a device, once per machine, before any time budget starts to run."""
     wanted = torch.device(device)
     if backend_for(wanted, torch.float32).name == "triton_cuda":
         from nerfcli.kernels.triton_cuda.cubin import is_compiled
@@ -138,8 +138,8 @@ def prepare(notify: Callable[[str], None], device: str = "cpu") -> None:
 
 
 def _fast_backend(device: torch.device, dtype: torch.dtype, wanted: str) -> tuple[Backend | None, str | None]:
-    """Return the compiled backend for these numbers, or why there is none."""
-    # Fields of float64 are for comparing with the reference, which nobody needs to be warned of.
+    """Return the compiled backend for a device and dtype, or why there is none."""
+    # float64 fields are for comparison with the reference: no warning is due that they run on plain torch.
     if wanted == "triton_cuda" or (wanted == "auto" and device.type == "cuda" and dtype != torch.float64):
         return _triton_backend(device, dtype, wanted)
     if wanted == "numba_cpu" or (wanted == "auto" and device.type == "cpu" and dtype == torch.float32):
@@ -154,7 +154,7 @@ def _fast_backend(device: torch.device, dtype: torch.dtype, wanted: str) -> tupl
 
 
 def _triton_backend(device: torch.device, dtype: torch.dtype, wanted: str) -> tuple[Backend | None, str | None]:
-    why_not = why_not_triton(device)
+    why_not = triton_unavailable_reason(device)
     if why_not is None and dtype == torch.float32:
         from nerfcli.kernels.triton_cuda.backend import TritonBackend
 

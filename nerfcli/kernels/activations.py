@@ -23,7 +23,7 @@ class _BoundedExp(torch.autograd.Function):
 
 
 def density_from_log(log_density: Tensor) -> Tensor:
-    """exp(x) for |x| <= 15, constant beyond, with a gradient that never vanishes or overflows.
+    """Return exp(x) with x clipped to [-15, 15], and with a gradient that never vanishes or overflows.
 
     Args:
         log_density: x, any shape, finite.
@@ -31,7 +31,7 @@ def density_from_log(log_density: Tensor) -> Tensor:
     Returns:
         density in [3e-7, 3.3e6], in 1 / unit of the training frame.
 
-    The gradient is density itself, also beyond the limits: a plain clamp would hold a value that went too far forever.
+    The gradient is the density itself, even beyond the limits: a plain clamp would trap values beyond them forever.
     """
     return _BoundedExp.apply(log_density)  # type: ignore[return-value]
 
@@ -49,12 +49,12 @@ class _Opacity(torch.autograd.Function):
 
 
 def opacity(optical_depth: Tensor) -> Tensor:
-    """1 - exp(-x) with all digits where x is small, and its gradient exp(-x) with all of them where x is large.
+    """Return 1 - exp(-x) at full precision for small x, with a gradient exp(-x) at full precision for large x.
 
     Args:
         optical_depth: x, any shape, >= 0.
 
-    torch's own gradient of expm1 is its value plus 1: a difference that has no digits left where x is above 17 in
-    float32, or above 37 in float64.
+    torch computes the gradient of expm1 as its value plus 1, which cancels to 0 where x is above 17 in float32, or
+    above 37 in float64.
     """
     return _Opacity.apply(optical_depth)  # type: ignore[return-value]

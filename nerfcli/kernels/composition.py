@@ -25,7 +25,7 @@ from nerfcli.kernels.interface import (
 )
 from nerfcli.kernels.reference.compositing import contracted_distance, off_target, scale_gradients, sum_along_rays
 
-# Samples whose densities are computed at a time, where marching cannot stop behind what it meets.
+# Samples whose densities are computed at a time, for media whose marching cannot stop at opaque samples.
 CHUNK = 2**16
 
 
@@ -60,7 +60,7 @@ class Parts(Protocol):
 
 
 class ComposedBackend(abc.ABC):
-    """See `interface.Backend`. What differs is in `parts`, and in how a hash grid is sampled and asked."""
+    """See `interface.Backend`. Subclasses differ in `parts`, and in how they sample and evaluate a hash grid."""
 
     name: str
     deterministic: bool
@@ -154,7 +154,7 @@ class ComposedBackend(abc.ABC):
         )
         light = self.parts.light_ends(density, starts, ends, offsets=offsets, shares=shares)
         stopped = transmittance <= math.exp(-march.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
-        behind = torch.maximum(background, 1.0 - background).amax(-1)  # how far any colour is from the background's
+        behind = torch.maximum(background, 1.0 - background).amax(-1)  # largest difference from the background's colour
         left_out = UNSEEN * self._sum_along_rays(torch.where(unseen, weights, 0.0), offsets)
         error = left_out + torch.where(stopped, transmittance * behind, 0.0)
         return RaysSeen(colour, light, error, Intervals(density, starts, ends, offsets))
@@ -172,23 +172,23 @@ class ComposedBackend(abc.ABC):
 
     @abc.abstractmethod
     def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid, visits: Tensor | None) -> Samples:
-        """`reference.visible_samples`."""
+        """See `reference.visible_samples`."""
 
     @abc.abstractmethod
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
-        """Return the coordinates of samples again, with the gradients of their rays."""
+        """Return the coordinates of samples again, differentiable in their rays."""
 
     @abc.abstractmethod
     def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, sink: Tensor | None) -> Tensor:
-        """Return the codes of samples again, with gradients."""
+        """Return the encoded features of samples again, with gradients."""
 
     @abc.abstractmethod
     def _density_of(self, encoded: Tensor, grid: HashGrid) -> Tensor:
-        """Densities of codes, without gradients."""
+        """Return the densities of encoded features, without gradients."""
 
     @abc.abstractmethod
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
-        """Densities and colours of codes, seen along directions (R, 3) of rays `index` (N,)."""
+        """Return densities and colours of encoded features, seen along directions (R, 3) of rays `index` (N,)."""
 
     def _off_target(
         self,
@@ -200,11 +200,11 @@ class ComposedBackend(abc.ABC):
         rays: Tensor,
         distances: Tensor,
     ) -> Tensor:
-        """`reference.off_target`; `rays` (N,) are those of the samples."""
+        """See `reference.off_target`; `rays` (N,) are the rays of the samples."""
         return off_target(weights, transmittance, middles, offsets=offsets, distances=distances)
 
     def _sum_along_rays(self, values: Tensor, offsets: Tensor) -> Tensor:
-        """`reference.sum_along_rays` of numbers (N,), without gradients."""
+        """See `reference.sum_along_rays`; for scalars (N,), without gradients."""
         return sum_along_rays(values, offsets)
 
     def _radiance(
@@ -217,14 +217,14 @@ class ComposedBackend(abc.ABC):
         widths: Tensor | None,
         sink: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """Densities and colours of samples, seen along directions (R, 3) of rays `index` (N,), with gradients."""
+        """Return densities and colours of samples along directions (R, 3) of rays `index` (N,), with gradients."""
         encoded = self._encoded(samples, grid, widths=widths, sink=sink)
         return self._networks(encoded, directions, index, grid)
 
     def _visible(self, rays: Rays, march: March, medium: HashGrid | Medium, visits: Tensor | None) -> Samples:
         if isinstance(medium, HashGrid):
             return self._visible_in_grid(rays, march, medium, visits)
-        with torch.no_grad():  # what stands behind surfaces is computed and left out
+        with torch.no_grad():  # samples behind surfaces are computed, then left out
             starts, ends, coordinates, offsets = self.parts.occupied_samples(rays, march)
             density = torch.cat([medium.density(chunk) for chunk in coordinates.split(CHUNK)])
             lit = self.parts.optical_depth_before(density, ends - starts, offsets) < march.max_optical_depth
@@ -235,7 +235,7 @@ class ComposedBackend(abc.ABC):
 
 
 def _widths(rays: Rays, samples: Samples, index: Tensor, grid: HashGrid, *, contraction: str) -> Tensor | None:
-    """Return the widths that rays stand for at their samples (N,), where the grid fades with them."""
+    """Return the footprint widths (N,) of rays at their samples; None if the grid does not fade with them."""
     if not grid.antialias or rays.cones is None:
         return None
     return sample_widths(

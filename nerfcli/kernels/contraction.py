@@ -1,11 +1,11 @@
-"""Contraction of space to the unit cube of the field's grids: none, or with distant space mapped inside.
+"""Contraction of space into the unit cube of the field's grids: none, or with distant space mapped into it.
 
-    none    the cube [-1, 1]^3 of the training frame is all there is
-    l2      the unit ball stays as it is, all beyond it goes into the ball of radius 2
-    linf    the cube [-1, 1]^3 stays as it is, all beyond it goes into the cube [-2, 2]^3
+    none    only the cube [-1, 1]^3 of the training frame is represented
+    l2      the unit ball is unchanged; everything beyond it is mapped into the ball of radius 2
+    linf    the cube [-1, 1]^3 is unchanged; everything beyond it is mapped into the cube [-2, 2]^3
 
-A ball wastes the corners of the grid's cube, almost half of it; a cube bends straight lines at its edges, and draws
-what lies along its diagonals nearer.
+The ball wastes the corners of the grid's cube, almost half of it; the cube bends straight lines at its edges, and pulls
+points along its diagonals nearer.
 """
 
 import torch
@@ -16,7 +16,7 @@ CONTRACTIONS = ("none", "l2", "linf")
 
 
 def contract(points: Tensor) -> Tensor:
-    """Map all of space into the ball of radius 2; the unit ball stays as it is.
+    """Map all of space into the ball of radius 2, leaving the unit ball unchanged.
 
     contract(x) = x for |x| <= 1, else (2 - 1/|x|) x / |x|
 
@@ -24,9 +24,9 @@ def contract(points: Tensor) -> Tensor:
         points: (..., 3) finite; components up to half of the dtype's largest number.
 
     Returns:
-        (..., 3) with norm below or at 2.
+        (..., 3) with norm at most 2.
 
-    Differentiable everywhere, also at 0: norms below 1 are raised to 1, so that no gradient passes through a root at 0.
+    Differentiable everywhere, even at 0: norms below 1 are raised to 1, so that no gradient passes through a root at 0.
     Source: Barron et al. 2022, Mip-NeRF 360, arXiv:2111.12077, eq. 10.
     """
     limit = torch.finfo(points.dtype).max
@@ -38,7 +38,7 @@ def contract(points: Tensor) -> Tensor:
 
 
 def contract_to_cube(points: Tensor) -> Tensor:
-    """Map all of space into the cube [-2, 2]^3; the cube [-1, 1]^3 stays as it is.
+    """Map all of space into the cube [-2, 2]^3, leaving the cube [-1, 1]^3 unchanged.
 
     contract_to_cube(x) = x for m <= 1, else (2 - 1/m) x / m,  m = the largest of |x_1|, |x_2|, |x_3|
 
@@ -48,22 +48,22 @@ def contract_to_cube(points: Tensor) -> Tensor:
     Returns:
         (..., 3) with components within 2.
 
-    Differentiable but where two components are largest together; there, and at m = 1, autograd's choice holds.
-    Source: the contraction of Mip-NeRF 360 with the norm that nerfacto takes (Tancik et al. 2023, arXiv:2302.04264).
+    Differentiable except where two components tie for the largest, and at m = 1: there, autograd's choice holds.
+    Source: the contraction of Mip-NeRF 360 with the norm that nerfacto uses (Tancik et al. 2023, arXiv:2302.04264).
     """
     largest = points.abs().amax(-1, keepdim=True).clamp_min(1.0)
     return (2.0 - 1.0 / largest) * (points / largest)
 
 
 def grid_coordinates(points: Tensor, contraction: str) -> Tensor:
-    """Points of the training frame as coordinates of the unit cube that holds the field's grids.
+    """Convert points of the training frame to coordinates of the unit cube that holds the field's grids.
 
     Args:
         points: (..., 3) training frame.
         contraction: one of `CONTRACTIONS`.
 
     Returns:
-        (..., 3); inside [0, 1] for every point, but without contraction for those of [-1, 1]^3 only.
+        (..., 3); within [0, 1] for every point or, without contraction, only for points in [-1, 1]^3.
 
     Raises:
         ValueError: there is no such contraction.
@@ -82,12 +82,12 @@ def grid_coordinates(points: Tensor, contraction: str) -> Tensor:
 def cube_widths(points: Tensor, widths: Tensor, contraction: str) -> Tensor:
     """Compute the width of a pixel's footprint at points, in coordinates of the cube of `grid_coordinates`.
 
-    The stretch across the line from the centre: 1/2 without contraction, else 1/4 of (2 - 1/m) / m with m the norm of
-    the contraction, at least 1. What is far away is seen along that line.
+    Widths are scaled as lengths across the line from the centre, along which distant points are seen: by 1/2 without
+    contraction, else by 1/4 of (2 - 1/m) / m, where m is the norm of the contraction, at least 1.
 
     Args:
         points: (N, 3) training frame.
-        widths: (N,) of a pixel there, in units of the training frame.
+        widths: (N,) width of a pixel at the points, in units of the training frame.
         contraction: one of `CONTRACTIONS`.
 
     Returns:
@@ -110,13 +110,13 @@ def sample_widths(
     cones: Tensor,
     contraction: str,
 ) -> Tensor:
-    """`cube_widths` of pixels at the middles of intervals along rays, (N,).
+    """Return the `cube_widths` (N,) of pixels at the midpoints of intervals along rays.
 
     Args:
         origins, directions: (R, 3), unit directions, training frame.
         starts, ends: (N,) distances.
         rays: (N,) int64, the ray of each interval.
-        cones: (R,) width of the pixel of each ray per distance.
+        cones: (R,) width of each ray's pixel per unit of distance.
         contraction: one of `CONTRACTIONS`.
     """
     middles = (starts + ends) / 2

@@ -1,4 +1,4 @@
-"""What a machine has to compute with, and which backend runs on each device."""
+"""Description of a machine: its GPUs, its versions, and the backend that runs on each device."""
 
 import platform
 from importlib.metadata import PackageNotFoundError, version
@@ -10,10 +10,10 @@ from nerfcli import __version__, kernels
 
 
 def describe_machine(processors: int) -> dict[str, Any]:
-    """Describe GPUs and versions, and which backend works on each device, as plain values.
+    """Return the GPUs, the versions and the backend that runs on each device, as plain values.
 
     Args:
-        processors: that this process may use.
+        processors: number of processors that this process may use.
     """
     described: dict[str, Any] = {
         "nerfcli": __version__,
@@ -33,7 +33,7 @@ def describe_machine(processors: int) -> dict[str, Any]:
         described[str(device)] = (
             f"{properties.name}, {gigabytes:.0f} GB, compute capability {properties.major}.{properties.minor}"
         )
-        why_not = kernels.why_not_triton(device)
+        why_not = kernels.triton_unavailable_reason(device)
         described[f"backend on {device}"] = (
             f"triton_cuda, launched by {kernels.gpu_launcher(device)}"
             if why_not is None

@@ -1,4 +1,4 @@
-"""Directions as what a colour may depend on."""
+"""Spherical harmonics of the view directions on which colours may depend."""
 
 import math
 

@@ -1,8 +1,8 @@
-"""Interface of backends: everything above works per ray, everything inside per sample.
+"""Interface of backends: code above it works per ray, code inside it per sample.
 
-Letters: rays R; samples N of all rays together, packed ray after ray; `offsets` (R + 1,) int64, so that ray r owns
-samples offsets[r] up to offsets[r + 1]; intervals S of a ray; cells G along a side of the occupancy grid; table levels
-L, rows per level T, features per row F.
+Letters in shapes: R rays; N samples of all rays, packed ray after ray, where ray r owns samples offsets[r] up to, not
+including, offsets[r + 1], with `offsets` (R + 1,) int64; S intervals per ray; G cells along a side of the occupancy
+grid; L levels of a table, T rows per level, F features per row.
 
 On a GPU, `render_rays` of a hash grid makes the host wait once, for the number of samples.
 """
@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-# The colour of samples that are not asked for theirs; what they may miss is half of their weight.
+# Assumed colour of samples whose colour is not evaluated; the error is at most half of their weight.
 UNSEEN = 0.5
 
 
@@ -22,8 +22,8 @@ class Rays(NamedTuple):
 
     Args:
         origins, directions: (R, 3), unit directions.
-        jitter: (R,) in [0, 1): how far each cut moves towards the next one.
-        cones: (R,) width of what a ray stands for per distance; None for lines.
+        jitter: (R,) in [0, 1): fraction by which each cut is shifted towards the next edge.
+        cones: (R,) width of a ray's footprint per unit of distance; None for rays without width.
     """
 
     origins: Tensor
@@ -44,8 +44,8 @@ class March(NamedTuple):
             edges[k] + jitter[r] * (edges[k + 1] - edges[k]).
         occupied: (G, G, G) bool over the unit cube of `grid_coordinates`, indexed [z, y, x].
         contraction: see `grid_coordinates`; outside the cube of a bounded scene nothing is occupied.
-        max_optical_depth: > 0; each ray ends with the sample that brings its optical depth to this.
-        least_weight: >= 0; samples that absorb less of their ray's light than this may be left out, but never all.
+        max_optical_depth: > 0; each ray ends at the sample where its optical depth reaches this.
+        least_weight: >= 0; samples that absorb a smaller fraction of their ray's light may be left out, but never all.
     """
 
     edges: Tensor
@@ -56,13 +56,13 @@ class March(NamedTuple):
 
 
 class HashGrid(NamedTuple):
-    """A radiance field of a multiresolution hash grid and two small networks, which backends compile.
+    """A radiance field made of a multiresolution hash grid and two small networks, with compiled kernels in backends.
 
     Args:
         table: (L, T, F).
         resolutions: cells per axis of each level; 0 leaves a level out.
-        layers: of the networks: W1 (H, L * F), W2 (A, H), C1 (H, A + 16), C2 (H, H), C3 (3, H), see `radiance`.
-        view_degree: spherical harmonics of the direction that colours depend on, 0 to 3.
+        layers: weights of the networks: W1 (H, L * F), W2 (A, H), C1 (H, A + 16), C2 (H, H), C3 (3, H), see `radiance`.
+        view_degree: highest degree of the direction's spherical harmonics that colours depend on, 0 to 3.
         antialias: whether levels finer than a ray's cone fade out.
     """
 
@@ -77,27 +77,27 @@ class Medium(Protocol):
     """A radiance field of another type, evaluated by its own code."""
 
     def density(self, coordinates: Tensor) -> Tensor:
-        """Density (N,) in 1 / training unit at coordinates (N, 3) of the unit cube."""
+        """Return the density (N,), in 1 / training unit, at coordinates (N, 3) of the unit cube."""
         ...
 
     def radiance(
         self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Density (N,) and sRGB colour (N, 3) at coordinates (N, 3), seen along `directions` (R, 3) of `rays` (N,).
+        """Return density (N,) and sRGB colour (N, 3) at coordinates (N, 3) along `directions` (R, 3) of `rays` (N,).
 
         Args:
-            sink: the gradient of the field's table is added to it, and autograd gets none.
+            sink: buffer to which the gradient of the field's table is added, instead of passing it to autograd.
         """
         ...
 
 
 class Targets(NamedTuple):
-    """Additional losses of a training besides colours.
+    """Losses of training besides the colour loss.
 
     Args:
         near_scaling: whether gradients of samples at distance t < 1 are multiplied by t^2, see `scale_gradients`.
         distortion: whether `RaySums.distortion` is computed.
-        distances: (K,) > 0 at which the light of the last K rays should end, K <= R; None for none.
+        distances: (K,) > 0 at which the light of the last K rays should be absorbed, K <= R; None without such rays.
     """
 
     near_scaling: bool = False
@@ -110,10 +110,10 @@ class RaySums(NamedTuple):
 
     Args:
         rgb: (R, 3) sRGB on the background.
-        transmittance: (R,) the light that passes.
-        distortion: (R,) in contracted distance, see `contracted_distance`; (0,) where it is no target.
+        transmittance: (R,) fraction of the light that passes all samples.
+        distortion: (R,) in contracted distance, see `contracted_distance`; (0,) if it is not a target.
         off_target: (K,) in [0, 1], see `off_target`; (0,) without such targets.
-        samples: () int64, how many samples the rays have.
+        samples: () int64, total number of samples of the rays.
     """
 
     rgb: Tensor
@@ -149,9 +149,9 @@ class RaysSeen(NamedTuple):
 
     Args:
         rgb: (R, 3) sRGB on the background.
-        ends: where their light ends, distances along the ray in the training frame.
-        truncation_error: (R,) bound on what was left out of each channel of rgb.
-        intervals: the samples; without rays where they were not to be kept.
+        ends: where their light is absorbed, as distances along the ray in the training frame.
+        truncation_error: (R,) bound on the error of each channel of rgb from what was left out.
+        intervals: the samples; may be empty, with 0 rays, if they were not to be kept.
     """
 
     rgb: Tensor
@@ -161,15 +161,15 @@ class RaysSeen(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """The samples of rays that light gets to, without gradients.
+    """The samples of rays that light reaches, without gradients.
 
     Args:
         starts, ends: (N,) distances along the ray.
         density: (N,).
-        encoded: (N, L * F) what the hash grid gives there; None for another medium.
+        encoded: (N, L * F) features of the hash grid at the samples; None for another medium.
         coordinates: (N, 3) in the field's unit cube.
         offsets: (R + 1,).
-        rays: (N,) int64, the ray of each sample, where it is there already.
+        rays: (N,) int64, the ray of each sample, if it has been computed already.
     """
 
     starts: Tensor
@@ -182,11 +182,11 @@ class Samples(NamedTuple):
 
 
 class PixelTable(NamedTuple):
-    """The pixels of P photos, counted through all of them, row by row.
+    """The pixels of P photos, numbered through all photos, row by row.
 
     Args:
         first_pixel: (P,) int64, the number of the first pixel of each photo, increasing from 0.
-        first_bearing: (P,) int64, where the bearings of a photo's camera begin.
+        first_bearing: (P,) int64, index of the first bearing of each photo's camera.
         bearings: (B, 3) directions of pixels in the axes of their cameras.
         poses: (P, 4, 4) `world_from_cam`.
         colours: (M, C) uint8 values of all pixels.
@@ -199,14 +199,14 @@ class PixelTable(NamedTuple):
     colours: Tensor
 
 
-# Is shown tensors whose rows belong to samples, by name, with the ray (N,) of each row.
+# Called with a name, a tensor whose rows belong to samples, and the ray (N,) of each row.
 Trace = Callable[[str, Tensor, Tensor], None]
 
 
 class Backend(Protocol):
     """The hot operations on one kind of device.
 
-    `name` is what `backend_for` knows it by; `deterministic` says whether the same inputs give the same bits again.
+    `name` is its name in `backend_for`; `deterministic` says whether the same inputs always give the same bits.
     """
 
     @property
@@ -220,7 +220,7 @@ class Backend(Protocol):
         ...
 
     def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
-        """Origins (N, 3), directions (N, 3) and colours (N, C) in [0, 1] of chosen pixels (N,) int64."""
+        """Return origins (N, 3), directions (N, 3) and colours (N, C) in [0, 1] of chosen pixels (N,) int64."""
         ...
 
     def render_rays(
@@ -239,11 +239,11 @@ class Backend(Protocol):
 
         Args:
             background: (R, 3) sRGB, without gradient.
-            sink: of the table's shape; the gradient with respect to the table is added to it, and autograd gets none: a
-                buffer of megabytes need not be made, filled and added at every step.
-            visits: (C, C, C) over the unit cube; raised to the optical depth of the samples, those left out for their
-                weight among them, see `keep_largest`.
-            trace: is shown the tensors on the way.
+            sink: of the table's shape; the gradient with respect to the table is added to it instead of being passed to
+                autograd, which saves making, filling and adding a buffer of megabytes at every step.
+            visits: (C, C, C) over the unit cube; raised to the optical depth of the samples, including those left out
+                for their weight, see `keep_largest`.
+            trace: called with intermediate tensors.
 
         Differentiable in origins, directions, the table and the layers.
         """
@@ -265,29 +265,29 @@ class Backend(Protocol):
         Args:
             background: (R, 3) or (3,) sRGB.
             shares: quantiles to compute, each between 0 and 1.
-            negligible: what samples of a ray together may weigh that are not asked for their colour.
-            keep_intervals: whether the samples are wanted; a backend may return them all the same.
+            negligible: largest total weight of the samples of a ray whose colours are not evaluated.
+            keep_intervals: whether to return the samples; a backend may return them even if this is False.
         """
         ...
 
     def light_ends(self, intervals: Intervals, *, shares: tuple[float, ...]) -> LightEnds:
-        """Return where the light of rays ends, without gradients; see `reference.light_ends`."""
+        """Return where the light of rays is absorbed, without gradients; see `reference.light_ends`."""
         ...
 
     def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, share: float) -> Tensor:
-        """Return (R / rays_per_pixel,) the distance by which a fraction of the light of groups of rays is absorbed."""
+        """Return the distance (R / rays_per_pixel,) by which a fraction of the light of a group of rays is absorbed."""
         ...
 
     def density(self, coordinates: Tensor, medium: HashGrid | Medium) -> Tensor:
-        """Density (N,) at coordinates (N, 3) of the unit cube, without gradients."""
+        """Return the density (N,) at coordinates (N, 3) of the unit cube, without gradients."""
         ...
 
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
     ) -> Tensor:
-        """Interpolate in tables at points (N, 3) of the unit cube: (N, L * F); for media that are made of tables.
+        """Interpolate tables at points (N, 3) of the unit cube, giving (N, L * F), for media made of tables.
 
-        Differentiable in the table (into the sink, if there is one) and in points.
+        Differentiable in points and in the table, whose gradient goes into the sink if there is one.
         """
         ...
 
@@ -304,13 +304,13 @@ class Backend(Protocol):
         eps: float,
         decay: float = 0.0,
     ) -> None:
-        """Take one step of Adam with weight decay, in place, on the rows whose gradient is not zero, and zero it."""
+        """Take one step of Adam with weight decay, in place, on rows with a nonzero gradient, and zero the gradient."""
         ...
 
     def project(
         self, volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
     ) -> Tensor:
-        """Line integrals (R,) of a volume (Z, Y, X) along lines in float64; see `reference.project`.
+        """Return the line integrals (R,) of a volume (Z, Y, X) along lines in float64; see `reference.project`.
 
         Differentiable in the volume.
         """
@@ -330,7 +330,7 @@ class Backend(Protocol):
         ...
 
     def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
-        """Return a volume (Z, Y, X) >= 0 near `target` whose total variation is smaller, without gradients.
+        """Return a volume (Z, Y, X) >= 0 near `target` with a smaller total variation, without gradients.
 
         Args:
             threshold: (Z, Y, X) > 0.

@@ -1,1 +1,1 @@
-"""Pixels on disk: photos and pictures (`images`), depth maps that say what they mean (`depth`), `video`."""
+"""Files of photos (`images`), depth maps with their definition (`depth_pictures`), videos, meshes and volumes."""

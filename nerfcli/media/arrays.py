@@ -1,6 +1,6 @@
-"""Depth maps as NumPy's own files: .npy with its meaning beside it, .npz with the maps of a picture and their meaning.
+"""Depth maps as NumPy files: .npy with its definition beside it, .npz with the maps of a picture and their definition.
 
-An archive holds one array per map under the names of `picture_maps.MAPS`, and "meta", the description as JSON text:
+An archive holds one array per map under the names of `exr.CHANNELS` or "rgb", and "meta", the description as JSON:
 
     archive = np.load("a.npz"); depth = archive["depth"]; meta = json.loads(str(archive["meta"]))
 """
@@ -27,19 +27,19 @@ def write_npy(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
         ValueError: depth is not float32 (height, width), or meta holds a number that is not finite.
     """
     check_map(depth)
-    # The sidecar first: a depth map never stands without its meaning, even if the command is killed between.
+    # The sidecar first, so that a depth map never exists without its definition, even if the command is killed.
     write_json(path.with_suffix(".json"), meta.to_json())
     with atomic_path(path) as partial, partial.open("wb") as file:
         np.save(file, depth)
 
 
 def write_npz(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> None:
-    """Write the maps of a picture and what they mean into one archive, losslessly compressed; atomic.
+    """Write the maps of a picture and their definition into one archive, losslessly compressed; atomic.
 
     Args:
-        path: the folder is made if need be.
-        maps: by name: those of `exr.CHANNELS` (H, W) and rgb (H, W, 3 or 4), float32.
-        meta: of the depth; of another map where there is no depth among them.
+        path: the file; its folder is created if needed.
+        maps: float32 arrays by name: those of `exr.CHANNELS` (H, W) and rgb (H, W, 3 or 4).
+        meta: the definition of the depth, or of another map if depth is not among them.
 
     Raises:
         UserError: the file cannot be written.
@@ -53,15 +53,15 @@ def write_npz(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of a .npz file by name, without the description; that of a .npy file as "array".
+    """Read the arrays of a .npz file by name, without the description, or the array of a .npy file as "array".
 
     Nothing in the file is run as code.
 
     Raises:
-        UserError: missing, damaged, or with other contents than numbers and text.
+        UserError: the file is missing, damaged, or contains anything but numbers and text.
     """
     try:
-        # Opened here, because NumPy leaves a file open that it cannot read.
+        # Opened here, because NumPy does not close a file that it cannot read.
         with path.open("rb") as file:
             loaded = np.load(file, allow_pickle=False)
             if isinstance(loaded, np.ndarray):

@@ -1,8 +1,8 @@
 """Definition of the values of a depth map, stored in every file and read back.
 
-A depth map without its convention is a riddle: along the ray or along the optical axis, in which unit, a mean or a
-median, and what stands where nothing was hit. Two files whose answers differ do not belong into one folder, one video
-or one mesh.
+A depth map without its convention is ambiguous: it may be measured along the ray or along the optical axis, in any
+unit, as a mean or a median, with any value where nothing was hit. Files whose definitions differ must not be mixed in
+one folder, video or mesh.
 """
 
 import json
@@ -17,14 +17,14 @@ from nerfcli import __version__
 from nerfcli.errors import UserError
 
 FORMAT = "nerfcli depth 2"
-# The word under which a description stands in PNG text chunks, OpenEXR attributes and NPZ archives.
+# The key of a description in PNG text chunks and OpenEXR attributes.
 KEY = "nerfcli"
 AXES = {"ray": "along the ray", "z": "along the optical axis (z)"}
 QUANTITIES = (
     *("depth", "spread", "disagreement", "coverage", "parallax", "lower", "upper"),
     *("confidence", "depth_deviation", "colour_deviation"),
 )
-# The convention of what is no depth itself.
+# The convention of quantities other than depth.
 CONVENTION_OF = {
     "spread": "standard-deviation",
     "disagreement": "median-conditional",
@@ -36,7 +36,7 @@ CONVENTION_OF = {
     "depth_deviation": "deviation-of-members",
     "colour_deviation": "deviation-of-members",
 }
-# The unit of what is no length.
+# The unit of quantities that are not lengths.
 UNIT_OF = {
     "coverage": "photos",
     "parallax": "degrees",
@@ -71,25 +71,26 @@ class DepthMeta:
     """Definition and provenance of the values of a map.
 
     Args:
-        convention: which depth of the ray's distribution: "conditional", "median", "quantile:0.05", ...; for other
+        convention: which statistic of depth along the ray: "conditional", "median", "quantile:0.05", ...; for other
             quantities the entry of `CONVENTION_OF`.
         axis: "ray", distance from the camera's centre along the ray; or "z", along the optical axis.
-        unit: "metre", or "arbitrary" where the scale of the scene is not known; of other quantities see `UNIT_OF`.
+        unit: "metre", or "arbitrary" if the scale of the scene is unknown; for quantities that are not lengths, see
+            `UNIT_OF`.
         opacity_floor: pixels whose opacity is below it have no value.
-        invalid: the value of pixels without one: "nan", or "0" in files of whole numbers.
-        background_distance: what a ray that hits nothing counts as, where the convention needs that.
+        invalid: the value that marks pixels without one: "nan", or "0" in integer files.
+        background_distance: the distance that counts for light that hits nothing, if the convention needs it.
         min_views, min_parallax_deg: coverage and parallax below which a pixel has no depth.
         quantity: one of `QUANTITIES`.
-        unit_source: how the unit is known ("gps", "distances", ...); None where unknown.
-        units_per_level: of files of whole numbers: value = level * units_per_level.
-        error_bounds: what rendering states about its own error, by name; plain numbers and text. They bound the
-            rendering of the field, not the field.
+        unit_source: how the unit is known ("gps", "distances", ...); None if unknown.
+        units_per_level: for integer files: value = level * units_per_level.
+        error_bounds: bounds of the rendering error by name, as plain numbers and text. They apply to the rendering of
+            the field, not to the field itself.
         view: the camera of the map: name, camera (model, width, height, params), world_from_cam; plain values.
-        provenance: run, field_sha256 and what else says how the map was made; plain values.
-        layers: what else stands in the same file, by name: convention and opacity_floor of the other maps.
+        provenance: run, field_sha256 and other facts about the map's origin; plain values.
+        layers: the other maps in the same file, by name, with their convention and opacity_floor.
 
     Raises:
-        ValueError: another axis or quantity.
+        ValueError: unknown axis or quantity.
     """
 
     convention: str
@@ -115,9 +116,9 @@ class DepthMeta:
             raise ValueError(f"quantity must be one of {', '.join(QUANTITIES)}, got {self.quantity}")
 
     def of(self, quantity: str, *, opacity_floor: float | None = None, convention: str | None = None) -> Self:
-        """Return the meaning of another map of the same picture, along the same axis; the floor too if none is given.
+        """Return the definition of another map of the same picture, along the same axis.
 
-        The convention is that of `CONVENTION_OF` if none is given.
+        opacity_floor defaults to that of this map, convention to the entry of `CONVENTION_OF`.
         """
         if quantity == self.quantity:
             return self
@@ -136,7 +137,7 @@ class DepthMeta:
 
     @property
     def title(self) -> str:
-        """A few words for legends: "conditional depth"."""
+        """A short title for legends, such as "conditional depth"."""
         named = {
             "spread": "spread of depth",
             "disagreement": "|median - conditional| depth",
@@ -152,15 +153,15 @@ class DepthMeta:
 
     @property
     def _percentage(self) -> str:
-        """Return the level of an interval, or the tolerance of a confidence, as a percentage: "90 %"."""
+        """The level of an interval, or the tolerance of a confidence, as a percentage: "90 %"."""
         return f"{100 * float(self.convention.partition(':')[2] or 'nan'):g} %"
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, with the format and the version that wrote them."""
+        """Return plain values, with the format and the nerfcli version that wrote them."""
         return {"format": FORMAT, "nerfcli": __version__, **asdict(self)}
 
     def to_text(self) -> str:
-        """`to_json` on one line of ASCII.
+        """Return `to_json` as one line of ASCII.
 
         Raises:
             ValueError: a number is not finite.
@@ -193,15 +194,13 @@ class DepthMeta:
 
 
 def limits_in_words(min_views: int, min_parallax_deg: float) -> str:
-    """Return what makes a pixel lose its depth: "a coverage below 2 photos or ..."; empty without a limit."""
+    """Describe the limits below which a pixel loses its depth: "a coverage below 2 photos or ..."; "" without any."""
     views = [f"a coverage below {min_views} photos"] if min_views else []
     return " or ".join([*views, *([f"a parallax below {min_parallax_deg:g} degrees"] if min_parallax_deg else [])])
 
 
 def difference_of(one: DepthMeta, other: DepthMeta) -> str | None:
-    """Describe how two maps differ if they must not be mixed: "convention median and conditional"; None if they
-    agree.
-    """
+    """Describe a difference that forbids mixing two maps: "convention median and conditional"; None if they agree."""
     for name in _WHAT_MUST_AGREE:
         a, b = getattr(one, name), getattr(other, name)
         if a != b:
@@ -210,15 +209,15 @@ def difference_of(one: DepthMeta, other: DepthMeta) -> str | None:
 
 
 def as_floats(meta: DepthMeta) -> DepthMeta:
-    """Return the meaning of a map once its levels are read as lengths."""
+    """Return the definition of a map after its integer levels are converted to lengths."""
     return replace(meta, invalid="nan", units_per_level=None)
 
 
 def refuse_mixing(metas: Iterable[tuple[Path, DepthMeta]]) -> None:
-    """Refuse maps that mean different things where they would be taken for one kind: a folder, a video, a mesh.
+    """Refuse maps with different definitions where only one is allowed: in a folder, a video or a mesh.
 
     Raises:
-        UserError: two of them differ; names both files and what differs.
+        UserError: two definitions differ; the message names both files and the difference.
     """
     first: tuple[Path, DepthMeta] | None = None
     for path, meta in metas:
@@ -229,7 +228,7 @@ def refuse_mixing(metas: Iterable[tuple[Path, DepthMeta]]) -> None:
 
 
 def mixed(path: Path, other: Path, difference: str) -> UserError:
-    """Return the two-line error for maps that would be taken for one kind and are not."""
+    """Return the two-line error for two maps with different definitions in one place."""
     return UserError(
         f"{path} and {other} have different definitions: {difference}",
         "keep depth with different definitions in separate folders: choose another one with -o",
@@ -237,7 +236,7 @@ def mixed(path: Path, other: Path, difference: str) -> UserError:
 
 
 def entries_of_text(text: str | None) -> dict[str, Any] | None:
-    """Return the JSON object in a text; None where there is none."""
+    """Return the JSON object in a text; None if it contains none."""
     try:
         entries = json.loads(text or "")
     except ValueError:
@@ -246,7 +245,7 @@ def entries_of_text(text: str | None) -> dict[str, Any] | None:
 
 
 def check_map(values: np.ndarray, *, channels: bool = False) -> None:
-    """Refuse what is no map.
+    """Check the dtype and the shape of a map.
 
     Raises:
         ValueError: not float32 (H, W), or with `channels` not float32 (H, W, 3 or 4).

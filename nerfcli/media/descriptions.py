@@ -20,7 +20,7 @@ from nerfcli.media.ffmpeg import ffmpeg_program
 
 VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".mov", ".gif")
 
-# What the readers raise on files that are damaged; they promise no common base class.
+# Exceptions of the readers for damaged files; no common base class is documented.
 _DAMAGED = (
     *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError, NotImplementedError),
     *(struct.error, zlib.error, zipfile.BadZipFile, tifffile.TiffFileError, Image.DecompressionBombError),
@@ -28,13 +28,13 @@ _DAMAGED = (
 
 
 def description_of(path: Path) -> dict[str, Any] | None:
-    """Return the description that a file of ours carries, as plain values; None where a file has none.
+    """Return the description in a file that nerfcli wrote, as plain values; None if a file has none.
 
     Args:
         path: TIFF, OpenEXR, NPZ, NPY (with its .json beside it), PNG or a video.
 
     Raises:
-        UserError: missing, damaged, or of another kind.
+        UserError: the file is missing, damaged, or of another kind.
     """
     suffix = path.suffix.lower()
     reader = _READERS.get(suffix)
@@ -55,7 +55,7 @@ def description_of(path: Path) -> dict[str, Any] | None:
 
 
 def depth_meta_of(path: Path) -> DepthMeta | None:
-    """Return the meaning of the depth in a file of ours; None where it does not say.
+    """Return the definition of the depth in a file that nerfcli wrote; None if it states none.
 
     Raises:
         UserError: see `description_of`.
@@ -80,13 +80,13 @@ def _of_tiff(path: Path) -> str | None:
 
 def _of_exr(path: Path) -> str | None:
     with path.open("rb") as stream:
-        content = io.BytesIO(stream.read())  # a path alone is refused without saying why
+        content = io.BytesIO(stream.read())  # given a path, OpenEXR refuses a file without saying why
     with OpenEXR.File(content, header_only=True) as file:
         return file.header().get(KEY)
 
 
 def _of_npz(path: Path) -> str | None:
-    # Opened here, because NumPy leaves a file open that it cannot read.
+    # Opened here, because NumPy does not close a file that it cannot read.
     with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         return str(archive["meta"]) if "meta" in archive.files else None
 

@@ -2,10 +2,10 @@
 
     R, G, B (, A)     colour in linear light, primaries of sRGB; with A premultiplied, as OpenEXR defines it
     Z                 the requested depth: Nuke's depth.Z, the Depth pass of Blender
-    Y                 the depth once more where there is no colour: OpenCV and imageio look for Y, R, G, B alone, and
-                      give zeros without a word where a file has none of them
+    Y                 the depth again if there is no colour: OpenCV and imageio look only for Y, R, G, B, and silently
+                      return zeros if a file has none of them
     opacity.V         1 - transmittance
-    spread.V          standard deviation of the distance at which light ends
+    spread.V          standard deviation of the distance at which light is absorbed
     disagreement.V    |median - conditional|
     coverage.V        number of training photos that see the surface
     parallax.V        largest angle between the rays of two of them, degrees
@@ -44,10 +44,10 @@ def write_exr(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
     """Write the maps of a picture into one file, losslessly compressed; atomic.
 
     Args:
-        path: the folder is made if need be.
-        maps: by name: those of `CHANNELS` (H, W), every bit of which comes back, and rgb (H, W, 3 or 4), sRGB in [0, 1]
-            with straight alpha; float32.
-        meta: of the depth; of another map where there is no depth among them.
+        path: the file; its folder is created if needed.
+        maps: float32 arrays by name: those of `CHANNELS` (H, W), every bit of which is preserved, and rgb
+            (H, W, 3 or 4), sRGB in [0, 1] with straight alpha.
+        meta: the definition of the depth, or of another map if depth is not among them.
 
     Raises:
         UserError: the file cannot be written.
@@ -69,7 +69,7 @@ def write_exr(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
         "comments": meta.in_words(),
         KEY: meta.to_text(),
     }
-    encoded = io.BytesIO()  # OpenEXR's own errors of writing do not say what is wrong with the disk
+    encoded = io.BytesIO()  # OpenEXR's own write errors do not say what is wrong with the disk
     OpenEXR.File(header, channels).write(encoded)
     with atomic_path(path) as partial:
         partial.write_bytes(encoded.getbuffer())
@@ -98,10 +98,10 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
 
 @contextlib.contextmanager
 def _captured_stderr() -> Iterator[Callable[[], str]]:
-    """Keep what OpenEXR prints while it reads a damaged file, which says more than its exceptions, off the terminal.
+    """Capture OpenEXR's messages about a damaged file, which say more than its exceptions, instead of printing them.
 
     Yields:
-        The last line so far.
+        A function that returns the last line so far.
     """
     sys.stderr.flush()
     terminal = os.dup(2)
@@ -121,7 +121,7 @@ def _captured_stderr() -> Iterator[Callable[[], str]]:
 
 
 def _colour_channels(srgb: np.ndarray) -> dict[str, np.ndarray]:
-    """R, G, B and, where there is one, A."""
+    """Return R, G, B in linear light and, if there is alpha, A, by which they are then multiplied."""
     linear = linear_light(srgb[..., :3])
     if srgb.shape[2] == 3:
         return {name: np.ascontiguousarray(linear[..., index]) for index, name in enumerate("RGB")}

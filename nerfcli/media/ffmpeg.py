@@ -1,4 +1,4 @@
-"""The program ffmpeg: the one that comes with imageio-ffmpeg, or another by IMAGEIO_FFMPEG_EXE."""
+"""The ffmpeg program: the one that comes with imageio-ffmpeg, or the one that IMAGEIO_FFMPEG_EXE names."""
 
 import shutil
 
@@ -17,7 +17,7 @@ def ffmpeg_program(purpose: str, *, instead: str = "") -> str:
         instead: what else the user can do, for the end of the hint.
 
     Raises:
-        UserError: there is none, or IMAGEIO_FFMPEG_EXE names no program.
+        UserError: ffmpeg is not found, or IMAGEIO_FFMPEG_EXE names no program.
     """
     try:
         program = imageio_ffmpeg.get_ffmpeg_exe()

@@ -1,6 +1,6 @@
 """Facts about a depth, picture or video file: its description, size, and range of values.
 
-A file of another program is described as what it is: numbers without a stated convention.
+A file of another program is reported as numbers without a stated convention.
 """
 
 import json
@@ -21,7 +21,7 @@ from nerfcli.media.float_tiff import read_any_tiff
 from nerfcli.media.levels import depth_of_levels
 
 _KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".exr": "OpenEXR", ".npz": "NPZ", ".npy": "NPY", ".png": "PNG"}
-# What an export writes about itself, beside the folders of its outputs.
+# The file in which an export describes itself, beside the folders of its outputs.
 RENDERS = "render.json"
 NOT_STATED = (
     "the file does not state the definition of depth (mean, median, ...), its axis (ray or optical axis) or its unit"
@@ -30,14 +30,14 @@ _LEVELS_NOT_STATED = "the length of a level is not stated either: often 1 mm, 0.
 
 
 def file_facts(path: Path) -> dict[str, Any]:
-    """Return the facts of one file as plain values.
+    """Return the facts about one file as plain values.
 
-    Keys: kind ("depth", "preview", "picture", "video", "array"), format, width and height, meaning (`DepthMeta` as
-    plain values, None where nothing is stated), in_words, maps: per map its dtype, valid_share, min, median and max
-    in the unit of the meaning; texts: other text that a PNG carries; note: what is not known.
+    Keys: kind ("depth", "levels", "preview", "picture", "video", "array"), format, width and height, meaning
+    (`DepthMeta` as plain values, None if not stated), in_words, maps (for each map its dtype, valid_share, min, median
+    and max in the unit of the meaning), texts (other texts in a PNG), note (what is not known).
 
     Raises:
-        UserError: missing, damaged, or of another kind.
+        UserError: the file is missing, damaged, or of another kind.
     """
     entries = description_of(path)
     meta = _meta(path, entries)
@@ -58,13 +58,13 @@ def file_facts(path: Path) -> dict[str, Any]:
 
 
 def renders_facts(folder: Path) -> dict[str, Any]:
-    """Return the facts of a folder that `nerfcli render` wrote.
+    """Return the facts about a folder that `nerfcli render` wrote.
 
-    Keys: kind ("renders"), format, frames, meaning and in_words of its depth, files: how many depth files say so,
+    Keys: kind ("renders"), format, frames, meaning and in_words of its depth, files (how many state a definition),
     outputs, run.
 
     Raises:
-        UserError: its description cannot be read, or its depth files do not mean the same.
+        UserError: its description cannot be read, or its depth files have different definitions.
     """
     try:
         content = json.loads((folder / RENDERS).read_text(encoding="utf-8"))
@@ -95,20 +95,20 @@ def renders_facts(folder: Path) -> dict[str, Any]:
 
 
 def _depth_metas(folder: Path) -> Iterator[tuple[Path, DepthMeta]]:
-    """Yield every file of numbers below a folder that says what its depth means."""
+    """Yield every numeric file below a folder that states its definition, and that definition."""
     for path in sorted(folder.rglob("*")):
         if path.suffix in _KINDS and path.is_file():
             meta = depth_meta_of(path)
-            # Previews carry the meaning of what they show; they are no numbers.
+            # Previews carry the definition of the map that they show, but are not numeric.
             if meta is not None and (path.suffix != ".png" or meta.units_per_level is not None):
                 yield path, meta
 
 
 def _meta(path: Path, entries: dict[str, Any] | None) -> DepthMeta | None:
-    """Return the meaning in a description.
+    """Return the definition of depth in a description; None if there is none.
 
     Raises:
-        UserError: the description is ours, but of a format that is not known here.
+        UserError: the description is in a format of a later version of nerfcli.
     """
     if entries is None:
         return None
@@ -180,7 +180,7 @@ def _video_facts(path: Path) -> dict[str, Any]:
 
 
 def _size_of(maps: dict[str, np.ndarray]) -> dict[str, int]:
-    """Width and height, where all maps have one."""
+    """Return the width and height if all maps have the same; else nothing."""
     sizes = {array.shape[:2] for array in maps.values() if array.ndim >= 2}
     if len(sizes) != 1:
         return {}
@@ -189,7 +189,7 @@ def _size_of(maps: dict[str, np.ndarray]) -> dict[str, int]:
 
 
 def _statistics(maps: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """Return of each map how its numbers are stored, how many are valid, and their range."""
+    """Return for each map how its values are stored, the fraction that is valid, and their range."""
     return {name: _range(array) for name, array in maps.items()}
 
 

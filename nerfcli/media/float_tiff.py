@@ -1,4 +1,4 @@
-"""Depth maps as float32 TIFF: one map, losslessly compressed, what it means as JSON in the ImageDescription."""
+"""Depth maps as float32 TIFF: one losslessly compressed map, with its definition as JSON in the ImageDescription."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 from nerfcli.media.depth_pictures import DepthMeta, check_map
 
-# Of zlib: the lower bits of depths are noise, so that more effort saves 0.5 %, in twice the time.
+# zlib level: the lower bits of depths are noise, so a higher level saves only 0.5 % and takes twice the time.
 _LEVEL = 1
 
 
@@ -18,16 +18,16 @@ def write_tiff(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
     """Write a depth map as float TIFF; atomic.
 
     Args:
-        path: the folder is made if need be.
-        depth: float32 (height, width); every bit comes back, NaN too.
-        meta: what the numbers mean.
+        path: the file; its folder is created if needed.
+        depth: float32 (height, width); every bit is preserved, including NaN.
+        meta: the definition of the values.
 
     Raises:
         UserError: the file cannot be written.
         ValueError: depth is not float32 (height, width), or meta holds a number that is not finite.
     """
     check_map(depth)
-    description = meta.to_text()  # escapes all but ASCII, as the tag demands
+    description = meta.to_text()  # only ASCII, as the tag requires
     with atomic_path(path) as partial:
         tifffile.imwrite(
             partial,
@@ -41,10 +41,10 @@ def write_tiff(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
 
 
 def read_tiff(path: Path) -> tuple[np.ndarray, DepthMeta]:
-    """Read what `write_tiff` wrote: depth float32 (height, width), and what it means.
+    """Read a file of `write_tiff`: the depth, float32 (height, width), and its definition.
 
     Raises:
-        UserError: missing, damaged, not a float32 map, or without a description of its convention.
+        UserError: the file is missing, damaged, not a float32 map, or does not describe its convention.
     """
     depth, description = read_any_tiff(path)
     if depth.dtype != np.float32 or depth.ndim != 2:
@@ -73,5 +73,5 @@ def read_any_tiff(path: Path) -> tuple[np.ndarray, str]:
             return page.asarray(), page.description
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}", "give a depth TIFF") from error
-    except Exception as error:  # tifffile lets through whatever its decoders raise
+    except Exception as error:  # tifffile passes on any exception of its decoders
         raise UserError(f"{path} is damaged or not a TIFF file: {error}", "render the depth map again") from error

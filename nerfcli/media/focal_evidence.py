@@ -16,7 +16,7 @@ _FILM_DIAGONAL_MM = 43.27
 # Sides that agree within this are the same after rounding; JPEGs are also trimmed to whole blocks of 8 pixels.
 _SAME_SIDE = 0.003
 _ROUNDING_PX = 1.5
-# Longer over shorter side of the pictures that cameras store; of another shape, without a recorded size, it is a crop.
+# Ratios of the longer to the shorter side of camera pictures; another shape without a recorded size means a crop.
 _CAMERA_SHAPES = (5 / 4, 4 / 3, 3 / 2, 16 / 9)
 _SAME_SHAPE = 0.01
 # Between a fisheye and a strong telephoto lens, relative to the picture's longer side.
@@ -27,13 +27,13 @@ _SENSOR_RANGE_MM = (2.5, 60.0)
 
 @dataclass(frozen=True)
 class FocalEvidence:
-    """The focal length of a file by its EXIF.
+    """The focal length of a file according to its EXIF.
 
     Args:
-        focal_px: None if EXIF does not say. Where it does not hold, that of the largest crop that fits: at least as
-            long as the true one is for a file that was resized after cropping, and a place to start from.
-        holds: whether nothing in EXIF speaks against the focal length.
-        doubt: what does, "" if nothing.
+        focal_px: None if EXIF does not state it. If it does not hold, the value for the largest crop that fits: a lower
+            bound of the true focal length and a starting point.
+        holds: whether nothing in EXIF contradicts the focal length.
+        doubt: the contradiction; "" if there is none.
         whole_px: (longer, shorter) side of the picture as the camera took it, at the file's scale.
     """
 
@@ -46,8 +46,8 @@ class FocalEvidence:
 def focal_evidence(exif: Exif) -> FocalEvidence:
     """Return the focal length of a photo from EXIF, and whether it applies to the file as it is.
 
-    From the 35 mm equivalent, by the diagonal; without one, from the focal length and the sensor's resolution. The
-    latter counts the pixels of the recorded size, whatever size the file has now.
+    It is computed from the 35 mm equivalent and the diagonal; without an equivalent, from the focal length in mm and
+    the sensor's resolution, which refers to pixels of the recorded size even if the file was resized.
     """
     file_px = (float(max(exif.width, exif.height)), float(min(exif.width, exif.height)))
     if exif.focal_mm is None and exif.focal_35mm is None:
@@ -64,7 +64,7 @@ def focal_evidence(exif: Exif) -> FocalEvidence:
 
 
 def _whole(file_px: tuple[float, float], taken_px: tuple[int, int] | None) -> tuple[tuple[float, float], str]:
-    """(longer, shorter) side of the uncropped picture at the file's scale, and why its scale is not known, or ""."""
+    """Return the (longer, shorter) side of the uncropped picture at the file's scale, and why the scale is in doubt."""
     longer, shorter = file_px
     size = f"{longer:.0f}x{shorter:.0f}"
     if taken_px is None:
@@ -78,7 +78,7 @@ def _whole(file_px: tuple[float, float], taken_px: tuple[int, int] | None) -> tu
         return file_px, ""
     whole = (float(taken_longer), float(taken_shorter))
     if any(_same(side, taken) for side, taken in zip(file_px, whole, strict=True)):
-        return whole, ""  # one side is as the camera took it: the other one was cut, and nothing was resized
+        return whole, ""  # one side is unchanged: the other one was cropped, and nothing was resized
     scale = max(scales)
     doubt = f"EXIF is for {taken_longer}x{taken_shorter} pixels, but the file has {size}: cropped after the shot"
     return (scale * taken_longer, scale * taken_shorter), doubt
@@ -92,7 +92,7 @@ def _focal_px(exif: Exif, whole_px: tuple[float, float]) -> float | None:
     taken_longer = max(exif.taken_px)
     sensor_mm = taken_longer / exif.sensor_px_per_mm
     if not _SENSOR_RANGE_MM[0] <= sensor_mm <= _SENSOR_RANGE_MM[1]:
-        return None  # the resolution is that of another size than the recorded one
+        return None  # the resolution refers to another size than the recorded one
     return exif.focal_mm * exif.sensor_px_per_mm * whole_px[0] / taken_longer
 
 

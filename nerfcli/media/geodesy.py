@@ -1,4 +1,4 @@
-"""GPS positions in metres."""
+"""Conversion of GPS positions to metres."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ _FLATTENING = 1 / 298.257223563
 
 
 def ecef(latitude_deg: np.ndarray, longitude_deg: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Earth-centred coordinates (N, 3) in metres, of positions (N,) on WGS 84 with heights above the ellipsoid.
+    """Return earth-centred coordinates (N, 3), in metres, of WGS 84 positions (N,) with heights above the ellipsoid.
 
     x = (n + h) cos(lat) cos(lon), y = (n + h) cos(lat) sin(lon), z = ((1 - e^2) n + h) sin(lat),
     n = a / sqrt(1 - e^2 sin^2(lat)), e^2 = f (2 - f).  Source: NIMA TR8350.2, eq. 4-14.
@@ -28,10 +28,10 @@ def ecef(latitude_deg: np.ndarray, longitude_deg: np.ndarray, height: np.ndarray
 
 
 def east_north_up(positions: Sequence[Position]) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """Positions in metres east, north and up of the first one, (N, 3), and that one.
+    """Return positions in metres east, north and up of the first one, (N, 3), and the first one's GPS position.
 
-    EXIF altitudes are above the sea, not above the ellipsoid; both are taken for one, which moves all alike. A photo
-    without altitude is taken to be at the median altitude of the others.
+    EXIF altitudes are above sea level, not above the ellipsoid; ignoring the difference moves all positions alike. A
+    photo without altitude is placed at the median altitude of the others.
     """
     latitude, longitude = (np.array([position[i] for position in positions], dtype=np.float64) for i in (0, 1))
     heights = [position[2] for position in positions if position[2] is not None]

@@ -1,6 +1,6 @@
-"""Photos and rendered pictures: what a folder holds, 8-bit sRGB pixels, EXIF, exact downscaling, PNG.
+"""Photos and rendered pictures: listing of folders, 8-bit sRGB pixels, EXIF, exact downscaling, PNG.
 
-The EXIF orientation is applied once, here, so that sizes, pixels and cameras all mean the upright picture.
+The EXIF orientation is applied once, here, so that sizes, pixels and cameras all refer to the upright picture.
 """
 
 import io
@@ -26,7 +26,7 @@ from nerfcli.errors import UserError
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
 
-# Pillow takes more than 179 megapixels for an attack; phones make photos of 200. Now it refuses from 537 on.
+# By default Pillow refuses more than 179 megapixels as an attack, but phones take photos of 200. The limit is now 537.
 Image.MAX_IMAGE_PIXELS = 2**28
 
 _UPRIGHT_FROM_STORED = {
@@ -38,31 +38,31 @@ _UPRIGHT_FROM_STORED = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-# What Pillow's decoders raise on files that are damaged; it promises no common base class.
+# Exceptions of Pillow's decoders for damaged files; no common base class is documented.
 _DAMAGED = (
     *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError),
     *(struct.error, zlib.error, Image.DecompressionBombError),
 )
-# Of EXIF's FocalPlaneResolutionUnit; 4 and 5 are no standard, but some cameras write them.
+# Values of EXIF's FocalPlaneResolutionUnit; 4 and 5 are not standard, but some cameras write them.
 _RESOLUTION_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FORMATS = "JPEG, PNG, TIFF, WebP or BMP"
 _SRGB = ImageCms.createProfile("sRGB")
-# Two colour spaces that agree within this many of 255 levels on a grid of colours are the same one.
+# Two colour spaces that agree within this many of 255 levels on a grid of colours count as the same.
 _SAME_COLOUR_LEVELS = 2
-# Of zlib; and PNG's filter "up": 9 % larger than with a filter chosen for each line, in half the time.
+# zlib level, and PNG's filter "up": files are 9 % larger than with a filter chosen per line, but take half the time.
 _PNG_LEVEL, _PNG_UP = 4, 2
-_PNG_COLOURS = {1: 0, 3: 2, 4: 6}  # PNG's colour types by channels
+_PNG_COLOURS = {1: 0, 3: 2, 4: 6}  # PNG's colour types by number of channels
 
 
 @dataclass(frozen=True)
 class Exif:
-    """EXIF data of a photo; None where it is missing or implausible.
+    """EXIF data of a photo; entries that are missing or implausible are None.
 
     focal_35mm is the equivalent focal length on 36 x 24 mm film. orientation is 1...8, 1 where absent.
     width and height are those of the upright picture. gps is (latitude_deg, longitude_deg, altitude in metres
-    or None), north and east positive. taken is when, in seconds of the camera's own clock, comparable between photos of
-    one camera. taken_px is the (width, height) that EXIF records for the picture, as the camera stored it;
-    sensor_px_per_mm how many of its pixels there are on a millimetre of the sensor.
+    or None), north and east positive. taken is the time of the shot in seconds of the camera's own clock, comparable
+    between photos of one camera. taken_px is the (width, height) that EXIF records for the picture, as the camera
+    stored it; sensor_px_per_mm is the number of its pixels per millimetre of the sensor.
     """
 
     make: str | None
@@ -83,10 +83,10 @@ class Exif:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Return the picture files of a folder itself, sorted by name; hidden files and subfolders are left out.
+    """Return the picture files directly in a folder, sorted by name; hidden files and subfolders are left out.
 
     Raises:
-        UserError: the folder is not there or cannot be listed.
+        UserError: the folder does not exist or cannot be listed.
     """
     try:
         files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
@@ -97,31 +97,31 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) of the upright picture, from the header alone.
+    """Return the (width, height) of the upright picture, from the header alone.
 
     Raises:
-        UserError: see `read_image`; damage behind the header is not seen.
+        UserError: see `read_image`; damage after the header is not detected.
     """
     with _opened(path) as image:
         return _upright_size(image)
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read a picture as upright 8-bit sRGB, whatever the file holds.
+    """Read a picture as upright 8-bit sRGB.
 
-    Grey, palette, CMYK and 16-bit pixels (the high byte is kept) are brought to 8-bit RGB. Colours in another
-    embedded profile than sRGB are converted; a profile that cannot be used is ignored.
+    Grey, palette, CMYK and 16-bit pixels (the high byte is kept) are converted to 8-bit RGB. Colours with an embedded
+    profile other than sRGB are converted; a profile that cannot be used is ignored.
 
     Returns:
         uint8, writable: (height, width, 3) RGB, or (height, width, 4) RGBA with straight alpha if the file
         has transparency.
 
     Raises:
-        UserError: the file is missing, empty, cut short, damaged, no picture, or has float or 32-bit pixels.
+        UserError: the file is missing, empty, truncated, damaged, not a picture, or has float or 32-bit pixels.
     """
     with _opened(path) as image:
         image.load()
-        # Asked after loading: Pillow itself turns TIFF files upright while it loads them, and then says 1.
+        # Read after loading: Pillow turns TIFF files upright while it loads them, and then reports orientation 1.
         orientation = _orientation(image)
         srgb = _to_srgb(image, path)
         if orientation != 1:
@@ -134,7 +134,7 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
     Args:
         pixels: uint8 (height, width), or with 3 or 4 channels.
-        orientation: of the file that they belong to.
+        orientation: the EXIF orientation of their file.
     """
     _check_pixels(pixels)
     transpose = _UPRIGHT_FROM_STORED.get(orientation)
@@ -142,14 +142,14 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def downscale(image: np.ndarray, factor: float) -> np.ndarray:
-    """Return a smaller picture; each pixel is the mean of the area that it covers, fractions of pixels included.
+    """Return a smaller picture; each pixel is the mean of the area that it covers, including fractions of pixels.
 
-    Colours are averaged with alpha as their weight, so that what transparent pixels hide does not bleed in;
-    where alpha is 0 all over, the colour is 0. A picture whose size stays the same is copied as it is.
+    Colours are averaged with alpha as the weight, so that colours of transparent pixels do not bleed in;
+    where alpha is 0 in the whole area, the colour is 0. A picture whose size stays the same is copied.
 
     Args:
         image: uint8 (height, width), (height, width, 3) or (height, width, 4) with straight alpha.
-        factor: >= 1; the sizes are divided by it and rounded, to 1 pixel at least.
+        factor: >= 1; width and height are divided by it and rounded, to at least 1 pixel.
 
     Raises:
         ValueError: factor < 1, or not an 8-bit picture.
@@ -172,10 +172,10 @@ def downscale(image: np.ndarray, factor: float) -> np.ndarray:
 
 
 def read_exif(path: Path) -> Exif:
-    """Read the EXIF entries that matter for cameras. Odd or damaged entries read as absent.
+    """Read the EXIF entries that describe the camera. Odd or damaged entries count as absent.
 
     Raises:
-        UserError: see `read_image`; damage behind the header is not seen.
+        UserError: see `read_image`; damage after the header is not detected.
     """
     with _opened(path) as image:
         width, height = _upright_size(image)
@@ -206,9 +206,9 @@ def write_png(path: Path, image: np.ndarray, *, metadata: dict[str, str] | None 
     """Write a picture as PNG, atomically, with `metadata` as its text chunks (any Unicode; keys in Latin-1).
 
     Args:
-        path: the folder is made if need be.
+        path: the file; its folder is created if needed.
         image: uint8 (height, width), (height, width, 3) or (height, width, 4) with straight alpha.
-        metadata: what the picture is, by keyword.
+        metadata: texts about the picture, by keyword.
 
     Raises:
         UserError: the file cannot be written.
@@ -243,7 +243,7 @@ def _check_pixels(image: np.ndarray) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """Open the file as a lazy Pillow image; what goes wrong with the file inside the block becomes a UserError."""
+    """Open the file as a lazy Pillow image; errors of the file inside the block become a UserError."""
     try:
         if path.stat().st_size == 0:
             raise UserError(f"{path} is empty (0 bytes)", "copy the photo again, or remove the file")
@@ -272,7 +272,7 @@ def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
     mode = "RGBA" if image.has_transparency_data else "RGB"
     # A 16-bit PNG is "I" in older releases of Pillow.
     if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
-        # The high byte, as Pillow does it for 16-bit colour; exact for 8-bit pixels that were widened to 16.
+        # Keep the high byte, as Pillow does for 16-bit colour; this is exact for 8-bit pixels that were widened to 16.
         image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
     if image.mode in ("I", "F"):
         kind = "integer" if image.mode == "I" else "float"
@@ -288,12 +288,12 @@ def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
 
 
 def _from_profile(image: Image.Image, profile: bytes) -> Image.Image:
-    """`image` (L, RGB, RGBA or CMYK) in sRGB; unchanged if the profile is sRGB already or cannot be used."""
+    """Convert an image (L, RGB, RGBA or CMYK) to sRGB, or return it as is if the profile is sRGB or cannot be used."""
     output_mode = image.mode if image.mode in ("RGB", "RGBA") else "RGB"
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         transform = ImageCms.buildTransform(source, _SRGB, image.mode, output_mode)
-        # Names of profiles tell little ("c2" is sRGB, "sRGB-elle-V2-g10" is linear): compare colours instead.
+        # Names of profiles are unreliable ("c2" is sRGB, "sRGB-elle-V2-g10" is linear): compare colours instead.
         if image.mode == output_mode:
             levels = np.arange(0, 256, 17, dtype=np.uint8)
             grid = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(1, -1, 3)
@@ -304,12 +304,12 @@ def _from_profile(image: Image.Image, profile: bytes) -> Image.Image:
         converted = ImageCms.applyTransform(image, transform)
     except (ImageCms.PyCMSError, OSError, ValueError):
         return image
-    assert converted is not None  # None is what Pillow returns for transforms in place
+    assert converted is not None  # Pillow returns None only for transforms in place
     return converted
 
 
 def _upright_size(image: Image.Image) -> tuple[int, int]:
-    # Pillow swaps the size of a TIFF when it opens it, although the tag still says how it is stored.
+    # Pillow swaps width and height of a TIFF on opening, although the tag still has the orientation as stored.
     width, height = image.size
     return (height, width) if image.format != "TIFF" and _orientation(image) >= 5 else (width, height)
 
@@ -335,14 +335,14 @@ def _text(value: Any) -> str | None:
 
 
 def _number(value: Any) -> float | None:
-    """Return a finite number from a rational, or from the first of several."""
+    """Return a finite number from a number or rational, or from the first of several; None if there is none."""
     if isinstance(value, tuple) and value:
         return _number(value[0])
     if not isinstance(value, (int, float, Rational)):
         return None
     try:
         number = float(value)
-    except ArithmeticError:  # over 0, or too large
+    except ArithmeticError:  # a zero denominator, or too large
         return None
     return number if math.isfinite(number) else None
 
@@ -367,7 +367,7 @@ def _sensor_resolution(camera: dict[int, Any]) -> float | None:
 
 
 def _clock(value: Any, fraction: Any) -> float | None:
-    """Seconds of the camera's clock, from its local time, whatever its zone, and the digits after the point."""
+    """Return seconds of the camera's clock from its local time, ignoring its time zone, and the decimal digits."""
     digits = _text(fraction)
     try:
         local = datetime.strptime(_text(value) or "", "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
@@ -383,12 +383,12 @@ def _position(gps: dict[int, Any]) -> tuple[float, float, float | None] | None:
         return None
     altitude = _number(gps.get(ExifTags.GPS.GPSAltitude))
     if altitude is not None and gps.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01"):
-        altitude = -altitude  # below the sea
+        altitude = -altitude  # below sea level
     return latitude, longitude, altitude
 
 
 def _degrees(value: Any, hemisphere: Any, *, limit: float) -> float | None:
-    """Degrees from (degrees, minutes, seconds) and the letter of the hemisphere."""
+    """Return degrees from (degrees, minutes, seconds) and the letter of the hemisphere."""
     if not isinstance(value, tuple) or len(value) != 3:
         return None
     parts = [_number(part) for part in value]

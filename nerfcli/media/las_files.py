@@ -1,4 +1,4 @@
-"""Points as .las and .laz, which GIS programs and point-cloud viewers read, with a description of what they are.
+"""Points as .las and .laz files, for GIS programs and point-cloud viewers, with a description of their values.
 
 laspy writes and reads them, lazrs compresses .laz: `pip install 'nerfcli[las]'`.
 """
@@ -17,10 +17,10 @@ from nerfcli.errors import UserError
 from nerfcli.media.mesh_files import KEY
 
 SUFFIXES = (".las", ".laz")
-# Of LAS 1.2, which every program reads: places and 16-bit colours.
+# LAS 1.2, which every program reads; its point format 2 has coordinates and 16-bit colours.
 _POINT_FORMAT, _VERSION = 2, "1.2"
-# Places are whole numbers of this part of the largest extent, rounded to a power of ten: finer than any measurement,
-# and far from the ends of 32 bits.
+# Coordinates are integer multiples of this fraction of the largest extent, rounded up to a power of ten: finer than any
+# measurement, and far from overflowing 32 bits.
 _RESOLUTION = 1e-8
 _COLOURS = ("red", "green", "blue")
 
@@ -29,7 +29,7 @@ def las_module() -> ModuleType:
     """Return laspy.
 
     Raises:
-        UserError: it, or what compresses .laz, is not installed.
+        UserError: laspy, or lazrs, which compresses .laz, is not installed.
     """
     try:
         importlib.import_module("lazrs")
@@ -42,10 +42,10 @@ def write_las(path: Path, columns: Mapping[str, np.ndarray], *, description: Map
     """Write points, compressed if the suffix is .laz; atomic.
 
     Args:
-        path: the folder is made if need be.
-        columns: (N,) by name: x, y, z, rounded to 1e-8 of their extent; red, green, blue as uint8; the others as extra
-            dimensions of their own type.
-        description: plain values, in a record of the user "nerfcli".
+        path: the file; its folder is created if needed.
+        columns: arrays (N,) by name: x, y, z, rounded to between 1e-8 and 1e-7 of the largest extent; red, green, blue,
+            uint8; all others become extra dimensions with their own dtype.
+        description: plain values, stored as JSON in a variable-length record of the user "nerfcli".
 
     Raises:
         UserError: the file cannot be written, or laspy is not installed.
@@ -64,7 +64,7 @@ def write_las(path: Path, columns: Mapping[str, np.ndarray], *, description: Map
     points = laspy.LasData(header)
     points.x, points.y, points.z = places.T
     for name in _COLOURS:
-        setattr(points, name, columns[name].astype(np.uint16) * 257)  # 255 becomes the largest of 16 bits
+        setattr(points, name, columns[name].astype(np.uint16) * 257)  # 255 becomes 65535
     for name in extras:
         points[name] = columns[name]
     with atomic_path(path) as partial:
@@ -72,10 +72,10 @@ def write_las(path: Path, columns: Mapping[str, np.ndarray], *, description: Map
 
 
 def las_facts(path: Path) -> dict[str, Any]:
-    """Return what the header of a .las or .laz file says, and its description.
+    """Return the facts in the header of a .las or .laz file, with its description.
 
     Raises:
-        UserError: it is damaged, or laspy is not installed.
+        UserError: the file is damaged, or laspy is not installed.
     """
     laspy = las_module()
     try:

@@ -1,7 +1,7 @@
-"""Depth as 16-bit PNG: whole levels of a stated length, millimetres where the scene is in metres; 0 is no depth.
+"""Depth as 16-bit PNG: integer levels of a stated length, a millimetre where possible; 0 means no depth.
 
 value = level * units_per_level, rounded to the nearest level. Nothing wraps and nothing is clipped: a depth that does
-not fit is an error, before a file is written.
+not fit raises an error before a file is written.
 """
 
 import math
@@ -21,13 +21,12 @@ MILLIMETRE = 1e-3
 
 
 def chosen_scale(largest: float, unit: str) -> float:
-    """Return the length of a level for a whole clip, in scene units:
-    1, 2 or 5 times a power of ten, the finest that fits.
+    """Return the finest length of a level that fits a whole clip: 1, 2 or 5 times a power of ten, in scene units.
 
-    In metres it is never finer than a millimetre, so that files are in millimetres wherever that fits.
+    In metres it is never finer than a millimetre, so that files are in millimetres whenever that fits.
 
     Args:
-        largest: the largest depth of the clip, >= 0; 0 where there is none.
+        largest: the largest depth of the clip, >= 0; 0 if there is none.
         unit: "metre" or "arbitrary".
 
     Raises:
@@ -41,24 +40,24 @@ def chosen_scale(largest: float, unit: str) -> float:
     if finest == 0:
         return 1.0
     decade = math.floor(math.log10(finest)) - 1
-    # float("2e-5") is the number that people write; 2 * 10.0**-5 may be its neighbour.
+    # float("2e-5") is exactly the number that people write; 2 * 10.0**-5 may be the next float.
     steps = [float(f"{digit}e{power}") for power in range(decade, decade + 4) for digit in (1, 2, 5)]
     return next(step for step in steps if step >= finest * (1 - 1e-12) and largest <= LARGEST_LEVEL * step * (1 + 1e-9))
 
 
 def write_png16(path: Path, depth: np.ndarray, meta: DepthMeta, *, units_per_level: float) -> None:
-    """Write a depth map as 16-bit grey PNG with its meaning in the text chunk "nerfcli"; atomic.
+    """Write a depth map as 16-bit grey PNG with its definition in the text chunk "nerfcli"; atomic.
 
     Args:
-        path: the folder is made if need be.
+        path: the file; its folder is created if needed.
         depth: float32 (height, width), NaN where there is none.
-        meta: what the numbers mean; the scale, the invalid value and the largest error of rounding are added.
+        meta: the definition of the values; the scale, the invalid value and the largest rounding error are added.
         units_per_level: the length of a level in the unit of `meta`, > 0.
 
     Raises:
         UserError: a depth does not fit into 16 bits, is negative or so small that it would read as no depth; or the
             file cannot be written.
-        ValueError: depth is not float32 (height, width), units_per_level not positive, or meta not of a depth.
+        ValueError: depth is not float32 (height, width), units_per_level is not positive, or meta is not of a depth.
     """
     check_map(depth)
     if not 0 < units_per_level < math.inf or meta.quantity != "depth":
@@ -74,7 +73,7 @@ def write_png16(path: Path, depth: np.ndarray, meta: DepthMeta, *, units_per_lev
 
 
 def scale_in_words(meta: DepthMeta) -> str:
-    """Return "a level is 1 mm, 0 is no value"."""
+    """Describe the levels: "one level is 1 mm, 0 means no value"."""
     if meta.units_per_level is None:
         return "NaN means no value"
     if meta.unit == "metre":
@@ -83,12 +82,12 @@ def scale_in_words(meta: DepthMeta) -> str:
 
 
 def depth_of_levels(levels: np.ndarray, units_per_level: float) -> np.ndarray:
-    """float32 depth with NaN for level 0."""
+    """Return float32 depth with NaN for level 0."""
     return np.where(levels == 0, np.nan, levels * units_per_level).astype(np.float32)
 
 
 def _levels(path: Path, depth: np.ndarray, units_per_level: float) -> tuple[np.ndarray, float]:
-    """uint16 levels, and the largest error of rounding in the unit of the depth."""
+    """Return uint16 levels, and the largest rounding error in the unit of the depth."""
     valid = ~np.isnan(depth)
     exact = np.where(valid, depth, 0).astype(np.float64) / units_per_level
     levels = np.rint(exact)

@@ -1,7 +1,7 @@
-"""Masks: which pixels of a photo may be used. What is white is used, what is black is not.
+"""Masks that select the pixels of a photo to use: white pixels are used, black ones are not.
 
-A mask is a picture in any format, named after its photo. It has the size of the photo, either upright or as the file
-stores it: tools that ignore the EXIF orientation make the latter, and it is then turned as the photo is.
+A mask is a picture in any format, named after its photo. It has the size of the photo, either upright or as stored in
+the file: tools that ignore the EXIF orientation write the latter, and the mask is then turned like the photo.
 """
 
 from pathlib import Path
@@ -11,17 +11,16 @@ import numpy as np
 from nerfcli.errors import UserError
 from nerfcli.media.images import IMAGE_SUFFIXES, read_exif, read_image, upright
 
-# Compression of these formats leaves traces around an edge, in the black and in the white.
+# Formats whose compression leaves artefacts around an edge, in both the black and the white areas.
 _LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg", ".webp"})
 _MIDDLE = 128
 _HINT = "a mask must have the size of its photo; black pixels are ignored"
 
 
 def find_mask(name: str, masks: Path) -> Path | None:
-    """Find the mask of the photo `name` in the folder `masks`, None if it has none.
+    """Find the mask of the photo `name` in the folder `masks`; None if it has none.
 
-    photo.jpg.png, as COLMAP names it, goes before photo.png, and other formats come last; so does the photo's own name,
-    photo.jpg.
+    The order of preference is photo.jpg.png (COLMAP's name), photo.png, the photo's own name, then other formats.
     """
     whole, stem = masks / name, (masks / name).with_suffix("")
     suffixes = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
@@ -38,14 +37,14 @@ def read_mask(path: Path, photo: Path) -> np.ndarray:
     """Read the mask of a photo.
 
     Args:
-        path: the mask. If its largest level is 1, that is white.
+        path: the mask. If its largest level is 1, then 1 means white.
         photo: its photo.
 
     Returns:
-        uint8 (height, width), upright: 0 where the photo is not to be used, 255 where it is, between them on edges.
+        uint8 (height, width), upright: 0 for pixels to ignore, 255 for pixels to use, values in between on edges.
 
     Raises:
-        UserError: one of the two cannot be read, or their sizes do not fit.
+        UserError: one of the two cannot be read, or their sizes do not match.
     """
     levels = read_image(path)[..., :3].max(axis=-1)
     exif = read_exif(photo)

@@ -1,7 +1,7 @@
-"""Meshes and points as files: PLY, GLB and OBJ, each with a description of what its numbers are.
+"""Meshes and points as PLY, GLB and OBJ files, each with a description of its values.
 
-The description is plain values, the same for all formats: in PLY and OBJ a comment `nerfcli` with JSON, in GLB
-`asset.extras`. A comment in words beside it says unit and frame.
+The description consists of plain values, the same for all formats: a comment `nerfcli` with JSON in PLY and OBJ,
+`asset.extras` in GLB. Further comments state the unit and the frame in words.
 """
 
 import json
@@ -32,15 +32,15 @@ _CODES = {
     }.items()
     for word in words
 }
-# Of glTF 2.0: kinds of components and of chunks.
+# Component types and chunk types of glTF 2.0.
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
-# Positions are stored as floats around the middle where they lie farther from the origin than so many of their size.
+# Float positions are stored relative to their mean if it is at least this many times their extent from the origin.
 _FAR = 1000.0
 
 
 def comments_of(description: Mapping[str, Any]) -> list[str]:
-    """Lines that say what a file holds: for people, then for programs."""
+    """Return the comment lines that describe a file, first for people, then for programs."""
     unit, source = description.get("unit"), description.get("unit_source")
     stated = {"metre": "metre", "arbitrary": "arbitrary, the scale of the scene is not known"}.get(str(unit), str(unit))
     return [
@@ -62,7 +62,7 @@ def write_ply(
 
     Args:
         path: the file.
-        columns: (N,) of each property of a vertex, float32, float64, int32, uint16 or uint8.
+        columns: vertex properties by name, (N,) float32, float64, int32, uint16 or uint8.
         faces: (F, 3).
         description: plain values.
 
@@ -86,14 +86,14 @@ def write_ply(
 
 
 def read_ply_header(path: Path) -> tuple[dict[str, int], dict[str, str], list[str], int]:
-    """Read what a PLY file says it holds.
+    """Read the header of a PLY file.
 
     Returns:
-        elements and how many there are; properties of a vertex and their NumPy types; comments; where the body begins,
-        0 where it is not binary with the lowest byte first.
+        The elements and their counts; the properties of a vertex and their NumPy types; the comments; the offset of the
+        body, 0 if it is not binary little-endian.
 
     Raises:
-        UserError: it is no PLY file.
+        UserError: it is not a PLY file.
     """
     with path.open("rb") as file:
         head = file.read(2**20)
@@ -118,11 +118,10 @@ def read_ply_header(path: Path) -> tuple[dict[str, int], dict[str, str], list[st
 
 
 def read_ply_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the vertices (N, 3) and triangles (F,
-    3) int64 of a binary PLY whose faces hold nothing else than three vertices.
+    """Read the vertices (N, 3) and triangles (F, 3), int64, of a binary PLY whose faces hold only three indices.
 
     Raises:
-        UserError: it is something else, or cut short.
+        UserError: the file is of another kind, or truncated.
     """
     elements, properties, _, start = read_ply_header(path)
     dtype = np.dtype(list(properties.items()))
@@ -139,7 +138,7 @@ def read_ply_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def write_obj(
     path: Path, vertices: np.ndarray, faces: np.ndarray, *, colours: np.ndarray, description: Mapping[str, Any]
 ) -> None:
-    """Write a mesh as OBJ, atomically: a colour behind each position, as most programs read it.
+    """Write a mesh as OBJ, atomically, with a colour after each position, which most programs can read.
 
     Args:
         path: the file.
@@ -170,8 +169,8 @@ def write_glb(
 ) -> None:
     """Write a mesh as binary glTF 2.0, atomically.
 
-    Positions stay in their frame; the turn to glTF's +Y up is the root node's. Colours are in linear light, as glTF has
-    them, and the material is unlit: they hold the light of the scene.
+    Positions keep their frame; the root node rotates them to glTF's +Y up. Colours are converted to linear light, as
+    glTF requires, and the material is unlit because the colours already contain the scene's lighting.
 
     Args:
         path: the file.
@@ -241,7 +240,7 @@ def read_glb_json(path: Path) -> dict[str, Any]:
     """Read the JSON of a binary glTF.
 
     Raises:
-        UserError: it is none, or cut short.
+        UserError: it is not a binary glTF, or truncated.
     """
     data = path.read_bytes()
     try:

@@ -12,18 +12,18 @@ from nerfcli.media.las_files import las_facts
 from nerfcli.media.mesh_files import KEY, read_glb_json, read_ply_header
 from nerfcli.media.volume_files import Volume, read_nrrd, read_volume_npz
 
-# Of files that say nothing about themselves.
+# Note for files without a description.
 NOT_STATED = "nothing in the file says its unit or its frame"
 SUFFIXES = (".ply", ".glb", ".obj", ".nrrd", *LAS_SUFFIXES)
 
 
 def model_facts(path: Path) -> dict[str, Any] | None:
-    """Return the facts of a file by their names; None where an archive is no volume.
+    """Return the facts about a file by name; None for an archive that is not a volume.
 
-    Keys: kind, format, counts, low and high corner where they are known, and the description: unit, frame, run, ...
+    Keys: kind, format, counts, low and high corner if known, and the description: unit, frame, run, ...
 
     Raises:
-        UserError: missing or damaged.
+        UserError: the file is missing or damaged.
     """
     if not path.is_file():
         raise UserError(f"there is no {path}", "give a file that exists")
@@ -79,7 +79,7 @@ def _glb_facts(path: Path) -> dict[str, Any]:
         facts |= {"low": positions["min"], "high": positions["max"]}
         root = content["nodes"][content["scenes"][0]["nodes"][0]]
         facts["root_node"] = f"{root.get('name', 'unnamed')}, matrix {root.get('matrix')}"
-    except (KeyError, IndexError, TypeError):  # another program's: it may hold anything
+    except (KeyError, IndexError, TypeError):  # written by another program: it may contain anything
         facts["note"] = "its first mesh has no list of triangles"
     extras = content.get("asset", {}).get("extras") or {}
     return (extras if extras else {"note": NOT_STATED}) | facts
@@ -99,7 +99,7 @@ def _obj_facts(path: Path) -> dict[str, Any]:
 
 
 def volume_facts(volume: Volume, form: str) -> dict[str, Any]:
-    """Return the facts of a volume, whatever its file."""
+    """Return the facts about a volume from a file of any format."""
     facts: dict[str, Any] = {"kind": "volume", "format": form, "voxel_size": volume.voxel_size}
     shape = next(iter(volume.maps.values())).shape[:3]
     facts |= {"voxels": "x".join(map(str, shape)), "first_centre": volume.origin.tolist()}
@@ -108,7 +108,7 @@ def volume_facts(volume: Volume, form: str) -> dict[str, Any]:
         finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
         span = f", {finite.min():.6g} to {finite.max():.6g}" if finite.size else ", no numbers"
         facts[name] = f"{values.dtype}{span}, {100 * finite.size / values.size:.1f} % known"
-    # A map's own name may be a word of the description, which says what its numbers are.
+    # The description may define a map's values under the map's own name, which is already a key of `facts`.
     described = dict(volume.description or {"note": NOT_STATED})
     meanings = {f"{name}_is": described.pop(name) for name in volume.maps if name in described}
     return described | facts | meanings

@@ -1,4 +1,4 @@
-"""Depth maps to look at: colours on one range, with a legend that names convention, axis and unit."""
+"""Previews of depth maps: false colours over a range of depths, with a legend that names convention, axis and unit."""
 
 import math
 from collections.abc import Sequence
@@ -16,17 +16,17 @@ _NUM_TICKS = 5
 
 
 def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_map: str = "turbo") -> np.ndarray:
-    """Depth in colours (turbo: blue near, red far) with a legend below it.
+    """Return a depth map in false colours (turbo: blue near, red far) with a legend below it.
 
-    Depths outside lo...hi have the colours of the ends, as the legend says; pixels that are not finite are
-    hatched grey. A picture too narrow for the legend is centred on a wider sheet. The size depends on the
-    shape and the other arguments alone, so that the previews of a video fit together.
+    Depths outside lo...hi have the colours of the ends, as the legend says; pixels that are not finite are hatched
+    grey. A picture too narrow for the legend is centred on a wider sheet. The size depends only on the map's shape and
+    the other arguments, so all previews of a video have the same size.
 
     Args:
         depth: (height, width).
-        meta: named in the legend.
-        lo: the depth that has the first colour, in the unit of `meta`.
-        hi: the depth that has the last colour, >= lo.
+        meta: the definition of the values, for the legend.
+        lo: the depth with the first colour, in the unit of `meta`.
+        hi: the depth with the last colour, >= lo.
         colour_map: one of `colour_maps.COLOUR_MAPS`.
 
     Returns:
@@ -46,13 +46,14 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_
 
 
 def coloured(depth: np.ndarray, *, lo: float, hi: float, colour_map: str) -> np.ndarray:
-    """Return the colours of `preview` without its legend, uint8 RGB (height, width, 3);
-    arguments and errors as there.
+    """Return the false colours of `preview` without the legend, uint8 RGB (height, width, 3).
+
+    Arguments and errors are those of `preview`.
     """
     if not -math.inf < lo <= hi < math.inf:
         raise ValueError(f"lo <= hi must be finite, got {lo}, {hi}")
     valid = np.isfinite(depth)
-    # float64, and clipped before the division: a narrow range neither underflows nor overflows.
+    # In float64 and clipped before the division, so that a narrow range neither underflows nor overflows.
     level = np.where(valid, depth, lo).astype(np.float64)
     np.clip(level, lo, hi, out=level)
     level -= lo
@@ -66,7 +67,7 @@ def coloured(depth: np.ndarray, *, lo: float, hi: float, colour_map: str) -> np.
 
 
 def beside(sheets: Sequence[np.ndarray]) -> np.ndarray:
-    """Pictures side by side, aligned at the top; white below those that are less high.
+    """Place pictures side by side, aligned at the top, with white below the shorter ones.
 
     Args:
         sheets: uint8 (height, width, 3), at least one.
@@ -80,9 +81,9 @@ def beside(sheets: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(filled, axis=1)
 
 
-@lru_cache(maxsize=8)  # that of all frames of a clip
+@lru_cache(maxsize=8)  # all frames of a clip have the same legend
 def _legend(lines: tuple[str, ...], suffix: str, *, lo: float, hi: float, colour_map: str, width: int) -> np.ndarray:
-    """Colour bar, numbers with a suffix, lines of text; wider than `width` if the text needs it."""
+    """Draw a colour bar, numbers with a suffix and lines of text; wider than `width` if the text needs it."""
     size = min(max(round(width / 40), 12), 28)
     font = ImageFont.load_default(size)
     numbers = _tick_labels(lo, hi, suffix=suffix)
@@ -109,7 +110,7 @@ def _legend(lines: tuple[str, ...], suffix: str, *, lo: float, hi: float, colour
 
 
 def _lines(meta: DepthMeta) -> tuple[str, ...]:
-    """Return what the legend says of the values."""
+    """Return the lines of the legend that describe the values."""
     unit = {"arbitrary": "arbitrary units", "metre": "metres"}.get(meta.unit, meta.unit)
     if meta.quantity in UNIT_OF:
         return meta.title, f"in {unit}; hatched: no value"
@@ -117,7 +118,7 @@ def _lines(meta: DepthMeta) -> tuple[str, ...]:
 
 
 def _tick_labels(lo: float, hi: float, *, suffix: str) -> list[str]:
-    """Evenly spaced numbers with enough digits to tell them apart; the ends include what lies beyond them."""
+    """Return evenly spaced numbers with enough digits to tell them apart; the ends are marked "<=" and ">="."""
     step = (hi - lo) / (_NUM_TICKS - 1)
     decimals = min(max(1 - math.floor(math.log10(step)), 0), 12) if step > 0 else 3
     numbers = [f"{lo + index * step:.{decimals}f}{suffix}" for index in range(_NUM_TICKS)]

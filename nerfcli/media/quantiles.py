@@ -1,4 +1,4 @@
-"""Quantiles of more numbers than fit in memory: exact, by counting twice."""
+"""Exact quantiles of more numbers than fit in memory, by counting in two passes."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -8,18 +8,18 @@ _HALF = 2**16
 
 
 def quantiles(maps: Callable[[], Iterable[np.ndarray]], shares: Sequence[float]) -> list[float]:
-    """Exact quantiles of all finite values of many arrays; memory does not depend on their number.
+    """Return exact quantiles of all finite values of many arrays, in memory that does not depend on their number.
 
-    Floats are put in order by their bits. The first pass counts them by the upper half of these, the second one those
-    in the halves that matter by the lower half.
+    Floats are ordered by their bits. The first pass counts all values by their upper 16 bits; the second pass counts
+    the values in the bins that contain a quantile by their lower 16 bits.
 
     Args:
-        maps: gives the arrays, float32 of any shape; called twice, and must give the same both times.
-        shares: in [0, 1].
+        maps: returns the arrays, float32 of any shape; called twice, and must return the same both times.
+        shares: fractions in [0, 1].
 
     Returns:
-        For each share the smallest value that at least this share of all values does not exceed; nothing where there
-        is no finite value.
+        For each fraction, the smallest value that at least this fraction of all values does not exceed; an empty list
+        if there is no finite value.
     """
     upper_counts = np.zeros(_HALF, dtype=np.int64)
     for values in maps():
@@ -44,7 +44,7 @@ def quantiles(maps: Callable[[], Iterable[np.ndarray]], shares: Sequence[float])
 
 
 def _ordered(values: np.ndarray) -> np.ndarray:
-    """Return the finite values as uint32 in the same order: bits of negative floats count backwards."""
+    """Return the finite values as uint32 in the same order; the bits of negative floats are inverted."""
     bits = np.ascontiguousarray(values[np.isfinite(values)], dtype=np.float32).view(np.uint32)
     return np.where(bits >> 31 == 1, ~bits, bits | np.uint32(1 << 31))
 

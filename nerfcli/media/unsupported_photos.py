@@ -1,19 +1,19 @@
-"""Photos in formats that cannot be read, so that they are named and not passed over."""
+"""Photos in formats that cannot be read, so that they are reported instead of silently skipped."""
 
 from pathlib import Path
 
 from nerfcli.media.images import list_images
 
-# What phones and cameras write and Pillow does not read.
+# Formats of phones and cameras that Pillow does not read.
 _UNSUPPORTED_SUFFIXES = frozenset(
     {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 )
 
 
 def unsupported_photos(folder: Path) -> list[Path]:
-    """Return photos of a folder itself in formats that cannot be read (HEIC, raw), sorted by name.
+    """Return the photos directly in a folder whose formats cannot be read (HEIC, raw), sorted by name.
 
-    A raw file is left out if the same photo stands beside it as a picture that can be read.
+    A file is left out if a readable picture of the same name, apart from the suffix, is beside it.
     """
     read = {path.stem for path in list_images(folder)}
     return sorted(

@@ -18,15 +18,15 @@ from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 from nerfcli.media.ffmpeg import ANOTHER_FFMPEG, ffmpeg_program
 
-# Left alone, ffmpeg converts by the matrix of standard television and tags nothing; players guess another. A picture
-# holds sRGB, so that is the transfer curve; "setparams" tags the frames, which is where encoders read it.
+# By default ffmpeg converts with the matrix of standard-definition television and writes no tags, and players assume
+# another matrix. Pictures are sRGB, so its transfer curve is used; "setparams" tags the frames, where encoders look.
 _COLOURS = (
     "scale=out_color_matrix=bt709:out_range=tv,"
     "setparams=colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1:range=tv"
 )
-# Players take a delay under 2 hundredths of a second for 10.
+# Players treat a delay below 2 hundredths of a second as 10 hundredths.
 GIF_FASTEST_FPS = 50.0
-# Ordered dither does not crawl over areas that stand still, as error diffusion does.
+# Ordered dither does not crawl over static areas, as error diffusion does.
 _DITHER = "[0:v][1:v]paletteuse=dither=bayer:bayer_scale=4"
 
 
@@ -35,11 +35,11 @@ class VideoFormat:
     """Encoder settings of one video format.
 
     Args:
-        suffix: of the files; two formats never share one, so that their videos stand side by side.
+        suffix: suffix of the files, different for each format, so that their videos fit in one folder.
         encoder: the name that `ffmpeg -encoders` lists.
-        crf: constant quality that is visually close to the pictures, 0 is best; None where there is no such scale.
-        worst_crf: the end of that scale.
-        arguments: of ffmpeg besides.
+        crf: constant quality that is visually close to the pictures, 0 is best; None if there is no such scale.
+        worst_crf: the worst value on that scale.
+        arguments: further arguments of ffmpeg.
     """
 
     suffix: str
@@ -50,7 +50,7 @@ class VideoFormat:
 
 
 FORMATS = {
-    # Beside the preset medium: three quarters of the time, files 1 % (photos) to 15 % (depth) larger, 0.05 dB less.
+    # Compared with preset medium: three quarters of the time, files 1 % (photos) to 15 % (depth) larger, 0.05 dB less.
     "mp4": VideoFormat(".mp4", "libx264", 16, 51, ("-preset", "fast", "-movflags", "+faststart")),
     # Apple's players want the tag hvc1.
     "h265": VideoFormat(
@@ -98,25 +98,25 @@ def write_video(
     plays: int = 1,
     comment: str = "",
 ) -> None:
-    """Encode frames as they come; memory does not grow with their number. The file appears when it is complete.
+    """Encode frames one by one, with memory independent of their number. The file appears when it is complete.
 
-    Frames of odd width or height get their last column or row twice, because video formats store colour for pairs of
-    pixels (gif does not, and keeps them as they are). The same frames give the same gif; the other encoders may write
-    a few bits otherwise on a busy machine.
+    The last column or row of frames with odd width or height is doubled, because video formats store colour for pairs
+    of pixels (a gif does not, and frames stay unchanged). The same frames give the same gif; the output of the other
+    encoders may differ in a few bits on a busy machine.
 
     Args:
         path: the file to write, with the suffix of `form`.
-        frames: gives the frames from the first to the last, uint8 (height, width, 3) sRGB, all of one size; called
+        frames: returns the frames from the first to the last, uint8 (height, width, 3) sRGB, all of one size; called
             for each pass over them (a gif takes one for its palette and one for its pixels).
         form: one of `FORMATS`.
         fps: frames per second, > 0.
-        crf: constant quality from 0, best, to `form.worst_crf`; the format's own if None.
-        plays: times the clip is shown: repeated in the file, or written for the player of a gif, where 0 is for ever.
-        comment: what the container's comment shall say.
+        crf: constant quality from 0, best, to `form.worst_crf`; the format's default if None.
+        plays: how many times the clip is shown: repeated in the file, or stated in a gif, where 0 means forever.
+        comment: the container's comment.
 
     Raises:
         UserError: the file cannot be written, there is no ffmpeg, or it fails.
-        ValueError: fps is not positive, no frame came, or one of another shape or type.
+        ValueError: fps is not positive, there are no frames, or a frame has the wrong shape or type.
     """
     if not fps > 0:
         raise ValueError(f"fps must be positive, got {fps}")
@@ -136,11 +136,11 @@ def write_video(
 def _write_gif(
     partial: Path, frames: Callable[[], Iterable[np.ndarray]], *, fps: float, plays: int, comment: str, target: Path
 ) -> None:
-    """Write one palette over the clip, then the pixels: to do both at once, ffmpeg would keep all frames in memory."""
+    """Write one palette for the clip, then the pixels: in a single pass, ffmpeg would keep all frames in memory."""
     with tempfile.TemporaryDirectory(prefix=f"{partial.name}-", dir=partial.parent) as folder:
         palette, plain = Path(folder) / "palette.png", Path(folder) / "plain.gif"
         _encode(frames(), palette, ["-vf", "palettegen=reserve_transparent=0", "-update", "1"], fps=fps, target=target)
-        # The format counts repetitions; ffmpeg takes -1 for none, 0 for ever.
+        # The format counts repetitions; ffmpeg takes -1 for none, 0 for forever.
         arguments = ["-i", f"file:{palette}", "-lavfi", _DITHER, "-loop", f"{plays - 1 or -1 if plays else 0}"]
         _encode(frames(), plain, arguments, fps=fps, target=target)
         _add_gif_comment(plain, partial, comment)
@@ -173,10 +173,10 @@ def _encode(frames: Iterable[np.ndarray], output: Path, arguments: list[str], *,
                     command = [
                         *(ffmpeg, "-hide_banner", "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"),
                         *("-s", f"{shape[1]}x{shape[0]}", "-framerate", f"{fps}", "-i", "-", *arguments),
-                        # No random numbers and no dates; "file:", because a colon in a name would read as a protocol.
+                        # No random numbers and no dates; "file:", because a colon would be read as a protocol.
                         *("-bitexact", f"file:{output}"),
                     ]
-                    # Of a session of its own: Ctrl-C is ours to handle.
+                    # In a separate session, so that Ctrl-C does not reach it: this process handles it.
                     process = subprocess.Popen(
                         command,
                         stdin=subprocess.PIPE,
@@ -189,7 +189,7 @@ def _encode(frames: Iterable[np.ndarray], output: Path, arguments: list[str], *,
                 assert process.stdin is not None
                 try:
                     process.stdin.write(frame.tobytes())
-                except OSError as error:  # a broken pipe: the encoder's own words are in its log
+                except OSError as error:  # a broken pipe: the encoder's message is in its log
                     process.wait()
                     raise _failure(target, log) from error
             if process is None:
@@ -203,7 +203,7 @@ def _encode(frames: Iterable[np.ndarray], output: Path, arguments: list[str], *,
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:
-    """End the encoder where it has not ended by itself."""
+    """Kill the encoder if it is still running, and wait for it."""
     process.kill()
     assert process.stdin is not None
     with suppress(OSError):

@@ -1,8 +1,8 @@
 """Videos as input: their frames in order, decoded by ffmpeg, upright, with square pixels and their time stamps.
 
-By ffmpeg as a program, and not by OpenCV's VideoCapture: it mirrors frames as well as turning them where the metadata
-ask for it, goes on behind a damaged place, and says what is damaged or missing, where VideoCapture only ends early.
-Frames are handed on one at a time, so that a long video needs no more memory than a short one.
+The ffmpeg program is used instead of OpenCV's VideoCapture because it both rotates and mirrors frames as the metadata
+require, continues after a damaged section, and reports what is damaged or missing; VideoCapture merely ends early.
+Frames are yielded one at a time, so that a long video needs no more memory than a short one.
 """
 
 import math
@@ -24,16 +24,16 @@ from nerfcli.media.images import IMAGE_SUFFIXES
 
 T = TypeVar("T")
 
-# ffmpeg turns and mirrors frames as the metadata say before it filters them.
+# ffmpeg rotates and mirrors frames according to the metadata before it filters them.
 _UPRIGHT = "scale=w='max(1,round(iw*if(gt(sar,0),sar,1)))':h=ih,setsar=1,format=rgb24"
-# What ffmpeg says of a file that ends too early, whatever the container.
+# ffmpeg's messages about a truncated file, in any container.
 _CUT_SHORT = re.compile(r"ended prematurely|partial file|moov atom not found", re.IGNORECASE)
 _ERROR = re.compile(r"\[(error|fatal)\] (.*)")
 _TIME = re.compile(r" pts_time:(\S+)")
-# What ffmpeg would make pictures of although it is no video: text as screen art, photos, lists of other files.
+# Inputs that ffmpeg would decode although they are not videos: text as screen art, photos, lists of other files.
 _NO_VIDEO = re.compile(r"Input #0, (tty|image2|concat|hls|dash|sdp|ico|\w+_pipe)\b")
 _HDR = re.compile(r"smpte2084|arib-std-b67")
-# Channels of the picture formats that say their own size.
+# Numbers of channels of PGM and PPM, picture formats that state their own size.
 _CHANNELS = {b"P5": 1, b"P6": 3}
 _LINES_KEPT = 60
 
@@ -56,7 +56,7 @@ class Video:
 
 @dataclass(frozen=True)
 class MeasuredFrames(Generic[T]):
-    """What was measured of each frame, its time (frames,) from the first one on, and how many errors decoding gave."""
+    """The measured value of each frame, its time since the first one, (frames,), and the number of decoding errors."""
 
     seconds: np.ndarray
     values: list[T]
@@ -64,10 +64,10 @@ class MeasuredFrames(Generic[T]):
 
 
 def open_video(path: Path) -> Video:
-    """Read the head of a video and its first frame.
+    """Read the header of a video and decode its first frame.
 
     Raises:
-        UserError: no such file, no video in it, or none that can be decoded.
+        UserError: the file does not exist, contains no video, or cannot be decoded.
     """
     if not path.is_file():
         raise UserError(f"{path} does not exist", "give a video file, or a folder of photos")
@@ -105,10 +105,10 @@ def measure_frames(
         video: from `open_video`.
         measure: gets uint8 (height, width): the frame in grey, averaged down where it is larger than `longer_side`.
         longer_side: pixels.
-        progress: called with the fraction that is done, 0...1, where the video states its duration and frame rate.
+        progress: called with the fraction that is done, 0...1, if the video states its duration and frame rate.
 
     Raises:
-        UserError: the video is cut short, or cannot be decoded.
+        UserError: the video is truncated, or cannot be decoded.
     """
     factor = max(1.0, max(video.width, video.height) / longer_side)
     size = f"{max(1, round(video.width / factor))}:{max(1, round(video.height / factor))}"
@@ -131,13 +131,13 @@ def read_frames(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
 
     Args:
         video: from `open_video`.
-        numbers: which, counted from 0, rising.
+        numbers: indices of the frames, from 0, in ascending order.
 
     Yields:
         uint8 (height, width, 3) RGB, upright, with square pixels.
 
     Raises:
-        UserError: the video has no such frame; it has changed since it was measured.
+        UserError: a frame is missing, as the video has changed since it was measured.
     """
     given = 0
     with _decoding(video.path, f"select='{_one_of(numbers)}',{_UPRIGHT}", "ppm") as decoder:
@@ -150,10 +150,10 @@ def read_frames(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
 
 
 class _Decoder:
-    """A running ffmpeg: its pictures on stdout, what it says on stderr sorted by a thread of its own.
+    """A running ffmpeg: its pictures come from stdout, and a separate thread sorts its messages on stderr.
 
-    Of a long or endless log only this is kept: head, the first lines; said, the last errors; errors, how many there
-    were; times, the seconds that showinfo names; cut_short, whether the file ends too early.
+    Of a possibly endless log only this is kept: the first lines (head), the last errors (said), their number (errors),
+    the seconds that showinfo prints (times), and whether the file is truncated (cut_short).
     """
 
     def __init__(self, process: "subprocess.Popen[bytes]"):
@@ -182,7 +182,7 @@ class _Decoder:
             yield picture
 
     def finish(self) -> None:
-        """Wait for the end, so that everything is heard."""
+        """Wait until ffmpeg has ended and all its messages are read."""
         self._process.wait()
         self._listener.join()
 
@@ -190,7 +190,7 @@ class _Decoder:
         assert self._process.stderr is not None
         for raw in self._process.stderr:
             line = raw.decode("utf-8", errors="replace").rstrip()
-            # First, and in every line: showinfo writes its own in pieces, and what another thread says may come amid.
+            # First, and in every line: showinfo prints its lines in pieces, between which other messages may appear.
             self.cut_short = self.cut_short or bool(_CUT_SHORT.search(line))
             if time := _TIME.search(line):
                 self.times.append(time[1])
@@ -204,12 +204,12 @@ class _Decoder:
 
 @contextmanager
 def _decoding(path: Path, filters: str, codec: str, *, more: Sequence[str] = ()) -> Iterator[_Decoder]:
-    """ffmpeg at work on the first video stream (covers and thumbnails are none); it is gone when the block ends."""
+    """Run ffmpeg on the first video stream, without covers and thumbnails; it is killed when the block ends."""
     command = [
         *(ffmpeg_program(f"cannot read {path}"), "-hide_banner", "-nostats", "-nostdin", "-loglevel", "level+info"),
-        # "file:", because a colon in a name would read as a protocol; and no list of files may lead elsewhere.
+        # "file:", because a colon in a name would be read as a protocol. The whitelist keeps inputs on this machine.
         *("-protocol_whitelist", "file,pipe", "-i", f"file:{path}", "-map", "0:V:0"),
-        # Each frame once, whatever its time: else ffmpeg repeats and drops frames to make the rate constant.
+        # Pass each frame exactly once: otherwise ffmpeg repeats and drops frames to make the rate constant.
         *("-fps_mode", "passthrough", "-vf", filters, *more, "-c:v", codec, "-f", "image2pipe", "-"),
     ]
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -226,7 +226,7 @@ def _decoding(path: Path, filters: str, codec: str, *, more: Sequence[str] = ())
 
 
 def _read_picture(pipe: IO[bytes]) -> np.ndarray | None:
-    """Read the next PGM or PPM picture of 8 bits; None at the end, even if it comes amid one."""
+    """Read the next 8-bit PGM or PPM picture; None at the end of the stream, even if it is inside a picture."""
     magic = pipe.readline().strip()
     if not magic:
         return None
@@ -239,7 +239,7 @@ def _read_picture(pipe: IO[bytes]) -> np.ndarray | None:
 
 
 def _one_of(numbers: Sequence[int]) -> str:
-    """ffmpeg's expression for "the number is one of these": a search tree, since sums of 100 terms are too deep."""
+    """Return ffmpeg's expression for "n is one of `numbers`": a search tree, since sums of 100 terms are too deep."""
     if len(numbers) == 1:
         return f"eq(n,{numbers[0]})"
     half = len(numbers) // 2
@@ -247,7 +247,7 @@ def _one_of(numbers: Sequence[int]) -> str:
 
 
 def _times(stamps: Sequence[str], count: int, fps: float) -> np.ndarray:
-    """Seconds from the first frame on; from the frame rate where the stamps are missing or do not rise."""
+    """Return seconds since the first frame; from the frame rate if time stamps are missing or do not increase."""
     with suppress(ValueError):
         seconds = np.array([float(stamp) for stamp in stamps])
         if len(seconds) == count and np.isfinite(seconds).all() and (np.diff(seconds) > 0).all():

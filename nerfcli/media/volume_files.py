@@ -1,4 +1,4 @@
-"""Grids of numbers in space as files: NPZ with everything, NRRD with one map for imaging programs.
+"""Volumes, maps on a grid of voxels, as files: NPZ with all maps, NRRD with one map for imaging programs.
 
 Arrays are indexed [x, y, z]. The centre of voxel (i, j, k) is origin + voxel_size * (i, j, k).
 """
@@ -23,12 +23,12 @@ _TYPES = {"<f4": "float", "|u1": "uchar", "<f8": "double"}
 
 @dataclass(frozen=True)
 class Volume:
-    """Maps on a grid.
+    """Maps on a grid of voxels.
 
     Args:
         maps: by name, (X, Y, Z) or (X, Y, Z, C).
-        origin: (3,) centre of the first voxel, in the frame of the description.
-        voxel_size: between centres.
+        origin: (3,) centre of the first voxel, in the frame that the description names.
+        voxel_size: distance between the centres of adjacent voxels.
         description: plain values.
     """
 
@@ -51,7 +51,7 @@ def write_volume_npz(volume: Volume, path: Path) -> None:
 
 
 def write_nrrd(volume: Volume, name: str, path: Path) -> None:
-    """Write one map as NRRD 5 (gzip), atomically; the description stands under the key `nerfcli`.
+    """Write one map as NRRD 5 (gzip), atomically, with the description under the key `nerfcli`.
 
     Raises:
         UserError: the file cannot be written.
@@ -79,7 +79,7 @@ def write_nrrd(volume: Volume, name: str, path: Path) -> None:
         "",
         "",
     ]
-    # The first axis is the fastest in the file.
+    # In the file, the first axis varies fastest.
     packed = zlib.compressobj(6, zlib.DEFLATED, 31)
     body = packed.compress(np.ascontiguousarray(values.transpose(2, 1, 0)).tobytes()) + packed.flush()
     with atomic_path(path) as partial:
@@ -113,7 +113,7 @@ def read_nrrd(path: Path) -> tuple[np.ndarray, dict[str, str]]:
 
 
 def read_volume_npz(path: Path) -> Volume | None:
-    """Read the volume that `write_volume_npz` wrote; None where the archive is something else.
+    """Read the volume that `write_volume_npz` wrote; None if the archive is something else.
 
     Raises:
         UserError: it is damaged.

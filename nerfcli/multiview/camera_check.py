@@ -1,8 +1,8 @@
 """Check given cameras against matched features of pairs of photos.
 
-A field that learns the world through a lens of the wrong length learns a world that is bent to fit, and its residuals
-tell little of it. Matched features do: the ray of one photo lies in the plane that the ray of the other spans with the
-line between both cameras, whatever the depth.
+A field trained with a wrong focal length learns a scene that is distorted to fit the photos, so its residuals hardly
+reveal the error. Matched features do: at any depth, the ray of one photo is in the epipolar plane, which contains the
+ray of the other photo and the baseline.
 """
 
 import math
@@ -16,17 +16,17 @@ from nerfcli.multiview.features import Matches
 from nerfcli.multiview.training_matches import radians_per_pixel
 from nerfcli.photos.loading import LoadedPhoto
 
-# Logarithms of factors of the focal length that are looked at: a wrong unit or crop is off by more, and every photo
-# shows it.
+# Logarithms of factors of the focal length: the limit and the two step sizes of the search. A wrong unit or crop is off
+# by more, and is obvious in every photo.
 FARTHEST, COARSE, FINE = 0.1, 0.01, 0.001
-# A miss of so many pixels counts half of what it would: larger ones are wrong matches more and more.
+# Scale of the robust cost in pixels: the larger a miss, the more likely the match is wrong.
 MISS_PX = 1.0
-# Fewer matches, or pairs of photos, tell nothing.
+# The check needs at least this many matches and pairs of photos.
 FEWEST_MATCHES, FEWEST_PAIRS = 60, 10
 MOST_MATCHES = 4000
-# The jackknife leaves out one of so many parts of the photos at a time.
+# The jackknife divides the photos into this many parts and leaves out one part at a time.
 PARTS = 10
-# Factors for which rays are computed; between them they are interpolated, to 1e-6 rad.
+# Log factors at which rays are computed (Chebyshev nodes); interpolation between them is accurate to 1e-6 rad.
 NODES = FARTHEST * np.cos(np.pi * (np.arange(6) + 0.5) / 6)
 
 
@@ -35,10 +35,10 @@ class CameraCheck:
     """Result of a check of cameras against matches.
 
     Args:
-        log_focal: all focal lengths should be exp of this times as long.
-        error: its standard error; infinite where no length within reach is best.
-        misses_px: median distances of features from their lines, as given and with the factor.
-        matches: how many there are.
+        log_focal: logarithm of the factor by which all focal lengths should be multiplied.
+        error: its standard error; infinite where the best factor is at the end of the search range.
+        misses_px: median distances of features from their epipolar lines, without and with the factor.
+        matches: number of matches.
     """
 
     log_focal: float
@@ -50,12 +50,12 @@ class CameraCheck:
 def check_cameras(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> CameraCheck | None:
     """Check cameras against matches; None where there are too few.
 
-    The factor has the least sum of log(1 + (miss / MISS_PX)^2) over all matches. Its error comes from a jackknife over
-    photos: a wrong pose moves all matches of a photo alike.
+    The factor minimises the sum of log(1 + (miss / MISS_PX)^2) over all matches. Its error comes from a jackknife over
+    photos, because a wrong pose moves all matches of a photo alike.
 
     Args:
-        photos: to train on.
-        matched: what they have in common; some of it may be wrong.
+        photos: the training photos.
+        matched: their matches, of which some may be wrong.
     """
     usable = [
         matches
@@ -69,7 +69,7 @@ def check_cameras(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> 
     pairs = [_Pair(photos, matches, every) for matches in usable]
 
     def costs(places: np.ndarray) -> np.ndarray:
-        """(places, pairs)"""
+        """Return the costs (places, pairs) of log factors (places,)."""
         return np.array([[np.log1p(np.square(pair.misses(place))).sum() for pair in pairs] for place in places])
 
     coarse = np.arange(-FARTHEST, FARTHEST + COARSE / 2, COARSE)
@@ -87,7 +87,7 @@ def check_cameras(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> 
 
 
 class _Pair:
-    """Every n-th match of two photos; its rays for any focal length."""
+    """Every n-th match of two photos, with its rays at any focal length."""
 
     def __init__(self, photos: Sequence[LoadedPhoto], matches: Matches, every: int):
         one, other = (photos[index].frame for index in matches.photos)
@@ -102,8 +102,8 @@ class _Pair:
         self._rays = [ray[:, finite] for ray in rays]
 
     def misses(self, log_focal: float) -> np.ndarray:
-        """(N,) angles between rays and the planes they should lie in, in units of MISS_PX."""
-        # Lagrange's polynomials of the nodes.
+        """Return the angles (N,) between rays and their epipolar planes, in units of MISS_PX."""
+        # Lagrange polynomials of the nodes.
         apart = NODES[:, None] - NODES[None, :] + np.eye(len(NODES))
         shares = np.prod(np.where(np.eye(len(NODES), dtype=bool), 1.0, (log_focal - NODES[None, :]) / apart), axis=1)
         one, other = (np.tensordot(shares, ray, axes=1) for ray in self._rays)
@@ -111,18 +111,18 @@ class _Pair:
         for ray, partner in ((one, other), (other, one)):
             normal = np.cross(self._baseline, partner)
             length = np.linalg.norm(normal, axis=1)
-            # A ray along the line between the cameras spans no plane: it misses nothing.
+            # A ray along the baseline has no epipolar plane: its miss is 0.
             away.append(np.abs(np.einsum("ni,ni->n", ray, normal)) / np.maximum(length, 1e-300))
         return np.maximum(*away) / self._unit
 
 
 def _median_miss(pairs: Sequence[_Pair], log_focal: float) -> float:
-    """Return the median distance in pixels."""
+    """Return the median miss of all matches, pixels."""
     return MISS_PX * float(np.median(np.concatenate([pair.misses(log_focal) for pair in pairs])))
 
 
 def _lowest(places: np.ndarray, costs: np.ndarray) -> float:
-    """Return where a parabola through the lowest cost and its neighbours has its bottom."""
+    """Return the minimum of the parabola through the lowest cost and its neighbours."""
     i = int(np.clip(costs.argmin(), 1, len(costs) - 2))
     before, at, after = costs[i - 1 : i + 2]
     bend = before - 2 * at + after

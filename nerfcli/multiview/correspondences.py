@@ -9,8 +9,8 @@ from nerfcli.multiview.training_matches import LONGER_SIDE_PX, chosen_pairs, mat
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.scene import Scene
 
-# What features of a photo take on one thread, and comparing them, for each of the pixels in which they are sought:
-# 0.5 to 0.8 us were measured. It decides whether there is time for it, and is no promise.
+# Time on one thread to find and match features, per pixel of the photos that are searched: 0.5 to 0.8 us were measured.
+# It only serves to decide whether there is enough time.
 SECONDS_PER_PIXEL = 0.7e-6
 
 
@@ -19,8 +19,8 @@ class Shared:
 
     Args:
         scene: may have a COLMAP model.
-        photos: to train on.
-        threads: that look for features.
+        photos: the training photos.
+        threads: number of threads that find and match features.
     """
 
     def __init__(self, scene: Scene, photos: Sequence[LoadedPhoto], *, threads: int):
@@ -38,20 +38,20 @@ class Shared:
 
     @cached_property
     def matched(self) -> tuple[Matches, ...]:
-        """Features of pairs of photos."""
+        """Matched features of pairs of photos."""
         return match(self._photos, threads=self._threads)
 
     @cached_property
     def of_model(self) -> Tracks:
-        """Points of structure from motion; none where the scene does not give their observations."""
+        """Tracks from structure from motion; empty where the scene does not have the observations."""
         return tracks_of_model(self._scene, self._photos)
 
     @cached_property
     def of_matches(self) -> Tracks:
-        """Points of matched features."""
+        """Tracks from matched features."""
         return tracks_of_matches(self._photos, self.matched)
 
     @property
     def tracks(self) -> Tracks:
-        """The best there are."""
+        """Tracks from structure from motion, or from matched features where there are none."""
         return self.of_model if self.of_model.count else self.of_matches

@@ -1,4 +1,4 @@
-"""The epipolar geometry of two photos without poses, and how far matches are from it.
+"""Epipolar geometry of two photos without poses, and distances of matches from it.
 
 Letters: x and y are the pixels of a match in the first and in the second photo, F the fundamental matrix, y F x = 0.
 """
@@ -10,14 +10,14 @@ import numpy as np
 def fundamental_matrix(
     x: np.ndarray, y: np.ndarray, *, within_px: float, trials: int = 2000, least: int = 8
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the fundamental matrix (3, 3) that most matches (N, 2) agree on; return it and which do, (N,) bool.
+    """Estimate the fundamental matrix (3, 3) of matches (N, 2); return it and the mask of its inliers, (N,) bool.
 
-    All NaN, and none, where there is no such matrix. Deterministic.
+    The matrix is NaN, without inliers, where none is found. Deterministic.
 
     Args:
-        within_px: how far a match may be from its epipolar lines.
-        trials: samples of matches at most.
-        least: fewer matches have no such matrix.
+        within_px: inlier threshold, the distance of a match from its epipolar lines.
+        trials: maximum number of random samples of matches.
+        least: minimum number of matches.
     """
     nothing = np.full((3, 3), np.nan), np.zeros(len(x), dtype=bool)
     if len(x) < least:

@@ -1,4 +1,4 @@
-"""Exposures of photos by what they have in common: the ratio of light at pixels that show the same point."""
+"""Exposures of photos, estimated from the ratio of light at pixels that show the same point."""
 
 from collections.abc import Sequence
 
@@ -11,32 +11,32 @@ from nerfcli.multiview.graph import connected_groups
 from nerfcli.multiview.stereo import DenseDepth
 from nerfcli.photos.loading import LoadedPhoto
 
-# Pixels of each photo that are looked up in others, and how many of these, the nearest.
+# Number of pixels of each photo that are looked up in other photos, and number of other photos (the nearest ones).
 MOST_PIXELS, OTHERS = 2000, 12
-# Two depths of a point agree within this part of them. Levels between which a ratio tells the exposure.
+# Two depths of a point agree within this fraction. Only levels between the other two numbers are used.
 CONSISTENT, DARKEST, BRIGHTEST = 0.02, 20, 240
-# Pairs with fewer common pixels are ignored; the weight of a pair stops growing at the other number, as errors of
+# Pairs with fewer common pixels are ignored; the weight of a pair is their number, capped because the errors of
 # neighbouring pixels are correlated.
 FEWEST, MOST_WEIGHT = 50, 500
-# Around each pixel, so that details which do not lie on one another to the pixel cancel.
+# Window over which levels are averaged, so that misalignments by a pixel hardly matter.
 WINDOW_PX = 3
 ROUNDS = 5
-# Of sRGB from 0 to 1, so that logarithms exist.
+# Lower bound of sRGB values (0 to 1), so that logarithms are finite.
 LEAST_LIGHT = 1e-3
 
 
 def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]) -> np.ndarray:
     """Estimate the logarithms (P, 3) of the gains of photos in linear light, per channel, with mean 0.
 
-    The log ratio of a pair is the median over its common pixels; gains minimise the sum of absolute differences to
-    these log ratios.
+    The log ratio of a pair is the median over its common pixels. Differences between log gains fit these log ratios by
+    least absolute errors.
 
     Args:
-        photos: with pixels in sRGB.
-        dense: the depths of each.
+        photos: photos with pixels in sRGB.
+        dense: the dense depths of each photo.
 
     Returns:
-        NaN for photos that share too little with the others to be compared.
+        The log gains; NaN for photos that share too little with the others to be compared.
     """
     levels = [np.ascontiguousarray(photo.pixels[..., :3]) for photo in photos]
     around = [cv2.blur(pixels, (WINDOW_PX, WINDOW_PX)).astype(np.float64) / 255.0 for pixels in levels]
@@ -76,7 +76,7 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
 
 
 def _gains(count: int, pairs: np.ndarray, ratios: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return (count, 3) gains whose differences fit ratios (N, 3) of pairs (N, 2); NaN outside the largest group."""
+    """Fit log gains (count, 3) to log ratios (N, 3) of pairs (N, 2); NaN outside the largest connected group."""
     gains = np.full((count, 3), np.nan)
     group = connected_groups(range(count), [tuple(pair) for pair in pairs.tolist()])[0] if count else []
     if len(group) < 2:
@@ -88,7 +88,7 @@ def _gains(count: int, pairs: np.ndarray, ratios: np.ndarray, weights: np.ndarra
     design = np.zeros((len(first) + 1, len(group)))
     design[np.arange(len(first)), second] = 1.0
     design[np.arange(len(first)), first] -= 1.0
-    design[-1] = 1.0  # their mean is 0
+    design[-1] = 1.0  # the mean log gain is 0
     for channel in range(3):
         wanted = np.append(ratios[inside, channel], 0.0)
         robust, found = np.ones(len(first)), np.zeros(len(group))

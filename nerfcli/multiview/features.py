@@ -1,6 +1,6 @@
-"""SIFT features of a photo, and which features of two photos show the same thing.
+"""SIFT features of a photo, and matches between the features of two photos.
 
-Nothing of the cameras needs to be known: training, `doctor` and `convert --detect` look for features here.
+No cameras are needed. Used by training, `doctor` and `convert --detect`.
 """
 
 from dataclasses import dataclass
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-# A match is kept if it is nearer than the second-best feature by this factor. Source: Lowe 2004, section 7.1.
+# A match is kept if it is nearer than this times the second-nearest feature. Source: Lowe 2004, section 7.1.
 RATIO = 0.75
-# Where the geometry of the pair is estimated next and sorts out what is wrong.
+# For use where the geometry of the pair is estimated next, which removes wrong matches.
 LOOSE_RATIO = 0.8
 
 
@@ -20,7 +20,7 @@ class Features:
 
     Args:
         pixels: (N, 2) in the photo, pixel centres at 0.5.
-        sizes: (N,) float32, diameter of what was found, in pixels of the reduced photo.
+        sizes: (N,) float32, diameters of the features, in pixels of the reduced photo.
         responses: (N,) float32, contrast.
         descriptors: (N, 128) float32, whole numbers from 0 to 255.
     """
@@ -36,8 +36,8 @@ class Matches:
     """Features that two photos have in common; some matches are wrong.
 
     Args:
-        photos: their numbers.
-        pixels: (N, 2) of each, centres at 0.5.
+        photos: the indices of the two photos.
+        pixels: (N, 2) in each photo, pixel centres at 0.5.
     """
 
     photos: tuple[int, int]
@@ -49,21 +49,21 @@ def find_features(grey: np.ndarray, *, longer_side_px: int, most: int, used: np.
 
     Args:
         grey: uint8.
-        longer_side_px: smaller photos stay as they are.
-        most: features, those of the highest contrast; at equal contrast there may be a few more.
-        used: (H, W) bool, where features are looked for; None for everywhere.
+        longer_side_px: smaller photos are not enlarged.
+        most: number of features to keep, by contrast; a few more at equal contrast.
+        used: (H, W) bool, where to look for features; None for everywhere.
     """
     height, width = grey.shape
     scale = min(1.0, longer_side_px / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if scale < 1 else grey
     mask = None if used is None else cv2.resize(used.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    # Without the precise upscaling, OpenCV's keypoints lie a quarter of a pixel off.
+    # Without precise upscaling, OpenCV's keypoints are off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=most, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(small, mask)
     if descriptors is None:
         keypoints, descriptors = [], np.zeros((0, 128), dtype=np.float32)
-    # OpenCV's positions have pixel centres at whole numbers.
+    # OpenCV has pixel centres at whole numbers.
     found = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
     return Features(
         found * (width / size[0], height / size[1]),
@@ -74,10 +74,10 @@ def find_features(grey: np.ndarray, *, longer_side_px: int, most: int, used: np.
 
 
 def mutual_matches(one: np.ndarray, other: np.ndarray, *, ratio: float = RATIO) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of features that are each other's nearest, and nearer by `ratio` than the second nearest.
+    """Return the indices of features that are each other's nearest, and nearer than `ratio` times the second nearest.
 
     Args:
-        one, other: descriptors (N, 128) and (M, 128); squared distances of SIFT's are exact in float32.
+        one, other: descriptors (N, 128) and (M, 128); squared distances between SIFT descriptors are exact in float32.
     """
     if min(len(one), len(other)) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)

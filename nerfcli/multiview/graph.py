@@ -1,4 +1,4 @@
-"""Photos as a graph: which of them joins hold together."""
+"""Photos as a graph: groups that are connected by joins."""
 
 from collections.abc import Iterable, Sequence
 
@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 
 def connected_groups(photos: Sequence[int], joins: Iterable[tuple[int, int]]) -> list[list[int]]:
-    """Return the photos that chains of joins hold together, the largest group first, each in the order of `photos`.
+    """Return the groups of photos that joins connect, the largest first, each in the order of `photos`.
 
     Example:
         >>> connected_groups([7, 8, 9], [(9, 7)])

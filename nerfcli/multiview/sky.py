@@ -1,5 +1,6 @@
-"""Pixels of training photos that may show the sky: without texture, above the horizon, alike in all photos that look
-the same way wherever these were taken.
+"""Pixels of training photos that may show the sky.
+
+They have no texture, are above the horizon, and look alike in all photos that look the same way, wherever taken.
 """
 
 import math
@@ -11,24 +12,24 @@ import numpy as np
 
 from nerfcli.photos.loading import LoadedPhoto
 
-# Size at which photos are compared, and how many others each is compared with.
+# Size at which photos are compared, and number of other photos that each is compared with.
 LONGER_SIDE_PX, OTHERS = 160, 6
-# Grey levels of a sky spread by less than this within so many pixels.
+# Standard deviation of levels below which a pixel has no texture, and the window in which it is measured.
 MOST_SPREAD, WINDOW_PX = 6.0, 7
-# Levels by which photos may differ, their exposures aside; from here on a level is white.
+# Largest difference of levels between photos, apart from their exposures; levels from the second number on are white.
 MOST_DIFFERENCE, WHITE = 32.0, 245.0
 # Photos that look elsewhere show another part of the sky.
 SAME_WAY_COS = np.cos(np.radians(60.0))
-# A smaller part of a photo is no sky, nor are fewer pixels that two photos share.
+# Smallest sky region, as a fraction of the photo. Fewest pixels for a gain, and fewest in a region that must agree.
 LEAST_PART, FEWEST_SHARED = 0.005, 50
-# A region is the sky where this part of it agrees with other photos.
+# A region may be sky if more than this fraction of its pixels that other photos see agrees with them.
 MOST_OF = 0.25
 
 
 def sky_masks(photos: Sequence[LoadedPhoto], *, threads: int) -> list[np.ndarray]:
-    """Return for each photo (H, W) bool which pixels may show the sky.
+    """Return for each photo the mask (H, W) of the pixels that may show the sky.
 
-    A wall of one colour looks the same from everywhere, too: whether these pixels are the sky is left to a trial.
+    A wall of one colour also looks the same from everywhere: a trial decides whether these pixels are the sky.
     """
     with ThreadPoolExecutor(max(1, threads)) as pool:
         small = list(pool.map(_Small, photos))
@@ -47,7 +48,7 @@ def sky_masks(photos: Sequence[LoadedPhoto], *, threads: int) -> list[np.ndarray
 
 
 class _Small:
-    """A reduced photo: its mean levels around each pixel, and where these hardly spread."""
+    """A reduced photo: its mean levels around each pixel, and the mask of pixels without texture."""
 
     def __init__(self, photo: LoadedPhoto):
         camera = photo.frame.camera
@@ -66,7 +67,10 @@ class _Small:
 
 
 def _agreed(own: _Small, others: Sequence[_Small], up: np.ndarray) -> np.ndarray:
-    """Return (h, w) whether more photos agree with a pixel along its direction than contradict."""
+    """Return the mask (h, w) of regions that agree with other photos.
+
+    A pixel agrees if more photos agree with it in its direction than contradict it.
+    """
     rays, valid = own.camera.pixel_bearings()
     rays = rays @ own.turn.T
     is_above = np.einsum("pi,i->p", rays, up) > 0
@@ -92,7 +96,7 @@ def _agreed(own: _Small, others: Sequence[_Small], up: np.ndarray) -> np.ndarray
 
 
 def _regions(shape: tuple[int, ...], candidate: np.ndarray, *, agreed: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return (h, w) the connected regions of candidates of which most that other photos see too agree with them."""
+    """Return the mask (h, w) of connected regions of candidates of which enough pixels agree with other photos."""
     mask = np.zeros(math.prod(shape), dtype=np.uint8)
     mask[candidate] = 1
     count, labels = cv2.connectedComponents(mask.reshape(shape), connectivity=4)

@@ -1,10 +1,10 @@
 """Detect two motions in a capture: a background fixed in the image, and a moving object.
 
-A tripod and a turntable give two sets of matches. Those of the background do not move at all, whatever the two photos
-are; those of the object follow an epipolar geometry of their own, which the first set contradicts. No other capture
-does both. A camera that moves leaves hardly any match in its place, and what there is (the far distance, the point that
-it keeps in the middle, the point that it moves towards) agrees with the geometry of the rest. Photos that were copied
-have matches that do not move, but no others.
+A tripod and a turntable give two sets of matches. Matches on the background do not move at all in any pair of photos;
+matches on the object follow their own epipolar geometry, which the first set contradicts. No other capture has both.
+With a moving camera, hardly any match stays in place, and those that do (far away, at the point that the camera keeps
+in the centre, at the point that it moves towards) agree with the geometry of the rest. Copies of one photo have matches
+that do not move, but no others.
 
 Letters: x and y are the pixels of a match in the first and in the second photo, F a fundamental matrix.
 """
@@ -16,29 +16,31 @@ import numpy as np
 
 from nerfcli.multiview.epipolar import epipolar_px, fundamental_matrix
 
-# A match is still if it moved by less than this share of the picture's diagonal; that is 2 px at 1600 x 1200.
+# A match is still if it moved by less than this fraction of the picture's diagonal: 2 px at 1600 x 1200.
 _STILL = 0.001
-# In small pictures features are found no better than this.
+# Lower bound of this tolerance, because features in small pictures are not located more precisely.
 _LEAST_STILL_PX = 0.75
-# Of matches that change smoothly over the picture, eight times as many moved by one to three such lengths as by less.
+# Still matches must be at least `_LEAST_PEAK` times as many as the matches that moved by 1 to `_RING` tolerances. With
+# motion that changes smoothly over the picture, eight times as many would have moved that far as stayed still.
 _RING = 3.0
 _LEAST_PEAK = 2.0
-# A tripod that gives way shifts the whole background by so many lengths at most.
+# Largest shift of the whole background, as from a tripod that gives way, in tolerances.
 _SHAKEN = 4.0
-# From so many such lengths on a match moved for certain.
+# A match that moved by more than this many tolerances moved for certain.
 _MOVED = 4.0
 _LEAST_MATCHES = 15
 _LEAST_FOR_GEOMETRY = 12
-# A geometry that explains so much of what stays and of what moves, to twice a length, makes them one motion.
+# If one geometry explains this fraction of the still and of the moving matches to within 2 tolerances, they are one
+# motion.
 _MOST_AGREEING = 0.7
-# Cells of the picture in which still matches are counted.
+# Cells (columns, rows) of the picture in which still matches are counted.
 _CELLS = (16, 12)
 
-# Of the pairs that tell anything, the share that must show two motions or nothing but the still one. Measured: all of
-# them on turntables, none on captures with a camera that moves.
+# Least `Stationary.share`, the fraction of the pairs with any motion that show two motions. Measured: all of them on
+# turntables, none on captures with a moving camera.
 LEAST_SHARE = 0.5
 _LEAST_PAIRS = 3
-# Less of the picture than this is a time stamp or a mark, not a background.
+# Still matches that cover less of the picture are a time stamp or a watermark, not a background.
 _LEAST_CELLS = 12
 _LEAST_EXTENT = 0.25
 
@@ -48,10 +50,11 @@ class Motions:
     """Motions found in the matches of two photos.
 
     Args:
-        stays: (N,) bool, matches in their place; none if they are no more than what a smooth motion leaves there.
-        moves: (N,) bool, the others that agree on one geometry of two views.
-        agreeing: share of both that one geometry explains, of that part of which it explains less; NaN without both.
-        cells: those of the picture in which still matches are, by number.
+        stays: (N,) bool, matches that stay in place; none if a smooth motion would leave as many in place.
+        moves: (N,) bool, moving matches that are inliers of one epipolar geometry.
+        agreeing: fraction of the still or of the moving matches, whichever is less, that one geometry explains; NaN
+            without either.
+        cells: numbers of the cells of the picture that contain still matches.
     """
 
     stays: np.ndarray
@@ -61,17 +64,17 @@ class Motions:
 
     @property
     def still(self) -> int:
-        """Matches that stayed in their place."""
+        """Number of matches that stayed in place."""
         return int(self.stays.sum())
 
     @property
     def moving(self) -> int:
-        """Matches that moved, by one geometry."""
+        """Number of matches that moved, with one geometry."""
         return int(self.moves.sum())
 
     @property
     def two(self) -> bool:
-        """Whether there are two motions, one of which is none."""
+        """Whether there are both static matches and matches of another motion."""
         return self.still >= _LEAST_MATCHES and self.moving >= _LEAST_MATCHES and self.agreeing < _MOST_AGREEING
 
     @property
@@ -90,10 +93,10 @@ class Stationary:
     """Summary over many pairs.
 
     Args:
-        two, still, moved: pairs with two motions, with the still one alone, and with one that moves.
-        photos: that are in a pair with two motions.
-        cells: share of the picture in which matches stay in their place in two pairs or more.
-        extent: share of the picture that a box around these takes.
+        two, still, moved: number of pairs with two motions, with static matches alone, and with one motion.
+        photos: number of photos in pairs with two motions.
+        cells: fraction of the picture's cells that have still matches in at least two pairs with two motions.
+        extent: fraction of the picture that the box around these cells covers.
     """
 
     two: int
@@ -130,10 +133,10 @@ def still_px(size: tuple[int, int]) -> float:
 
 
 def in_place(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which matches (N, 2) of pictures of (width, height) stay in their place, (N,) bool, and its shift (2,).
+    """Return which matches (N, 2) of pictures of (width, height) stay in place, (N,) bool, and the common shift (2,).
 
-    The whole place may be shifted by a few pixels, as by a tripod that gives way. None stay if so few do that they are
-    no more than what a motion that changes smoothly over the picture leaves there.
+    The whole background may be shifted by a few pixels, as from a tripod that gives way. No match is reported if a
+    motion that changes smoothly over the picture would leave as many in place.
     """
     within = still_px(size)
     motion = y - x
@@ -154,7 +157,7 @@ def in_place(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> tuple[np.nd
 
 
 def _densest(motion: np.ndarray, start: np.ndarray, within: float) -> np.ndarray:
-    """Return the centre of the most motions (N, 2) near a start: the mean of those nearby, again and again."""
+    """Return the mode of motions (N, 2) near a start, by mean shift."""
     at = start
     for _ in range(10):
         near = np.linalg.norm(motion - at, axis=1) < within
@@ -205,9 +208,9 @@ def together(pairs: Sequence[tuple[int, int, Motions]]) -> Stationary:
 
 
 def _common(x: np.ndarray, y: np.ndarray, *, one: np.ndarray, other: np.ndarray, within: float) -> np.ndarray:
-    """Return the fundamental matrix that most of two sets of matches agree on, as many of the one as of the other.
+    """Estimate the fundamental matrix of two sets of matches together, with equally many of each.
 
-    What moved may be flat, and then has many such matrices, of which one may hold for what stayed, too.
+    If the moving matches are on a plane, many matrices fit them, and one may also fit the still ones.
     """
     count = min(one.sum(), other.sum())
     chosen = np.concatenate(

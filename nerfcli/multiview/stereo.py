@@ -19,11 +19,11 @@ from nerfcli.multiview.triangulation import LEAST_ANGLE_RAD, triangulate
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.undistorted import pinhole_of, undistorted
 
-# Photos that each photo is matched with, and how many of these have to agree on a depth. On the desk, 44 % of the
-# pixels are within 1 % of the truth with three and 52 % with four, in 1.3 times the time.
+# Photos that each photo is matched with, and how many of them have to agree on a depth. On the desk scene, 44 % of the
+# pixels are within 1 % of the truth with three neighbours and 52 % with four, in 1.3 times the time.
 NEIGHBOURS, LEAST_AGREEING = 4, 2
-# Pictures are matched at most at this size; below the other one, matching finds too little. The time per pixel on one
-# thread, as measured, decides about the size, and is no promise.
+# Largest size at which pictures are matched; below the smaller size, matching finds too little. The size is chosen by
+# the measured time per pixel on one thread, which is only an estimate.
 LONGER_SIDE_PX, LEAST_SIDE_PX = 480, 160
 SECONDS_PER_PIXEL = 1.5e-6
 # Best angle between rays of two photos, and how fast pairs at smaller and larger angles get worse. Source: Yao et al.
@@ -31,29 +31,29 @@ SECONDS_PER_PIXEL = 1.5e-6
 BEST_ANGLE_DEG, SMALLER_DEG, LARGER_DEG = 5.0, 1.0, 10.0
 # A point counts as seen by photos that look at it within this angle of a photo in which it was found.
 SAME_SIDE_COS = np.cos(np.radians(40.0))
-# More points take time and memory, and change nothing.
+# More points take time and memory, but do not change the result.
 MOST_POINTS = 20_000
-# Fewer points that two photos share do not make them neighbours.
+# Fewest points that two photos must share to be neighbours.
 FEWEST_SHARED = 12
-# Depths are sought around the plane that fits a photo's points best, as far away from it as these percentiles of the
-# points, and this many times their distance beyond.
+# Depths are searched around the plane that fits a photo's points best, between these percentiles of the points' offsets
+# from it, extended at either end by this fraction of their difference.
 RANGE_PERCENTILES, BEYOND = (0.5, 99.5), 0.5
-# In inverse depth, at least this part of the median one to either side.
+# Least extension at either end, in inverse depth, as a fraction of the median inverse depth.
 LEAST_RANGE = 0.15
 PLANE_ROUNDS = 10
-# A plane that the other photo sees this much narrower or wider is seen by it from too far aside.
+# If the plane is narrower or wider than this in the other photo, its view is too oblique for the plane to be used.
 LEAST_NARROWING, MOST_NARROWING = 0.3, 3.0
-# Baselines that point into the photo more than this cannot be rectified.
+# Pairs cannot be rectified if the cosine between the baseline and the viewing direction is larger than this.
 MOST_FORWARD_COS = 0.85
 MOST_DISPARITIES, MOST_ENLARGEMENT = 256, 4.0
 BLOCK_PX = 5
-# What is seen at a smaller cosine to the common viewing direction of a pair is left out.
+# Points at a smaller cosine to the common viewing direction of a pair are left out.
 LEAST_RISE = 0.2
-# Error of a disparity, pixels: measured on the desk, where it is that of two thirds of the pixels.
+# Error of a disparity, pixels: two thirds of the pixels of the desk scene have at most this error.
 DISPARITY_ERROR_PX = 0.8
-# Depths of two photos at the same place agree within this part of them.
+# Depths of two photos at the same place agree within this fraction.
 CONSISTENT = 0.02
-# Two depths agree within this many standard errors, and this part of them.
+# Two depths agree within this many times the sum of their standard errors plus this fraction of the depth.
 AGREE_ERRORS, AGREE_PART = 0.7, 0.005
 # Where grey levels spread by less than this, there is nothing to match.
 LEAST_SPREAD = 3.0
@@ -66,7 +66,7 @@ class DenseDepth:
     Args:
         pixels: (N, 2) int64 column and row in the training photo; each pixel at most once.
         distances: (N,) along their rays, scene units.
-        errors: (N,) expected error of each, as a part of it.
+        errors: (N,) expected relative errors of the distances.
     """
 
     pixels: np.ndarray
@@ -87,7 +87,7 @@ class _View:
 
 
 def affordable_side_px(photos: Sequence[LoadedPhoto], *, seconds: float, threads: int) -> int:
-    """Return the longer side of the pictures that can be matched in a time; 0 if that is too short."""
+    """Return the longer side of the pictures that can be matched in a given time; 0 if it is too short."""
     aspects = [min(photo.pixels.shape[:2]) / max(photo.pixels.shape[:2]) for photo in photos]
     side = min(LONGER_SIDE_PX, math.sqrt(seconds * threads / (SECONDS_PER_PIXEL * sum(aspects))))
     return int(side) if side >= LEAST_SIDE_PX else 0
@@ -98,18 +98,18 @@ def dense_depths(
 ) -> list[DenseDepth]:
     """Estimate the distance of the pixels of each photo on which several of its neighbours agree.
 
-    Each photo is rectified with up to `NEIGHBOURS` others and matched by semi-global matching. A depth counts where
-    `LEAST_AGREEING` neighbours give it within its error (one, where there is only one), and where the depth of a
-    neighbour at the same place confirms it; it is their mean weighted by inverse variance.
+    Each photo is rectified with up to `NEIGHBOURS` others and matched by semi-global matching. A depth is accepted if
+    `LEAST_AGREEING` neighbours agree on it within the errors (one, where there is only one), and if the depth map of a
+    neighbour confirms it. It is the mean of the agreeing depths, weighted by inverse variance.
 
     Args:
-        photos: to train on.
+        photos: the training photos.
         tracks: sparse points, which determine the neighbours and the range of depths.
-        longer_side_px: of the pictures that are matched.
-        threads: photos at a time.
+        longer_side_px: longer side of the pictures that are matched.
+        threads: number of photos processed at a time.
 
     Returns:
-        One entry per photo, empty where nothing is known.
+        One entry per photo, without pixels where nothing is known.
 
     Source: Hirschmüller 2008, Stereo processing by semi-global matching, TPAMI 30(2); OpenCV's StereoSGBM.
     """
@@ -117,7 +117,7 @@ def dense_depths(
     centres = np.array([photo.frame.centre for photo in photos])
     near = _neighbours(points, shown, centres)
     own_threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # a photo per thread
+    cv2.setNumThreads(1)  # each thread processes a photo
     try:
         with ThreadPoolExecutor(max(1, threads)) as pool:
             views = list(pool.map(lambda photo: _view(photo, longer_side_px), photos))
@@ -138,7 +138,7 @@ def dense_depths(
 
 
 def _points_shown(photos: Sequence[LoadedPhoto], tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangulated points (P, 3), and whether each photo shows them (photos, P)."""
+    """Return the triangulated points (P, 3), and which of them each photo shows, (photos, P) bool."""
     surface = triangulate([photo.frame for photo in photos], tracks)
     found = np.isfinite(surface.misses_px)
     count = tracks.count
@@ -160,7 +160,7 @@ def _points_shown(photos: Sequence[LoadedPhoto], tracks: Tracks) -> tuple[np.nda
 
 
 def _neighbours(points: np.ndarray, shown: np.ndarray, centres: np.ndarray) -> list[list[int]]:
-    """Return the photos that each photo is matched with, the best first."""
+    """Return for each photo the photos to match it with, the best first."""
     rays = (points - centres[:, None]).astype(np.float32)
     rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
     found = []
@@ -198,14 +198,14 @@ def _view(photo: LoadedPhoto, longer_side_px: int) -> _View:
 
 @dataclass(frozen=True)
 class _Map:
-    """Inverse depths (h, w) float32 along the optical axis, NaN where none, and their errors."""
+    """Inverse depths (h, w) float32 along the optical axis, NaN where unknown, and their errors."""
 
     rho: np.ndarray
     errors: np.ndarray
 
 
 def _map(view: _View, others: Sequence[_View], points: np.ndarray) -> _Map:
-    """Match a view with its neighbours; `points` (P, 3) are those that it shows."""
+    """Match a view with its neighbours; `points` (P, 3) are the ones that the view shows."""
     matched = [found for other in others if (found := _matched(view, other, points)) is not None]
     rho, errors, agreeing = _agreed(matched, view.grey.shape)
     rho[(agreeing < max(1, min(LEAST_AGREEING, len(matched)))) | ~view.shown | ~_has_texture(view.grey)] = np.nan
@@ -239,7 +239,7 @@ def _depth(photo: LoadedPhoto, view: _View, own: _Map, others: Sequence[tuple[_V
 
 
 def _has_texture(grey: np.ndarray) -> np.ndarray:
-    """(h, w) whether the grey levels around each pixel differ by more than noise."""
+    """Return the mask (h, w) of pixels around which the grey levels differ by more than noise."""
     levels = grey.astype(np.float32)
     window = (2 * BLOCK_PX + 1, 2 * BLOCK_PX + 1)
     mean = cv2.blur(levels, window)
@@ -250,8 +250,8 @@ def _matched(one: _View, other: _View, points: np.ndarray) -> tuple[np.ndarray, 
     """Return inverse depths (h, w) of the first view's pixels by matching a pair, NaN where unknown, and their errors.
 
     None where the pair cannot be rectified. Both pictures are turned so that the baseline is along their rows: a point
-    at z in the turned axes then has the disparity f * baseline / z. The second one is then stretched so that the plane
-    that fits the points best has none: surfaces near it look alike in both, at whatever angle they are seen.
+    at z in the turned axes then has the disparity f * baseline / z. The second picture is then stretched so that the
+    plane that fits the points best has zero disparity: surfaces near it look alike in both, at any viewing angle.
     """
     baseline = float(np.linalg.norm(other.centre - one.centre))
     forward = one.turn[2] + other.turn[2]
@@ -263,7 +263,7 @@ def _matched(one: _View, other: _View, points: np.ndarray) -> tuple[np.ndarray, 
     y /= np.linalg.norm(y)
     turned = np.stack([x, y, np.cross(x, y)])
     focal = one.matrix[0, 0]
-    # In turned axes, a plane is affine in inverse z.
+    # In the turned axes, the inverse z of a plane is affine in (x / z, y / z).
     seen = (points - one.centre) @ turned.T
     seen = seen[seen[:, 2] > LEAST_RISE * np.linalg.norm(seen, axis=1)]
     if len(seen) < FEWEST_SHARED:
@@ -277,13 +277,13 @@ def _matched(one: _View, other: _View, points: np.ndarray) -> tuple[np.ndarray, 
     least, most = np.percentile(off, RANGE_PERCENTILES)
     margin = max(BEYOND * (most - least), LEAST_RANGE * float(np.median(inverse_z)))
     per_disparity = narrowing / (focal * baseline)  # inverse z
-    # The matcher prefers whole disparities: that of the plane is one.
+    # The matcher prefers whole disparities: make that of the plane whole.
     least, most = per_disparity * math.floor((least - margin) / per_disparity), most + margin
     count = 16 * int(np.clip(np.ceil((most - least) / per_disparity / 16), 1, MOST_DISPARITIES // 16))
     low, high = _bounds(one, turned, focal)
     other_low, other_high = _bounds(other, turned, focal)
     top, bottom = max(low[1], other_low[1]), min(high[1], other_high[1])
-    # The matcher leaves out as many columns on the left as there are disparities. The least of these is made 0.
+    # The matcher skips as many columns on the left as there are disparities. The least disparity is made 0.
     width, height = int(high[0] - low[0]) + 1 + count, int(bottom - top)
     if height < 2 * BLOCK_PX or width * height > MOST_ENLARGEMENT * one.grey.size:
         return None
@@ -330,7 +330,7 @@ def _fitted_plane(places: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _disparities(left: np.ndarray, right: np.ndarray, count: int) -> np.ndarray:
-    """(h, w) float32 disparities of the left picture, NaN where matching is not clear."""
+    """Return the disparities (h, w) float32 of the left picture, NaN where the match is ambiguous."""
     squares = BLOCK_PX * BLOCK_PX
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
@@ -348,20 +348,20 @@ def _disparities(left: np.ndarray, right: np.ndarray, count: int) -> np.ndarray:
 
 
 def _bounds(view: _View, turned: np.ndarray, focal: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the largest place of a view's corners in a turned picture, pixels."""
+    """Return the least and the largest coordinates (2,) of a view's corners in a turned picture, pixels."""
     height, width = view.grey.shape
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], dtype=np.float64)
     rays = corners @ (turned @ view.turn.T @ np.linalg.inv(view.matrix)).T
     places = (
         focal * rays[:, :2] / np.maximum(rays[:, 2:], LEAST_RISE)
-    )  # what is turned away further makes the box too large
+    )  # corners that are turned away further would make the box too large
     return places.min(0), places.max(0)
 
 
 def _agreed(
     matched: Sequence[tuple[np.ndarray, np.ndarray]], shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return inverse depths (h, w) that most estimates agree on, their standard errors, and how many agree."""
+    """Return the inverse depths (h, w) that most estimates agree on, their standard errors, and how many agree."""
     best, error = (np.full(shape, np.nan, np.float32) for _ in range(2))
     agreeing = np.zeros(shape, np.int8)
     for one, (rho, errors) in enumerate(matched):
@@ -369,7 +369,7 @@ def _agreed(
         total, mean = (np.zeros(shape, np.float32) for _ in range(2))
         for other, (other_rho, other_errors) in enumerate(matched):
             within = AGREE_ERRORS * (errors + other_errors) + AGREE_PART * rho
-            with np.errstate(invalid="ignore"):  # no estimate agrees with none
+            with np.errstate(invalid="ignore"):  # NaN agrees with nothing
                 agree = np.abs(other_rho - rho) <= within
             weights = agree / np.square(other_errors)
             number += agree

@@ -1,7 +1,7 @@
 """Tracks: which training photos saw which points, from structure from motion or from matched features.
 
-Held-out photos take no part: of what structure from motion saw, only the sightings in training photos are read, and
-neither the other ones nor the places that points have got from them.
+Held-out photos are not used: only the observations in training photos are read from structure from motion, neither
+those in held-out photos nor the 3D positions of points, which depend on them.
 """
 
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ class Tracks:
     """Sightings of points.
 
     Args:
-        photos: (O,) int64, the number of the photo of each sighting.
-        points: (O,) int64, that of its point, from 0 on.
-        rays: (O, 3) unit directions from the photo's camera, in the scene's frame; NaN where a lens has none.
+        photos: (O,) int64, the index of the photo of each sighting.
+        points: (O,) int64, the index of its point, from 0 on.
+        rays: (O, 3) unit directions from the photo's camera, in the scene's frame; NaN where the lens has no ray.
     """
 
     photos: np.ndarray
@@ -43,20 +43,20 @@ def tracks_of_model(scene: Scene, photos: Sequence[LoadedPhoto]) -> Tracks:
     if capture is not None and capture.observations is not None:
         seen = capture.observations
         index_of = {frame.name: index for index, frame in enumerate(capture.frames)}
-        of_frame = places_of(np.where(seen.point_index >= 0, seen.frame_index, -1), len(capture.frames))
+        of_frame = indices_by_value(np.where(seen.point_index >= 0, seen.frame_index, -1), len(capture.frames))
         for number, photo in enumerate(photos):
             index = index_of.get(photo.frame.name)
             if index is None:
                 continue
             own = of_frame[index]
-            # The photo may be smaller or turned: the model's own camera knows what its pixels mean.
+            # The loaded photo may be downscaled or rotated: observations are in pixels of the model's own camera.
             rays = _rays(capture.frames[index].camera.bearings(seen.pixels[own]), capture.frames[index].world_from_cam)
             parts.append((np.full(len(own), number), seen.point_index[own], rays))
     return Tracks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def tracks_of_matches(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> Tracks:
-    """Matches of two photos each, as points that both saw; some are wrong."""
+    """Return matches as tracks, with a point seen by two photos for each match; some are wrong."""
     parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))]
     first = 0
     for matches in matched:
@@ -70,12 +70,12 @@ def tracks_of_matches(photos: Sequence[LoadedPhoto], matched: Sequence[Matches])
     return Tracks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def places_of(numbers: np.ndarray, count: int) -> list[np.ndarray]:
-    """For each number from 0 to count - 1, where it stands, in rising order; others are left out."""
+def indices_by_value(numbers: np.ndarray, count: int) -> list[np.ndarray]:
+    """Return the positions of each number from 0 to count - 1, in increasing order; other numbers are ignored."""
     order = np.argsort(numbers, kind="stable")
     return np.split(order, np.searchsorted(numbers[order], np.arange(count + 1)))[1:-1]
 
 
 def _rays(bearings: tuple[np.ndarray, np.ndarray], world_from_cam: np.ndarray) -> np.ndarray:
-    """(N, 3) in the scene's frame of bearings (N, 3) and whether each is one."""
+    """Return rays (N, 3) in the scene's frame of bearings (N, 3) and their validity (N,); NaN where not valid."""
     return np.where(bearings[1][:, None], bearings[0], np.nan) @ world_from_cam[:3, :3].T

@@ -1,6 +1,6 @@
 """Features that two training photos have in common.
 
-They tell of the geometry of a capture before anything is learned: where surfaces are, and whether the lenses fit.
+They show the geometry of a capture before any training: where surfaces are, and whether the focal lengths are right.
 """
 
 from collections.abc import Sequence
@@ -14,22 +14,22 @@ from nerfcli.cameras.layout import centres_of, views_of
 from nerfcli.multiview.features import Features, Matches, find_features, mutual_matches
 from nerfcli.photos.loading import LoadedPhoto
 
-# Features are sought in photos whose longer side is at most this, so that it takes seconds.
+# Photos are reduced to this longer side to find features, so that it takes seconds.
 LONGER_SIDE_PX = 600
 MOST_FEATURES = 1500
-# Photos, evenly chosen, that are compared with others, and the others: of those that look about the same way, which
-# ones, from the nearest on. Near ones have most in common, far ones tell most.
+# Number of evenly chosen photos that are compared with others, and the ranks of these others by distance among the
+# photos that look about the same way. Near ones have the most in common, far ones constrain the geometry the most.
 MOST_PHOTOS = 16
 PARTNERS = (1, 3, 9)
 SAME_WAY_COS = np.cos(np.radians(40.0))
 
 
 def match(photos: Sequence[LoadedPhoto], *, threads: int) -> tuple[Matches, ...]:
-    """Return the matches of `chosen_pairs` that have any."""
+    """Match the features of `chosen_pairs`; return the pairs that have matches."""
     pairs = chosen_pairs(photos)
     wanted = sorted({index for pair in pairs for index in pair})
     own_threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # a photo per thread, and no more threads than requested
+    cv2.setNumThreads(1)  # each thread processes a photo: no more threads than requested
     try:
         with ThreadPoolExecutor(max(1, threads)) as pool:
             features = dict(zip(wanted, pool.map(lambda index: _features(photos[index]), wanted), strict=True))
@@ -40,7 +40,7 @@ def match(photos: Sequence[LoadedPhoto], *, threads: int) -> tuple[Matches, ...]
 
 
 def chosen_pairs(photos: Sequence[LoadedPhoto]) -> list[tuple[int, int]]:
-    """Pairs of photos that look about the same way from different places."""
+    """Return pairs of photos that look about the same way from different places."""
     frames = [photo.frame for photo in photos]
     centres, views = centres_of(frames), views_of(frames)
     pairs: set[tuple[int, int]] = set()

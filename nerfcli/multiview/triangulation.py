@@ -8,12 +8,11 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.multiview.tracks import Tracks
 
-# How far a sighting may be from its point, in pixels of the training photo; poses and lenses of captures are often off
-# by one or two.
+# Largest reprojection error, in pixels of the training photo; poses and lenses of captures are often off by one or two.
 WITHIN_PX = 3.0
-# Two rays that meet at a smaller angle do not tell the distance: half a pixel would change it by a tenth and more.
+# Rays that meet at a smaller angle do not determine the distance: half a pixel would change it by a tenth or more.
 LEAST_ANGLE_RAD = np.radians(1.0)
-# After the first round, points are found without the sightings that were far off.
+# After the first round, sightings that were far off are left out.
 ROUNDS = 2
 
 
@@ -23,8 +22,8 @@ class Surface:
 
     Args:
         points: (P, 3) in the scene's frame, float64; NaN where photos do not agree.
-        misses_px: (O,) how far each sighting is from its point, in pixels of the training photo at its middle; NaN
-            where it is too far, or there is no point.
+        misses_px: (O,) reprojection error of each sighting, in pixels at the centre of the training photo; NaN where it
+            is too large, or there is no point.
     """
 
     points: np.ndarray
@@ -32,21 +31,21 @@ class Surface:
 
     @property
     def found(self) -> np.ndarray:
-        """(N, 3): the points that there are."""
+        """Points (N, 3) on which photos agree."""
         return self.points[np.isfinite(self.points).all(axis=1)]
 
 
 def triangulate(frames: Sequence[Frame], tracks: Tracks) -> Surface:
-    """Return the point that all rays of a track pass nearest to, for each track that two photos at least agree on.
+    """Triangulate each track on which at least two photos agree: the point nearest to all its rays.
 
     x = (sum_i I - d_i d_i^T)^-1 sum_i (I - d_i d_i^T) o_i,  d_i unit rays, o_i camera centres
 
-    Two rays at the angle a make the least eigenvalue of the matrix 1 - cos a: below that of `LEAST_ANGLE_RAD` the
-    distance is not known. Accuracy: a few per cent of the distance at worst, and a few wrong ones may be among them.
+    For two rays at an angle a, the least eigenvalue of the matrix is 1 - cos a; below that of `LEAST_ANGLE_RAD`, the
+    distance is not known. Accuracy: a few per cent of the distance at worst, except for a few points that are wrong.
 
     Args:
-        frames: of the photos.
-        tracks: what they saw.
+        frames: frames of the photos.
+        tracks: their sightings.
     """
     centres = np.array([frame.centre for frame in frames])
     middle = centres.mean(axis=0)  # far from the origin of GPS coordinates, rounding would cost digits
@@ -67,13 +66,13 @@ def triangulate(frames: Sequence[Frame], tracks: Tracks) -> Surface:
 
 
 def _nearest(origins: np.ndarray, tracks: Tracks, used: np.ndarray) -> np.ndarray:
-    """(P, 3) the point nearest to the used rays of each track; NaN where they do not tell one."""
+    """Return the point nearest to the used rays of each track, (P, 3); NaN where they do not determine one."""
     of, rays, origins = tracks.points[used], tracks.rays[used], origins[used]
 
     def summed(values: np.ndarray) -> np.ndarray:
         return np.bincount(of, values, tracks.count)
 
-    # Sum by sum, as a matrix for each sighting would be as large as the photos of a large capture.
+    # Entry by entry: a matrix for each sighting would take as much memory as the photos of a large capture.
     products = [[summed(rays[:, i] * rays[:, j]) for j in range(3)] for i in range(3)]
     matrices = np.eye(3) * np.bincount(of, minlength=tracks.count)[:, None, None] - np.array(products).transpose(
         2, 0, 1

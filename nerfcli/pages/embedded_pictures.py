@@ -1,4 +1,4 @@
-"""Pictures inside a page: as data, each once however often it is shown."""
+"""Pictures embedded in a page as data, each stored once however often it is shown."""
 
 import base64
 
@@ -9,7 +9,7 @@ JPEG_QUALITY = 85
 
 
 def data_uri(data: bytes, kind: str) -> str:
-    """Return an encoded picture as the address of itself.
+    """Return an encoded picture as a data URI.
 
     Args:
         kind: jpeg or png.
@@ -18,17 +18,17 @@ def data_uri(data: bytes, kind: str) -> str:
 
 
 def jpeg_bytes(picture: np.ndarray, *, longest_px: int | None = None, quality: int = JPEG_QUALITY) -> bytes:
-    """Return a photo or a rendering, encoded.
+    """Encode a photo or a rendering as JPEG.
 
     Args:
         picture: (H, W, 3) uint8 sRGB.
-        longest_px: its longer side at most; smaller pictures stay as they are. None for any size.
+        longest_px: limit of its longer side; smaller pictures are not scaled. None for no limit.
     """
     return _encoded(fitted(picture, longest_px), ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
 def png_bytes(picture: np.ndarray) -> bytes:
-    """Return a drawing, encoded without loss: (H, W, 3) uint8 sRGB."""
+    """Encode a drawing (H, W, 3) uint8 sRGB as PNG, without loss."""
     return _encoded(picture, ".png", [])
 
 
@@ -42,7 +42,7 @@ def fitted(picture: np.ndarray, longest_px: int | None) -> np.ndarray:
 
 
 def picture_rule(name: str, uri: str) -> str:
-    """Return a CSS rule that gives elements of a class a picture, so that one that is shown twice is stored once."""
+    """Return a CSS rule that shows a picture in all elements of a class, so that it is stored only once."""
     return f".{name}{{background-image:url({uri})}}"
 
 

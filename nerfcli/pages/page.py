@@ -1,4 +1,4 @@
-"""HTML page around the content of a command: head, common style, origin; and writing it."""
+"""HTML page around the content of a command: head, common style, origin; and writing the page."""
 
 import hashlib
 import json
@@ -12,7 +12,7 @@ from typing import Any
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 
-# An earlier page of the same kind is known by what stands this near to its beginning.
+# An earlier page of the same kind is recognised by a mark within this many bytes from its beginning.
 _HEAD_BYTES = 4096
 
 
@@ -29,7 +29,7 @@ class Mark:
     source: Path
 
     def html(self) -> str:
-        """HTML of the mark in the page's head."""
+        """Return the HTML of the mark for the page's head."""
         identity = hashlib.sha256(str(self.source.resolve()).encode()).hexdigest()[:16]
         return f'<meta name="nerfcli-{self.kind}" content="{identity}">'
 
@@ -48,12 +48,12 @@ def page_html(
 
     Args:
         title: plain text.
-        mark: whose page it is.
+        mark: mark of the page's source.
         style: CSS that follows `page.css`.
-        body: HTML, whatever comes from outside escaped.
-        script: JavaScript that runs when the body is there; for data see `data_element`.
+        body: HTML, in which all outside text is escaped.
+        script: JavaScript that runs once the body exists; for its data see `data_element`.
         origin: a digest of what the page was made from, for `is_made_from`.
-        connect: let it fetch from the server that it came from, and from no other.
+        connect: True to let the page fetch from its own server, and no other.
     """
     server = " 'self'" if connect else ""
     return _PAGE.substitute(
@@ -70,13 +70,13 @@ def page_html(
 
 
 def data_element(name: str, content: Any) -> str:
-    """Data for the page's script, which finds it with JSON.parse(document.getElementById(name).textContent).
+    """Return data for the page's script, which reads it by JSON.parse(document.getElementById(name).textContent).
 
     Raises:
-        ValueError: NaN or infinity, for which JSON has no word.
+        ValueError: NaN or infinity, which JSON cannot represent.
     """
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    # Inside a script element nothing else than these letters can end it or begin another.
+    # Only these characters can end a script element or begin another one inside it.
     safe = text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
     return f'<script type="application/json" id="{escape(name)}">{safe}</script>'
 
@@ -113,10 +113,10 @@ def refuse_foreign(path: Path, mark: Mark, *, about: str) -> None:
     """Raise unless a page may be written at a path: it is free, or holds an earlier page with the same mark.
 
     Args:
-        about: what such a page is of, for the message: "capture".
+        about: the subject of such a page, for the message: "capture".
 
     Raises:
-        UserError: something else stands there.
+        UserError: something else exists there.
     """
     if not path.exists():
         return

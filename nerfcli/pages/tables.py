@@ -9,8 +9,8 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Col
 
     Args:
         columns: the headings.
-        rows: as many cells each.
-        numbers: columns that are aligned to the right.
+        rows: each with as many cells.
+        numbers: indices of the columns that are aligned to the right.
     """
 
     def line(tag: str, cells: Sequence[str]) -> str:

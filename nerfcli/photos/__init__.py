@@ -1,1 +1,1 @@
-"""Photos as they are trained on and compared with: their pixels, masks and exposures."""
+"""Photos for training and evaluation: their pixels, masks and exposures."""

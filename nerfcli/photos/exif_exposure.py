@@ -10,7 +10,7 @@ from nerfcli.media.images import read_exif
 
 
 def log_exposures(frames: Sequence[Frame]) -> np.ndarray:
-    """Return logarithms of the exposures of photos, for comparison among them: (n,), NaN where EXIF lacks them.
+    """Return the logarithms (n,) of the photos' exposures, comparable with each other; NaN where EXIF lacks them.
 
     exposure = shutter time * ISO speed / f-number^2, to which the linear light of a photo is proportional
 

@@ -9,13 +9,13 @@ from nerfcli.cameras.rigid import Similarity
 
 
 def pixel_footprint(frames: Sequence[Frame], training_from_scene: Similarity) -> float:
-    """Return the footprint of a pixel of the median photo at the centre of the training frame, in its units.
+    """Return the median over photos of a pixel's footprint at the centre of the training frame, in its units.
 
-    distance / focal length, the distance at least 1: what cameras inside the unit ball look at is about its radius
-    away.
+    The footprint is distance / focal length. The distance is at least 1, since cameras inside the unit ball look at
+    things about one radius away.
 
     Args:
-        frames: with the cameras of the photos as they are trained on, downscaled ones.
+        frames: with the cameras of the downscaled training photos.
         training_from_scene: the normalisation.
     """
     footprints = []

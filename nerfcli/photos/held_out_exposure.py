@@ -8,22 +8,22 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.photos.exif_exposure import log_exposures
 from nerfcli.render.model import Model
 
-# Where the gains of a held-out photo come from: the model has no exposures; EXIF; EXIF and an offset interpolated from
-# the training photos taken before and after; these photos alone; the mean of all training photos.
+# Sources of a held-out photo's gains: none, as the model has no exposures; EXIF; EXIF and an offset interpolated from
+# the training photos taken before and after; those training photos alone; the mean of all training photos.
 SOURCES = ("none", "EXIF", "EXIF and training photos around", "training photos around", "their mean")
 
 
 def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Interpolate (T, 3) gains along the capture for photos between others; 0, the mean, where that is a better guess.
+    """Interpolate log gains (T, 3) from photos taken before and after, or return 0, the mean, if that is better.
 
-    A camera that adapts to what it sees does so from photo to photo: then the neighbours of a photo tell its gains.
-    Whether they do is seen by leaving out each known photo in turn: the squared differences to what its neighbours tell
-    have to be below those to the mean of all others.
+    A camera that adapts its exposure does so gradually, so the neighbours of a photo predict its gains. Leave-one-out
+    cross-validation over the known photos decides: the sum of squared errors of interpolation has to be below that of
+    the mean of all other photos.
 
     Args:
-        places: (P,) of the photos whose gains are known, in the order in which they were taken, increasing.
-        log_gains: (P, 3) theirs.
-        wanted: (T,) places of other photos.
+        places: (P,) of the photos with known gains, increasing in the order in which they were taken.
+        log_gains: (P, 3) logarithms of their gains.
+        wanted: (T,) places of the photos to predict.
     """
     if len(places) < 3:
         return np.zeros((len(wanted), 3))
@@ -34,15 +34,15 @@ def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray)
 
 
 def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> float:
-    """Return the factor, from 0 to 1, by which gains of photos follow the exposures in EXIF.
+    """Return the slope, from 0 to 1, of the photos' log gains over their log exposures in EXIF.
 
-    Tone curves make it smaller than 1. Each photo is left out in turn and predicted from the others, with and without
-    EXIF. The factor is 0 if the mean of the others or the photos before and after predict it better, by squared
-    differences, than EXIF does alone or with an offset from the photos before and after.
+    Tone curves make it smaller than 1. By leave-one-out cross-validation, it is 0 if the mean of the other photos or
+    the photos before and after predict a photo better, by squared errors, than EXIF does alone or with an offset from
+    the photos before and after.
 
     Args:
         places, log_gains: see `gains_between`.
-        exif: (P,) logarithms of exposures; where these are not known, the photo takes no part.
+        exif: (P,) logarithms of exposures; photos without a known one are ignored.
     """
     known = np.isfinite(exif)
     places, log_gains, exif = places[known], log_gains[known], exif[known]
@@ -63,14 +63,14 @@ def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> f
 def gains_beyond_exif(
     places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray, wanted: np.ndarray, *, slope: float
 ) -> np.ndarray:
-    """Return the offsets (T, 3) to add to the gains that EXIF predicts, slope * (exif - mean exif).
+    """Return the offsets (T, 3) to add to the log gains that EXIF predicts, slope * (exif - mean exif).
 
     Errors of learned gains add up along a capture, and cameras change their white balance, so the offsets are
     interpolated from the photos before and after; they are 0 where `gains_between` prefers the mean.
 
     Args:
         places, log_gains, wanted: see `gains_between`.
-        exif: (P,) logarithms of exposures; where these are not known, the photo takes no part.
+        exif: (P,) logarithms of exposures; photos without a known one are ignored.
         slope: see `exif_slope`.
     """
     known = np.isfinite(exif)
@@ -81,28 +81,30 @@ def gains_beyond_exif(
 
 
 def _slope(exif: np.ndarray, log_gains: np.ndarray) -> float:
-    """Return that of the straight line that fits gains (P, 3) best, one for all channels, kept from 0 to 1."""
+    """Return the least-squares slope of log gains (P, 3) over `exif`, one for all channels, clipped to [0, 1]."""
     off = exif - exif.mean()
     squares = 3.0 * float(np.square(off).sum())
     return float(np.clip((off[:, None] * log_gains).sum() / squares, 0.0, 1.0)) if squares > 0 else 0.0
 
 
 def _left_out(predict: Callable[[np.ndarray], np.ndarray], log_gains: np.ndarray) -> float:
-    """Return the sum of squared errors of predictions of each photo's gains from the others, (P,) bool."""
+    """Return the leave-one-out sum of squared errors of `predict`, which is given the mask (P,) bool of the others."""
     others = [np.arange(len(log_gains)) != left for left in range(len(log_gains))]
     return float(sum(np.square(predict(o) - log_gains[~o][0]).sum() for o in others))
 
 
 def log_gains_of(frames: Sequence[Frame], model: Model) -> np.ndarray:
-    """Return the logarithms (N, 3) of the gains of photos relative to the pictures of a model: from EXIF plus the
-    model's offset; without EXIF, from the training photos around; else 0."""
+    """Return the logarithms (N, 3) of the gains of photos relative to the pictures of a model.
+
+    They are from EXIF plus the model's offset; without EXIF, from the training photos around; else 0.
+    """
     by_exif = _by_exif(frames, model)
     offsets, around = _by_name(frames, model.beyond_exif), _by_name(frames, model.exposures)
     return np.where(np.isfinite(by_exif)[:, None], by_exif[:, None] + offsets, around)
 
 
 def gain_sources(frames: Sequence[Frame], model: Model) -> list[str]:
-    """Return where `log_gains_of` has the gains of each photo from, one of `SOURCES`."""
+    """Return the source of each photo's gains in `log_gains_of`, one of `SOURCES`."""
     none, exif, both, around, mean = SOURCES
     if model.log_exposure is None and not model.exposures:
         return [none] * len(frames)
@@ -113,17 +115,17 @@ def gain_sources(frames: Sequence[Frame], model: Model) -> list[str]:
 
 
 def _by_name(frames: Sequence[Frame], log_gains: Mapping[str, tuple[float, ...]]) -> np.ndarray:
-    """Return the gains (N, 3) of photos, 0 for those without an entry."""
+    """Return the log gains (N, 3) of photos, 0 for those without an entry."""
     return np.array([log_gains.get(frame.name, (0.0,) * 3) for frame in frames]).reshape(-1, 3)
 
 
 def _by_exif(frames: Sequence[Frame], model: Model) -> np.ndarray:
-    """Return the logarithms of gains that EXIF tells, (N,), NaN where it does not."""
+    """Return the log gains that EXIF predicts, (N,), NaN where it predicts none."""
     if model.log_exposure is None or model.exif_slope == 0.0:
         return np.full(len(frames), np.nan)
     return model.exif_slope * (log_exposures(frames) - model.log_exposure)
 
 
 def _interpolated(places: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """(T, 3) linear between places, constant beyond."""
+    """Interpolate values at the wanted places, (T, 3): linearly between places, constant beyond."""
     return np.stack([np.interp(wanted, places, channel) for channel in values.T], axis=-1)

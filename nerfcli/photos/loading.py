@@ -1,4 +1,4 @@
-"""Photos as a training sees them: read, turned upright, averaged over squares, with what their masks mean."""
+"""Load photos for training: read them, turn them upright, downscale them and apply their masks."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -35,7 +35,7 @@ def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: 
         frames: with their images and masks.
         factor: of the downscaling.
         threads: to read with.
-        masks: what their black means: "ignore", or "empty": it then is the alpha of the photos that have a mask.
+        masks: meaning of black in masks: "ignore" (not used), or "empty" (transparent).
 
     Raises:
         UserError: a photo cannot be read, or has another size than its camera.
@@ -45,7 +45,7 @@ def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: 
 
 
 def load_photo(frame: Frame, factor: float, masks: str) -> LoadedPhoto:
-    """Read one photo; arguments as of `load_photos`."""
+    """Read one photo, with arguments as for `load_photos`."""
     if frame.image is None:
         raise UserError(
             f"{frame.name} has no photo", "this view can be rendered, but not used for training or evaluation"
@@ -68,17 +68,17 @@ def load_photo(frame: Frame, factor: float, masks: str) -> LoadedPhoto:
     if frame.mask is not None and masks == "empty":
         pixels = _emptied(pixels, read_mask(frame.mask, frame.image))
     elif frame.mask is not None:
-        # A pixel of the small picture counts only where all that it averages counts.
+        # A pixel of the downscaled picture is used only if all pixels that it averages are.
         used = downscale(read_mask(frame.mask, frame.image), factor) == 255
     return LoadedPhoto(replace(frame, camera=downscaled_camera(frame.camera, factor)), downscale(pixels, factor), used)
 
 
 def downscaled_camera(camera: Camera, factor: float) -> Camera:
-    """Return the camera of a picture that `media.images.downscale` made smaller."""
+    """Return the camera of a picture downscaled by `media.images.downscale`."""
     return camera.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
 
 
 def _emptied(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """RGBA: clear where the mask is black, or where the photo is clear itself."""
+    """Return the pixels as RGBA, transparent where the mask is black or the photo itself is transparent."""
     alpha = mask if pixels.shape[-1] == 3 else np.minimum(mask, pixels[..., 3])
     return np.concatenate([pixels[..., :3], alpha[..., None]], axis=-1)

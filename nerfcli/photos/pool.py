@@ -1,4 +1,4 @@
-"""The photos in memory, and random pixels with their rays."""
+"""Training photos in memory, and random pixels of them with their rays."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,18 +18,18 @@ from nerfcli.photos.footprint import pixel_footprint
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photo
 from nerfcli.photos.storage import IN_MEMORY, PhotoStorage
 
-# In float64, the bearings of a large photo would take more than the photo.
+# Bearings are computed in blocks: in float64, those of a whole large photo would take more memory than the photo.
 PIXELS_AT_A_TIME = 2**18
 
 
 @dataclass(frozen=True)
 class Album:
-    """Photos one after another.
+    """Photos in one contiguous array.
 
     Args:
-        photos: their pixels are views of `colours`; photos without alpha are opaque where others have alpha.
+        photos: their pixels are views of `colours`; if any photo has alpha, those without are opaque.
         colours: (pixels of all photos, 3 or 4) uint8.
-        fills_frame: whether a photo has no alpha of its own.
+        fills_frame: True if any photo has no alpha of its own.
     """
 
     photos: tuple[LoadedPhoto, ...]
@@ -40,14 +40,14 @@ class Album:
 def load_album(
     frames: Sequence[Frame], *, factor: int, threads: int, storage: PhotoStorage, masks: str = "ignore"
 ) -> Album:
-    """Load photos with `load_photos` into one array in `storage`.
+    """Load photos with `load_photo` into one array in `storage`.
 
     Raises:
         UserError: a photo cannot be read, or has another size than its camera.
     """
     cameras = [downscaled_camera(frame.camera, factor) for frame in frames]
     begins = np.cumsum([0, *(camera.width * camera.height for camera in cameras)])
-    # Nobody knows before decoding whether a photo has alpha; the first one that has decides anew.
+    # Alpha is known only after decoding: start with three channels, and restart with four if a photo has alpha.
     for channels in (3, 4):
         colours = storage.array((int(begins[-1]), channels), np.uint8)
         fills: list[bool] = []
@@ -76,14 +76,14 @@ def load_album(
 
 
 class Drawn(NamedTuple):
-    """Pixels with their rays.
+    """Random pixels with their rays.
 
     Args:
-        origins, directions: (N, 3) training frame, unit directions.
+        origins, directions: (N, 3) in the training frame; directions are unit vectors.
         colours: (N, 3 or 4) float32 in [0, 1].
-        numbers: (N,) int64, counted through all photos.
-        distances, trust: (K,) of the last K of them, those whose surface is known; see `point_depth.PointDepths`.
-        weights: (N,) what each counts in the loss; none where all count alike.
+        numbers: (N,) int64 indices of the pixels, counted through all photos.
+        distances, trust: (K,) of the last K pixels, whose surface depth is known; see `point_depth.PointDepths`.
+        weights: (N,) weight of each pixel in the loss; empty if all are equal.
     """
 
     origins: Tensor
@@ -95,7 +95,7 @@ class Drawn(NamedTuple):
     weights: Tensor
 
     def every(self, first: int, step: int) -> "Drawn":
-        """Return the pixels `first`, `first + step`, ...; those whose surface is known are the last ones again."""
+        """Return the pixels `first`, `first + step`, ...; those with known surface depth remain the last ones."""
         if step == 1:
             return self
         begins = {"distances": len(self.numbers) - len(self.distances), "trust": len(self.numbers) - len(self.trust)}
@@ -107,7 +107,7 @@ class Drawn(NamedTuple):
 
 
 class Pool(Protocol):
-    """Source of training pixels: photos with poses (P, 4, 4), training frame, and cameras."""
+    """Source of training pixels: photos with cameras and poses (P, 4, 4), in the training frame."""
 
     colours: Tensor
     first_pixel: Tensor
@@ -118,11 +118,11 @@ class Pool(Protocol):
 
     @property
     def has_alpha(self) -> bool:
-        """Whether the colours have four channels."""
+        """True if the colours have four channels."""
         ...
 
     def draw(self, count: int, generator: torch.Generator) -> Drawn:
-        """`count` random pixels, with replacement."""
+        """Draw `count` random pixels, with replacement."""
         ...
 
     def photo_of(self, numbers: Tensor) -> Tensor:
@@ -131,18 +131,19 @@ class Pool(Protocol):
 
 
 class PixelPool:
-    """All usable pixels of some photos, and the ray of each, in the training frame; `frames` are those of the photos.
+    """All usable pixels of a set of photos, and their rays in the training frame.
 
-    Bearings are kept once per camera, not per photo: photos that share intrinsics share them. `without_ray` counts the
-    pixels that the lens model has no direction for, which are left out; `footprint` is that of `pixel_footprint`;
-    `cones` (P,) are the widths of a pixel of each photo per distance, `sizes` (P, 2) heights and widths of the photos.
+    Bearings are stored once per camera, so photos that share intrinsics share them. `frames` are those of the photos;
+    `without_ray` is the number of pixels without a direction in the lens model, which are left out; `footprint` is from
+    `pixel_footprint`; `cones` (P,) are the widths of a pixel of each photo at distance 1; `sizes` (P, 2) are the
+    heights and widths of the photos.
 
     Args:
-        photos: one at least.
+        photos: at least one.
         training_from_scene: the normalisation.
         device: where the pixels are drawn.
-        colours: those of all photos, where they stand one after another already.
-        storage: where arrays of the size of the photos go.
+        colours: of all photos in one array, if there is such an array already.
+        storage: for arrays as large as the photos.
     """
 
     def __init__(
@@ -204,7 +205,7 @@ class PixelPool:
         return self.colours.shape[-1] == 4
 
     def draw(self, count: int, generator: torch.Generator) -> Drawn:
-        """`count` random pixels, with replacement."""
+        """Draw `count` random pixels, with replacement."""
         return self.rays_of(self.numbers(count, generator))
 
     def numbers(self, count: int, generator: torch.Generator) -> Tensor:
@@ -213,7 +214,7 @@ class PixelPool:
         return chosen if self.usable is None else self.usable[chosen]
 
     def is_usable(self, numbers: Tensor) -> Tensor:
-        """Return (N,) whether pixels (N,), numbered through all photos, may be used for training."""
+        """Return whether pixels (N,), counted through all photos, may be used for training; (N,) bool."""
         if self.usable is None:
             return torch.ones_like(numbers, dtype=torch.bool)
         places = torch.searchsorted(self.usable, numbers).clamp_max(self.usable_count - 1)
@@ -231,7 +232,7 @@ class PixelPool:
         return torch.searchsorted(self.first_pixel, numbers, right=True) - 1
 
     def place(self, number: int) -> tuple[str, int, int]:
-        """Return the photo's name, column and row of the pixel with a number."""
+        """Return the photo's name, the column and the row of the pixel with an index."""
         photo = int(self.photo_of(torch.tensor(number, device=self.first_pixel.device)))
         name, width = self.names_and_widths[photo]
         row, column = divmod(number - int(self.first_pixel[photo]), width)
@@ -239,7 +240,7 @@ class PixelPool:
 
 
 def _fill_bearings(camera: Camera, bearings: np.ndarray, storage: PhotoStorage) -> np.ndarray:
-    """Write the camera's bearings, a part at a time, and return which pixels (N,) have one."""
+    """Fill in the camera's bearings block by block, and return which pixels have one, (N,) bool."""
     valid = np.empty(len(bearings), dtype=bool)
     for begin in range(0, len(bearings), PIXELS_AT_A_TIME):
         part = slice(begin, min(begin + PIXELS_AT_A_TIME, len(bearings)))
@@ -257,7 +258,7 @@ def _one_after_another(photos: Sequence[LoadedPhoto]) -> np.ndarray:
 
 
 def _with_alpha(pixels: np.ndarray) -> np.ndarray:
-    """RGBA: opaque where the photo has no alpha."""
+    """Return the pixels as RGBA, opaque if the photo has no alpha."""
     if pixels.shape[-1] == 4:
         return pixels
     return np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=-1)

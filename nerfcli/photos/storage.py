@@ -1,7 +1,7 @@
-"""Storage of training photos: in memory or in memory-mapped files, decided from their sizes.
+"""Storage of training photos: in memory or in memory-mapped files, chosen by their sizes.
 
-What is resident is what counts. Pages of a mapped file are given back when they become too many, and read again from
-the system's cache or the disk when they are needed: the numbers are the same, bit for bit.
+Resident memory is what counts. Pages of mapped files are released when too much is resident, and read again from the
+system's cache or the disk when they are needed; results are the same, bit for bit.
 """
 
 import mmap
@@ -21,24 +21,24 @@ from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.memory import resident_bytes
 from nerfcli.runs.settings import TrainSettings
 
-# Resident memory of a step, measured: 0.35 GB at 65536 samples.
+# Resident memory of a training step per sample, measured: 0.35 GB at 65536 samples.
 _BYTES_PER_SAMPLE = 6000
-# The field, its gradient, two moments, and those but the gradient once more in the sentinel's copy.
+# The field, its gradient and two moments, plus the sentinel's copy of all of these except the gradient.
 _COPIES_OF_FIELD = 7
-# Default size of other kinds than the hash grid.
+# Default size of fields other than the hash grid.
 _LARGEST_FIELD_BYTES = 64 * 2**20
-# A photo that is being decoded: Pillow's picture, the array, and what is made on the way to the smaller one.
+# Memory to decode a photo: Pillow's picture, the array, and the intermediate results of downscaling.
 _BYTES_PER_DECODED_PIXEL = 12
 
 
 @dataclass(frozen=True)
 class Needs:
-    """Bytes that a training takes.
+    """Memory that a training run needs, in bytes.
 
     Args:
-        photos: for photos.
-        step: for the field, its optimiser and a step.
-        rest: for all but photos, in the machine's memory.
+        photos: for the photos.
+        step: for the field, its optimiser and a training step.
+        rest: for everything except the photos, in the machine's main memory.
     """
 
     photos: int
@@ -47,7 +47,7 @@ class Needs:
 
 
 def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -> Needs:
-    """Estimate the memory of photos and field from their sizes, in addition to what is resident now."""
+    """Estimate the memory of photos and field from their sizes; `rest` includes what is resident now."""
     sizes = [(frame.camera.width // factor) * (frame.camera.height // factor) for frame in frames]
     of_cameras = {frame.camera: size for frame, size in zip(frames, sizes, strict=True)}
     may_have_alpha = any(
@@ -56,7 +56,7 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     photos = (4 if may_have_alpha else 3) * sum(sizes) + 12 * sum(of_cameras.values())
     if any(frame.mask is not None for frame in frames):
         photos += 9 * sum(sizes)
-    if settings.model == "auto":  # trials learn from a list of the pixels that they are not judged by
+    if settings.model == "auto":  # trials train on a list of pixels, those they are not scored on
         photos += 9 * sum(sizes) + 12 * sum(of_cameras.values())
     largest = max(frame.camera.width * frame.camera.height for frame in frames)
     step = _COPIES_OF_FIELD * field_bytes(settings) + _BYTES_PER_SAMPLE * settings.samples_per_step
@@ -65,27 +65,27 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
 
 
 def field_bytes(settings: TrainSettings) -> int:
-    """Estimate the memory of the numbers of a field, once."""
+    """Estimate the memory of one copy of a field's parameters."""
     hash_rows = 16 * settings.levels * 2**settings.chosen_log2_rows
     return settings.field_memory_bytes or (hash_rows if settings.field == "hash" else _LARGEST_FIELD_BYTES)
 
 
 class InMemory:
-    """Arrays as they are."""
+    """Storage in ordinary arrays."""
 
     def array(self, shape: tuple[int, ...], dtype: np.dtype | type) -> np.ndarray:
         """Return an array to be filled."""
         return np.empty(shape, dtype)
 
     def release_pages(self) -> None:
-        """Give nothing back."""
+        """Do nothing: ordinary arrays have no pages to release."""
 
 
 class InFiles:
-    """Arrays in files without a name, which are gone when the process is, however it ends.
+    """Storage in files without a name, which vanish with the process, however it ends.
 
     Args:
-        folder: where there is room on a disk.
+        folder: of the files, on a disk with enough room.
         limit: bytes that may be resident.
     """
 
@@ -104,7 +104,7 @@ class InFiles:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self._folder, prefix=".photos-") as file:
-                # Reserved now: a disk that is full later would end the process when a page is written.
+                # Reserved now: if the disk filled up later, writing a page would kill the process.
                 if hasattr(os, "posix_fallocate"):
                     os.posix_fallocate(file.fileno(), 0, size)
                 else:
@@ -116,10 +116,10 @@ class InFiles:
         return np.frombuffer(pages, dtype=dtype, count=int(np.prod(shape))).reshape(shape)
 
     def release_pages(self) -> None:
-        """Give pages back if too much is resident."""
+        """Release pages if too much memory is resident."""
         if resident_bytes(os.getpid()) > self._limit:
             for pages in self._maps:
-                with suppress(AttributeError, ValueError):  # not on every system
+                with suppress(AttributeError, ValueError):  # not available on every system
                     pages.madvise(mmap.MADV_DONTNEED)
 
 
@@ -128,15 +128,15 @@ IN_MEMORY = InMemory()
 
 
 def check_device_memory(needs: Needs, device: torch.device, limit: int | None) -> str:
-    """Keep torch within a limit of memory on a CUDA device, and return a message for the user.
+    """Limit the memory that torch uses on a CUDA device, and return a message for the user.
 
     Args:
-        needs: of the training.
-        device: that it is to run on.
-        limit: bytes that it may use there; None for all that are free.
+        needs: of the training run.
+        device: the device that it will run on.
+        limit: bytes that it may use there; None for all free memory.
 
     Raises:
-        UserError: photos and training do not fit into the limit, or into what is free.
+        UserError: photos and training do not fit into the limit or the free memory.
     """
     free, total = torch.cuda.mem_get_info(device)
     needed = needs.photos + needs.step
@@ -158,7 +158,7 @@ def storage_for(needs: Needs, limit: int | None, *, folder: Path) -> tuple[Photo
     Args:
         needs: of all photos and the field.
         limit: bytes that may be resident; None for no limit.
-        folder: for files.
+        folder: for files with photos.
 
     Raises:
         UserError: the training does not fit, even with the photos on the disk.
@@ -177,7 +177,7 @@ def storage_for(needs: Needs, limit: int | None, *, folder: Path) -> tuple[Photo
         f"memory: about {_gigabytes(total)} needed, limit {_gigabytes(limit)}: the photos ({_gigabytes(needs.photos)}"
         f") are kept in temporary files in {folder}"
     )
-    # Room for the pages that a step brings back: the system maps 16 of them around each pixel that is looked at.
+    # Leave room for the pages that a step reads again: the system maps 16 of them around each pixel that is read.
     return InFiles(folder, limit - (limit - needs.rest) // 2), text
 
 

@@ -9,15 +9,15 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 
-# A plane cannot hold what a fisheye or a sphere sees: of these, the middle is kept.
+# Widest field of view: a plane cannot hold all that a fisheye or spherical camera sees, so only the middle is kept.
 WIDEST_DEG = 100.0
 
 
 def pinhole_of(camera: Camera) -> Camera:
-    """Return the pinhole camera of the same size that sees about the same; a pinhole camera is itself.
+    """Return the pinhole camera of the same size with about the same view; a PINHOLE camera is returned as it is.
 
-    Focal length and principal point are the camera's. The focal length is larger where the picture would be wider than
-    `WIDEST_DEG`, and the principal point is then in the middle.
+    It keeps the camera's focal length and principal point. If the picture would be wider than `WIDEST_DEG`, the focal
+    length is larger and the principal point is in the middle.
     """
     if camera.model == "PINHOLE":
         return camera
@@ -29,7 +29,7 @@ def pinhole_of(camera: Camera) -> Camera:
 
 
 def pinhole_frame(frame: Frame) -> Frame:
-    """Return the frame with the pinhole camera of its own."""
+    """Return the frame with `pinhole_of` its camera."""
     return replace(frame, camera=pinhole_of(frame.camera))
 
 
@@ -38,11 +38,12 @@ def undistorted(pixels: np.ndarray, camera: Camera, pinhole: Camera) -> tuple[np
 
     Args:
         pixels: (H, W, C) uint8 of `camera`.
-        camera: that took it.
-        pinhole: any size.
+        camera: the camera that took the photo.
+        pinhole: the camera to resample for, of any size.
 
     Returns:
-        (height, width, C) uint8 of `pinhole`; (height, width) bool: pixels that the photo shows, the others are black.
+        picture (height, width, C) uint8 of `pinhole`; mask (height, width) bool of the pixels that the photo covers.
+        Other pixels are black.
     """
     if camera == pinhole:
         return pixels, np.ones(pixels.shape[:2], dtype=bool)
@@ -52,7 +53,7 @@ def undistorted(pixels: np.ndarray, camera: Camera, pinhole: Camera) -> tuple[np
     shape = (pinhole.height, pinhole.width)
     # The centre of the first pixel is at 0.5 here and at 0 in OpenCV.
     x, y = (np.where(shown, places[:, axis] - 0.5, -1e6).astype(np.float32).reshape(shape) for axis in (0, 1))
-    # The border's own colour for places between the edge and the first centre.
+    # Between the picture's edge and the first pixel centre, the colour of the border is repeated.
     picture = cv2.remap(pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(*shape, -1)
     seen = shown.reshape(shape)
     return np.where(seen[..., None], picture, 0).astype(np.uint8), seen

@@ -12,7 +12,7 @@ from nerfcli.poses.input.photos import MIN_PHOTOS, Photos
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.model.reasons import Evidence, dominant, reason
 
-# Photos in other parts than the largest, as a share of all, from which on that is what is wrong with the capture.
+# Fraction of all photos outside the largest part, above which the refusal blames the disconnected parts.
 _MUCH_APART = 0.3
 
 
@@ -21,7 +21,7 @@ class ImageReport:
     """A photo, whether it registered, and the reason if not.
 
     orientation: the EXIF orientation (1...8) that was applied before anything else; the camera is that of the upright
-    picture. pose_blur_px: how far a typical point moves in it by one standard deviation of its pose.
+    picture. pose_blur_px: motion of a typical point in the photo by one standard deviation of its pose.
     """
 
     name: str
@@ -35,17 +35,17 @@ class ImageReport:
 class PosesReport:
     """Content of poses_report.json, with the same names.
 
-    verdict: whether the result is believed, why not, and all that was measured (see `acceptance`). pose_blur_px:
-    median, largest, and the photo that has it. lenses: the lens models that were tried for each camera, with held-out
-    errors. parts: sizes of the groups of photos that matches hold together.
-    seconds: per stage, of the call that wrote the report; what an earlier one left is not in them. models: the sizes of
-    all models found, the kept one first. attempts: what each rung of the ladder gave. matching: the rule for pairs, and
-    their number. points: how many the kept model has. intrinsics: what was given of them, see `cameras.Grouped`.
-    strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components: each model's photos and
-    why it is apart from the largest, in the order of sizes, by which `--component` counts. not_computed: checks that
-    could not be computed, and why. not_finite: where the report has null for a number that was not finite.
+    verdict: whether the result is accepted, why not, and all measurements (see `acceptance`). pose_blur_px: median,
+    largest, and the photo that has the largest. lenses: the lens models tried for each camera, with held-out errors.
+    parts: sizes of the groups of photos connected by matches.
+    seconds: per stage, for the call that wrote the report; time spent in earlier calls is not included. models: the
+    sizes of all models found, the kept one first. attempts: the result of each rung of the ladder. matching: the rule
+    for pairs, and their number. points: number of points of the kept model. intrinsics: the given intrinsics, see
+    `cameras.Grouped`. strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components: each
+    model's photos and why it is not joined to the largest, ordered by size, as `--component` counts them. not_computed:
+    checks that could not be computed, and why. not_finite: where the report has null for a number that was not finite.
     cut_short: what was stopped because it took far longer than planned.
-    moving_foreground: an object that turns before a still background, and its masks, in numbers; see `turntable`.
+    moving_foreground: facts about an object that turns in front of a static background, and its masks; see `turntable`.
     """
 
     registered: int
@@ -73,7 +73,7 @@ class PosesReport:
     cut_short: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Plain lists and dictionaries."""
+        """Return plain lists and dictionaries."""
         return asdict(self)
 
 
@@ -85,7 +85,7 @@ def make_report(
     matching: dict[str, Any],
     intrinsics: dict[str, Any] | None = None,
 ) -> PosesReport:
-    """Put what the worker found into words."""
+    """Make the report from the worker's result."""
     models: list[list[int]] = result["models"]
     images = {name: ImageReport(name, False, f"unreadable: {why}") for name, why in photos.unreadable.items()}
     blur: dict[str, float] = result["pose_blur_px"]
@@ -126,7 +126,7 @@ def make_report(
 
 
 def closing_notes(report: PosesReport) -> list[str]:
-    """Return what the user should know of a result that is kept, a sentence each."""
+    """Return notes for the user on a result that is kept, one sentence each."""
     notes = []
     placed = {image.name for image in report.images if image.registered}
     if len(report.parts) > 1 and report.registered < report.total:
@@ -169,11 +169,12 @@ def _blur_summary(images: Iterable[ImageReport]) -> dict[str, Any] | None:
 
 
 def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:
-    """Return why a result is refused, exit code 4:
-    the contradicting evidence, or the most frequent reason of missing photos.
+    """Return the error for a refused result (exit code 4), or None if it is accepted.
+
+    It states the contradicting evidence, or the most frequent reason why photos are missing.
     """
     failures = report.verdict["failures"]
-    # Who asks for a smaller model knows that it has few of the photos.
+    # A user who requests a smaller model knows that it has few of the photos.
     least_share = report.settings.min_registered if report.settings.component == 1 else 0.0
     enough = report.registered >= max(MIN_PHOTOS, least_share * report.total)
     if failures and (enough or "baseline" in failures[0]["kind"]):

@@ -1,8 +1,8 @@
 """Structure from motion: from a folder of photos to a scene folder with poses, intrinsics and points.
 
 The photos are not copied into the scene and not changed. The cameras refer to upright pictures, as
-`media.images.read_image` gives them: pycolmap 4.2 does not apply the EXIF orientation, so it gets upright copies
-of the photos that are stored lying down, in the work folder.
+`media.images.read_image` returns them: pycolmap 4.2 does not apply the EXIF orientation, so the work folder gets
+upright copies of photos that are stored rotated.
 """
 
 import json
@@ -33,7 +33,7 @@ from nerfcli.poses.input.work_photos import lay_out
 from nerfcli.poses.judge.checks import UNDERWAY
 from nerfcli.poses.model.cameras import GivenIntrinsics, Grouped, group_by_given, group_photos
 from nerfcli.poses.report import PosesReport, closing_notes, make_report, refusal
-from nerfcli.poses.workspace import POINTS_FILE, is_in_the_making, keep_refused, publish, workspace
+from nerfcli.poses.workspace import POINTS_FILE, is_under_construction, keep_refused, publish, workspace
 
 
 def estimate_poses(
@@ -50,8 +50,8 @@ def estimate_poses(
     """Estimate where the photos of a folder were taken, and write a scene.
 
     Writes sparse/0 (the model with the most photos), poses_report.json and, last, scene.json; the database of features
-    and matches stays beside them. A scene that stands at `scene_dir` is replaced. What an earlier call left there,
-    complete or not, is continued: only what depends on photos or settings that have changed is done again.
+    and matches stays beside them. An existing scene at `scene_dir` is replaced. Work that an earlier call left there,
+    complete or not, is reused: only steps that depend on changed photos or settings are repeated.
 
     Args:
         photos_dir: the folder with the photos.
@@ -59,17 +59,17 @@ def estimate_poses(
         settings: see `PoseSettings`.
         notify: receives messages for the user, one sentence at a time.
         progress: receives (stage, done, total); the stages are "read", "extract", "enlarge" where photos have few
-            features, "features" (per photo, of those requested), "pair" where look-alikes are sought, "match",
+            features, "features" (per photo, of those requested), "pair" where look-alikes are searched for, "match",
             "map", "merge" where the mapper leaves several models, "locate" where single photos are left, and
             "check", in this order.
         limits: see `Limits`.
         planned: receives the plan before the long work starts.
-        given: intrinsics that are known beforehand.
+        given: known intrinsics, if any.
 
     Raises:
         ValueError: a setting is out of its range.
-        UserError: the photos are too few or cannot be read, too few of them could be placed or the evidence speaks
-            against the result (exit code 4), the scene cannot be written, another process is at work on it, a limit was
+        UserError: the photos are too few or cannot be read, too few of them could be placed or the evidence contradicts
+            the result (exit code 4), the scene cannot be written, another process is working on it, a limit was
             reached, or pycolmap died.
     """
     start = time.perf_counter()
@@ -82,7 +82,7 @@ def estimate_poses(
         work = space.folder
         job = _prepare(photos, settings, grouped=grouped, pairing=pairing, work=work, notify=notify)
         _work(job, work, limits=limits, lock=space.lock, progress=progress, notify=notify)
-        result = _read_json(work / "result.json")["content"]  # that the worker has written or found whole
+        result = _read_json(work / "result.json")["content"]  # written by the worker, or complete from before
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
         matching = {"rule": pairing.rule, "pairs": result["pairs"]}
         if settings.pairs_file is not None:
@@ -124,10 +124,10 @@ def plan_poses(
     progress: Callable[[str, int, int], None],
     given: GivenIntrinsics | None = None,
 ) -> tuple[Photos, Grouped, Pairing, Plan]:
-    """Read the photos, decide on cameras and on what to compare, and say how long it will take; nothing is written.
+    """Read the photos, choose cameras and pairs, and estimate how long the work will take; nothing is written.
 
     Raises:
-        ValueError, UserError: as for `estimate_poses`, as far as that can be known now.
+        ValueError, UserError: as for `estimate_poses`, if the cause can be found before the work.
     """
     check_settings(settings)
     photos = find_photos(photos_dir, lambda done, total: progress("read", done, total))
@@ -142,19 +142,20 @@ def plan_poses(
 
 
 def photo_notes(photos: Photos, grouped: Grouped) -> list[str]:
-    """List which files are skipped and why, and what is known of the cameras of the others."""
+    """List the skipped files with reasons, and notes on the cameras of the other photos."""
     return [*(f"{name} is skipped: {why}" for name, why in photos.unreadable.items()), *grouped.notes]
 
 
 def is_same_scene(
     scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: GivenIntrinsics | None = None
 ) -> bool:
-    """Return whether `scene_dir` was made from the current photos in `photos_dir`
-    with these settings, except threads.
+    """Return whether `scene_dir` was made from the current photos in `photos_dir` with these settings.
+
+    The settings threads and accept_refused are not compared.
     """
     try:
         return _is_same(scene_dir, photos_dir, settings, given=given)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError):  # a file is not there, or damaged
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError):  # a file is missing or damaged
         return False
 
 
@@ -170,7 +171,7 @@ def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given
         del wanted_settings[name]
     if (known and (known["use"], known["key"])) != (given and (given.use, given.calibration.key)):
         return False
-    made_with = asdict(PoseSettings()) | report["settings"]  # a setting that it does not know yet had its default
+    made_with = asdict(PoseSettings()) | report["settings"]  # settings newer than the report had their defaults
     return (
         made.resolve() == photos_dir.resolve()
         and sorted(image["name"] for image in report["images"]) == sorted(names)
@@ -189,7 +190,7 @@ def _work(
     progress: Callable[[str, int, int], None],
     notify: Callable[[str], None],
 ) -> None:
-    """Run the worker; where a check ends it, run it again without that check, for the model is on disk by then."""
+    """Run the worker; if a check ends it, run it again without that check, since the model is on disk by then."""
     since = time.monotonic()
     while True:
         (work / UNDERWAY).unlink(missing_ok=True)
@@ -247,7 +248,7 @@ def _prepare(
 
 
 def _masks_of(report: PosesReport, scene_dir: Path) -> Path | None:
-    """Return the folder of the masks that the poses were found with, of the user or of an object that turns."""
+    """Return the folder of the masks used for the poses: the user's, those of a turning object, or None."""
     if report.settings.masks:
         return Path(report.settings.masks)
     found = report.moving_foreground
@@ -265,20 +266,20 @@ def _split(report: PosesReport, holdout: str) -> dict[str, str | None]:
 
 
 def _check_destination(scene_dir: Path, photos_dir: Path) -> None:
-    """Refuse a destination that holds something else than a scene, since the scene takes its place."""
+    """Refuse a destination that contains anything other than a scene, since the scene replaces it."""
     scene_path, photos_path = scene_dir.resolve(), photos_dir.resolve()
     hint = "choose another folder with -o"
     if photos_path.is_relative_to(scene_path):
         raise UserError(f"the scene {scene_dir} would overwrite the photos in {photos_dir}", hint)
     if scene_dir.exists() and not scene_dir.is_dir():
         raise UserError(f"cannot write the scene {scene_dir}: a file with this name exists", hint)
-    ours = (scene_dir / scene.SCENE_FILE).is_file() or is_in_the_making(scene_dir)
+    ours = (scene_dir / scene.SCENE_FILE).is_file() or is_under_construction(scene_dir)
     if scene_dir.is_dir() and any(scene_dir.iterdir()) and not ours:
         raise UserError(f"cannot write the scene {scene_dir}: the folder contains other files", hint)
 
 
 def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserError:
-    """Make the error for a result that is refused; its numbers and its model stay, but nothing that is a scene."""
+    """Make the error for a refused result, and keep its report and its model, but not as a scene."""
     older = (scene_dir / scene.SCENE_FILE).is_file()
     folder = scene_dir / "work" if older else scene_dir
     path = folder / "poses_report.json"

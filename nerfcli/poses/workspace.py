@@ -1,11 +1,11 @@
-"""A scene's folder while the scene is in the making, and the step that makes it a scene.
+"""A scene's folder while the scene is under construction, and the step that turns it into a scene.
 
-    SCENE/work/          what is complete so far: see `stages`
-    SCENE/database.db    features and matches, for the next time; COLMAP reads it
-    SCENE/refused-model/ instead of a scene: what the checks refused
+    SCENE/work/          the completed stages: see `stages`
+    SCENE/database.db    features and matches, for the next call; COLMAP can read it
+    SCENE/refused-model/ a model that the checks refused, instead of a scene
     SCENE/scene.json     written last: with it the folder is a scene
 
-Whoever works in the folder holds its lock. A process that is killed lets go of it, and the next one goes on.
+The process that works in the folder holds its lock. If it is killed, the lock is released and the next one continues.
 """
 
 import shutil
@@ -21,14 +21,14 @@ from nerfcli.poses.input.job import database_path
 from nerfcli.scene import SCENE_FILE
 
 _LOCK = "poses.lock"
-# A model that the checks refuse; nothing takes a folder of this name for a scene.
+# Folder of a model that the checks refused; nothing takes a folder of this name for a scene.
 REFUSED = "refused-model"
 POINTS_FILE = "points.ply"
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """folder: SCENE/work. lock: a descriptor that the worker inherits, so that the lock outlives neither of the two."""
+    """folder: SCENE/work. lock: a descriptor that the worker inherits, so that the lock lasts until both have ended."""
 
     folder: Path
     lock: int
@@ -39,7 +39,7 @@ def workspace(scene_dir: Path) -> Iterator[Workspace]:
     """Open the work folder of a scene, for one process at a time.
 
     Raises:
-        UserError: another process works there, or nothing can be written there.
+        UserError: another process is working there, or the folder cannot be written.
     """
     folder = scene_dir / "work"
     with exclusive(folder / _LOCK, f"nerfcli poses is working on {scene_dir}") as lock:
@@ -48,20 +48,20 @@ def workspace(scene_dir: Path) -> Iterator[Workspace]:
         yield Workspace(folder, lock)
 
 
-def is_in_the_making(scene_dir: Path) -> bool:
+def is_under_construction(scene_dir: Path) -> bool:
     """Return whether an earlier call worked on a scene here, complete or not."""
     return (scene_dir / "work" / _LOCK).is_file()
 
 
 def publish(scene_dir: Path, describe: Callable[[], None], *, keep_models: bool) -> None:
-    """Put the model that the worker left into its place; then `describe` writes the report and, last, scene.json.
+    """Copy the worker's model into the scene; then `describe` writes the report and, last, scene.json.
 
-    Until then the folder is no scene, and calling again goes on from the complete model.
+    Until then the folder is not a scene, and another call continues from the complete model.
 
     Args:
         scene_dir: the scene's folder.
         describe: writes the report and scene.json.
-        keep_models: whether the mapped models stay in the work folder, for another component of them.
+        keep_models: whether the mapped models stay in the work folder, for another --component later.
     """
     work = scene_dir / "work"
     (scene_dir / SCENE_FILE).unlink(missing_ok=True)
@@ -77,7 +77,7 @@ def publish(scene_dir: Path, describe: Callable[[], None], *, keep_models: bool)
 
 
 def keep_refused(scene_dir: Path, folder: Path) -> Path:
-    """Copy the model that the worker left to `folder`/refused-model, with its points as PLY, and return where it is."""
+    """Copy the worker's model to `folder`/refused-model, with its points as PLY, and return that folder."""
     import pycolmap
 
     found = scene_dir / "work" / "sparse" / "0"
@@ -88,7 +88,7 @@ def keep_refused(scene_dir: Path, folder: Path) -> Path:
 
 
 def database_bytes(scene_dir: Path) -> int:
-    """Size of the database of features and matches, 0 if there is none."""
+    """Return the size of the database of features and matches, 0 if there is none."""
     path = database_path(scene_dir / "work")
     return path.stat().st_size if path.exists() else 0
 
@@ -97,5 +97,5 @@ def drop_database(scene_dir: Path) -> None:
     """Delete features and matches. The scene stays; estimating it again starts from scratch."""
     for path in scene_dir.glob(database_path(scene_dir / "work").name + "*"):
         path.unlink()
-    if is_in_the_making(scene_dir):
+    if is_under_construction(scene_dir):
         shutil.rmtree(scene_dir / "work")

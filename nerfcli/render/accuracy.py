@@ -1,9 +1,9 @@
 """Accuracy of a rendering relative to its field: bounds stored with every picture, and a measurement.
 
-Two errors are kept apart. What was left out for speed (the early stop, colours of negligible samples) is bounded for
-every pixel. That density and colour are taken as constant inside each interval is measured: some rays are rendered
-again with every interval cut into 2 and into 4, the field evaluated anew in each part. Both are about the rendering of
-the field. How far the field is from the scene, only photos and depths that it has not seen can tell.
+Two errors are kept apart. Truncation for speed (the early stop, colours of negligible samples) is bounded for every
+pixel. The error of constant density and colour inside each interval is measured: some rays are rendered again with
+every interval cut into 2 and into 4 parts, and the field evaluated in each part. Both errors concern the rendering of
+the field. Only held-out photos and depths can show how far the field is from the scene.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ IN_WORDS = (
     "random pixels what deeper stops and finer samples change"
 )
 PIXELS = 256
-# Of the renderings that are compared with each other: what they leave out must not show.
+# Tolerance of the renderings that are compared with each other: their truncation must be negligible.
 TIGHT = 1e-6
 
 
@@ -46,11 +46,11 @@ class MeasuredError:
     """Differences between renderings of the same rays.
 
     Args:
-        colour: of the largest channel, sRGB in [0, 1], between intervals as they are and cut into 4.
-        colour_halved: the same between intervals cut into 2 and into 4: where it is much smaller, the steps converge.
+        colour: of the channel that differs most, sRGB in [0, 1], between whole intervals and intervals cut into 4.
+        colour_halved: the same between intervals cut into 2 and into 4: if it is much smaller, the steps converge.
         depth, depth_halved: the same for the requested depth, in the unit of the scene; None without depth.
-        depth_stop: what the tolerance changed of depth, which has no bound of its own: the light that was left out may
-            end anywhere; None without depth.
+        depth_stop: change of depth due to the tolerance; it has no bound, because the light that was left out may end
+            anywhere. None without depth.
     """
 
     colour: Spread
@@ -95,8 +95,8 @@ def measure_error(
         model: the trained model.
         frame: camera and pose in the scene's frame.
         depth: the depth to measure along with the colour.
-        tolerance: of the rendering, for `depth_stop`.
-        seed: of the choice of pixels.
+        tolerance: tolerance of the rendering that `depth_stop` is about.
+        seed: seed for the choice of pixels.
     """
     total = frame.camera.width * frame.camera.height
     pixels = np.sort(np.random.default_rng(seed).choice(total, size=min(total, PIXELS), replace=False))
@@ -114,7 +114,7 @@ def measure_error(
 
 
 def refined(cuts: Tensor, parts: int) -> Tensor:
-    """(S * parts + 1,) distances that cut each interval of `cuts` (S + 1,) into equal parts."""
+    """Return the distances (S * parts + 1,) that cut each interval of `cuts` (S + 1,) into equal parts."""
     share = torch.arange(parts, dtype=cuts.dtype, device=cuts.device) / parts
     inner = cuts[:-1, None] + cuts.diff()[:, None] * share
     return torch.cat([inner.flatten(), cuts[-1:]])
@@ -123,7 +123,7 @@ def refined(cuts: Tensor, parts: int) -> Tensor:
 def _renderings(
     model: Model, frame: Frame, pixels: np.ndarray, *, depth: DepthRequest | None, tolerance: float
 ) -> tuple[Tensor, Tensor]:
-    """Colours (4, P, 3) and depths (4, P) of pixels: as rendered; then tightly with intervals whole, halved, in 4."""
+    """Return colours (4, P, 3), depths (4, P): as rendered; then at `TIGHT` with intervals whole and cut in 2 and 4."""
     rays = pixel_rays(frame, model.training_from_scene, pixels=pixels, places=CENTRES, device=model.device)
     directions, cosines = rays.directions[rays.valid], rays.cosines[rays.valid]
     background = colours_behind(model.background, directions)

@@ -1,18 +1,18 @@
-"""The meanings of "the depth of a ray". They differ wherever a ray meets more than one surface or none.
+"""Definitions of the depth of a ray. They differ wherever a ray meets more than one surface or none.
 
 With end density p(t) = T(t) sigma(t), whose integral is the opacity:
 
-    conditional   integral of t p(t) / opacity: the mean place where light ends, given that it ends
+    conditional   integral of t p(t) / opacity: the mean distance at which light ends, given that it ends
     moment        integral of t p(t): small where the ray is not opaque; a building block, not a distance
-    background    moment + T * background distance: the mean with what passes counted at the background
-    max-weight    the mean place inside the interval that stops most light; depends on where the ray is cut
+    background    moment + T * background distance: the mean if light that passes ends at the background
+    max-weight    the mean distance inside the interval that stops most light; depends on where the ray is cut
     median        where half of all light has ended: T(t) = 1/2
-    quantile:q    where the share q of all light has ended: T(t) = 1 - q
+    quantile:q    where the fraction q of all light has ended: T(t) = 1 - q
 
-All are exact for density that is constant inside an interval; `reference.depth` defines them. Which rays have one:
-moment and background every ray; conditional and max-weight those with at least `min_opacity`, which must not be zero
-opacity; a quantile q those with at least max(q, min_opacity), as it counts all light and not only that which ends.
-What is undefined is NaN, never a plausible number.
+All are exact for density that is constant inside an interval; `reference.depth` defines them. Moment and background are
+defined for every ray; conditional and max-weight for rays whose opacity is at least `min_opacity` and not zero; a
+quantile q for rays whose opacity is at least max(q, min_opacity), because it counts all light and not only the light
+that ends. Undefined values are NaN, never a plausible number.
 """
 
 from dataclasses import dataclass
@@ -34,18 +34,18 @@ class DepthRequest:
     """Definition of the depth to render.
 
     Args:
-        convention: one of `CONVENTIONS`, or "quantile:0.05" with a share between 0 and 1.
-        axis: "ray" for the distance along the ray, "z" for that along the optical axis.
+        convention: one of `CONVENTIONS`, or for example "quantile:0.05", with a fraction between 0 and 1.
+        axis: "ray" for the distance along the ray, "z" for the distance along the optical axis.
         min_opacity: rays that are less opaque have no depth, spread or disagreement; see `effective_floor`.
-        background_distance: distance along the ray that the background convention counts for what passes, in the
-            scene's unit; needed by that convention only.
+        background_distance: distance along the ray at which the background convention counts the light that passes, in
+            the scene's unit; only needed by that convention.
         min_views, min_parallax_deg: coverage and parallax of the median point below which an export removes the depth;
             see `visibility`.
-        level: of the interval between the outputs lower and upper, see `depth_errors`.
-        depth_tolerance: relative error up to which the output confidence counts a depth as right.
+        level: confidence level of the interval between the outputs lower and upper, see `depth_errors`.
+        depth_tolerance: largest relative error of a depth that the output confidence counts as right.
 
     Raises:
-        ValueError: no such convention or axis.
+        ValueError: unknown convention or axis.
     """
 
     convention: str
@@ -82,7 +82,7 @@ def is_convention(name: str) -> bool:
 
 
 def effective_floor(request: DepthRequest) -> float:
-    """Return the opacity below which a pixel has no depth: 0 for the conventions that every ray has."""
+    """Return the opacity below which a pixel has no depth: 0 for conventions that are defined for every ray."""
     if request.convention in ("moment", "background"):
         return 0.0
     return max(request.min_opacity, request.share or 0.0)
@@ -97,9 +97,9 @@ def requested(request: DepthRequest, ends: LightEnds, *, background_distance: Te
     """Select the requested depth (R,).
 
     Args:
-        request: which depth.
-        ends: where light ends, with the quantiles of `shares(request)`, along the axis and in the unit wanted.
-        background_distance: (R,) the request's, along that axis and in that unit.
+        request: the definition of depth.
+        ends: where light ends, with the quantiles of `shares(request)`, along the requested axis and in its unit.
+        background_distance: (R,) that of the request, along the same axis and in the same unit.
     """
     moment = torch.where(ends.mean.isnan(), 0.0, ends.mean * ends.opacity)
     match request.convention:
@@ -118,15 +118,15 @@ def requested(request: DepthRequest, ends: LightEnds, *, background_distance: Te
 
 
 def spread(request: DepthRequest, ends: LightEnds) -> Tensor:
-    """Standard deviation (R,) of where light ends, given that it ends; NaN below the request's `min_opacity`."""
+    """Return the standard deviation (R,) of where light ends, given that it ends; NaN below `min_opacity`."""
     return torch.where(ends.opacity >= request.min_opacity, ends.spread, torch.nan)
 
 
 def disagreement(request: DepthRequest, ends: LightEnds) -> Tensor:
-    """|median - conditional| (R,); NaN where either is undefined: below 1/2 or below the request's `min_opacity`."""
+    """Return |median - conditional| (R,); NaN where the opacity is below 1/2 or below the request's `min_opacity`."""
     return (median(request, ends) - ends.mean).abs()
 
 
 def median(request: DepthRequest, ends: LightEnds) -> Tensor:
-    """Distance (R,) at which half of all light has ended; NaN below 1/2 or below the request's `min_opacity`."""
+    """Return the distance (R,) at which half of all light has ended; NaN below an opacity of 1/2 or `min_opacity`."""
     return torch.where(ends.opacity >= request.min_opacity, ends.quantiles[:, 0], torch.nan)

@@ -1,4 +1,4 @@
-"""Errors of a field's depth by how many photos see the surface, and the intervals and confidence that follow."""
+"""Errors of a field's depth by the number of photos that see the surface; intervals and confidence of depth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,11 +6,11 @@ from typing import Any, Self
 
 import numpy as np
 
-# Coverage from which each stratum begins. Where no photo sees the surface there is nothing to measure an error with.
+# Least coverage of each stratum. Where no photo sees the surface, no error can be measured.
 STRATA = (1, 2, 4)
-# Of the errors in a stratum, the quantiles that are kept: every half per cent.
+# Quantiles of the errors in a stratum that are kept: every half per cent.
 _SHARES = np.linspace(0.0, 1.0, 201)
-# Measured pixels and photos that a stratum needs: those of one photo have errors in common.
+# Measured pixels and photos that a stratum needs; several photos, because errors within one are correlated.
 LEAST_PIXELS, LEAST_PHOTOS = 200, 2
 
 
@@ -20,9 +20,9 @@ class DepthErrors:
 
     Args:
         quantiles: (strata, 201) from the least to the largest; NaN where too little was measured.
-        pixels: measured in each stratum.
-        photos: that were measured in.
-        matched: proportion of the pixels of these photos that could be matched, and so measured.
+        pixels: number of pixels measured in each stratum.
+        photos: number of photos in which errors were measured.
+        matched: fraction of the pixels of these photos that could be matched, and so measured.
     """
 
     quantiles: np.ndarray
@@ -32,7 +32,7 @@ class DepthErrors:
 
     @classmethod
     def of(cls, errors: np.ndarray, coverage: np.ndarray, photos: np.ndarray, *, matched: float) -> Self:
-        """Sum up errors (N,) of pixels with a coverage (N,) in photos with these numbers (N,)."""
+        """Summarise errors (N,) of pixels, given their coverage (N,) and the indices of their photos (N,)."""
         rows, counts = [], []
         for number in range(len(STRATA)):
             inside = _stratum(coverage) == number
@@ -42,10 +42,10 @@ class DepthErrors:
         return cls(np.stack(rows), tuple(counts), len(np.unique(photos)), matched)
 
     def bounds(self, median: np.ndarray, coverage: np.ndarray, *, level: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the central interval of depth, (lower, upper) like `median`, that holds `level` of what was measured.
+        """Return the central interval of depth, (lower, upper) like `median`, with a fraction `level` of the errors.
 
-        lower = median (1 + q), with the quantile q of the errors in the pixel's stratum at (1 - level) / 2; upper with
-        that at (1 + level) / 2. NaN where no photo sees the surface, or too little was measured in the stratum.
+        lower = median (1 + q), where q is the quantile of the errors in the pixel's stratum at (1 - level) / 2; upper
+        uses the quantile at (1 + level) / 2. NaN where no photo sees the surface, or the stratum has too few errors.
 
         Source: split conformal prediction by groups: Angelopoulos and Bates 2021, arXiv:2107.07511, section 4.1.
         """
@@ -58,16 +58,17 @@ class DepthErrors:
         return sides[0], sides[1]
 
     def confidence(self, coverage: np.ndarray, *, tolerance: float) -> np.ndarray:
-        """Return the proportion of errors of at most `tolerance` in each pixel's stratum, from 0 to 1, like `coverage`.
+        """Return the fraction of errors of at most `tolerance` in each pixel's stratum, from 0 to 1, like `coverage`.
 
-        F(tolerance) - F(-tolerance), with the distribution function F between the kept quantiles. NaN as in `bounds`.
+        F(tolerance) - F(-tolerance), with the distribution function F interpolated between the kept quantiles. NaN as
+        in `bounds`.
         """
         number = _stratum(coverage)
         of_strata = np.array([np.diff(np.interp((-tolerance, tolerance), row, _SHARES))[0] for row in self.quantiles])
         return np.where(number >= 0, of_strata[number], np.nan).astype(np.float32)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; null for a stratum without quantiles."""
+        """Return plain values; null for a stratum without quantiles."""
         rows = [None if np.isnan(row).any() else row.tolist() for row in self.quantiles]
         counts = {"pixels": list(self.pixels), "photos": self.photos, "matched": self.matched}
         return {"strata": list(STRATA), "quantiles": rows, **counts}
@@ -82,5 +83,5 @@ class DepthErrors:
 
 
 def _stratum(coverage: np.ndarray) -> np.ndarray:
-    """Number of the stratum; -1 where coverage is 0 or NaN."""
+    """Return the index of the stratum; -1 where coverage is 0 or NaN."""
     return np.searchsorted(STRATA, np.nan_to_num(coverage), side="right") - 1

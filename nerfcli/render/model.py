@@ -1,4 +1,4 @@
-"""A trained field with everything that is needed to look at it: the frame it lives in, where it is empty, the steps."""
+"""A trained field with everything that rendering needs: its frame, its empty space, the steps along rays."""
 
 import dataclasses
 import hashlib
@@ -20,7 +20,7 @@ from nerfcli.field.kinds import fresh_field, settings_from_json
 from nerfcli.render.sampling import step_edges
 
 FORMAT = "nerfcli field 2"
-# Before there was a choice of contractions; still read.
+# Format without a choice of contractions; still read.
 FORMAT_1 = "nerfcli field 1"
 BACKGROUND = "background.logits"
 
@@ -35,11 +35,11 @@ class Marching:
     growth: float
 
     def edges(self) -> Tensor:
-        """(S + 2,) distances."""
+        """Return the edges (S + 2,) of the steps."""
         return step_edges(self.near, self.far, shortest_step=self.shortest_step, growth=self.growth)
 
     def stretched(self, factor: float) -> "Marching":
-        """Return the same span in steps `factor` times as long, > 0."""
+        """Return the same span with steps `factor` (> 0) times as long."""
         return replace(self, shortest_step=factor * self.shortest_step, growth=factor * self.growth)
 
 
@@ -52,16 +52,16 @@ class Model:
         occupied: (G, G, G) bool over the field's unit cube.
         marching: the steps along rays.
         background: sRGB behind everything, for pictures without alpha.
-        training_from_scene: the invertible normalisation.
-        unit: unit of length of the scene's own frame, "arbitrary" or "metre".
-        unit_source: how a metre is known; None where unknown.
-        log_exposure: the mean of the training photos by EXIF, if the model knows photos of different exposures; see
+        training_from_scene: normalisation of the scene to the training frame.
+        unit: unit of length of the scene's frame, "arbitrary" or "metre".
+        unit_source: how the metre is known; None where unknown.
+        log_exposure: mean log exposure of the training photos by EXIF, if the model has gains of photos; see
             `photos.exif_exposure`.
-        exif_slope: by how much gains follow the exposures that EXIF tells, see `held_out_exposure.exif_slope`.
-        exposures: of held-out photos by name, logarithms of their gains (3,) as training tells them where EXIF
-            does not; see `photos.held_out_exposure`.
-        beyond_exif: of held-out photos by name, offsets (3,) to the gains that EXIF predicts.
-        sha256: of the file that it was read from.
+        exif_slope: factor by which gains follow the exposures in EXIF, see `held_out_exposure.exif_slope`.
+        exposures: log gains (3,) of held-out photos by name, estimated from the training photos where EXIF does not
+            give them; see `photos.held_out_exposure`.
+        beyond_exif: offsets (3,) to the gains that EXIF predicts, of held-out photos by name.
+        sha256: SHA-256 of the file that the model was read from.
     """
 
     field: Field
@@ -88,11 +88,11 @@ class Model:
 
     @property
     def thread_safe(self) -> bool:
-        """Whether several threads may render it at the same time; on a CPU alone."""
+        """Whether several threads may render it at the same time; only on a CPU."""
         return self.device.type == "cpu" and kernels.thread_safe()
 
     def stretched(self, factor: float) -> "Model":
-        """Return the same field, looked at in steps along rays `factor` times as long as those of the training."""
+        """Return the same model with steps along rays `factor` times as long."""
         return replace(self, marching=self.marching.stretched(factor))
 
 
@@ -118,7 +118,7 @@ def save_model(path: Path, model: Model) -> None:
 
 
 def load_model(path: Path, device: str) -> Model:
-    """Read what `save_model` wrote.
+    """Read a model that `save_model` wrote.
 
     Raises:
         UserError: the file is missing, damaged, not a field of this version, or holds weights that are not finite.
@@ -155,7 +155,7 @@ def load_model(path: Path, device: str) -> Model:
 
 
 def _background(described: Any, tensors: dict[str, Tensor]) -> Background:
-    """Return the background that `save_model` described; its tensor is taken out of `tensors`."""
+    """Return the background that `save_model` described; removes its tensor from `tensors`."""
     if isinstance(described, dict):
         sphere = SphereBackground(described["side"])
         sphere.logits.data = tensors.pop(BACKGROUND)

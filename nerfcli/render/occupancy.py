@@ -12,8 +12,8 @@ DECAY = 0.8
 class Occupancy:
     """Content of each cell: a decaying maximum of the optical depth of one ray step.
 
-    It comes from asking the field at random points. What lies behind surfaces stays as it is, and costs nothing: rays
-    stop before they get there.
+    It is updated by evaluating the field at random points. Space behind surfaces is not removed, at no cost: rays stop
+    before they reach it.
     Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, appendix C, with a faster decay for short trainings.
     """
 
@@ -21,17 +21,17 @@ class Occupancy:
         self.optical_depth = torch.full((side, side, side), torch.inf, device=device)
 
     def above(self, optical_depth: float) -> Tensor:
-        """(side, side, side) bool, indexed [z, y, x]: cells that hold more than `least`, and those never looked at.
+        """Return the cells, (side, side, side) bool indexed [z, y, x], above `least` or never evaluated.
 
-        A cell with NaN counts as holding more: rays look into it, and the loss finds the NaN.
+        A cell with NaN counts as above, so that rays sample it and the loss detects the NaN.
         """
         return ~(self.optical_depth <= self.least(optical_depth))
 
     def least(self, optical_depth: float) -> Tensor:
-        """Return () this optical depth, or the mean of all cells where that is less.
+        """Return the threshold, (): this optical depth, or the mean over all cells if that is less.
 
-        In a short training, all of space may still be fog that is thinner than any threshold; where no ray looks,
-        nothing is learned any more.
+        In a short training, all of space may still be fog below any fixed threshold; cells that rays skip would not
+        learn any more.
         """
         return self.optical_depth.nanmean().clamp_max(optical_depth)
 
@@ -46,15 +46,15 @@ class Occupancy:
         growth: float,
         generator: torch.Generator,
     ) -> None:
-        """Evaluate the field at one random point in each of some cells.
+        """Evaluate the field at one random point in each of the chosen cells.
 
         Args:
             field: the field being trained.
-            detail: of the field, see `Field.medium`.
-            cells: which of the cells, numbered (z * side + y) * side + x; in this order their features are near in
+            detail: level of detail of the field, see `Field.medium`.
+            cells: slice of the cells, numbered (z * side + y) * side + x; in this order their features are close in
                 memory.
-            shortest_step, growth: the step schedule of `sampling.step_edges`; distance is taken from the origin of
-                the training frame, near which the cameras are.
+            shortest_step, growth: the step schedule of `sampling.step_edges`; distances are from the origin of the
+                training frame, near which the cameras are.
             generator: source of the random points, on the grid's device.
         """
         side, device = self.optical_depth.shape[0], self.optical_depth.device
@@ -74,5 +74,5 @@ class Occupancy:
         return {"optical_depth": self.optical_depth}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Take up what `state` gave."""
+        """Restore the state that `state` returned."""
         self.optical_depth = tensors["optical_depth"]

@@ -1,4 +1,4 @@
-"""Whole pictures of a trained model, tile by tile: colour, opacity, depth, and how far they can be trusted."""
+"""Whole pictures of a trained model, tile by tile: colour, opacity, depth and their uncertainty."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ from nerfcli.render.tracing import TOLERANCE, render_rays
 
 RAYS_PER_TILE = 2**14
 RAYS_PER_GPU_TILE = 2**16
-# A tile of a GPU takes this share of its memory at most, even where every step of its rays is in an occupied cell and
-# takes so many bytes.
+# A tile on a GPU takes at most this fraction of its memory, even if every step of its rays is in an occupied cell and
+# takes this many bytes.
 SHARE_OF_GPU, BYTES_PER_STEP = 1 / 8, 110
-# Rays and what is behind them are made for this many at a time: their last bits must not depend on the tile.
+# Rays and their background are computed in blocks of this many, so that their last bits do not depend on the tile.
 RAYS_PER_BLOCK = 2**18
 
 
@@ -30,8 +30,8 @@ class Quality:
     """Rendering quality of a picture.
 
     Args:
-        tolerance: what a channel of a colour may miss for speed, in (0, 1]; see `tracing`.
-        samples_per_pixel: rays of a pixel, at the places of `rays.places_in_pixel`.
+        tolerance: largest truncation error of a colour channel, in (0, 1]; see `tracing`.
+        samples_per_pixel: number of rays per pixel, at the places of `rays.places_in_pixel`.
 
     Raises:
         ValueError: out of range.
@@ -47,7 +47,7 @@ class Quality:
 
 @dataclass(frozen=True)
 class RenderedPicture:
-    """What was seen from one frame: NumPy float32, lengths in the scene's unit, NaN where undefined.
+    """Rendering of one frame: NumPy float32, lengths in the scene's unit, NaN where undefined.
 
     Args:
         rgb: (H, W, 3) sRGB in [0, 1], composited on the background; on black, it is premultiplied by the opacity.
@@ -55,13 +55,13 @@ class RenderedPicture:
         depth: (H, W) as requested; None when not requested.
         spread: (H, W) standard deviation of where light ends, along the axis of depth; None without depth.
         disagreement: (H, W) |median - conditional| along that axis; None without depth.
-        median: (H, W) along that axis, where half of all light is absorbed; None without depth.
-        truncation_error: (H, W) bound on what was left out of each channel of rgb; the tolerance at most.
+        median: (H, W) distance along that axis at which half of all light is absorbed; None without depth.
+        truncation_error: (H, W) bound on the truncation error of each channel of rgb; the tolerance at most.
         valid: (H, W) bool; False where the lens has no ray (rgb is then the background, opacity 0).
-        coverage, parallax: (H, W) of the points at `median`, see `visibility`; None unless an export adds them.
-        lower, upper: (H, W) of an interval of depth, see `depth_errors`; None unless an export adds them.
-        confidence: (H, W) proportion of depths within a tolerance, see `depth_errors`; None unless an export adds it.
-        depth_deviation, colour_deviation: (H, W) between the members of a run; None unless an export adds them.
+        coverage, parallax: (H, W) for the points at `median`, see `visibility`; None unless an export adds them.
+        lower, upper: (H, W) bounds of an interval of depth, see `depth_errors`; None unless an export adds them.
+        confidence: (H, W) fraction of depths within a tolerance, see `depth_errors`; None unless an export adds it.
+        depth_deviation, colour_deviation: (H, W) deviation between the members of a run; None unless an export adds it.
     """
 
     rgb: np.ndarray
@@ -92,23 +92,23 @@ def render_picture(
     on_tile: Callable[[int], None] | None = None,
     rays_per_tile: int | None = None,
 ) -> RenderedPicture:
-    """Render one frame; every bit of it is the same for any size of tiles and any number of threads.
+    """Render one frame; the result is bit-identical for any tile size and number of threads.
 
-    A pixel of several samples is the mean of its rays in colour and opacity; its depth, spread and disagreement are
-    those of the mixture of their end distances along the axis of depth: see `pixels`.
+    With several samples per pixel, colour and opacity are means over its rays; depth, spread and disagreement are those
+    of the mixture of their end distances along the axis of depth, see `pixels`.
 
     Args:
         model: the trained model.
         frame: camera and pose in the scene's frame.
-        background: behind everything.
-        depth: which depth to compute along with the colour.
-        quality: how much work to put into it.
-        on_tile: called with the number of pixels after each tile.
-        rays_per_tile: how many are rendered at a time, a matter of speed and memory alone; None for what suits the
-            device.
+        background: colour behind everything.
+        depth: the depth to compute along with the colour; None for none.
+        quality: tolerance and number of samples.
+        on_tile: called after each tile with its number of pixels.
+        rays_per_tile: number of rays rendered at a time, which only affects speed and memory; None for the default of
+            the device.
 
     Raises:
-        UserError: the field gives numbers that are not finite.
+        UserError: the rendering has numbers that are not finite.
     """
     if depth is not None and depth.convention == "background" and depth.background_distance is None:
         raise ValueError("the background convention needs a background distance")
@@ -144,7 +144,7 @@ def render_picture(
 
 
 def default_rays_per_tile(model: Model) -> int:
-    """Return how many rays are rendered at a time on the device of a model."""
+    """Return the number of rays rendered at a time on the device of a model."""
     if model.device.type != "cuda":
         return RAYS_PER_TILE
     total = torch.cuda.get_device_properties(model.device).total_memory
@@ -165,7 +165,7 @@ def _refuse_non_finite(frame: Frame, maps: dict[str, np.ndarray]) -> None:
 
 
 def straight_rgba(picture: RenderedPicture) -> np.ndarray:
-    """(H, W, 4) float32 sRGB with straight alpha of a picture that was rendered on black; 0 where nothing is."""
+    """Return sRGB with straight alpha (H, W, 4) float32 of a picture rendered on black; 0 where opacity is 0."""
     alpha = picture.opacity[..., None]
     colour = np.divide(picture.rgb, alpha, out=np.zeros_like(picture.rgb), where=alpha > 0)
     return np.concatenate([np.minimum(colour, 1.0), alpha], axis=-1)
@@ -174,8 +174,8 @@ def straight_rgba(picture: RenderedPicture) -> np.ndarray:
 def _render_tile(
     model: Model, rays: PictureRays, part: slice, *, background: Tensor, depth: DepthRequest | None, quality: Quality
 ) -> tuple[Tensor, ...]:
-    """Colour, opacity, truncation error, validity of the pixels of some rays; if wanted, depth, spread, disagreement
-    and median.
+    """Render the pixels of some rays: colour, opacity, truncation error, validity; if requested, depth, spread,
+    disagreement and median.
     """
     directions, count = rays.directions[part], quality.samples_per_pixel
     wanted = shares(depth) if depth is not None else ()
@@ -191,7 +191,8 @@ def _render_tile(
         keep_intervals=count > 1,
     )
     scale = model.training_from_scene.scale
-    # From the training frame's distance along the ray to the scene's along the axis; there is no z behind the camera.
+    # From distances along the ray in the training frame to distances along the axis in the scene's unit. There is no z
+    # behind the camera.
     factor, ahead = torch.full_like(rays.cosines[part], 1.0 / scale), torch.ones_like(rays.valid[part])
     if depth is not None and depth.axis == "z":
         ahead = rays.cosines[part] > 0

@@ -1,8 +1,8 @@
 """Pixels from rays: one ray per pixel, or the equally weighted mixture of several.
 
-The end distance of a pixel of several rays is that of a ray drawn from them: the conditional mean is the mean of the
-rays' means weighted by their opacity, its variance holds that between the rays, a quantile is that of all their light,
-and max-weight looks at the intervals of all of them. Distances along z are those of each ray's own direction.
+The end distances of a pixel with several rays are the mixture of those of the rays: the conditional mean is the mean of
+the rays' means weighted by their opacity, the variance includes the variance between the rays, a quantile is taken over
+all their light, and max-weight considers the intervals of all of them. Distances along z use each ray's own direction.
 """
 
 from typing import NamedTuple
@@ -19,10 +19,10 @@ class Pixels(NamedTuple):
 
     Args:
         rgb: (P, 3) sRGB on the background.
-        ends: where their light ends, as long as the factor says.
-        truncation_error: (P,) bound on what was left out of each channel of rgb.
-        to_background: (P,) from a background's distance along the ray to that wanted, for the light that passes.
-        valid: (P,) whether all rays of the pixel exist; the others have the background and no opacity.
+        ends: where their light ends; distances are multiplied by `factor`.
+        truncation_error: (P,) bound on the truncation error of each channel of rgb.
+        to_background: (P,) `factor` for the distance of the background, the mean over the light that passes.
+        valid: (P,) whether all rays of the pixel exist; other pixels show the background with opacity 0.
     """
 
     rgb: Tensor
@@ -45,19 +45,19 @@ def pixels_of_rays(
     """Combine `count` adjacent rays into each pixel.
 
     Args:
-        seen: of R rays, with the quantiles `shares`.
-        valid: (R,) rays that exist.
-        background: (R, 3) sRGB; a pixel that does not exist has that of its first ray.
-        factor: (R,) > 0, from distances along the ray to those wanted.
-        shares: of the quantiles.
+        seen: rendered values of R rays, with the quantiles `shares`.
+        valid: (R,) whether the rays exist.
+        background: (R, 3) sRGB; a pixel that is not valid has the background of its first ray.
+        factor: (R,) > 0, by which distances along the ray are multiplied to get the requested ones.
+        shares: fractions of light of the quantiles.
         count: rays per pixel, a divisor of R.
-        backend: that of the field.
+        backend: backend of the field.
     """
     rgb, error, ends, to_background = seen.rgb, seen.truncation_error, _scaled(seen.ends, factor), factor
     if count > 1:
         ends = _mixture(seen, ends, factor=factor, shares=shares, count=count, backend=backend)
         rgb, error, valid = rgb.view(-1, count, 3).mean(1), error.view(-1, count).mean(1), valid.view(-1, count).all(1)
-        # The light that passes counts the backgrounds of the rays that it passes along.
+        # The rays are weighted by the light that passes along them.
         passing = seen.ends.transmittance.view(-1, count) + torch.finfo(factor.dtype).tiny
         to_background = (passing * factor.view(-1, count)).sum(1) / passing.sum(1)
     return Pixels(
@@ -81,12 +81,12 @@ def _scaled(ends: LightEnds, factor: Tensor) -> LightEnds:
 def _mixture(
     seen: RaysSeen, ends: LightEnds, *, factor: Tensor, shares: tuple[float, ...], count: int, backend: Backend
 ) -> LightEnds:
-    """Return where light ends that goes along one of `count` rays; `ends` are theirs, scaled by `factor`."""
+    """Return where the light of pixels of `count` rays ends; `ends` are those of the rays, scaled by `factor`."""
     opacity = ends.opacity.view(-1, count)
     total = opacity.sum(1)
     defined = total > 0
     weights = opacity / torch.where(defined, total, 1.0)[:, None]
-    # A ray on which nothing ends has no mean, and no weight.
+    # A ray with opacity 0 has no mean, and no weight.
     means = torch.where(opacity > 0, ends.mean.view(-1, count), 0.0)
     spreads = torch.where(opacity > 0, ends.spread.view(-1, count), 0.0)
     mean = (weights * means).sum(1)

@@ -1,7 +1,8 @@
 """Rays of a camera through its pixels, in the training frame.
 
-Ray of pixel p:  origin = R c + t scaled,  direction = R_frame R_cam bearing(p)  with unit norm, so that distances
-along rays are lengths and density times length is an optical depth.
+Ray of pixel p:  origin = s R c + t,  direction = R R_cam bearing(p), with the camera's centre c and the similarity
+(s, R, t) from the scene to the training frame. Directions have unit norm, so that distances along rays are lengths and
+density times length is an optical depth.
 """
 
 import functools
@@ -22,14 +23,14 @@ CENTRES = np.array([[0.5, 0.5]])
 
 @dataclass(frozen=True)
 class PictureRays:
-    """Rays of pixels of one picture, row by row, those of a pixel side by side.
+    """Rays of pixels of one picture, row by row; the rays of a pixel are adjacent.
 
     Args:
         origin: (3,) the camera's centre, training frame.
         directions: (N, 3) unit.
-        valid: (N,) bool; places that the lens model cannot invert have no ray.
-        cosines: (N,) between each ray and the optical axis: z = distance * cosine.
-        cones: (N,) width per distance of what a ray stands for: a pixel's, or a share of its area.
+        valid: (N,) bool; False where the lens model cannot be inverted.
+        cosines: (N,) of the angle between each ray and the optical axis: z = distance * cosine.
+        cones: (N,) footprint of each ray per distance: the width of a pixel, or of an equal part of its area.
     """
 
     origin: Tensor
@@ -42,9 +43,9 @@ class PictureRays:
 def pixel_rays(
     frame: Frame, training_from_scene: Similarity, *, pixels: np.ndarray, places: np.ndarray, device: torch.device
 ) -> PictureRays:
-    """Rays of pixels (M,), counted row by row, at the same places (P, 2) inside [0, 1]^2 of each: N = M * P.
+    """Return the rays of pixels (M,), numbered row by row, at the same places (P, 2) in [0, 1]^2 in each: N = M * P.
 
-    Geometry is in float64, the result in float32.
+    Computed in float64; the result is in float32.
     """
     return _turned(frame, training_from_scene, *_bearings(frame.camera, pixels, places, device), count=len(places))
 
@@ -52,16 +53,16 @@ def pixel_rays(
 def successive_rays(
     frame: Frame, training_from_scene: Similarity, *, pixels: range, count: int, device: torch.device
 ) -> PictureRays:
-    """`pixel_rays` at `places_in_pixel(count)`; what the next picture of the same camera needs again is kept."""
+    """Return `pixel_rays` at `places_in_pixel(count)`; bearings are cached for further pictures of the same camera."""
     return _turned(frame, training_from_scene, *_bearings_of_range(frame.camera, pixels, count, device), count=count)
 
 
 def _turned(
     frame: Frame, training_from_scene: Similarity, bearings: Tensor, valid: Tensor, *, count: int
 ) -> PictureRays:
-    """Rays from bearings (N, 3), float64, in the axes of the camera; `count` of them are of the same pixel."""
+    """Return the rays of bearings (N, 3), float64, in the axes of the camera, with `count` rays per pixel."""
     world_from_cam = torch.from_numpy(training_from_scene.apply_pose(frame.world_from_cam)).to(bearings.device)
-    # Component by component: products of matrices round differently with the number of rows.
+    # Not a matrix product, whose rounding depends on the number of rows.
     columns = world_from_cam[:3, :3].T
     directions = bearings[:, :1] * columns[0] + bearings[:, 1:2] * columns[1] + bearings[:, 2:] * columns[2]
     width = 1.0 / (frame.camera.focal_px * math.sqrt(count))
@@ -75,7 +76,7 @@ def _turned(
 
 
 def _bearings(camera: Camera, pixels: np.ndarray, places: np.ndarray, device: torch.device) -> tuple[Tensor, Tensor]:
-    """(N, 3) float64 and (N,) bool, whether there are any."""
+    """Return the bearings (N, 3) float64 and whether each exists, (N,) bool."""
     corners = np.stack([pixels % camera.width, pixels // camera.width], axis=-1)
     bearings, valid = camera.bearings((corners[:, None] + places).reshape(-1, 2))
     return torch.from_numpy(bearings).to(device), torch.from_numpy(valid).to(device)

@@ -1,4 +1,4 @@
-"""Sampling along rays: schedules of distances, stratified samples, and draws from a histogram."""
+"""Schedule of the steps along rays."""
 
 import math
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def step_edges(near: float, far: float, *, shortest_step: float, growth: float) -> Tensor:
-    """Distances that cut every ray: steps of `shortest_step`, growing with distance.
+    """Return the distances that cut every ray, in steps of `shortest_step` that grow with distance.
 
     step(t) = max(shortest_step, growth * t * max(1, t)): a pixel covers more the farther away it is, and beyond the
     unit ball equal steps in 1 / t are about equal steps in contracted space.

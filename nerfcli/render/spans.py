@@ -1,4 +1,4 @@
-"""Rays through a field of blocks: each span of a ray that is in one cell is rendered by the field of that block."""
+"""Rays through a field of blocks: each span of a ray inside a block's cell is rendered by the field of that block."""
 
 import math
 
@@ -19,16 +19,16 @@ def trace_in_spans(
     shares: tuple[float, ...],
     negligible: float,
 ) -> RaysSeen:
-    """`Backend.trace_rays` with the samples, of rays without jitter.
+    """Render rays as `Backend.trace_rays` does, without jitter and with the samples kept.
 
-    Spans of intervals are halved until the middles of the first and the last one are in the same cell: cells are
-    convex. With T the light that passes the spans in front of span k:  colour = sum_k T_k colour_k + T background.
-    Where light ends is computed from the samples of all spans.
+    Spans of intervals are halved until the midpoints of their first and last intervals are in the same cell; this
+    suffices because cells are convex. With T_k the transmittance of the spans in front of span k,
+    colour = sum_k T_k colour_k + T background. The distribution of depth is computed from the samples of all spans.
     """
     intervals = len(march.edges) - 2
     rgb, left_out = torch.zeros_like(rays.origins), torch.zeros_like(rays.jitter)
     transmittance = torch.ones_like(rays.jitter)
-    stop = math.exp(-march.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
+    stop = math.exp(-march.max_optical_depth) * (1 + 1e-5)  # with a margin, so that rounding does not hide a stop
     seen_spans: list[tuple[Tensor, Intervals]] = []
     waiting = [(0, intervals, torch.arange(len(rays.origins), device=rays.origins.device))]
     while waiting:  # the nearest span of each ray comes first
@@ -56,7 +56,7 @@ def trace_in_spans(
             )
             passed, through = transmittance[own], seen.ends.transmittance
             rgb[own] += passed[:, None] * seen.rgb
-            # The span's own stop is one of the whole ray, and counted there.
+            # A stop inside the span ends the whole ray; its error is added below.
             span_error = seen.truncation_error - torch.where(through <= stop, through, 0.0)
             left_out[own] += passed * span_error.clamp_min(0.0)
             transmittance[own] = passed * through
@@ -69,7 +69,7 @@ def trace_in_spans(
 
 
 def _seen_in_block(field: BlocksField, number: int, rays: Rays, march: March, negligible: float) -> RaysSeen:
-    """Return what rays see on black in the frame of one block, with the samples in the frame of all."""
+    """Render rays on black with the field of one block; the samples returned are in the frame of all blocks."""
     block, own = field.settings.blocks[number], field.fields[number]
     assert isinstance(own, Field)
     seen = own.backend.trace_rays(
@@ -85,7 +85,7 @@ def _seen_in_block(field: BlocksField, number: int, rays: Rays, march: March, ne
 
 
 def _joined(spans: list[tuple[Tensor, Intervals]], rays: Rays) -> Intervals:
-    """Return the samples of all rays, of which each span has those of some, packed ray after ray."""
+    """Join the samples of all spans, packed ray after ray."""
     counts = torch.zeros(len(rays.origins), dtype=torch.int64, device=rays.origins.device)
     for own, intervals in spans:
         counts[own] += intervals.offsets.diff()

@@ -1,9 +1,9 @@
 """Trace rays: colour, distribution of depth, and the error of early stopping.
 
-Two things are left out for speed. A ray ends where little light is left (the stop), and samples whose weights are
-negligible have their colour taken as grey, without evaluating it. Together they change a colour by at most the
-tolerance, and `RaysSeen.truncation_error` bounds by how much they changed each one. The bound is one on the rendering
-of the field with its steps, not on the field.
+Two approximations save time. A ray ends where little light is left (the early stop), and the colours of samples with
+negligible weights are taken as grey instead of evaluated. Together they change a colour by at most the tolerance;
+`RaysSeen.truncation_error` bounds the change of each colour. The bound concerns the rendering of the field with its
+steps, not the field.
 """
 
 import math
@@ -20,7 +20,7 @@ from nerfcli.render.spans import trace_in_spans
 
 # The default: a quarter of a grey level.
 TOLERANCE = 1 / 1020
-# The share of the tolerance that the stop may take. Surfaces end rays at once, so that a deep stop costs little.
+# Fraction of the tolerance for the early stop. Surfaces end rays at once, so a deep stop costs little.
 STOP_SHARE = 0.1
 
 
@@ -40,16 +40,16 @@ def render_rays(
     cones: Tensor | None = None,
     keep_intervals: bool = True,
 ) -> RaysSeen:
-    """March rays through the model. The answer of a ray does not depend on the others.
+    """March rays through the model. The result of a ray does not depend on the other rays.
 
     Args:
         model: the trained model.
         origins, directions: (R, 3) in the training frame, unit directions.
         background: (3,) or (R, 3) sRGB.
         shares: quantiles to compute.
-        tolerance: bound on what is left out of a colour, > 0.
-        cones: (R,) width per distance of what each ray stands for, see `kernels.Rays`; None for lines.
-        keep_intervals: whether the samples are wanted.
+        tolerance: bound on the truncation error of a colour, > 0.
+        cones: (R,) footprint of each ray per distance, see `kernels.Rays`; None for lines.
+        keep_intervals: whether to return the samples.
     """
     cuts = uniform_cuts(model.marching).to(directions)
     return render_cut_rays(
@@ -67,7 +67,7 @@ def render_rays(
 
 @lru_cache(maxsize=4)
 def uniform_cuts(marching: Marching) -> Tensor:
-    """(S + 1,) float64 distances at which pictures cut all rays: in the middle between those of a training."""
+    """Return the distances (S + 1,) float64 at which pictures cut all rays: the midpoints of the training's steps."""
     edges = marching.edges()
     return edges[:-1] + 0.5 * edges.diff()
 
@@ -84,12 +84,12 @@ def render_cut_rays(
     cones: Tensor | None = None,
     keep_intervals: bool = True,
 ) -> RaysSeen:
-    """`render_rays` with all rays cut at the same distances `cuts` (S + 1,)."""
+    """March rays as `render_rays` does, all cut at the same distances `cuts` (S + 1,)."""
     field = model.field
-    edges = torch.cat([cuts, cuts[-1:]])  # the last is never used: there is no jitter
+    edges = torch.cat([cuts, cuts[-1:]])  # the last edge is not used, because there is no jitter
     rays = Rays(origins, directions, torch.zeros_like(directions[:, 0]), cones)
     march = March(edges, model.occupied, model.contraction, deepest(tolerance))
-    # All negligible samples of a ray together weigh no more than their share of the tolerance allows.
+    # All negligible samples of a ray together use at most the rest of the tolerance.
     negligible = (1.0 - STOP_SHARE) * tolerance / UNSEEN
     if isinstance(field, BlocksField):
         return trace_in_spans(field, rays, march, background=background, shares=shares, negligible=negligible)

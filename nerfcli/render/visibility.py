@@ -1,4 +1,4 @@
-"""Visibility of points: which photos see them, by the field's own depths, and the angle between the photos' rays."""
+"""Visibility of points: which photos see them, according to the field's depths, and the angle between the rays."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,23 +15,23 @@ from nerfcli.render.pictures import render_picture
 
 # Longer side of the depth maps of the photos, pixels.
 MAX_SIZE = 160
-# A photo sees a point where its own depth there is within this share of the point's distance...
+# A photo sees a point if the photo's depth there differs from the point's distance by at most this fraction of it...
 SAME = 0.01
-# ...and the surface is not seen more from the side than this: one pixel would show too much of it.
+# ...and the angle of incidence is at most this: beyond it, one pixel covers too much of the surface.
 STEEPEST_DEG = 80.0
-# Points whose rays are compared at a time: what that takes stays in the processor's cache.
+# Number of points processed at a time, so that their data stay in the processor's cache.
 _BLOCK = 2**12
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Distances (H, W) from a camera to the surface along its rays, float32; NaN where it sees none."""
+    """Distances (H, W) from a camera to the surface along its rays, float32; NaN where there is none."""
 
     frame: Frame
     distances: np.ndarray
 
     def points(self) -> np.ndarray:
-        """Points (N, 3) of the surface in the scene's frame, row by row, without the pixels that see none."""
+        """Return the points (N, 3) of the surface in the scene's frame, row by row, without pixels that see none."""
         rays, _ = self.frame.camera.pixel_bearings()
         there = np.isfinite(self.distances.ravel())
         pose = self.frame.world_from_cam
@@ -45,13 +45,13 @@ def depth_maps(
     max_size: int = MAX_SIZE,
     on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[DepthMap]:
-    """Render the median distance that each photo sees, through its own lens, small; see `without_steep`.
+    """Render a small map of the median distance for each photo, through its own lens; see `without_steep`.
 
     Args:
         model: the trained model.
-        frames: as the photos have them.
-        max_size: longer side of the maps at most, pixels.
-        on_progress: called with how much is done.
+        frames: frames of the photos.
+        max_size: largest longer side of the maps, pixels.
+        on_progress: called with the fraction that is done.
     """
     maps = []
     for frame in frames:
@@ -68,7 +68,7 @@ def without_steep(view: DepthMap) -> DepthMap:
     rays, _ = view.frame.camera.pixel_bearings()
     rays = rays.reshape(*view.distances.shape, 3)
     cosines = -(normals_of_points(rays * view.distances[..., None], view.distances) * rays).sum(-1)
-    # NaN, where the distances around are no surface, compares as False: the edge of an object is seen.
+    # A NaN normal, without a surface around the pixel, is not steep: edges of objects are kept.
     steep = cosines < np.cos(np.radians(STEEPEST_DEG))
     return DepthMap(view.frame, np.where(steep, np.float32(np.nan), view.distances))
 
@@ -76,7 +76,7 @@ def without_steep(view: DepthMap) -> DepthMap:
 def sees(view: DepthMap, points: np.ndarray) -> np.ndarray:
     """Return which points (N, 3) of the scene, finite, a camera sees: (N,) bool.
 
-    A point is seen where it lies in the picture, and one of the four pixels around it has its distance.
+    A point is seen if it is inside the picture and one of the four nearest pixels has its distance.
     """
     camera, pose = view.frame.camera, view.frame.world_from_cam
     local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -128,7 +128,7 @@ def largest_angle_deg(seen: np.ndarray, points: np.ndarray, centres: np.ndarray)
         rows = several[first : first + _BLOCK]
         used = np.flatnonzero(seen[rows].any(axis=0))
         here = seen[np.ix_(rows, used)]
-        # Where a camera does not see the point, one that does stands in: it adds no angle.
+        # A camera that does not see the point is replaced by one that does, which adds no angle.
         chosen = np.where(here, np.arange(len(used)), here.argmax(axis=1)[:, None])
         away = (centres[used] - points[rows, None]).astype(np.float32)  # (rows, used, 3)
         rays = normalize(torch.from_numpy(np.take_along_axis(away, chosen[..., None], axis=1)), dim=-1)
@@ -138,7 +138,7 @@ def largest_angle_deg(seen: np.ndarray, points: np.ndarray, centres: np.ndarray)
 
 
 def small_frame(frame: Frame, max_size: int) -> Frame:
-    """Return the frame with a picture whose longer side has `max_size` pixels at most, through the same lens."""
+    """Return the frame with its picture reduced to a longer side of at most `max_size` pixels, with the same lens."""
     camera = frame.camera
     factor = max(1.0, max(camera.width, camera.height) / max_size)
     size = (max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))

@@ -1,1 +1,1 @@
-"""One page about a training, or about several side by side."""
+"""One page about a training run, or about several side by side."""

@@ -1,4 +1,4 @@
-"""Drawings of a report as SVG: curves of a training against its seconds, and the cameras seen from above."""
+"""SVG drawings for a report: training curves over seconds, and the cameras seen from above."""
 
 import math
 from collections.abc import Sequence
@@ -11,15 +11,15 @@ from nerfcli.cameras.frame import Frame
 
 _WIDTH, _HEIGHT = 520, 230
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 10, 8, 34
-# Points of a curve that are drawn; more do not show at this size.
+# Most points drawn per curve; more would not be visible at this size.
 _MOST_POINTS = 400
-# Length of the lines that tell where cameras look, as a share of the drawing.
+# Length of the lines that show viewing directions, as a fraction of the drawing.
 _SIGHT = 0.05
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Values of one run: a number of its colour, what it is called, abscissae and ordinates; `dots` marks each."""
+    """Curve of one run: colour index, label, x and y values; with `dots`, each point gets a marker."""
 
     colour: int
     label: str
@@ -29,12 +29,12 @@ class Curve:
 
 
 def curves(drawn: Sequence[Curve], *, x_title: str, y_title: str, logarithmic: bool = False) -> str:
-    """Curves on common axes; "" where there is nothing to draw.
+    """Draw curves on common axes; return "" if there is nothing to draw.
 
     Args:
         drawn: curves; values that are not finite, or not positive on a logarithmic axis, are left out.
-        x_title, y_title: what is on the axes, with the unit.
-        logarithmic: the scale of the ordinates.
+        x_title, y_title: titles of the axes, with the unit.
+        logarithmic: use a logarithmic y axis.
     """
     points = [
         [
@@ -79,9 +79,9 @@ def curves(drawn: Sequence[Curve], *, x_title: str, y_title: str, logarithmic: b
 
 
 def from_above(train: Sequence[Frame], test: Sequence[Frame]) -> str:
-    """Places and sights of the cameras in the plane in which they lie best; "" without cameras.
+    """Draw positions and viewing directions of the cameras in their best-fitting plane; return "" without cameras.
 
-    The plane is that of the two largest principal axes of the places, so that it does not depend on which way is up.
+    The plane is that of the two largest principal axes of the positions, so it does not depend on which way is up.
     """
     frames = [*train, *test]
     if not frames:
@@ -117,7 +117,7 @@ def _line(curve: Curve, places: Sequence[tuple[float, float]]) -> str:
 
 
 def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, float]]:
-    """At most `_MOST_POINTS`, the last among them."""
+    """Return about `_MOST_POINTS` of the points, evenly spaced, including the last."""
     step = -(-len(points) // _MOST_POINTS)
     return points if step <= 1 else [*points[:-1:step], points[-1]]
 
@@ -128,7 +128,7 @@ def _padded(low: float, high: float) -> tuple[float, float]:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """About five round numbers between two."""
+    """Return about five round numbers between two values."""
     raw = (high - low) / 5
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(power * factor for factor in (1, 2, 2.5, 5, 10) if power * factor >= raw)
@@ -137,7 +137,7 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def _decade_ticks(low: float, high: float) -> list[float]:
-    """Logarithms of 1, 2 and 5 times the powers of ten between two logarithms."""
+    """Return the logarithms, between two logarithms, of 1, 2 and 5 times powers of ten."""
     decades = range(math.floor(low), math.ceil(high) + 1)
     ticks = [decade + math.log10(factor) for decade in decades for factor in (1, 2, 5)]
     return [tick for tick in ticks if low <= tick <= high]

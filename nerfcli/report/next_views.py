@@ -1,4 +1,4 @@
-"""The page about what the photos of a run have seen, and where to take further ones."""
+"""The page that shows what the photos of a run cover, and where to take further ones."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ class NextView:
 
     Args:
         frame: its camera and pose.
-        gain: of the surface, the share that it would be the first or second to see.
-        picture: (H, W, 3) uint8 sRGB, what the field shows from there.
+        gain: fraction of the surface that it would be the first or second photo to see.
+        picture: (H, W, 3) uint8 sRGB, rendered from there.
         coverage: (h, w) number of photos that see the surface; NaN where there is none.
     """
 
@@ -48,8 +48,8 @@ def next_views_html(
     Args:
         run: the folder; its name is the title.
         photos: the training photos.
-        shares: of the surface, by how many photos see it.
-        seen_twice: the share that two photos or more see, before and after the views.
+        shares: fractions of the surface, by the number of photos that see it.
+        seen_twice: fraction of the surface that at least two photos see, before and after adding the views.
         views: best first.
     """
     before, after = seen_twice
@@ -72,7 +72,7 @@ def next_views_html(
 
 
 def mark_of(run: Path) -> page.Mark:
-    """Return the mark of a run's page."""
+    """Return the mark of a run's page of next views."""
     return page.Mark("next-views", run)
 
 

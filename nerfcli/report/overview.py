@@ -1,4 +1,4 @@
-"""Runs of several captures in one table: a row each, with a photo beside its rendering, sorted by a click."""
+"""Table of runs on several captures: one row each with a photo beside its rendering, sortable by column."""
 
 from collections.abc import Sequence
 from html import escape
@@ -23,7 +23,7 @@ _COLUMNS = (
 
 
 def overview_html(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]]) -> str:
-    """Format a row for each run; the thumbnails are the photo of middle quality and its rendering."""
+    """Format a table with a row for each run; its thumbnail is the photo with the median PSNR beside its rendering."""
     headings = "".join(f"<th{_aligned(name)}><button>{name}</button></th>" for name in ("run", *dict(_COLUMNS)))
     rows = "".join(
         f"<tr><td>{_thumbnails(look)}</td><td>{escape(run.label)}</td>"

@@ -1,4 +1,4 @@
-"""The page: what was captured, how it was posed and trained, what it shows of photos it has not seen, and how fast."""
+"""The report page: capture, poses, training, renderings of held-out photos, and speed."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -37,7 +37,7 @@ from nerfcli.report.views import (
 )
 from nerfcli.sealed import digest
 
-# Curves of more runs than these share colours.
+# With more runs than this, curves share colours.
 COLOURS = 6
 DEPTH_COLOURS = "turbo"
 _PICTURE_PX = 800
@@ -50,12 +50,12 @@ def mark_of(runs: Sequence[Path]) -> page.Mark:
 
 
 def origin_of(runs: Sequence[RunFacts], hashes: Sequence[str], *, views: int, depth: DepthRequest) -> str:
-    """Return a digest of all that a page is made from: fields, numbers, logs, settings, and what is shown of them.
+    """Return a digest of everything a page is made from: fields, metrics, logs, settings, and display options.
 
     Args:
-        runs: what the folders say.
-        hashes: of their fields.
-        views, depth: how many held-out photos, and which depth of them.
+        runs: facts from the folders.
+        hashes: digests of their fields.
+        views, depth: number of held-out photos to show, and the depth that is shown.
     """
     facts = [[run.label, run.config.to_json(), run.log, run.metrics, run.poses] for run in runs]
     return digest([__version__, list(hashes), facts, views, asdict(depth)])
@@ -68,8 +68,8 @@ def page_html(
 
     Args:
         runs: at least one.
-        looks: what each of them shows of held-out photos; runs of a capture show the same ones.
-        depths: the meaning of each run's depths.
+        looks: renderings of held-out photos by each run; runs of a capture show the same photos.
+        depths: meaning of each run's depths.
         origin: see `origin_of`.
     """
     ranges = _depth_ranges(runs, looks)
@@ -110,7 +110,7 @@ def _structure(view: Seen) -> str:
 
 
 def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]]) -> list[tuple[float, float]]:
-    """Return the range of colours of each run's depths: the same for all runs of a scene."""
+    """Return the depth range of each run's colour scale, which all runs of a scene share."""
     scenes = scenes_of(runs)
     return [
         depth_range([view for other, look in zip(scenes, looks, strict=True) if other == scene for view in look])
@@ -153,7 +153,7 @@ def _views_html(
 def _layers(
     first: Seen, seen: Sequence[tuple[RunFacts, Seen, tuple[float, float]]], *, alone: bool
 ) -> list[dict[str, str]]:
-    """Return what can be shown of a photo: itself, then pictures, errors, depths and coverage of all runs."""
+    """Return the layers of a photo: itself, then the renderings, errors, depths and coverage of all runs."""
 
     def layer(kind: str, run: RunFacts, picture: np.ndarray) -> dict[str, str]:
         return _layer(kind if alone else f"{run.label}: {kind}", picture)
@@ -184,7 +184,7 @@ def _legends_html(runs: Sequence[RunFacts], ranges: Sequence[tuple[float, float]
 
 
 def coverage_legend() -> str:
-    """Return the legend of maps of coverage."""
+    """Return the legend of coverage maps."""
     words = "training photos that see the surface; hatched: no surface"
     return _legend("coverage", COVERAGE_COLOURS, "0", f">= {COVERAGE_RANGE}", words)
 
@@ -222,7 +222,7 @@ def _curves_html(runs: Sequence[RunFacts]) -> str:
 
 
 def _cameras_html(runs: Sequence[RunFacts]) -> str:
-    """Return the cameras of every scene, once."""
+    """Draw the cameras of every scene, each scene once."""
     drawn: dict[str, str] = {}
     for run, scene in zip(runs, scenes_of(runs), strict=True):
         drawn.setdefault(scene, from_above(run.frames.train, run.frames.test))

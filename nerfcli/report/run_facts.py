@@ -1,4 +1,4 @@
-"""Facts in the folders of a run and of its scene: settings, log, metrics, poses, warnings."""
+"""Facts read from the folders of a run and its scene: settings, log, metrics, poses, warnings."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -13,25 +13,25 @@ from nerfcli.runs.log import LogEntry
 from nerfcli.runs.run import Run
 
 POSES_REPORT = "poses_report.json"
-# Photos named in a warning; the others are counted.
+# Photos named in a warning; further ones are only counted.
 _NAMED = 6
-# Blur by the uncertainty of a pose that shows at the size of the photos.
+# Blur from the uncertainty of a pose that is visible at the size of the photos.
 _VISIBLE_BLUR_PX = 1.0
 
 
 @dataclass(frozen=True)
 class RunFacts:
-    """One run.
+    """Facts of one run.
 
     Args:
         path: its folder.
-        label: what it is called on the page.
+        label: its name on the page.
         config: RUN/config.json.
         log: RUN/log.jsonl.
-        metrics: RUN/metrics.json; None before it was evaluated, or where it is of another checkpoint.
-        poses: the scene's poses_report.json; None where poses came from elsewhere or the scene has moved.
-        frames: trained on, and held out.
-        field_bytes: of the checkpoint.
+        metrics: RUN/metrics.json; None if the run was not evaluated, or another checkpoint was.
+        poses: the scene's poses_report.json; None if the poses came from elsewhere or the scene was moved.
+        frames: training and held-out frames.
+        field_bytes: size of the checkpoint.
     """
 
     path: Path
@@ -49,8 +49,8 @@ def read_facts(run: Run, label: str, *, checkpoint_sha256: str) -> RunFacts:
 
     Args:
         run: the run.
-        label: what it is called on the page.
-        checkpoint_sha256: of its field: numbers of another one are left out.
+        label: its name on the page.
+        checkpoint_sha256: digest of its field; metrics of another checkpoint are left out.
 
     Raises:
         UserError: it is not a run, or one of its files cannot be read.
@@ -71,7 +71,7 @@ def read_facts(run: Run, label: str, *, checkpoint_sha256: str) -> RunFacts:
 
 
 def labels_of(runs: Sequence[Path]) -> list[str]:
-    """Return the shortest ends of the paths that are unique."""
+    """Return the shortest trailing parts of the paths that are unique; numbered paths if two are equal."""
     parts = [run.resolve().parts for run in runs]
     for depth in range(1, max(map(len, parts)) + 1):
         labels = ["/".join(part[-depth:]) for part in parts]
@@ -81,7 +81,7 @@ def labels_of(runs: Sequence[Path]) -> list[str]:
 
 
 def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
-    """(stage, text) of everything that was warned about on the way to this run, in the order of the stages."""
+    """Yield (stage, text) of all warnings from poses to evaluation of this run, in the order of the stages."""
     yield from _of_poses(facts.poses or {})
     missing = facts.config.missing_photos
     if missing:
@@ -101,7 +101,7 @@ def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
 
 
 def captures_of(runs: Sequence[RunFacts]) -> list[list[int]]:
-    """Return the indices of the runs by capture: runs that hold out a photo in common are of the same one."""
+    """Group the indices of the runs by capture: runs that share a held-out photo belong to the same capture."""
     captures: list[tuple[set[str], list[int]]] = []
     for index, run in enumerate(runs):
         photos = {str(frame.image.resolve()) if frame.image else frame.name for frame in run.frames.test}
@@ -115,7 +115,7 @@ def captures_of(runs: Sequence[RunFacts]) -> list[list[int]]:
 
 
 def scenes_of(runs: Sequence[RunFacts]) -> list[str]:
-    """Return what is the same for runs of the same scene, and for those trained on a part of its photos."""
+    """Return a scene identifier for each run; runs on a fraction of the photos get that of a run on all of them."""
     places = [(run.config.scene, run.config.split_sha256) for run in runs]
     whole = {
         place: run.config.scene_fingerprint
@@ -128,7 +128,7 @@ def scenes_of(runs: Sequence[RunFacts]) -> list[str]:
 
 
 def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:
-    """List the reasons why metrics of these runs must not be compared."""
+    """Yield the reasons why metrics of these runs must not be compared."""
     measured = [run for run in runs if run.metrics is not None]
     if any(len({runs[i].config.split_sha256 for i in capture}) > 1 for capture in captures_of(runs)):
         yield "the runs have different held-out photos"
@@ -159,10 +159,10 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _json(path: Path) -> dict[str, Any] | None:
-    """Return the object in a file; None where there is no such file.
+    """Return the JSON object in a file; None if the file does not exist.
 
     Raises:
-        UserError: it is there and is no JSON object.
+        UserError: the file cannot be read or is not a JSON object.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -13,7 +13,7 @@ _MEGA = 1e6
 
 
 def numbers_html(runs: Sequence[RunFacts]) -> str:
-    """Format metrics and their protocols."""
+    """Format the metrics of the runs and their protocols."""
     return _columns(runs, _NUMBERS) + _protocols_html(runs)
 
 
@@ -23,20 +23,20 @@ def capture_html(runs: Sequence[RunFacts]) -> str:
 
 
 def _columns(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Callable[[RunFacts], str]]]) -> str:
-    """Return a table with a column for each run; rows that no run has anything for are left out."""
+    """Return a table with a column for each run; rows that are empty for all runs are left out."""
     cells = [(name, *(read(run) for run in runs)) for name, read in rows]
     kept = [row for row in cells if any(row[1:])]
     return table(("", *(run.label for run in runs)), kept, numbers=range(1, len(runs) + 1))
 
 
 def _protocols_html(runs: Sequence[RunFacts]) -> str:
-    """Return how the numbers were made, each way once."""
+    """Return the evaluation protocols, each once."""
     protocols = dict.fromkeys(str(run.metrics["protocol"]) for run in runs if run.metrics)
     return "".join(f'<p class="legend"><b>protocol</b> {escape(protocol)}</p>' for protocol in protocols)
 
 
 def metric(key: str, form: str) -> Callable[[RunFacts], str]:
-    """Return what formats a mean over the held-out photos; "" where there is none."""
+    """Return a formatter of a mean over the held-out photos; it gives "" if there is none."""
 
     def read(run: RunFacts) -> str:
         value = (run.metrics or {}).get("mean", {}).get(key)
@@ -55,7 +55,7 @@ def _of(part: str, key: str, form: str, scale: float = 1.0) -> Callable[[RunFact
 
 
 def render_time(form: str) -> Callable[[RunFacts], str]:
-    """Return what formats the seconds per picture; "" where they were not measured."""
+    """Return a formatter of the seconds per picture; it gives "" if they were not measured."""
     return _of("render", "seconds_per_image", form)
 
 
@@ -73,12 +73,12 @@ def _shape(run: RunFacts) -> str:
 
 
 def number(value: float | None, digits: int) -> str:
-    """Format a number with so many digits; "" for None."""
+    """Format a number with `digits` decimals; "" for None."""
     return "" if value is None else f"{value:.{digits}f}"
 
 
 def last_logged(key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
-    """Return what formats the last logged value; "" where there is none."""
+    """Return a formatter of the last logged value; it gives "" if there is none."""
     return lambda run: form.format(run.log[-1][key] / scale) if run.log and key in run.log[-1] else ""
 
 
@@ -100,7 +100,7 @@ def _unit(run: RunFacts) -> str:
 
 
 def registered(run: RunFacts) -> str:
-    """Format how many photos have a pose; "" where the poses came from elsewhere."""
+    """Format the number of photos with a pose; "" if the poses came from elsewhere."""
     return f"{run.poses['registered']} of {run.poses['total']}" if run.poses and "registered" in run.poses else ""
 
 
@@ -114,7 +114,7 @@ def _verdict(run: RunFacts) -> str:
 
 
 def photos_html(runs: Sequence[RunFacts]) -> str:
-    """PSNR and SSIM of every held-out photo by every run, a table for each capture."""
+    """Format PSNR and SSIM of every held-out photo by every run, in a table for each capture."""
     tables = (_photos_html([runs[index] for index in capture], of_many=len(runs) > 1) for capture in captures_of(runs))
     return "".join(filter(None, tables)) or "<p>Not measured.</p>"
 
@@ -141,7 +141,7 @@ def _photos_html(runs: Sequence[RunFacts], *, of_many: bool) -> str:
 
 
 def _novelty(view: dict[str, Any] | None) -> list[str]:
-    """Return how far a held-out view is from the nearest that was trained on."""
+    """Format how far a held-out view is from the nearest training view."""
     if view is None:
         return ["", "", "", ""]
     distance, angle = number(view.get("distance_relative"), 3), number(view.get("angle_deg"), 1)
@@ -149,7 +149,7 @@ def _novelty(view: dict[str, Any] | None) -> list[str]:
 
 
 def ledger_html(runs: Sequence[RunFacts]) -> str:
-    """Format which stages used the held-out photos."""
+    """Format a table of the stages that used the held-out photos."""
     words = {True: "yes", False: "no", None: "not known"}
     rows = [
         (run.label, entry["stage"], words[entry["saw_held_out"]], entry["how"])
@@ -183,7 +183,7 @@ def selection_html(runs: Sequence[RunFacts]) -> str:
 
 
 def settings_html(runs: Sequence[RunFacts]) -> str:
-    """Return every setting and version; where runs differ, the row is marked and comes first."""
+    """Format all settings and versions; rows in which runs differ are marked and come first."""
     per_run = [
         _flat({"settings": run.config.settings.to_json(), "versions": dict(run.config.versions)}) for run in runs
     ]

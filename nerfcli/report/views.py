@@ -1,4 +1,4 @@
-"""Held-out photos beside what runs render of them: picture, error, depth, and how many photos see the surface."""
+"""Held-out photos beside their renderings: picture, error, depth, and number of photos that see the surface."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,14 +17,14 @@ from nerfcli.render.pictures import render_picture
 from nerfcli.render.visibility import DepthMap, small_frame
 from nerfcli.report.run_facts import RunFacts
 
-# Mean absolute difference of the channels that has the last colour of error maps, sRGB in [0, 1].
+# Mean absolute difference of the channels at the last colour of error maps, sRGB in [0, 1].
 ERROR_RANGE = 0.2
 ERROR_COLOURS = "viridis"
-# Longer side in pixels of the maps of coverage, and the number of photos from which on they have the last colour.
+# Longer side of coverage maps in pixels, and the number of photos at their last colour.
 COVERAGE_PX, COVERAGE_RANGE = 320, 8
 COVERAGE_COLOURS = "viridis"
 _COVERAGE = DepthRequest("median", "ray")
-# Of all depths, those at the ends of the range of colours.
+# Percentiles of all depths at the ends of the colour range.
 _RANGE_PERCENT = (1, 99)
 
 
@@ -33,11 +33,11 @@ class Seen:
     """Renderings of a held-out photo by a run.
 
     Args:
-        name: of the photo.
+        name: name of the photo.
         photo, picture, error: (H, W, 3) uint8 sRGB; RGBA photos on white.
         depth: (H, W) in the unit of the scene, NaN where there is none.
         coverage: (h, w) number of training photos that see the surface, in a smaller picture; NaN where there is none.
-        psnr, ssim: between picture and photo over the pixels that count, as in `evaluate`; SSIM may not be known.
+        psnr, ssim: of the picture against the photo over the used pixels, as in `evaluate`; SSIM may be unknown.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Seen:
 
 
 def common_names(runs: Sequence[RunFacts], count: int) -> list[str]:
-    """At most `count` photos that all runs of a capture hold out, by `spread_evenly` with the first known quality."""
+    """Choose up to `count` photos that all runs hold out: `spread_evenly` by PSNR of the first evaluated run."""
     names = [frame.name for frame in runs[0].frames.test]
     for run in runs[1:]:
         held_out = {frame.name for frame in run.frames.test}
@@ -78,10 +78,10 @@ def look_at(
 
     Args:
         model: the trained model.
-        held_out: the photos, whose masks leave pixels to compare.
-        depth: which depth to show.
-        photo_depths: of all training photos.
-        on_progress: called with how much of it is done, in [0, 1].
+        held_out: the photos; their masks must leave pixels to compare.
+        depth: definition of the depth to show.
+        photo_depths: depths of all training photos.
+        on_progress: called with the fraction done, in [0, 1].
     """
     views = []
     for photo in held_out:
@@ -107,7 +107,7 @@ def look_at(
 
 
 def coverage_map(model: Model, frame: Frame, photo_depths: Sequence[DepthMap]) -> np.ndarray:
-    """Return how many training photos see the surface in each pixel of a small picture (h, w), see `Seen`."""
+    """Count the training photos that see the surface in each pixel of a small picture (h, w), see `Seen`."""
     small = small_frame(frame, COVERAGE_PX)
     picture = render_picture(model, small, background=model.background, depth=_COVERAGE)
     seen = with_visibility(picture, small, axis=_COVERAGE.axis, photo_depths=photo_depths)
@@ -116,12 +116,12 @@ def coverage_map(model: Model, frame: Frame, photo_depths: Sequence[DepthMap]) -
 
 
 def coverage_picture(coverage: np.ndarray) -> np.ndarray:
-    """Return a map of `coverage_map` in colours, uint8 RGB; hatched where there is no surface."""
+    """Colour a map of `coverage_map`, as uint8 RGB; hatched where there is no surface."""
     return coloured(coverage, lo=0.0, hi=float(COVERAGE_RANGE), colour_map=COVERAGE_COLOURS)
 
 
 def depth_range(views: Sequence[Seen]) -> tuple[float, float]:
-    """Return the 1st and 99th percentile of all depths that are defined; (0, 1) where there is none."""
+    """Return the 1st and 99th percentile of all defined depths; (0, 1) if there are none."""
     valid = np.concatenate([np.empty(0), *(view.depth[np.isfinite(view.depth)] for view in views)])
     if not len(valid):
         return 0.0, 1.0
@@ -130,7 +130,7 @@ def depth_range(views: Sequence[Seen]) -> tuple[float, float]:
 
 
 def error_map(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np.ndarray:
-    """Mean absolute difference of the channels in colours, the last from `ERROR_RANGE` on; grey where none counts.
+    """Colour the mean absolute difference of the channels, from 0 to `ERROR_RANGE`; grey where pixels are unused.
 
     Args:
         picture, photo: (H, W, 3) uint8.
@@ -147,12 +147,12 @@ def error_map(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np
 
 
 def spread_evenly(names: Sequence[str], count: int, *, quality: dict[str, float]) -> list[str]:
-    """At most `count` of the names, in their order: the worst, the best, and evenly between by rank of quality.
+    """Choose up to `count` names, in their order: the worst, the best, and evenly between by rank of quality.
 
     Args:
-        names: of held-out photos.
+        names: names of held-out photos.
         count: >= 0.
-        quality: PSNR by name where it is known; where it is not of all, the names are spread by their order.
+        quality: PSNR by name; if it is not known for all, the names are spread by their order.
     """
     if len(names) <= count:
         return list(names)

@@ -1,7 +1,7 @@
-"""Blocks of a large scene: cells of ground, the photos that see each, and the fields of all joined into one.
+"""Blocks of a large scene: cells of the ground, the photos that see each cell, and joining the fields into one.
 
-The blocks of a run are in RUN/blocks/1, 2, ..., each a complete run; RUN itself has the joined field. Everything here
-follows from the scene alone, so that blocks can be trained by processes that know nothing of each other.
+The blocks of a run are in RUN/blocks/1, 2, ..., each a complete run; RUN itself has the joined field. The division
+depends on the scene alone, so that blocks can be trained by independent processes.
 """
 
 import math
@@ -22,21 +22,21 @@ from nerfcli.render.model import Marching, Model
 from nerfcli.runs.files import BLOCKS
 from nerfcli.scene import Scene, model_folder
 
-# A cell's margin, as a share of the size of what is in it.
+# Margin of a cell, as a fraction of the extent of its points.
 MARGIN = 0.15
-# A photo belongs to the blocks in whose cell or margin at least this share of the points lies that it sees.
+# A photo belongs to a block if at least this fraction of the points that it sees is in the block's cell or margin.
 LEAST_SHARE = 0.05
-# Fewer points or photos do not make a field.
+# Fewest points and photos of a block.
 LEAST_POINTS, LEAST_PHOTOS = 50, 2
-# Cells are measured between these percentiles of points: at the edge of the scene some are far away, or wrong.
+# Percentiles of points between which cells are measured: at the edge of the scene, some are far away or wrong.
 PERCENTILES = (5, 95)
-# Along a side of the occupancy grid of a joined field: 16 MB in all.
+# Largest number of cells along a side of the occupancy grid of a joined field: 16 MB in all.
 MOST_CELLS = 256
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A rectangle of ground; `low` is inside and `high` is not, both (2,) and infinite at the edge of the scene."""
+    """A rectangle of ground, including `low` and excluding `high`, both (2,) and infinite at the edge of the scene."""
 
     low: tuple[float, ...] = (-math.inf, -math.inf)
     high: tuple[float, ...] = (math.inf, math.inf)
@@ -49,12 +49,12 @@ class Cell:
 
 @dataclass(frozen=True)
 class Division:
-    """A scene in blocks.
+    """A scene divided into blocks.
 
     Args:
         ground: (2, 3) horizontal unit directions.
-        cells: of the blocks; each place is in exactly one.
-        scenes: of the blocks: photos that see their cells or margins, and the points in their cells.
+        cells: cells of the blocks; each place is in exactly one.
+        scenes: scenes of the blocks, with the photos that see the cell or its margin, and the points in the cell.
     """
 
     ground: np.ndarray
@@ -71,7 +71,7 @@ def divide(scene: Scene, count: int) -> Division:
     """Divide a scene into blocks with about equally many points.
 
     Raises:
-        UserError: nothing tells which photos see which points, or there are too few points or photos for so many.
+        UserError: it is not known which photos see which points, or there are too few points or photos.
     """
     folder = model_folder(scene.root)
     capture = parse_colmap(folder) if folder is not None else None
@@ -108,10 +108,10 @@ def divide(scene: Scene, count: int) -> Division:
 
 
 def joined(models: Sequence[Model], division: Division) -> Model:
-    """Return one model of those of all blocks.
+    """Join the models of all blocks into one.
 
-    Its unit ball holds theirs, its steps along rays are the shortest of theirs, and its background is that of the
-    first. If all blocks have the same field, the joined model renders what this renders.
+    Its unit ball contains those of the blocks, its steps along rays are the shortest of the blocks, and its background
+    is that of the first block. If all blocks have the same field, the joined model renders the same as that field.
     """
     centres = np.array([-model.training_from_scene.translation / model.training_from_scene.scale for model in models])
     radii = np.array([1.0 / model.training_from_scene.scale for model in models])
@@ -154,7 +154,7 @@ def joined(models: Sequence[Model], division: Division) -> Model:
 
 
 def _cells(cell: Cell, places: np.ndarray, count: int) -> list[Cell]:
-    """Divide a cell with places (N, 2) across its longer side, in proportion, until there are so many cells."""
+    """Divide a cell into `count` cells with equal numbers of its places (N, 2), each time across the longer side."""
     if count == 1:
         return [cell]
     first = count // 2
@@ -170,7 +170,7 @@ def _cells(cell: Cell, places: np.ndarray, count: int) -> list[Cell]:
 
 
 def _with_photos(scene: Scene, names: set[str]) -> Scene:
-    """Return the scene with some of its photos."""
+    """Return the scene with only the photos of these names."""
     kept = [index for index, frame in enumerate(scene.frames) if frame.name in names]
     return replace(
         scene,
@@ -181,12 +181,12 @@ def _with_photos(scene: Scene, names: set[str]) -> Scene:
 
 
 def _occupied(field: BlocksField, *, cells: int) -> Tensor:
-    """Return the cells (G, G, G) of a joined field's cube that hold something, and their neighbours.
+    """Return the cells (G, G, G) of a joined field's cube that are occupied or next to an occupied one, bool.
 
     Args:
-        field: the joined one.
-        cells: along a side, as many that no cell of a block's occupancy is smaller; the result has fewer where they
-            would be too many.
+        field: the joined field.
+        cells: number of cells along a side, with cells no larger than those of a block's occupancy; the result has
+            fewer if this is more than `MOST_CELLS`.
     """
     merged = math.ceil(cells / MOST_CELLS)
     side = math.ceil(cells / merged)

@@ -10,14 +10,14 @@ from nerfcli.cameras.rigid import vector_from_rotation
 
 
 def camera_moves(before: Sequence[Frame], after: Sequence[Frame], *, radius: float) -> dict[str, Any]:
-    """Median and largest change of the cameras of photos.
+    """Return the median and the largest change of the cameras of photos.
 
     Args:
         before, after: the same photos in the same order, at least one.
-        radius: of the scene, in its units.
+        radius: radius of the scene, in its units.
 
     Returns:
-        "rotation_deg", "translation_percent" of the radius and "focal_percent", each with "median" and "max".
+        "rotation_deg", "translation_percent" (of the radius) and "focal_percent", each with "median" and "max".
     """
     given, refined = (np.array([frame.world_from_cam for frame in frames]) for frames in (before, after))
     turns = np.linalg.norm(vector_from_rotation(np.swapaxes(given[:, :3, :3], 1, 2) @ refined[:, :3, :3]), axis=1)

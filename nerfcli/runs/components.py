@@ -1,7 +1,7 @@
-"""The parts of a model and of its training that a scene may need or not, each chosen by itself.
+"""Optional parts of a model and of its training, each chosen independently.
 
-A component is a field of `Components`. Its value says what is done; `CHOICES` tells, for each, which value switches it
-off, which one `--with NAME` stands for, and what `--with NAME=VALUE` may say.
+A component is a field of `Components`. `CHOICES` gives for each component the value that switches it off, the value
+that `--with NAME` stands for, and the values that `--with NAME=VALUE` allows.
 """
 
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from nerfcli.errors import UserError
 Value = bool | int | float | str
 Change = tuple[str, Value]
 
-# What may be behind all that the field holds.
+# Colours behind the field.
 BACKGROUNDS = ("auto", "black", "constant", "random", "sphere")
 LEARNED_BACKGROUNDS = ("constant", "sphere")
 EXPOSURES = ("none", "exif", "learned")
 CAMERAS = ("fixed", "poses", "focal", "all")
-# What is behind the black of a mask: something unknown, or nothing.
+# Meaning of black in a mask: unknown, or empty space.
 MASKS = ("ignore", "empty")
 PIXELS = ("anywhere", "error")
 # Spherical harmonics up to this degree: 16 of them.
@@ -30,16 +30,16 @@ class Components:
     """Components of the model and of its loss. The defaults suit nearly every scene.
 
     Args:
-        background: behind the field: "black"; a learned colour, "constant" or by direction ("sphere"); "random" colours
-            in training, for photos with alpha; "auto" is random for photos with alpha and black for all others.
-        view: how colours depend on the direction they are seen from: the highest degree of the spherical harmonics
-            that the colour network takes, 0 to 3. 0: not at all.
-        exposure: gains of the photos, see `field.exposure`: "none", those in "exif", or "learned" from there.
-        cameras: which camera parameters of the training photos are trained with the field: "poses"; "focal", the focal
-            length of each lens; "all", both and radial distortion; or nothing, "fixed". See `refinement`.
-        masks: what their black means: "ignore", not to be looked at; or "empty", nothing is there, as with alpha.
+        background: colour behind the field: "black"; learned, "constant" or by direction ("sphere"); "random" in
+            training, for photos with alpha; "auto" is random for photos with alpha and black for all others.
+        view: dependence of colours on the viewing direction: highest degree of the spherical harmonics that the colour
+            network takes, 0 (no dependence) to 3.
+        exposure: gains of the photos, see `field.exposure`: "none", from "exif", or "learned" starting from EXIF.
+        cameras: camera parameters of the training photos that are trained with the field: "poses"; "focal", the focal
+            length of each lens; "all", both and radial distortion; or "fixed", none. See `refinement`.
+        masks: meaning of black in masks: "ignore", not used; or "empty", empty space, as with alpha.
         points: weight of `kernels.RaySums.off_target`.
-        stereo: whether the points include pixels of training photos whose depth stereo matching tells, see
+        stereo: whether the points include pixels of training photos with a depth from stereo matching, see
             `multiview.stereo`.
         overlap: whether space near a camera that no other photo looks into stays empty; see `fit.coverage`.
         entropy: weight of `losses.opacity_entropy`.
@@ -47,8 +47,8 @@ class Components:
         distortion: weight of `kernels.RaySums.distortion`; 0.05 is best or as good as any on real and synthetic
             captures.
         antialias: whether details smaller than a pixel fade out of its view; see `reference.hash_encode`.
-        pixels: which ones are drawn: from "anywhere", or half of them where the "error" is; see `error_map`.
-        movers: whether pixels that show something that moves do not count in the loss; see `fit.movers`.
+        pixels: sampling of pixels: uniform ("anywhere"), or half of them where the "error" is large; see `error_map`.
+        movers: whether pixels that show moving things are left out of the loss; see `fit.movers`.
     """
 
     background: str = "auto"
@@ -75,9 +75,9 @@ class Choice:
     """Allowed values of a component.
 
     Args:
-        what: it does, in a few words.
-        off, on: the values that `--without` and `--with` stand for.
-        allowed: all values, or None for every number that is not negative.
+        what: short description.
+        off, on: values that `--without` and `--with` stand for.
+        allowed: all values; None for any number that is not negative.
     """
 
     what: str
@@ -89,7 +89,7 @@ class Choice:
         """Parse the value of a component.
 
         Raises:
-            UserError: it stands for none.
+            UserError: the value is not allowed.
         """
         if self.allowed is not None:
             for value in self.allowed:
@@ -126,12 +126,12 @@ assert tuple(CHOICES) == tuple(field.name for field in fields(Components))
 
 
 def choose(start: Components, *, included: Sequence[str], excluded: Sequence[str]) -> Components:
-    """`start` with some components switched on and off.
+    """Return `start` with some components switched on and off.
 
     Args:
-        start: what holds where nothing is said.
-        included: NAME, for the value that switches it on, or NAME=VALUE.
-        excluded: NAME, for the value that switches it off.
+        start: values of the components that are not named.
+        included: components to switch on, each as NAME or NAME=VALUE.
+        excluded: names of components to switch off.
 
     Raises:
         UserError: an unknown name or value, or a component that is named twice.
@@ -150,7 +150,7 @@ def choose(start: Components, *, included: Sequence[str], excluded: Sequence[str
 
 
 def differences(components: Components) -> dict[str, Value]:
-    """Return the components that are not as they are by default, with their values."""
+    """Return the components that differ from the defaults, with their values."""
     default = Components()
     return {name: value for name in CHOICES if (value := getattr(components, name)) != getattr(default, name)}
 

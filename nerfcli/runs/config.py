@@ -26,17 +26,17 @@ class RunConfig:
 
     Args:
         settings: as requested, with the downscale and contraction that were chosen.
-        scene: the folder of the scene, relative to where the user then was, or absolute.
+        scene: the folder of the scene, absolute or relative to the working directory of the training.
         scene_kind: the format of the scene, see `Scene`.
-        unit, unit_source: of length, see `Scene`.
+        unit, unit_source: unit of length, see `Scene`.
         scene_fingerprint: see `scene.fingerprint`.
         split_sha256: see `split_hash`.
-        holdout: the rule that chose the held-out photos; None where the scene says.
-        history: how cameras and points were found, see `Scene`; None if that was not written down.
-        missing_photos: that the scene lists and that were not on disk.
-        warnings: about the scene.
-        selection: how the components were chosen, where the scene decided; without its exposures.
-        versions: of nerfcli, Python, torch and NumPy.
+        holdout: the rule that chose the held-out photos; None where the scene defines them.
+        history: how cameras and points were found, see `Scene`; None if not recorded.
+        missing_photos: photos that the scene lists but that were not on disk.
+        warnings: warnings about the scene.
+        selection: automatic selection of the components, if there was one; without its exposures.
+        versions: versions of nerfcli, Python, torch and NumPy.
     """
 
     settings: TrainSettings = field(default_factory=TrainSettings)
@@ -66,11 +66,11 @@ class RunConfig:
         """Describe a training that begins now.
 
         Args:
-            scene: what is trained on.
+            scene: the scene that is trained on.
             settings: as requested.
-            factor: by which photos are made smaller.
-            contraction: of the field.
-            selection: how the components were chosen, where the scene decided.
+            factor: downscale factor of the photos.
+            contraction: contraction of the field.
+            selection: automatic selection of the components, if there was one.
         """
         return cls(
             settings=replace(settings, downscale=factor, contraction=contraction),
@@ -99,11 +99,11 @@ class RunConfig:
 
     @property
     def downscale(self) -> int:
-        """The side of the squares that photos were averaged over."""
+        """Side in pixels of the squares over which photos were averaged."""
         return self.settings.downscale or 1
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of the file; the order of its keys is that of every version before."""
+        """Return the content of the file; its keys are in the same order as in all earlier versions."""
         return {
             "scene": str(self.scene),
             "scene_kind": self.scene_kind,
@@ -122,10 +122,10 @@ class RunConfig:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "RunConfig":
-        """Read what `to_json` gave, or an earlier version.
+        """Read the content that `to_json` returned, in this or an earlier version.
 
         Raises:
-            KeyError, TypeError, ValueError, AttributeError: it is something else.
+            KeyError, TypeError, ValueError, AttributeError: the content is invalid.
         """
         settings, selection = TrainSettings.from_json(content.get("settings", {})), content.get("selection")
         return cls(
@@ -135,11 +135,11 @@ class RunConfig:
             missing_photos=tuple(content.get("missing_photos", ())),
             warnings=tuple(content.get("warnings", ())),
             versions=content.get("versions") or {},
-            **{name: content.get(name) for name in _AS_THEY_ARE},
+            **{name: content.get(name) for name in _COPIED_KEYS},
         )
 
 
-_AS_THEY_ARE = ("scene_kind", "unit", "unit_source", "scene_fingerprint", "split_sha256", "holdout", "history")
+_COPIED_KEYS = ("scene_kind", "unit", "unit_source", "scene_fingerprint", "split_sha256", "holdout", "history")
 
 
 def write_config(run: Path, config: RunConfig) -> None:
@@ -192,5 +192,5 @@ def no_run(path: Path) -> UserError:
 
 
 def split_hash(test_names: Iterable[str]) -> str:
-    """SHA-256 over the names of the held-out photos, in order: the same split has the same hash."""
+    """Return the SHA-256 of the sorted names of the held-out photos: the same split has the same hash."""
     return hashlib.sha256("\n".join(sorted(test_names)).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Decisions of the automatic selection: per candidate its gain, the error of the gain, and whether it is kept."""
+"""Decisions of the automatic selection: for each candidate, its gain with standard error, and whether it is kept."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -15,14 +15,14 @@ class Decision:
 
     Args:
         component, value: the change.
-        gain_db: in PSNR of pixels that were not trained on, at equal steps, the mean over photos; negative is a loss.
-            None where it was not tried, as for all numbers that follow.
-        error_db: its standard error.
-        trend_db: how much of the gain the second half of the steps brought.
-        cost: seconds of a step against those of a step without the change, minus 1.
-        gain_at_equal_time_db: the gain without what the steps would have brought that it costs.
-        kept: whether it is in the model.
-        why: in words.
+        gain_db: gain in PSNR of pixels that were not trained on, at equal steps, mean over photos; negative is a loss.
+            None if the candidate was not tried, as for the numbers below.
+        error_db: standard error of the gain.
+        trend_db: gain minus the gain halfway through the steps.
+        cost: time per step relative to a step without the change, minus 1.
+        gain_at_equal_time_db: gain minus what spending the extra time on more steps would bring.
+        kept: whether the change is in the model.
+        why: the reason, in words.
     """
 
     component: str
@@ -71,9 +71,9 @@ class Selection:
 
     Args:
         components: those of the model.
-        decisions: one per candidate; none where there was too little to spend.
-        seconds: of the search.
-        log_gains: (photos, 3) of the exposures that the trials found; None where exposures are not learned.
+        decisions: one per candidate; empty if the budget was too small.
+        seconds: seconds spent on the search.
+        log_gains: (photos, 3) log gains of exposure that the trials found; None where exposures are not learned.
         log_focal: see `Fitting`.
     """
 
@@ -92,7 +92,7 @@ class Selection:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any], *, wanted: Components) -> "Selection":
-        """Read what `to_json` gave, which has no exposures; `wanted` are the components where it names none."""
+        """Read the content that `to_json` returned, without exposures; `wanted` are the components if it has none."""
         chosen = content.get("components")
         return cls(
             components=Components(**chosen) if chosen else wanted,

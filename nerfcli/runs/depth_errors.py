@@ -1,4 +1,4 @@
-"""RUN/depth_errors.json: errors of the field's depth as measured with the held-out photos."""
+"""RUN/depth_errors.json: errors of the field's depth, measured with the held-out photos."""
 
 from pathlib import Path
 
@@ -10,14 +10,14 @@ FORMAT = "nerfcli depth errors 1"
 
 
 def read_depth_errors(run: Path, *, expected: str) -> DepthErrors | None:
-    """Return the kept errors; None where there are none, or none with this digest, or they are damaged."""
+    """Return the stored errors; None if they are missing, damaged, or have another digest."""
     try:
         content = read_sealed(run / DEPTH_ERRORS)
         if (content["format"], content["digest"], content["strata"]) != (FORMAT, expected, list(STRATA)):
             return None
         return DepthErrors.from_json(content)
     except (OSError, ValueError, LookupError, TypeError):
-        return None  # they are measured again
+        return None  # the caller measures them again
 
 
 def write_depth_errors(run: Path, errors: DepthErrors, *, digest: str) -> None:

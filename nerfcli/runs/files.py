@@ -1,4 +1,4 @@
-"""The names of the files in a run folder."""
+"""Names of the files in a run folder."""
 
 from nerfcli.cameras.formats.run_cameras import CAMERAS
 
@@ -14,7 +14,7 @@ PHOTO_DEPTHS = "photo_depths.npz"
 REPORT = "report.html"
 LOCK = ".train.lock"
 LIVE = ".live"
-# Of a reconstruction from an X-ray scan; tomography writes and reads it.
+# Written and read by tomography, for a reconstruction from an X-ray scan.
 RECONSTRUCTION = "reconstruction.json"
 
 __all__ = [

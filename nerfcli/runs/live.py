@@ -1,8 +1,8 @@
-"""RUN/.live: how a viewer of a run and its training, which are two processes, talk to each other.
+"""RUN/.live: files through which the viewer of a run and its training communicate; they are two processes.
 
-While somebody looks, the viewer writes a request about every second; a counter in it shows that the viewer lives. The
-training answers with its status and, every few seconds, its field. Nobody looks: there are no files, and the training
-only looks for one twice a second. Clocks of two machines that share a disk are never compared.
+While a viewer is open, it writes a request about every second; a counter in the request shows that the viewer is alive.
+The training answers with its status and, every few seconds, its field. Without a viewer there are no files, and the
+training only checks for a request twice a second. The clocks of two machines that share a disk are never compared.
 """
 
 import json
@@ -17,7 +17,7 @@ from nerfcli.atomic import write_json
 from nerfcli.runs.files import FIELD, LIVE
 
 REQUEST, STATUS = "request.json", "status.json"
-# Without a new count for so long, the other side has gone.
+# After this long without a new count, the other side is considered gone.
 VIEWER_SECONDS, TRAINING_SECONDS = 5.0, 20.0
 
 
@@ -32,7 +32,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Status:
-    """State of a training: `share` of the budget, `fields` written for viewers."""
+    """State of a training: `share` is the fraction of the budget spent, `fields` the number written for viewers."""
 
     count: int
     share: float
@@ -44,11 +44,11 @@ class Status:
 
 
 class Pulse:
-    """Tells by a counter whether the other side lives.
+    """Detects from a counter whether the other side is alive.
 
     Args:
-        seconds: without a new count after which it has gone.
-        clock: seconds of this process.
+        seconds: time without a new count after which the other side is considered gone.
+        clock: returns the time of this process, seconds.
     """
 
     def __init__(self, seconds: float, clock: Callable[[], float] = time.monotonic):
@@ -57,9 +57,9 @@ class Pulse:
         self._since = -float("inf")
 
     def beats(self, count: int | None) -> bool:
-        """Return whether it lives; `count` is what it last wrote, None where there is nothing."""
+        """Return whether the other side is alive; `count` is the last count that it wrote, None if there is none."""
         if count != self._count:
-            # The first count that is seen may be years old.
+            # The first count may have been written years ago.
             fresh = self._count is not None and count is not None
             self._since = self._clock() if fresh else -float("inf")
             self._count = count
@@ -67,17 +67,17 @@ class Pulse:
 
 
 def live_field(run: Path) -> Path:
-    """Return where a training puts its field for viewers."""
+    """Return the path at which a training writes its field for viewers."""
     return run / LIVE / FIELD
 
 
 def write_request(run: Path, request: Request) -> None:
-    """Write what a viewer wants."""
+    """Write the request of a viewer."""
     write_json(run / LIVE / REQUEST, asdict(request))
 
 
 def read_request(run: Path) -> Request | None:
-    """Return what a viewer wants; None where nothing can be read."""
+    """Return the request of a viewer; None if there is none, or it cannot be read."""
     content = _read(run / LIVE / REQUEST)
     return None if content is None else Request(**content)
 
@@ -88,26 +88,26 @@ def write_status(run: Path, status: Status) -> None:
 
 
 def read_status(run: Path) -> Status | None:
-    """Return the state of a training; None where nothing can be read."""
+    """Return the state of a training; None if there is none, or it cannot be read."""
     content = _read(run / LIVE / STATUS)
     return None if content is None else Status(**content)
 
 
 def end_request(run: Path) -> None:
-    """Remove the viewer's request, and the folder if the training has left it."""
+    """Remove the viewer's request, and the folder if the training has no files in it."""
     (run / LIVE / REQUEST).unlink(missing_ok=True)
-    with suppress(OSError):  # it is not empty, or not there
+    with suppress(OSError):  # the folder is not empty, or does not exist
         (run / LIVE).rmdir()
 
 
 def end_training(run: Path) -> None:
-    """Remove what the training wrote."""
+    """Remove the files that the training wrote."""
     for name in (STATUS, FIELD):
         (run / LIVE / name).unlink(missing_ok=True)
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    # Files are replaced whole; one that goes away, or is of another version, is none.
+    # Files are replaced atomically. One that has just been removed, or is of another version, counts as missing.
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

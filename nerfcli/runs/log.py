@@ -1,4 +1,4 @@
-"""RUN/log.jsonl: how a training went, a line at least every second."""
+"""RUN/log.jsonl: progress of a training, with a line at least every second."""
 
 import json
 import math
@@ -13,8 +13,11 @@ from nerfcli.runs.files import LOG
 
 
 class LogEntry(TypedDict):
-    """A line of the log: totals since the start, and speeds since the line before. Of the lines of an earlier version
-    some may be missing that are not in `_REQUIRED`; `heldout_psnr` stands in those of waypoints."""
+    """A line of the log: totals since the start, and speeds since the previous line.
+
+    Lines of earlier versions may lack entries that are not in `_REQUIRED`. Only the lines of waypoints have
+    `heldout_psnr`.
+    """
 
     step: int
     seconds: float
@@ -46,7 +49,7 @@ class TrainingSummary:
 
 
 def summary_of(log: Sequence[LogEntry]) -> TrainingSummary | None:
-    """Return what a training took; None if nothing was logged."""
+    """Return the summary of a training; None if nothing was logged."""
     if not log:
         return None
     last = log[-1]
@@ -60,7 +63,7 @@ def summary_of(log: Sequence[LogEntry]) -> TrainingSummary | None:
 
 
 def append_log(run: Path, entry: LogEntry) -> None:
-    """Append one whole line to RUN/log.jsonl.
+    """Append a line to RUN/log.jsonl.
 
     Raises:
         UserError: it cannot be written.
@@ -73,10 +76,10 @@ def append_log(run: Path, entry: LogEntry) -> None:
 
 
 def read_log(run: Path) -> list[LogEntry]:
-    """Return the entries of RUN/log.jsonl up to the first line that is not whole: a kill may have cut the last one.
+    """Return the entries of RUN/log.jsonl up to the first incomplete line: a kill may have cut the last one.
 
     Raises:
-        UserError: it is there and cannot be read.
+        UserError: the file exists and cannot be read.
     """
     try:
         lines = (run / LOG).read_text(encoding="utf-8", errors="replace").splitlines()
@@ -97,12 +100,12 @@ def read_log(run: Path) -> list[LogEntry]:
 
 
 def cut_log(run: Path, step: int) -> None:
-    """Remove the entries after `step`: a killed training logs more than its last checkpoint has."""
+    """Remove the entries after `step`: a killed training has logged steps after its last checkpoint."""
     _write_log(run, [entry for entry in read_log(run) if entry["step"] <= step])
 
 
 def add_to_log(run: Path, measured: Mapping[int, dict[str, Any]]) -> None:
-    """Add what was measured afterwards, by step, to the entries of these steps."""
+    """Add values that were measured after the training, by step, to the entries of these steps."""
     _write_log(run, [{**entry, **measured.get(entry["step"], {})} for entry in read_log(run)])
 
 

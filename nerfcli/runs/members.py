@@ -1,13 +1,13 @@
-"""The members of a run, RUN/members/1, 2, ...: further fields of the same scene whose differences show what varies."""
+"""The members of a run, RUN/members/1, 2, ...: further fields of the same scene, trained to see how much they vary."""
 
 from nerfcli.errors import UserError
 from nerfcli.runs.files import CONFIG, MEMBERS
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 
-# Fewer have no standard deviation.
+# Fewest members that have a standard deviation.
 FEWEST = 2
-# Of members that belong to one run, besides their seeds.
+# Settings in which the members of a run may differ, besides their seeds.
 _VARIED_SETTINGS = ("photo_fraction", "random_start", "field")
 
 
@@ -15,7 +15,7 @@ def members_of(run: Run) -> list[Run]:
     """Return the members of a run, at least `FEWEST`.
 
     Raises:
-        UserError: there are too few complete ones, or they belong to another training than the run's.
+        UserError: there are too few members, or one is incomplete or does not belong to the training of the run.
     """
     members = begun_members(run)
     hint = "train them: nerfcli train SCENE -o RUN --members 4, with the options of the run"
@@ -33,13 +33,13 @@ def members_of(run: Run) -> list[Run]:
 
 
 def begun_members(run: Run) -> list[Run]:
-    """Return the members whose training has begun, in their order."""
+    """Return the members whose training has begun, by number."""
     folders = [path for path in (run.path / MEMBERS).glob("*") if path.name.isdigit() and (path / CONFIG).exists()]
     return [Run(path) for path in sorted(folders, key=lambda path: int(path.name))]
 
 
 def members_in_words(run: Run) -> list[str]:
-    """Describe the members that have begun, a line each: seed, what else varies, and whether it is complete."""
+    """Describe each member whose training has begun in a line: seed, other varied settings, complete or not."""
     lines, first = [], run.config.settings.to_json()
     for member in begun_members(run):
         settings = member.config.settings
@@ -51,7 +51,7 @@ def members_in_words(run: Run) -> list[str]:
 
 
 def _difference(one: TrainSettings, other: TrainSettings) -> str | None:
-    """Return the first setting in which two trainings differ, of those that do not vary between members."""
+    """Describe the first difference between settings that members must have in common; None without any."""
     there, wanted = one.to_json(), other.to_json()
     may_differ = ("seed", *_VARIED_SETTINGS, "device", "threads")
     names = [name for name in wanted if name not in may_differ and there[name] != wanted[name]]

@@ -1,4 +1,4 @@
-"""A run: the folder that training wrote, as everything that comes after training sees it."""
+"""A run: the folder that training wrote, and access to its files."""
 
 import hashlib
 from functools import cached_property
@@ -23,9 +23,9 @@ class Run:
     """A run folder; each file is read on first use.
 
     Args:
-        path: the folder; nothing is read yet.
+        path: the folder; it is not read yet.
 
-    Every property raises a UserError where its file is missing or damaged.
+    Every property raises a UserError if its file is missing or damaged.
     """
 
     def __init__(self, path: Path):
@@ -41,7 +41,7 @@ class Run:
 
     @cached_property
     def cameras(self) -> RunCameras:
-        """Training and held-out frames, with their cameras as the field was trained with."""
+        """Training and held-out frames, with the cameras that the field was trained with."""
         return read_cameras(self.path)
 
     @cached_property
@@ -51,7 +51,7 @@ class Run:
 
     @cached_property
     def log(self) -> list[LogEntry]:
-        """RUN/log.jsonl, as far as its lines are whole; empty if there is none."""
+        """RUN/log.jsonl, up to the first incomplete line; empty if there is none."""
         return read_log(self.path)
 
     @property
@@ -85,7 +85,7 @@ class Run:
         return self.path / METRICS
 
     def model(self, device: str = "cpu") -> Model:
-        """Load the field with all that rendering needs; a call loads it again.
+        """Load the field with everything that rendering needs; each call loads it again.
 
         Raises:
             UserError: it is missing or damaged.
@@ -95,10 +95,10 @@ class Run:
         return load_model(self.field_path, device)
 
     def checkpoint_sha256(self) -> str:
-        """Hash of the field's file: metrics, renders and pages name the field by it.
+        """Return the hash of the field's file, which identifies the field in metrics, renders and pages.
 
         Raises:
-            UserError: it cannot be read.
+            UserError: the file cannot be read.
         """
         try:
             return hashlib.sha256(self.field_path.read_bytes()).hexdigest()
@@ -118,10 +118,10 @@ class Run:
         return read_json(self.metrics_path, needed=("mean",), hint=hint)
 
     def check_split(self) -> None:
-        """Refuse cameras whose held-out photos are not those that were held out of the training.
+        """Check that the held-out photos of the cameras are those that were held out of the training.
 
         Raises:
-            UserError: they are others.
+            UserError: they differ.
         """
         if self.config.split_sha256 != split_hash(frame.name for frame in self.cameras.test):
             raise UserError(
@@ -130,8 +130,10 @@ class Run:
             )
 
     def is_trained_from(self, scene: Scene, settings: TrainSettings) -> bool:
-        """Return whether it was trained from this scene with these settings; threads and device aside, an automatic
-        downscale, contraction and number of rows counting as whatever was chosen."""
+        """Return whether the run was trained from this scene with these settings.
+
+        Threads and device do not matter; an automatic downscale, contraction or number of rows matches any value.
+        """
         wanted = {key: value for key, value in settings.to_json().items() if key not in ("device", "threads")}
         for name in ("downscale", "contraction", "log2_rows"):
             if wanted[name] is None:
@@ -142,8 +144,9 @@ class Run:
         )
 
     def is_complete(self, settings: TrainSettings) -> bool:
-        """Return whether training reached the budget, by its last checkpoint:
-        the log of a killed training is ahead of it.
+        """Return whether training reached the budget, by its last checkpoint.
+
+        The log of a killed training may be ahead of the checkpoint.
         """
         if not self.is_trained:
             return False
@@ -158,7 +161,7 @@ class Run:
         return by_time or by_steps
 
     def saved_progress(self) -> tuple[int, float]:
-        """Steps and training seconds of the last checkpoint.
+        """Return the steps and training seconds of the last checkpoint.
 
         Raises:
             UserError: it cannot be read.
@@ -183,7 +186,7 @@ def load_run(path: str | Path) -> Run:
         The run; its configuration and cameras have been read, the field is loaded by `Run.model`.
 
     Raises:
-        UserError: it is no run, or damaged.
+        UserError: the folder is not a run, or is damaged.
     """
     run = Run(Path(path))
     _ = run.config, run.cameras

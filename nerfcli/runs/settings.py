@@ -13,18 +13,18 @@ from nerfcli.kernels import CONTRACTIONS
 from nerfcli.runs.components import LEARNED_BACKGROUNDS, Components
 
 DOWNSCALES = (1, 2, 4, 8)
-# `--downscale auto` takes the largest pictures whose longer side is within this many pixels.
+# `--downscale auto` takes the largest pictures whose longer side is at most this many pixels.
 AUTO_LONGER_SIDE_PX = 800
-# Sizes of a training on a GPU, which has nothing to do in small steps, and room for large tables.
+# Sizes of a training on a GPU, which small steps do not keep busy, and which has room for large tables.
 GPU_SIZES: dict[str, Any] = {"first_samples_per_step": 2**16, "samples_per_step": 2**18, "log2_rows": 19}
-# Steps until a step is twice as large. What many steps have gone over is learned by larger ones, which cost less for a
-# sample; a training that has few steps in all learns more from many small ones.
+# Number of steps in which the samples per step double, and the largest number of doublings. Small steps learn more per
+# sample at first, so short trainings have many of them; later, large steps are better and cost less per sample.
 DOUBLING_STEPS, MOST_DOUBLINGS = 600, 16
-# Samples that a training with a budget of time is expected to have for each second and CPU thread.
+# Expected number of samples per second and CPU thread, for trainings with a time budget.
 SAMPLES_PER_SECOND = 1e6
-# Short trainings learn more with few rows, each of which is seen often; long ones have room for what photos show: twice
-# as many rows from each of these numbers of samples on. 2^19 rows make the file of a field 68 MB and a step an eighth
-# slower than 2^18.
+# Short trainings learn more with few rows, each of which is seen often; long ones need more rows for the detail in the
+# photos. The number of rows doubles at each of these numbers of samples. With 2^19 rows, the file of a field has 68 MB
+# and a step is an eighth slower than with 2^18.
 FEWEST_LOG2_ROWS, DOUBLE_ROWS_FROM = 16, (37e6, 74e6, 400e6)
 
 
@@ -33,35 +33,36 @@ class TrainSettings:
     """Settings of a training.
 
     Args:
-        budget_seconds: training time to spend, without loading and held-out checks; None for no limit.
-        steps: optimiser steps in all, those before a resume included; None for no limit.
+        budget_seconds: training time, without loading and held-out checks; None for no limit.
+        steps: total number of optimiser steps, including those before a resume; None for no limit.
         downscale: photos are averaged over squares of this many pixels; None for automatic.
-        contraction: how space becomes the unit cube of the field, see `kernels.contraction`; None for automatic: none
-            for photos with alpha, which show an object and nothing else, l2 for others.
-        seed: of everything random.
+        contraction: mapping of space to the unit cube of the field, see `kernels.contraction`; None for automatic:
+            "none" for photos with alpha, which show only an object, "l2" for others.
+        seed: seed of all random numbers.
         device: a torch device name.
         threads: CPU threads.
-        first_samples_per_step, samples_per_step: field samples that a step aims at, at the start and at most; the
-            number of rays follows. Small steps learn more from a sample, large ones cost less each.
-        learning_rate, final_learning_rate: of Adam at the start and when the budget is used up.
+        first_samples_per_step, samples_per_step: target number of field samples of a step, at the start and at most;
+            determines the number of rays. Small steps learn more per sample, large ones cost less per sample.
+        learning_rate, final_learning_rate: learning rate of Adam at the start and at the end of the budget.
         warmup_steps: steps over which the learning rate rises from 0.
-        levels, log2_rows, width: size of a hash grid; see `HashFieldSettings`. There are compiled kernels for 8 levels
-            and width 32, on a GPU also 64; other sizes train in plain torch, many times slower. Rows are None for
+        levels, log2_rows, width: size of a hash grid, see `HashFieldSettings`. There are compiled kernels for 8 levels
+            and width 32, on a GPU also 64; other sizes train in plain torch, many times slower. log2_rows is None for
             automatic, see `chosen_log2_rows`.
-        components: what is in the model and in its loss.
-        field: what the field is made of, one of `kinds.KINDS`.
-        field_memory_bytes: what the field's numbers may take; None for what suits the kind, see `sizes.chosen_size`.
-        model: "default" takes the components as they are, "auto" lets the scene decide on those that are not `fixed`,
-            see `selection`.
-        fixed: names of components that the user has decided on.
-        photo_fraction: of the training photos, drawn by the seed without replacement, in (0, 1]; 1 for all.
+        components: components of the model and of its loss.
+        field: kind of field, one of `kinds.KINDS`.
+        field_memory_bytes: memory limit of the field's numbers; None for the default of the kind, see
+            `sizes.chosen_size`.
+        model: "default" uses the components as given, "auto" selects those that are not `fixed` for the scene, see
+            `selection`.
+        fixed: names of components that the user has chosen.
+        photo_fraction: fraction of the training photos to use, in (0, 1], drawn by the seed without replacement.
         random_start: standard deviation of the numbers in the coarsest levels of a hash grid at the start, see
             `HashField.start_randomly`; 0 for a field that starts as fog of density 1 everywhere.
-        blocks: that the scene is divided into, see `runs.blocks`; 0 for none.
-        block: the one that is trained, from 1 on; 0 for the whole scene.
+        blocks: number of blocks that the scene is divided into, see `runs.blocks`; 0 for none.
+        block: number of the block that is trained, from 1 on; 0 for the whole scene.
 
     Raises:
-        UserError: neither or a non-positive limit, an unknown downscale or kind of field.
+        UserError: no limit or a non-positive one, or another setting that is invalid or cannot be combined.
     """
 
     budget_seconds: float | None = 120.0
@@ -137,13 +138,13 @@ class TrainSettings:
             raise UserError(f"unknown contraction {self.contraction!r}", f"choose auto, {', '.join(CONTRACTIONS)}")
 
     def samples_at(self, step: float) -> float:
-        """Return the number of samples that a step aims at, the first one being step 0."""
+        """Return the target number of samples of a step; the first is step 0."""
         growth = 2.0 ** min(step / DOUBLING_STEPS, MOST_DOUBLINGS)
         return min(self.samples_per_step, growth * self.first_samples_per_step)
 
     @property
     def expected_samples(self) -> float:
-        """The samples of the whole training, about: by its steps or by its time on this many threads."""
+        """Approximate number of samples of the whole training, the lesser of those by steps and by time and threads."""
         by_steps, by_time = math.inf, math.inf
         if self.steps is not None:
             growth = max(1.0, self.samples_per_step / self.first_samples_per_step)
@@ -156,7 +157,7 @@ class TrainSettings:
 
     @property
     def chosen_log2_rows(self) -> int:
-        """The rows of each table as a power of two: as given, or by the length of the training."""
+        """Binary logarithm of the rows of each table: as given, or chosen by the length of the training."""
         if self.log2_rows is not None:
             return self.log2_rows
         return FEWEST_LOG2_ROWS + bisect(DOUBLE_ROWS_FROM, self.expected_samples)
@@ -175,7 +176,7 @@ class TrainSettings:
 
 
 def sizes_for(device: str) -> dict[str, Any]:
-    """Return the settings that depend on the device, where they are not the defaults of `TrainSettings`."""
+    """Return the settings for a device that differ from the defaults of `TrainSettings`."""
     return GPU_SIZES if device.startswith("cuda") else {}
 
 

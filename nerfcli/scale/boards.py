@@ -26,7 +26,7 @@ class CharucoBoard:
         columns, rows: squares across and down.
         square, marker: length of their sides in metres.
         dictionary: OpenCV's name, such as DICT_5X5_100.
-        legacy: whether the first square is white where the number of rows is even, as OpenCV before 4.6 made boards.
+        legacy: True for boards of OpenCV before 4.6, whose first square is white if the number of rows is even.
     """
 
     columns: int
@@ -49,9 +49,9 @@ class CharucoBoard:
 
 
 def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str) -> ScaleEstimate:
-    """Metres per unit from ArUco markers, each of which is in the scene once (see `scale_from_corners`).
+    """Estimate metres per unit from ArUco markers, each of which is in the scene once; see `scale_from_corners`.
 
-    A marker that one photo shows twice is not used there, nor one whose edges are not seen.
+    In a given photo, a marker is not used if it appears twice or its edges are not visible.
 
     Args:
         frames: with their photos.
@@ -59,8 +59,8 @@ def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str)
         dictionary: OpenCV's name, such as DICT_4X4_50.
 
     Raises:
-        UserError: an unknown dictionary, a side that is no length, a photo that cannot be read, or no marker that two
-            photos show.
+        UserError: an unknown dictionary, an invalid side, a photo that cannot be read, or no marker that two photos
+            show.
     """
     if not 0 < side < np.inf:
         raise UserError(f"invalid side length of markers: {side:g} m", "expected a positive length in metres")
@@ -85,7 +85,7 @@ def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str)
 
 
 def scale_from_charuco(frames: Sequence[Frame], board: CharucoBoard) -> ScaleEstimate:
-    """Metres per unit from the inner corners of a ChArUco board, over all neighbours (see `scale_from_corners`).
+    """Estimate metres per unit from all neighbouring inner corners of a ChArUco board; see `scale_from_corners`.
 
     Raises:
         UserError: an unknown dictionary or one with too few markers, a photo that cannot be read, or no corners that
@@ -125,10 +125,10 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def _photos(frames: Sequence[Frame]) -> Iterator[tuple[int, np.ndarray]]:
-    """Index and grey picture (H, W) uint8 of each frame with a photo.
+    """Yield the index and grey picture (H, W) uint8 of each frame with a photo.
 
     Raises:
-        UserError: a photo that cannot be read, or that is of another size than its camera.
+        UserError: a photo cannot be read, or has another size than its camera.
     """
     for index, frame in enumerate(frames):
         if frame.image is None:

@@ -1,6 +1,6 @@
 """Corners of printed patterns: triangulate them from the photos and compute the scale from known distances.
 
-Letters: a corner p is seen from camera centres c_i in unit directions d_i; a pixel there is 1 / f_i wide, in radians.
+Notation: a corner p is seen from camera centres c_i in unit directions d_i, where a pixel is 1 / f_i radians wide.
 """
 
 import math
@@ -15,20 +15,20 @@ from nerfcli.cameras.layout import nearest_to_rays
 from nerfcli.errors import UserError
 from nerfcli.scale.estimate import ScaleEstimate
 
-# A corner counts if its directions differ by as much somewhere: with less its depth is hardly known.
+# A corner is used if two of its directions differ by at least this; with less, its depth is hardly known.
 _LEAST_PARALLAX = np.radians(1.0)
 
-# Corners whose directions miss each other by more are wrong: a pattern that was moved, or that is there twice.
+# Corners whose rays miss each other by more than this are wrong: the pattern was moved, or there are two of it.
 _MOST_MISSED_PX = 5.0
 
-# Standard deviation over median absolute deviation, and of the median over that of the mean, of normal errors.
+# For normal errors: standard deviation / median absolute deviation, and standard error of the median / of the mean.
 _SIGMA_PER_MAD = 1.4826
 _MEDIAN_PER_MEAN = 1.2533
 
 
 @dataclass(frozen=True)
 class Side:
-    """Two corners of a printed pattern and their true distance in metres; `name` is what people know it by."""
+    """Two corners of a printed pattern and their true distance in metres; `name` is for people."""
 
     name: str
     first: Hashable
@@ -36,27 +36,27 @@ class Side:
     metres: float
 
 
-# Where each corner was seen, whatever names it: the frame's index, and the pixel (x, y) with pixel centres at 0.5.
+# Sightings of each corner, by any key: the frame's index, and the pixel (x, y) with pixel centres at 0.5.
 Sightings = Mapping[Any, Sequence[tuple[int, np.ndarray]]]
 
 
 def scale_from_corners(
     frames: Sequence[Frame], sightings: Sightings, sides: Sequence[Side], *, pattern: str
 ) -> ScaleEstimate:
-    """Metres per unit: the median over all sides of known by triangulated length.
+    """Estimate metres per unit: the median over all sides of their known length divided by their triangulated length.
 
-    Its standard error is that of a median of as many independent errors as there are sides, with their spread from the
-    median absolute deviation: an error of a corner along one side of a square is none along the other one. Errors that
-    all sides share, as of a wrong focal length, are not in it. The residuals are those of each name's mean side.
+    The standard error is that of the median of as many independent errors as there are sides, with their spread from
+    the median absolute deviation: a corner's error along one side of a square does not affect the adjacent side. It
+    excludes errors that all sides share, such as from a wrong focal length. Residuals are means over sides of one name.
 
     Args:
         frames: with their poses and lenses.
-        sightings: of the corners, through the photos.
-        sides: what is known.
-        pattern: for messages and the source, such as "ArUco markers of 0.05 m".
+        sightings: of the corners in the photos.
+        sides: pairs of corners at known distances.
+        pattern: its description for messages and the source, such as "ArUco markers of 0.05 m".
 
     Raises:
-        UserError: no corner is seen in two photos, from places far enough apart, where its directions meet.
+        UserError: no side has two corners seen in two photos, in directions that differ enough, whose rays meet.
     """
     points, reasons = {}, []
     for corner, seen in sightings.items():
@@ -85,7 +85,7 @@ def scale_from_corners(
 
 
 def _triangulated(frames: Sequence[Frame], seen: Sequence[tuple[int, np.ndarray]]) -> np.ndarray | str:
-    """Return the point (3,) where the directions meet, or why there is none."""
+    """Return the point (3,) where the rays meet, or the reason why there is none."""
     rays = [(frames[index], *frames[index].camera.bearings(pixel)) for index, pixel in seen]
     rays = [(frame, directions[0]) for frame, directions, valid in rays if valid[0]]
     if len({frame.name for frame, _ in rays}) < 2:
@@ -104,11 +104,11 @@ def _triangulated(frames: Sequence[Frame], seen: Sequence[tuple[int, np.ndarray]
 
 
 def nearest_in_pixels(c: np.ndarray, d: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the point (3,) that appears nearest to where rays point, and by how many pixels each misses it, (n,).
+    """Find the point (3,) nearest to rays in terms of pixels, and by how many pixels each ray misses it, (n,).
 
     p = argmin sum_i log(1 + e_i^2),  e_i = f_i |(1 - d_i d_i^T) (p - c_i)| / |p - c_i|
 
-    in pixels; the logarithm (Cauchy) keeps a wrong ray from moving it much.
+    The errors e_i are in pixels; the logarithm (Cauchy) limits the effect of a wrong ray.
 
     Args:
         c, d: (n, 3) origins and unit directions, n >= 2, not all parallel.

@@ -1,4 +1,4 @@
-"""Scale from distances that somebody measured: between two cameras, or between two points of the scene."""
+"""Scale from measured distances: between two cameras, or between two points of the scene."""
 
 import math
 import re
@@ -26,8 +26,8 @@ class KnownDistance:
     """A distance in scene units and in metres.
 
     Args:
-        name: what it is between, for people.
-        units: its length in the scene.
+        name: its two ends, as text for people.
+        units: its length in scene units.
         metres: its true length.
         tolerance: standard error of `metres` in metres, or None where unknown.
     """
@@ -57,7 +57,7 @@ def known_distance(text: str, frames: Sequence[Frame]) -> KnownDistance:
     """Parse "A B METRES" or "A B METRES+-ERROR"; A and B are names of images or points x,y,z.
 
     Raises:
-        UserError: something else, an unknown image, or a length that is none.
+        UserError: the text has another form, an image is unknown, or the length is invalid.
     """
     try:
         first, second, length = shlex.split(text)
@@ -72,17 +72,17 @@ def known_distance(text: str, frames: Sequence[Frame]) -> KnownDistance:
 
 
 def scale_from_distances(distances: Sequence[KnownDistance]) -> ScaleEstimate:
-    """Metres per unit by weighted least squares of the logarithm.
+    """Estimate metres per unit by weighted least squares of the logarithm.
 
     log s = sum_i w_i log(metres_i / units_i) / sum_i w_i,  w_i = (metres_i / tolerance_i)^2
 
-    In the logarithm every distance counts by its relative error, and scale and inverse scale are estimated alike.
-    Where not every distance has a tolerance all weights are 1.
+    In the logarithm every distance is weighted by its relative error, and estimates of the scale and of its inverse
+    agree. If any distance has no tolerance, all weights are 1.
 
     Returns:
-        The standard error is, with tolerances, s / sqrt(sum w), times sqrt(chi^2 / (n - 1)) where that is above 1: the
-        distances then disagree by more than was said. Without tolerances it is the one of the mean, from the scatter
-        of the distances, and None of a single distance. It does not hold errors that all distances share.
+        The estimate. With tolerances, its standard error is s / sqrt(sum w), times sqrt(chi^2 / (n - 1)) if that is
+        above 1, when the distances disagree by more than their tolerances. Without tolerances, it is that of the mean,
+        from the scatter of the distances, and None for a single distance. It excludes errors that all distances share.
 
     Raises:
         ValueError: no distance.
@@ -111,7 +111,7 @@ def scale_from_distances(distances: Sequence[KnownDistance]) -> ScaleEstimate:
 
 
 def _place(text: str, frames: Sequence[Frame]) -> np.ndarray:
-    """Return the point x,y,z, or the centre of the camera with this name; a name wins."""
+    """Return the point x,y,z, or the centre of the camera with this name; a matching name takes precedence."""
     if _POINT.fullmatch(text) and all(frame.name != text for frame in frames):
         return point_of(text, EXPECTED)
     return frames_named(frames, [text])[0].centre

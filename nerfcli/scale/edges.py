@@ -1,39 +1,39 @@
 """The corners of a dark square in a picture, from straight lines along its four edges.
 
-The corners that OpenCV 5.0 finds by itself lie inside a blurred square by 0.2 px (CORNER_REFINE_SUBPIX) to 0.7 px: a
-marker of 64 pixels measures 0.4 % too small. Lines through the middles of edges are not pulled inwards.
+The corners that OpenCV 5.0 finds are inside a blurred square by 0.2 px (CORNER_REFINE_SUBPIX) to 0.7 px, so a marker
+of 64 pixels measures 0.4 % too small. Lines through the middles of edges do not have this bias.
 """
 
 import cv2
 import numpy as np
 
-# Profiles across an edge: how many along it, over which part of it, and their steps in pixels.
+# Profiles across an edge: their number, the part of the edge that they cover, and their sampling step in pixels.
 _PROFILES = 48
 _PART = (0.1, 0.9)
 _STEP_PX = 0.25
 
-# How far profiles reach to both sides: as a share of the edge, well within the dark rim (1/9 in a 7x7 marker), because
-# blur brings in what is behind it; and within these pixels.
+# Reach of profiles to both sides: as a fraction of the edge, well within the dark rim (1/9 in a 7x7 marker), because
+# blur brings in light from behind the rim; and its limits in pixels.
 _REACH = 1 / 12
 _REACH_PX = (1.5, 8.0)
 
-# Profiles must be centred on the edge to be unbiased: how often they are put where the last lines were.
+# Number of rounds: profiles must be centred on the edge to be unbiased, so each round starts from the last lines.
 _ROUNDS = 4
 
-# Grey levels of 255 between the two sides of an edge, at least; and profiles that show one, of 48.
+# Least contrast across an edge in grey levels of 255, and least number of the 48 profiles that must show the edge.
 _LEAST_CONTRAST = 20.0
 _LEAST_PROFILES = 12
 
 
 def refined_corners(grey: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
-    """Return the corners of a dark square on white, to some hundredths of a pixel; None where an edge is not seen.
+    """Return the corners of a dark square on white, to a few hundredths of a pixel; None if an edge is not visible.
 
-    On profiles across each edge the edge is the mean position of the rise of brightness; a line is fitted to them, and
-    neighbouring lines meet in the corners.
+    On each profile across an edge, the edge is at the mean position of the rise in brightness. A line is fitted to
+    these positions, and neighbouring lines intersect in the corners.
 
     Args:
         grey: (H, W) uint8.
-        corners: (4, 2) roughly, in either sense of rotation; pixel centres at whole numbers, as in OpenCV.
+        corners: (4, 2) approximate, in either sense of rotation; pixel centres at whole numbers, as in OpenCV.
 
     Returns:
         (4, 2) float64, in the same order.
@@ -55,7 +55,7 @@ def refined_corners(grey: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
 
 
 def _edge(grey: np.ndarray, a: np.ndarray, b: np.ndarray, middle: np.ndarray) -> np.ndarray | None:
-    """Return the line [nx, ny, offset] along the edge from a to b of a dark square around `middle`."""
+    """Return the line [nx, ny, offset] of the edge from a to b of a dark square around `middle`, if visible."""
     length = float(np.linalg.norm(b - a))
     if length < 1:
         return None

@@ -1,4 +1,4 @@
-"""Estimate of metric scale, and a capture in metres."""
+"""Estimate of metric scale."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,11 +14,11 @@ class ScaleEstimate:
 
     Args:
         metres_per_unit: above 0.
-        standard_error: of metres_per_unit, in the same unit; None where nothing tells it (a single distance).
-        residuals: what is left of each measurement, by its name, in `residual_unit`.
+        standard_error: of metres_per_unit, in the same unit; None if it is unknown (a single distance).
+        residuals: (name, residual) of each measurement, in `residual_unit`.
         residual_unit: "percent" of a known length (measured minus known), or "metre".
-        source: what it comes from, for people.
-        details: what else is to be known of it, for people; "" if nothing.
+        source: origin of the estimate, as text for people.
+        details: further remarks on it, as text for people; "" if none.
     """
 
     metres_per_unit: float
@@ -35,11 +35,11 @@ class ScaleEstimate:
 
     @property
     def rms_residual(self) -> float:
-        """The root of the mean square of the residuals, in `residual_unit`."""
+        """Root mean square of the residuals, in `residual_unit`."""
         return float(np.sqrt(np.mean([value**2 for _, value in self.residuals])))
 
     def to_json(self) -> dict[str, Any]:
-        """{"metres_per_unit", "standard_error", "residuals", "residual_unit", "rms_residual", "source", "details"}."""
+        """Return the fields and "rms_residual" as a JSON object, with the residuals as an object by name."""
         return {
             "metres_per_unit": self.metres_per_unit,
             "standard_error": self.standard_error,

@@ -1,7 +1,8 @@
-"""Scale, and the place on Earth, from the GPS positions that cameras and phones write into their photos.
+"""Scale and location on Earth, from the GPS positions that cameras and phones write into their photos.
 
-GPS of phones is off by metres, and its errors last for minutes: it tells the scale of a street, not of a teapot. Errors
-that wander as slowly as the photographer does pass for the walk in up to 1 of 100 captures, and no residual shows that.
+The GPS of phones is off by metres, and its errors last for minutes: it gives the scale of a street, not of a teapot.
+In up to 1 of 100 captures, errors that drift as slowly as the photographer walks are taken for the walk, and no
+residual shows that.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,31 +19,31 @@ from nerfcli.media.geodesy import Position, east_north_up
 from nerfcli.media.images import read_exif
 from nerfcli.scale.estimate import ScaleEstimate
 
-# The photos must be spread this many times as wide as the GPS is off; pure noise, of which a similarity fits a part,
-# reaches 1.7 with 6 photos and 1.1 with 20.
+# Least ratio of the photos' spread to the GPS noise; pure noise, part of which a similarity fits, reaches 1.7 with 6
+# photos and 1.1 with 20.
 _SPREAD_PER_NOISE = 3.0
 
-# Per coordinate, in metres: what is taken where the photos are too few to tell it. Smartphones under open sky are
-# within 4.9 m. Source: gps.gov, "GPS accuracy", after van Diggelen & Enge 2015.
+# GPS noise per coordinate in metres, assumed if there are too few photos to estimate it. Smartphones under open sky
+# are within 4.9 m. Source: gps.gov, "GPS accuracy", after van Diggelen & Enge 2015.
 _TYPICAL_NOISE = 3.0
 _ENOUGH_TO_TELL = 6
 
-# Photos are left out in at most this many groups of neighbours, since their errors are alike.
+# Most groups of neighbouring photos, whose errors are correlated, that the jackknife leaves out in turn.
 _JACKKNIFE_GROUPS = 20
 
 
 @dataclass(frozen=True)
 class GpsFit:
-    """A capture on Earth.
+    """A capture fitted to GPS positions.
 
     Args:
         estimate: of the scale; residuals in metres for every photo with GPS.
-        enu_from_world: to metres east, north and up of `reference`; None where the photos stand too nearly on a line to
-            tell how the world is turned about it.
+        enu_from_world: to metres east, north and up of `reference`; None if the photos are too close to a line to
+            determine the rotation about it.
         reference: latitude and longitude in degrees and altitude in metres of the origin of ENU.
-        left_out: names of photos whose GPS is far off the others', and was not used.
+        left_out: names of photos whose GPS positions are outliers and were not used.
         spread: root mean square distance of the photos from their mean, metres.
-        noise: the GPS error, as a length in three dimensions, root mean square, metres.
+        noise: root mean square GPS error in three dimensions, metres.
     """
 
     estimate: ScaleEstimate
@@ -56,7 +57,7 @@ class GpsFit:
 def gps_positions(frames: Sequence[Frame]) -> dict[str, Position]:
     """Read the GPS positions of photos from EXIF, by frame name; photos without a position are omitted.
 
-    Latitude 0 and longitude 0 is what some cameras write before they know.
+    Latitude 0, longitude 0 is omitted too: some cameras write it before they have a fix.
 
     Raises:
         UserError: a photo cannot be read.
@@ -66,19 +67,19 @@ def gps_positions(frames: Sequence[Frame]) -> dict[str, Position]:
 
 
 def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -> GpsFit:
-    """Metres per unit from where the photos were taken.
+    """Estimate metres per unit from the GPS positions of the photos.
 
-    A similarity from camera centres to ENU metres, by least squares without outliers (`align_robustly`). The standard
-    error is the jackknife's over up to 20 groups of neighbouring photos, or sigma / sqrt(sum |x - mean|^2) where that
-    is larger, with sigma the GPS noise per coordinate; it is 3 m at least with fewer than 6 photos.
+    It fits a similarity from camera centres to ENU metres, by least squares without outliers (`align_robustly`). The
+    standard error is the larger of the jackknife's, over up to 20 groups of neighbouring photos, and
+    sigma / sqrt(sum |x - mean|^2), where sigma is the GPS noise per coordinate, at least 3 m with fewer than 6 photos.
 
     Args:
         frames: the cameras; those without a position are not used.
-        positions: by name, see `gps_positions`.
+        positions: by frame name, see `gps_positions`.
 
     Raises:
-        UserError: fewer than two positions, cameras at one place, or photos that are not spread 3 times as wide as
-            their GPS is off; with numbers.
+        UserError: fewer than two positions, all cameras or positions at one place, or a spread of the photos below 3
+            times the GPS noise; the error gives the numbers.
     """
     used = sorted((frame for frame in frames if frame.name in positions), key=lambda frame: frame.name)
     if len(used) < 2:
@@ -123,16 +124,16 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
 
 
 def _spans_a_plane(metres: np.ndarray, sigma: float) -> bool:
-    """Return whether points (N, 3) are as far off their best line as noise requires."""
+    """Return whether points (N, 3) deviate from their best line by clearly more than the noise."""
     off = np.linalg.svd(metres - metres.mean(axis=0), compute_uv=False)[1] if len(metres) >= 3 else 0.0
     return bool(off > _SPREAD_PER_NOISE * sigma)
 
 
 def _jackknife(x: np.ndarray, y: np.ndarray) -> float:
-    """Standard error of the scale: sqrt((g - 1) / g sum (s_i - mean)^2), s_i without the i-th of g groups.
+    """Return the standard error of the scale: sqrt((g - 1) / g sum (s_i - mean)^2), s_i without the i-th of g groups.
 
-    Groups are of neighbours, whose errors are alike.
-    0 with fewer than 4 points, where leaving one out leaves too little.
+    Groups are neighbouring photos, whose errors are correlated. The result is 0 for fewer than 4 points, which are too
+    few to leave one out.
 
     Source: Kuensch 1989, The jackknife and the bootstrap for general stationary observations, for the groups.
     """

@@ -1,4 +1,4 @@
-"""Diagnostics from the residuals of a short training: hints which components to try."""
+"""Diagnostics from the residuals of a short training, which suggest components to try."""
 
 from dataclasses import dataclass
 
@@ -9,11 +9,11 @@ from torch import Tensor
 from nerfcli.field.exposure import linear_from_srgb
 from nerfcli.search.sky import explained_by_direction
 
-# Levels that are compared in brightness: below is noise, above the sensor is full.
+# Levels that are compared in brightness: lower ones are noise, higher ones saturated.
 DARKEST, BRIGHTEST = 0.06, 0.95
-# A photo with fewer such pixels tells nothing of its exposure.
+# A photo with fewer such pixels tells nothing about its exposure.
 FEWEST_PIXELS = 12
-# The standard error of a median, in units of that of a mean; a standard deviation, in units of the median deviation.
+# Standard error of a median in units of that of a mean; standard deviation in units of the median absolute deviation.
 _OF_MEDIAN, _OF_DEVIATION = 1.2533, 1.4826
 
 
@@ -22,12 +22,10 @@ class Diagnostics:
     """Diagnostics of a scene from a short training.
 
     Args:
-        log_gains: (photos, 3) how much brighter each photo is than its rendering, in logarithms of linear light; their
-            mean is 0.
-        exposure_spread: standard deviation of the photos' brightness among them, without what the estimates' own noise
-            brings.
-        far_share: of the pixels, those whose light comes from where no photo sees it move, for the larger part.
-        sky_psnr: how well one colour explains these pixels, and a colour by direction, see
+        log_gains: (photos, 3) logarithm of the ratio of each photo to its rendering, in linear light; their mean is 0.
+        exposure_spread: standard deviation of the photos' log brightness, without the noise of its estimates.
+        far_share: fraction of the pixels whose light comes mostly from so far away that it shows no parallax.
+        sky_psnr: PSNR of these pixels predicted by one colour, and by a colour for each direction; see
             `sky.explained_by_direction`.
     """
 
@@ -43,13 +41,13 @@ def diagnose(
     """Compute the diagnostics from some pixels.
 
     The gain of a photo is the median over its pixels of log(measured / rendered), channel by channel: highlights and
-    edges that the model does not have yet do not move it.
+    edges that the model does not have yet do not affect it.
 
     Args:
         rendered, measured: (N, 3) sRGB.
-        photos: (N,) which photo each is of.
-        directions: (N, 3) of their rays, unit.
-        from_beyond: (N,) shares of their light that come from beyond the field, had it a background.
+        photos: (N,) the photo index of each pixel.
+        directions: (N, 3) unit directions of their rays.
+        from_beyond: (N,) fractions of their light from beyond the distance at which a background would begin.
         count: of the photos.
     """
     compared = ((measured > DARKEST) & (measured < BRIGHTEST) & (rendered > DARKEST)).cpu().numpy()

@@ -11,18 +11,18 @@ from nerfcli.runs.components import Change
 from nerfcli.runs.decisions import Decision
 from nerfcli.search.trials import Trial
 
-# A gain counts if it is above this many standard errors, and above what nobody sees.
+# A gain counts if it exceeds `LEAST_GAIN_DB`, which nobody sees, by this many standard errors.
 STANDARD_ERRORS = 2.0
-# The same of a gain that signs speak for, as well as the trial.
+# The same for a gain that diagnostics suggest, as well as the trial.
 LIKELY_ERRORS = 1.0
-# Of a gain with one seed only, and what it would differ by with another: measured 0.03 dB on the desk, 0.15 dB on balls
-# in front of nothing, which learn faster.
+# The same for a gain with one seed only, and its standard deviation between seeds: measured 0.03 dB on the desk, and
+# 0.15 dB on balls in front of nothing, which learn faster.
 CLEAR_ERRORS, SEED_DB = 5.0, 0.1
 LEAST_GAIN_DB = 0.05
-# What a model may lose that becomes simpler.
+# Loss that is accepted for a simpler model.
 MOST_LOSS_DB = 0.1
-# Photos in which there is next to nothing have hardly any error, and its logarithm is noise: this share of the mean
-# error is added to that of every photo.
+# Photos that show next to nothing have hardly any error, and its logarithm is noise: this fraction of the mean error is
+# added to that of every photo.
 FLOOR = 0.1
 ROUNDING_DB = 1e-6
 
@@ -45,17 +45,17 @@ def judge_one(
     """Judge an added component: its gain must exceed the noise.
 
     gain = mean over photos and seeds of 10 log10(MSE of base / MSE of candidate). Its variance is that of the mean over
-    photos, and that between seeds; with a single one that is SEED_DB squared, and the gain has to be the clearer. A
-    gain that becomes less by more than its error in the second half of the steps is taken for one that vanishes in a
-    longer training.
+    photos plus that of the mean over seeds; with a single seed, the latter is SEED_DB squared, and the gain must exceed
+    more standard errors. A gain that falls by more than its error in the second half of the steps is assumed to vanish
+    in a longer training.
 
     Args:
         base: trials without the change, one per seed.
-        change: what was tried.
-        tried: trials with it, in the same order of seeds.
-        by_time: whether it has to gain what its time would bring, too; where steps are what counts, the answer must not
-            depend on how fast the machine is.
-        standard_errors, clear_errors: that the gain has to be above, with more than one seed and with one.
+        change: the change that was tried.
+        tried: trials with the change, in the same order of seeds.
+        by_time: whether the gain must also exceed that of more steps in the same time; with a budget of steps, the
+            answer must not depend on the speed of the machine.
+        standard_errors, clear_errors: how many of them the gain has to exceed, with several seeds and with one.
     """
     gains = np.array([_gains(one, other) for one, other in zip(base, tried, strict=True)])
     seeds, photos = gains.shape
@@ -66,7 +66,7 @@ def judge_one(
     halves = [_gains(one, other, halfway=True).mean() for one, other in zip(base, tried, strict=True)]
     trend = gain - float(np.mean(halves))
     cost = sum(trial.seconds for trial in tried) / sum(trial.seconds for trial in base) - 1.0
-    # What twice as many steps bring to the model as it is.
+    # Gain of the unchanged model from twice as many steps.
     slope_db = max(0.0, float(np.mean([_gains_by_steps(trial).mean() for trial in base])))
     at_equal_time = gain - slope_db * math.log2(1.0 + cost) if by_time else gain
     errors = standard_errors if seeds > 1 else clear_errors
@@ -76,10 +76,9 @@ def judge_one(
 
 
 def judge_likely(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
-    """Judge an added component that the diagnostics suggest: a gain above one standard error is enough, or above two
-    with a single seed.
+    """Judge an added component that diagnostics suggest: one standard error is enough, or two with a single seed.
 
-    Arguments as of `judge_one`.
+    Arguments as for `judge_one`.
     """
     return judge_one(base, change, tried, by_time=by_time, standard_errors=LIKELY_ERRORS, clear_errors=STANDARD_ERRORS)
 
@@ -87,7 +86,7 @@ def judge_likely(base: Sequence[Trial], change: Change, tried: Sequence[Trial], 
 def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
     """Judge a component that corrects an error known from other evidence: it must not lose.
 
-    A trial is too short for most of its gain. Arguments as of `judge_one`.
+    A trial is too short for most of its gain. Arguments as for `judge_one`.
     """
     measured = judge_one(base, change, tried, by_time=by_time)
     gain, error = measured.gain_db or 0.0, measured.error_db or 0.0
@@ -97,10 +96,10 @@ def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial
 
 
 def judge_removal(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
-    """Judge the removal of a component: hardly anything must be lost, noise and trend included.
+    """Judge the removal of a component: hardly anything may be lost, noise and trend included.
 
-    What the model has learned by means of it is gone at once, and a model that does not need it learns that again
-    within the trial. Arguments as of `judge_one`.
+    What the model has learned with the component is lost at once; a model that does not need it recovers within the
+    trial. Arguments as for `judge_one`.
     """
     measured = judge_one(base, change, tried, by_time=by_time)
     gain, error, trend = measured.gain_db or 0.0, measured.error_db or 0.0, measured.trend_db or 0.0
@@ -125,7 +124,7 @@ def _against(gain: float, error: float, *, errors: float, trend: float, at_equal
 
 
 def _gains(base: Trial, changed: Trial, *, halfway: bool = False) -> np.ndarray:
-    """(judged photos,) dB that the change gains in each."""
+    """Return the gain of the change in each judged photo, (judged photos,) in dB."""
     judged = base.counts > 0
     errors = [(trial.halfway if halfway else trial.errors)[judged] / base.counts[judged] for trial in (base, changed)]
     floor = FLOOR * errors[0].mean() + 1e-12
@@ -133,5 +132,5 @@ def _gains(base: Trial, changed: Trial, *, halfway: bool = False) -> np.ndarray:
 
 
 def _gains_by_steps(trial: Trial) -> np.ndarray:
-    """(judged photos,) dB that the second half of its steps brought."""
+    """Return the gain from the second half of a trial's steps, (judged photos,) in dB."""
     return _gains(replace(trial, errors=trial.halfway), trial)

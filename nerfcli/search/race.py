@@ -1,4 +1,4 @@
-"""Compare candidates within a limit of time or steps: the best one first, then the others together with it."""
+"""Compare candidates within a budget of time or steps: the best one first, then the others in addition to it."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -20,14 +20,13 @@ from nerfcli.search.judgement import (
 )
 from nerfcli.search.trials import Trial, Trials, TrialStart
 
-# Steps of a trial against those of the training that it goes on from.
+# Steps of a trial relative to those of the training that it continues.
 STEPS_OF_START = 0.5
 SEEDS = 2
-# Leaving something out saves a little time in the training, and trying it takes some: of a limit of time, this share
-# may be over by then.
+# A removal saves only a little time in the training: its trials have to end within this fraction of a time budget.
 REMOVAL_SHARE = 0.65
-# And so much of it may be spent: 2 % of a training, where a search has 15. View dependence takes 5 %
-# of the time, and was left out on one scene of three.
+# They may take this fraction of the budget: 2 % of a training whose search has 15 %. View dependence takes 5 % of the
+# time, and was removed on one scene of three.
 REMOVAL_COST = 0.13
 NO_TIME, ONCE = "not tried, no time left", "not clear with one seed, and no time left for a second one"
 COSTS_MORE = "not tried, the trial would take longer than it could save"
@@ -51,7 +50,7 @@ class SearchBudget:
         return time.perf_counter() - self._began
 
     def can_afford(self, trials: int, *, of_steps: int, seconds_each: float, share_of_time: float = 1.0) -> bool:
-        """Return whether the rest is enough for some trials; with a time budget, within a fraction of the total."""
+        """Return whether the budget still allows some trials; only a fraction of a time budget may be used."""
         if self._seconds is not None:
             return self.spent + trials * seconds_each <= share_of_time * self._seconds
         return self._gone + trials * of_steps <= (self._steps or 0)
@@ -71,9 +70,9 @@ class Race:
     """Compare candidates with each other, all from the same start.
 
     Args:
-        trials, start: what they go on from.
-        budget: what the trials may cost.
-        requested: the components of the model to better.
+        trials, start: the trials, and the training that they continue.
+        budget: for the trials.
+        requested: the components of the model to improve.
     """
 
     def __init__(self, trials: Trials, start: TrialStart, budget: SearchBudget, requested: Components):
@@ -82,7 +81,7 @@ class Race:
         self._seconds_each = start.seconds * self._length / start.steps
         self.kept: list[Change] = []
         self.decisions: dict[Change, Decision] = {}
-        # Trials of what is kept so far, one per seed; and of what gained once beside it.
+        # Trials of the components kept so far, one per seed; and first trials of changes that may gain in addition.
         self._base: list[Trial] = []
         self._once: dict[Change, Trial] = {}
         self._rules: Mapping[Change, Rule] = {}
@@ -100,12 +99,13 @@ class Race:
     ) -> None:
         """Fill `decisions` and `kept`.
 
-        All additions with one seed; then the best of them with the others unless it is clear already, and if it is
-        kept, the rest once more beside it; and so on. Removals last, as what is added may do their work.
+        Try all additions with one seed, then the best of them with the other seeds unless it is clear already. If it is
+        kept, try the rest again in addition to it, and so on. Removals come last, as an addition may replace what is
+        removed.
 
         Args:
             additions, removals: changes to the requested model.
-            rules: for those of the additions that more than a trial speaks for; else `judge_one`.
+            rules: for additions that other evidence supports; the others use `judge_one`.
         """
         self.decisions = {change: untried(*change, NO_TIME) for change in (*additions, *removals)}
         self._rules = rules
@@ -119,7 +119,7 @@ class Race:
                     self._drop(other, f"{best[0]}={best[1]} is better")
                 self._try_once(list(self._once))
         for change in removals:
-            trials = 2 * SEEDS - len(self._base)  # to know for sure
+            trials = 2 * SEEDS - len(self._base)  # all seeds, for a sure answer
             if not self._can_run(trials, share_of_time=REMOVAL_SHARE):
                 continue
             if not self._budget.is_cheap(trials, of_steps=self._length, seconds_each=self._seconds_each):
@@ -130,9 +130,9 @@ class Race:
             self._is_confirmed(change, judge_removal)
 
     def _try_once(self, changes: Sequence[Change]) -> None:
-        """Try each with the first seed, beside what is kept: those that may gain are in `_once` then.
+        """Try each change with the first seed, in addition to what is kept; `_once` then has those that may gain.
 
-        What gains is tried with the other seeds before others are tried at all, where there is no time for both.
+        Once a change gains, time for its trials with the other seeds is reserved before further changes are tried.
         """
         reserved = 0
         for change in changes:
@@ -152,14 +152,17 @@ class Race:
         return self._rules.get(addition, judge_one)
 
     def _best(self) -> Change:
-        """Return the one that gains most; of a component's values that gain as much as seeds differ by, the one
-        proposed first, as it is the plainest."""
+        """Return the change with the largest gain.
+
+        Among values of that component whose gains differ by no more than the noise of seeds, return the one proposed
+        first, which is the simplest.
+        """
         gains = {change: self.decisions[change].gain_db or 0.0 for change in self._once}
         best = max(gains, key=lambda change: gains[change])
         return next(change for change in gains if change[0] == best[0] and gains[change] >= gains[best] - SEED_DB)
 
     def _is_confirmed(self, change: Change, rule: Rule) -> bool:
-        """Decide on a change: keep it if it is clear with one seed or also holds with the other seeds."""
+        """Decide on a change: keep it if its gain is clear with one seed, or is confirmed with the other seeds."""
         own = [self._once.pop(change)]
         decision = self._judged(rule, change, own)
         if not decision.kept and (decision.gain_db or 0.0) > -MOST_LOSS_DB:

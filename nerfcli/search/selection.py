@@ -1,9 +1,10 @@
 """Select the components of a model: each candidate against the current model, in paired short trainings.
 
-A component is added only if it is better by more than the noise, and left out only if that surely loses nothing. Gain
-and noise are measured, not assumed: every candidate goes on from the same start with the same seeds and pixels as the
-model that it would change, and what the gains differ by between seeds and between photos is their error. What is kept
-first is in the model that the next one has to better: two components that mend the same fault are not both needed.
+A component is added only if its gain exceeds the noise, and removed only if that surely loses hardly anything. Gain
+and noise are measured, not assumed: every candidate continues the same start with the same seeds and pixels as the
+model that it would change, and the variation of the gains between seeds and between photos gives their error. A
+component that is kept is in the model that the next one has to improve: two that correct the same fault are not both
+needed.
 """
 
 import math
@@ -18,37 +19,38 @@ from nerfcli.search.judgement import Rule, judge_likely, judge_supported
 from nerfcli.search.race import Race, SearchBudget
 from nerfcli.search.trials import Trials
 
-# Of the budget, for all trials together; and of those, for the training that they go on from.
+# Fraction of the budget for all trials together, and fraction of that for the training that they continue.
 SEARCH_SHARE, START_SHARE = 0.15, 0.2
-# A search whose first training is shorter than this tells nothing, and is left out.
+# A search whose first training would have fewer steps tells nothing, and is skipped.
 FEWEST_STEPS = 120
-# No machine goes so many steps in less time than this, and what an attempt takes would be missed elsewhere.
+# No machine takes that many steps in less time than this, and a vain attempt would cost the training time.
 LEAST_START_SECONDS = 0.3
-# A start of so many steps tells all that a longer one would: with 200, the right component is found in 9 or 10 of 10
+# A start of this many steps tells as much as a longer one: with 200, the right component is found in 9 or 10 of 10
 # seeds, on scenes of all kinds.
 MOST_START_STEPS = 250
-# Photos whose brightness differs by less than this, in logarithms of light, are as well without exposures.
-# Measured 0.12 to 0.23 where they need them, after 120 and 250 steps, up to 0.10 and 0.06 where not: a larger spread
-# speaks for them, whatever the trial says.
+# Spread of the photos' brightness, in logarithms of light. Below the first number, exposures do not help; above the
+# second, they are likely, and a smaller gain in the trial is enough. Measured after 120 and 250 steps: 0.12 to 0.23
+# where exposures are needed, up to 0.10 and 0.06 where not.
 LEAST_EXPOSURE_SPREAD, LIKELY_EXPOSURE_SPREAD = 0.06, 0.11
-# A sky that fills less of the pixels is as well painted on the field. Measured 14 to 26 % where there is one,
-# 0 to 3 % on most real captures, after 120 to 500 steps. A larger share speaks for a sky, whatever the trial says.
+# Fraction of pixels that show distant things. Below the first number, the field itself shows a sky as well; above the
+# second, a sky is likely, and a smaller gain in the trial is enough. Measured after 120 to 500 steps: 14 to 26 % with a
+# sky, 0 to 3 % on most real captures.
 LEAST_FAR_SHARE, LIKELY_FAR_SHARE = 0.01, 0.1
-# A larger share of pixels that look like a sky are one: measured 24 and 11 % where there is one, at most 2.9 % on eight
+# If a larger fraction of pixels looks like a sky, there is one: measured 24 and 11 % with a sky, at most 2.9 % on eight
 # captures without.
 LEAST_SKY_SHARE = 0.05
-# Directions tell the colours of a sky so much better than one colour does: measured 7.0 to 10.2 dB before a sky, 0.0 to
-# 0.8 on surfaces that a coarse field has put far away. Or they tell them well: an overcast sky has one colour.
+# A colour by direction predicts a sky better than one colour by at least this: measured 7.0 to 10.2 dB for a sky, 0.0
+# to 0.8 on surfaces that a coarse field has put far away. Or it predicts it this well: an overcast sky has one colour.
 LEAST_SKY_DB, LEAST_SKY_PSNR = 1.0, 22.0
-# Cameras whose photos agree to this are as good as the features: structure from motion leaves 0.1 to 0.4.
+# Cameras with an epipolar error below this are as good as the features: structure from motion leaves 0.1 to 0.4.
 LEAST_MISS_PX = 0.6
-# Poses with which they miss by this, whatever the lenses, are wrong; in between, a trial decides. Turned by half a
-# degree, photos of the desk miss by 1.5 to 2.3, at 400 pixels of width.
+# Poses with at least this epipolar error at any focal length are wrong; in between, a trial decides. Rotated by half a
+# degree, photos of the desk have 1.5 to 2.3, at 400 pixels of width.
 SURELY_MISSED_PX = 1.2
-# The focal length that matches tell is taken if it is so many standard errors and so far away from the given one, and
-# makes the misses so much smaller.
+# The focal length from matches is used if it differs from the given one by this many standard errors and this much in
+# the logarithm, and reduces the epipolar error to this fraction.
 FOCAL_ERRORS, LEAST_FOCAL, MISS_SHARE = 5.0, 0.003, 0.85
-# Values of "cameras" with which focal lengths learn.
+# Values of "cameras" with which focal lengths are learned.
 LEARN_FOCAL = ("focal", "all")
 
 
@@ -59,14 +61,14 @@ class Facts:
     Args:
         field: the kind of field.
         has_alpha: whether the photos have alpha: then nothing is behind the object.
-        has_exif: whether EXIF tells different exposures.
-        cameras_known: why the cameras need no doubt, in words; None where they may be wrong.
-        cameras: what matched features say of them; None where nothing is known.
-        points: how many pixels see a point whose distance is known.
-        stereo: how many pixels have a depth by stereo matching.
-        sky_share: of the pixels, those that look like a sky, see `multiview.sky`.
+        has_exif: whether exposures in EXIF differ.
+        cameras_known: in words, why the cameras can be trusted; None if they may be wrong.
+        cameras: their check against matched features; None if there is none.
+        points: number of pixels that see a point at a known distance.
+        stereo: number of pixels with a depth from stereo matching.
+        sky_share: fraction of the pixels that look like a sky, see `multiview.sky`.
         exposure_spread: standard deviation of the photos' brightness at points that they share, in logarithms of light.
-        fixed: components that the user has decided on.
+        fixed: names of the components that the user has set.
     """
 
     field: str
@@ -82,12 +84,12 @@ class Facts:
 
 
 def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components, float, list[Decision]]:
-    """Return the model with what matched features show about the cameras: another focal length than the given one,
-    or poses that do not fit; the logarithm of the length's factor, which is 0 elsewhere; and the decisions.
+    """Return the model with what matched features show about the cameras, the log focal factor, and the decisions.
 
-    Trials cannot decide about lengths: a model that has begun with a wrong one is bent to fit, and stays so for long.
-    For the same reason a requested model with trained lenses begins with the length that features tell. And
-    of poses a trial is too short to show more than that they do no harm, which features have shown.
+    Features may show that focal lengths have to change by this factor (its logarithm is 0 otherwise) or that poses do
+    not fit. Trials cannot decide on focal lengths: a model that has begun with a wrong one is bent to fit, and stays so
+    for long. For the same reason, a requested model with learned lenses begins with the focal length from features. For
+    poses, a trial is too short to show more than that learning them does no harm; features show that they are wrong.
     """
     check, learns = facts.cameras, requested.cameras in LEARN_FOCAL
     if check is None or ("cameras" in facts.fixed and not learns):
@@ -105,7 +107,7 @@ def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components,
             f"the epipolar error of {check.matches} matched features is {given:.2f} px, more at other focal lengths"
         )
     is_sure = abs(check.log_focal) > max(LEAST_FOCAL, FOCAL_ERRORS * check.error)
-    # Wrong poses ask for any length: one that is right leaves nothing to ask for.
+    # With wrong poses, any focal length may seem best; the right one leaves hardly any error.
     is_sure = is_sure and changed < min(MISS_SHARE * given, LEAST_MISS_PX)
     if is_sure:
         value = requested.cameras if learns else "focal"
@@ -125,8 +127,8 @@ def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components,
 def may_use_points(requested: Components, facts: Facts) -> bool:
     """Return whether triangulated points may be used for depth supervision.
 
-    The cameras have to fit. And where alpha tells what is empty, points gain at first only: they have cost half a
-    decibel on lego, in the time that their rays take.
+    The cameras must fit. With alpha, which tells where space is empty, points help only at first: on lego they cost
+    half a decibel, through the time that their rays take.
     """
     if "points" in facts.fixed:
         return bool(requested.points)
@@ -135,16 +137,15 @@ def may_use_points(requested: Components, facts: Facts) -> bool:
 
 
 def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bool:
-    """Return whether stereo matching may add to the points: it is as good as the cameras, as they are."""
+    """Return whether stereo matching may add to the points; it relies on the given cameras, as points do."""
     return requested.stereo if "stereo" in facts.fixed else has_time and facts.points > 0
 
 
 def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
-    """Return the model with the components that photos support before any training, unless they are set;
-    and the decisions about it.
+    """Return the model with components that photos support before any training, unless set, and the decisions.
 
-    Rays end at the points that photos share, and photos have the exposures that shared pixels tell. All of it is in
-    the model from the first step on: later, light has ended elsewhere already.
+    These are points, at which rays should end, depths from stereo matching, and exposures from shared pixels. They are
+    in the model from the first step on: later, density has formed elsewhere already.
     """
     wanted: list[tuple[Change, str]] = []
     if facts.points and may_use_points(requested, facts):
@@ -161,12 +162,12 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
 
 
 def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list[Change], list[Decision]]:
-    """Components that may help a scene, and those that nothing speaks for.
+    """Return changes that may help a scene, and decisions on those that nothing supports.
 
     Args:
-        start: what is in the model already.
-        signs: of its first training.
-        facts: of the scene.
+        start: components of the model so far.
+        signs: diagnostics of its first training.
+        facts: about the scene.
     """
     candidates: list[Change] = []
     declined: list[Decision] = []
@@ -184,7 +185,7 @@ def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list
         declined.append(untried("cameras", "poses", f"not tried, {facts.cameras_known}"))
     elif check is None:
         candidates.append(("cameras", "poses"))
-        # Within a trial, a right length changes as much as a wrong one: the coarse field pulls at both.
+        # In a trial, a right focal length changes as much as a wrong one, because of the coarse field.
         declined.append(untried("cameras", "focal", "not tried, too few matched features to decide"))
     elif min(check.misses_px) < LEAST_MISS_PX:
         reason = f"not tried, the epipolar error of matched features is only {min(check.misses_px):.2f} px"
@@ -218,7 +219,7 @@ def _against_sky(signs: Diagnostics) -> str | None:
 
 
 def rules(candidates: Sequence[Change], signs: Diagnostics, facts: Facts) -> dict[Change, Rule]:
-    """Return the rules for candidates that other evidence supports."""
+    """Return the rules for candidates that other evidence than a trial supports."""
     found: dict[Change, Rule] = {}
     for change in candidates:
         if change[0] == "cameras" and facts.cameras is not None:
@@ -233,15 +234,15 @@ def rules(candidates: Sequence[Change], signs: Diagnostics, facts: Facts) -> dic
 
 
 def removals(start: Components, facts: Facts) -> list[Change]:
-    """List the components that can be removed from a half-trained model: only of a hash grid, whose shape stays the
-    same.
-    """
+    """Return changes that remove components from a half-trained model: only for a hash grid, which keeps its shape."""
     return [("view", 0)] if start.view and "view" not in facts.fixed and facts.field == "hash" else []
 
 
 def _without_poses(model: Components) -> Components:
-    """Return what is tried of a model. Poses learn in their own trial only: they take a third of the time, and others
-    are too short for them to come anywhere."""
+    """Return the model for trials, without learned poses unless they are what is tried.
+
+    Poses take a third of the time, and trials of other components are too short for them to improve.
+    """
     return replace(model, cameras="fixed") if model.cameras == "poses" else model
 
 
@@ -262,18 +263,18 @@ def select(
 ) -> Selection:
     """Find the components that a scene needs.
 
-    Candidates race one another, see `race.Race`; beside those that are kept, what is in the model already is left out
-    if nothing is lost by that.
+    Candidates are compared in a race, see `race.Race`. After that, components of the model are removed if hardly
+    anything is lost.
 
     Args:
         trials: of the scene.
-        requested: what is in the model where nothing is found out.
-        facts: of the scene.
+        requested: the components to keep where nothing supports a change.
+        facts: about the scene.
         seconds: for all trials together; None to go by `steps`.
-        steps: of all trials together, where there is no limit of time.
+        steps: for all trials together, if there is no time budget.
 
     Returns:
-        What needs no trial, where a first training of `FEWEST_STEPS` is too much.
+        The selection; if the budget is too small for a first training of `FEWEST_STEPS`, only what needs no trial.
     """
     budget = SearchBudget(seconds, steps)
     first_steps = MOST_START_STEPS if seconds is not None else round(START_SHARE * (steps or 0))
@@ -289,11 +290,11 @@ def select(
     budget.charge(start.steps)
     if decided:
         without = trials.begin(_without_poses(requested), steps=start.steps)
-        assert without is not None  # it has no fewest steps
+        assert without is not None  # no minimum number of steps was given
         budget.charge(without.steps)
         decided = [
             judge_supported([without.trial], (one.component, one.value), [start.trial], by_time=budget.is_time)
-            for one in decided  # together, as none is tried without the other
+            for one in decided  # all together: they share one trial
         ]
         if not decided[0].kept:
             model, start = requested, without

@@ -1,4 +1,4 @@
-"""A colour for every direction, for what is so far away that all photos see it along the same one."""
+"""Sky: a colour for every direction, for things so far away that all photos see them in the same direction."""
 
 import math
 from collections.abc import Callable
@@ -11,20 +11,20 @@ from nerfcli.fit.adam import Adam
 from nerfcli.photos.psnr import psnr_of
 
 PAINT_RATE, PAINT_STEPS = 0.3, 30
-# Vertices per axis, where few pixels have to tell: with 32, noise costs a sky of one colour 6 dB.
+# Grid vertices per axis for estimates from few pixels: with 32, noise costs a sky of one colour 6 dB.
 COARSE_SIDE = 8
-# Fewer pixels of either half of the photos tell nothing.
+# Fewer pixels in either half of the photos tell nothing.
 FEWEST_PIXELS = 12
-# Levels of a sigmoid's ends, which it does not reach.
+# Initial levels are clipped to this range, as a sigmoid does not reach 0 and 1.
 DARKEST, BRIGHTEST = 0.02, 0.98
 
 
 def paint(background: SphereBackground, seen: Callable[[], tuple[Tensor, Tensor]]) -> None:
-    """Give each direction about the median colour of the pixels that look along it.
+    """Fit a background so that each direction has about the median colour of the pixels that look along it.
 
     Args:
         background: to be painted.
-        seen: gives directions (N, 3) and the sRGB colours (N, 3) along them, once for each of the steps.
+        seen: returns directions (N, 3) and the sRGB colours (N, 3) along them; called once per step.
     """
     adam = Adam(background.parameters())
     for _ in range(PAINT_STEPS):
@@ -36,18 +36,18 @@ def paint(background: SphereBackground, seen: Callable[[], tuple[Tensor, Tensor]
 
 
 def explained_by_direction(directions: Tensor, colours: Tensor, photos: Tensor) -> tuple[float, float]:
-    """Return how well colours that some photos have explain others: one colour for all directions, and one for each.
+    """Return how well half of the photos predict the other half by one colour, and by a colour for each direction.
 
-    A sky is where it is for all photos; surfaces are elsewhere in each. Photos of even numbers tell, and those of odd
-    ones are explained: neighbours, which see the same part of a sky.
+    A sky is in the same direction for all photos; surfaces are in a different one for each. Photos with even indices
+    predict those with odd ones, their neighbours, which see the same part of a sky.
 
     Args:
-        directions: (N, 3) of rays, unit.
+        directions: (N, 3) unit directions of rays.
         colours: (N, 3) sRGB.
-        photos: (N,) the numbers of their photos.
+        photos: (N,) the indices of their photos.
 
     Returns:
-        PSNR in dB of one colour, and of a colour by direction; infinite where either half has too few pixels.
+        PSNR in dB of one colour, and of a colour by direction; infinite if either half has too few pixels.
     """
     tells = photos % 2 == 0
     if min(int(tells.sum()), int((~tells).sum())) < FEWEST_PIXELS:

@@ -1,9 +1,9 @@
-"""Short trainings that differ in one thing, judged on blocks of the training photos that none of them sees.
+"""Trials: short trainings that differ in one thing, judged on blocks of the training photos that none of them sees.
 
-One training of the plainest model goes first. All others go on from where it stood, each with a change or with none:
-what they differ by is the change, not what a different start would have led to, and each takes a moment only.
+A training of the simplest model comes first. All trials continue from its state, each with a change or with none, so
+that they differ only by the change and not by their start, and each is short.
 
-The held-out photos of the scene take no part in this: what is chosen by looking at them could not be measured on them.
+The held-out photos of the scene are not used: a model chosen with them could not be measured on them.
 """
 
 import math
@@ -33,17 +33,17 @@ from nerfcli.runs.settings import FEWEST_LOG2_ROWS, TrainSettings
 from nerfcli.search.diagnostics import Diagnostics, diagnose
 from nerfcli.search.sky import paint
 
-# Photos are judged by squares of this side, or of a quarter of a small photo's: single pixels between known neighbours
-# would judge interpolation.
+# Photos are judged on squares of this side, or of a quarter of a small photo's side: single pixels between known
+# neighbours would test interpolation only.
 BLOCK_PX = 12
 BLOCK_SHARE = 0.06
 JUDGED_PIXELS = 8192
-# Of the whole schedule, what is over when the first training stops and the others go on.
+# Fraction of the schedule at which the first training stops and the trials continue.
 FORK_SHARE = 0.6
-# After so many steps it is known how many there will be, within this factor: of a machine that something else slowed
-# down, too. Where they are too few, the rest would be in vain.
+# After this many steps, the number of steps that the time allows is known within this factor, even on a machine slowed
+# down by other work. If it is too small, the rest would be in vain.
 PROBE_STEPS, PROBE_FACTOR = 10, 1.25
-# The choice of blocks and pixels: the same for all candidates of a scene, and not that of any training.
+# Seed of the choice of blocks and pixels: the same for all candidates of a scene, and not that of any training.
 SEED = 20_211
 
 
@@ -54,10 +54,10 @@ class Trial:
     Args:
         errors: (photos,) sums of squared differences of the judged pixels of each photo, sRGB.
         halfway: the same after half of its steps.
-        counts: (photos,) values that were summed.
-        seconds: it took.
-        steps: it went.
-        log_gains: (photos, 3) that it found, where it looked for any.
+        counts: (photos,) numbers of values that were summed.
+        seconds: that it took.
+        steps: number of its steps.
+        log_gains: (photos, 3) exposures of its model; None if it has none.
     """
 
     errors: np.ndarray
@@ -79,9 +79,9 @@ class TrialStart:
 
     Args:
         tensors, description: its state.
-        seconds: it took.
-        trial: what it achieved.
-        signs: what its residuals tell.
+        seconds: that it took.
+        trial: its result.
+        signs: diagnostics from its residuals.
     """
 
     tensors: dict[str, Tensor]
@@ -92,7 +92,7 @@ class TrialStart:
 
     @property
     def steps(self) -> int:
-        """It went."""
+        """Number of its steps."""
         return self.trial.steps
 
 
@@ -100,18 +100,18 @@ class Trials:
     """Trainings of one scene on the same pixels.
 
     Args:
-        photos: those to train on.
+        photos: the training photos.
         extent: of the field.
         settings: of the training that the trials are for; seed and components are given with each trial.
-        exif: (photos,) logarithms of the exposures that EXIF tells, relative to their mean.
+        exif: (photos,) logarithms of EXIF exposures, relative to their mean.
         log_focal: see `Fitting`.
         depths: sets of pixels whose distance is known.
-        log_gains: (photos, 3) of exposures that learn, where matched pixels tell them.
+        log_gains: (photos, 3) initial values of learned exposures, if matched pixels give any.
         sky: see `Fitting`.
         colours, storage: see `PixelPool`.
 
     Raises:
-        UserError: masks leave nothing to judge by.
+        UserError: masks leave no pixels to judge by.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class Trials:
         self._photos = self._pool.photo_of(self._judged.numbers).cpu().numpy()
         self._counts = np.bincount(self._photos, minlength=len(photos)) * 3
         self._extent = extent
-        # Small steps all along: they learn more from a sample, which is what a short training has few of.
+        # Small steps throughout: they learn more per sample, and a short training has few samples.
         self._settings = replace(settings, samples_per_step=settings.first_samples_per_step)
         self._exif = torch.from_numpy(exif).to(torch.float32)[:, None].expand(-1, 3)
         self._log_focal = log_focal
@@ -154,13 +154,13 @@ class Trials:
         """Train from the beginning to `FORK_SHARE` of a schedule.
 
         Args:
-            components: what is in the model.
-            steps: to go at most.
-            seconds: to take; how many steps were gone then is in the answer.
-            fewest: steps, for which it takes up to twice as long; it ends at once where these are surely out of reach.
+            components: of the model.
+            steps: largest number of steps.
+            seconds: time limit; the result tells how many steps were taken.
+            fewest: smallest number of steps, for which up to twice the time is used; end early if it is out of reach.
 
         Returns:
-            None where it did not come to the fewest steps.
+            The state; None if there were fewer than the fewest steps.
         """
         gains = self._log_gains if components.exposure == "learned" else None
         fitting = self._fitting(components, seed=self._settings.seed, log_gains=gains, cameras_from=0.0)
@@ -196,14 +196,14 @@ class Trials:
         return TrialStart(copies, description, sum(took), trial, signs)
 
     def go_on(self, start: TrialStart, components: Components, *, seed: int, steps: int) -> Trial:
-        """Continue to the end of the schedule with these components, and measure.
+        """Continue from `start` to the end of the schedule with other components, and measure.
 
         Args:
-            start: what `begin` gave.
-            components: what is in the model from here on. What is new begins so that it changes nothing: new
-                harmonics without weight, exposures as the residuals have them.
-            seed: of everything random; candidates with the same one draw the same pixels.
-            steps: to go.
+            start: from `begin`.
+            components: of the model from here on. New parts begin so that they change nothing: new harmonics with no
+                weight, exposures as in the residuals.
+            seed: of everything random; candidates with the same seed draw the same pixels.
+            steps: number of steps.
         """
         learned = start.signs.log_gains if self._log_gains is None else self._log_gains
         gains = {"exif": self._exif, "learned": learned}.get(components.exposure)
@@ -217,15 +217,18 @@ class Trials:
                 halfway = self._errors(fitting)
             seconds.append(self._advance(fitting, FORK_SHARE + (1.0 - FORK_SHARE) * done / steps))
         errors = self._errors(fitting)
-        # A median: other work on the machine must not look like the price of a component.
+        # A median, so that other work on the machine does not look like the cost of a component.
         took = statistics.median(seconds) * steps if seconds else 0.0
         exposure = fitting.parts.exposure
         found = exposure.log_gains().detach().clone() if exposure is not None else None
         return Trial(errors, errors if halfway is None else halfway, self._counts, took, steps, found)
 
     def _draws(self) -> Callable[[], tuple[Tensor, Tensor]]:
-        """Directions and colours of pixels of all photos, as if nothing stood before what is far away: what a field
-        without a background put there is cut away when it gets one."""
+        """Return a source of directions and colours of pixels, of the sky alone if its pixels are known.
+
+        Otherwise they are pixels of all kinds, as if nothing were in front of the background: what the field has put
+        far away is cut off when it gets one.
+        """
         generator = torch.Generator(device=self._pool.colours.device).manual_seed(SEED)
 
         def seen() -> tuple[Tensor, Tensor]:
@@ -236,7 +239,7 @@ class Trials:
         return seen
 
     def _fitting(self, components: Components, *, seed: int, log_gains: Tensor | None, cameras_from: float) -> Fitting:
-        # A trial is a short training, whatever comes after it.
+        # A trial is a short training, however long the training after it.
         rows = min(self._settings.chosen_log2_rows, FEWEST_LOG2_ROWS)
         settings = replace(self._settings, components=components, seed=seed, log2_rows=rows)
         return Fitting(
@@ -254,7 +257,7 @@ class Trials:
         )
 
     def _take_up(self, fitting: Fitting, start: TrialStart) -> None:
-        """Bring a fresh training to `start`, but for its random numbers and for what only its own model has."""
+        """Bring a fresh training to `start`, except for its random numbers and the parts besides the field."""
         own, _ = fitting.state()
         kept = {name: tensor for name, tensor in own.items() if name == "generator" or name.startswith("parts")}
         of_field = {name: tensor.clone() for name, tensor in start.tensors.items() if not name.startswith("parts")}
@@ -263,7 +266,7 @@ class Trials:
             fitting.field.forget_directions(start.description["field"]["view_degree"])
 
     def _advance(self, fitting: Fitting, fraction: float) -> float:
-        """Take a step; return it and the seconds it took."""
+        """Take a step, and return the seconds that it took."""
         began = time.perf_counter()
         fitting.advance(fraction)
         self._room.release_pages()
@@ -271,7 +274,7 @@ class Trials:
 
     @torch.no_grad()
     def _errors(self, fitting: Fitting) -> np.ndarray:
-        """(photos,) squared differences of the judged pixels, summed."""
+        """Return the sums of squared differences of the judged pixels, (photos,)."""
         fitting.settle()
         rendered, measured = fitting.compare(self._judged)
         errors = (rendered.clamp(0.0, 1.0) - measured).square().sum(-1).double().cpu().numpy()
@@ -279,7 +282,7 @@ class Trials:
 
 
 def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:
-    """(H, W) bool: the blocks of a photo that are judged, at least one."""
+    """Return the pixels of a photo in judged blocks, (H, W) bool; there is at least one block."""
     block = max(1, min(BLOCK_PX, min(shape[:2]) // 4))
     rows, columns = (-(-side // block) for side in shape[:2])
     chosen = generator.random((rows, columns)) < BLOCK_SHARE
@@ -288,8 +291,10 @@ def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarra
 
 
 def _split(photos: Sequence[LoadedPhoto], storage: PhotoStorage) -> tuple[list[LoadedPhoto], np.ndarray]:
-    """Return the photos without the blocks that are judged, and numbers of pixels of those blocks, counted through all
-    photos: as many of each photo, as far as it has them."""
+    """Return the photos without the judged blocks, and judged pixels from these blocks, numbered through all photos.
+
+    Each photo has the same number of judged pixels, as far as its blocks have them.
+    """
     generator = np.random.default_rng(SEED)
     sizes = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
     masks = storage.array((sum(sizes),), bool)

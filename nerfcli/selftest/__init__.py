@@ -1,1 +1,1 @@
-"""Hard cases with known answers, run on the user's machine, with errors and their bounds."""
+"""Hard numerical cases with known answers, run on the user's machine and checked against error bounds."""

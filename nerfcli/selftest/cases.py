@@ -2,8 +2,8 @@
 
 Rays are hard for rounding: thin and opaque, empty and dense, short and very long. Points are on borders and far away.
 
-Densities of `Group`s and lengths of their intervals are numbers of bfloat16, so that the same rays go into every
-precision, and an error is one of the arithmetic alone.
+Densities and interval lengths of `Group`s are exact in bfloat16, so that every precision gets the same rays and errors
+come from the arithmetic alone.
 """
 
 import math
@@ -13,9 +13,9 @@ import torch
 
 from nerfcli.selftest.measure import Precision
 
-# The largest number of bfloat16, which float32 holds too.
+# The largest bfloat16 number, which is also exact in float32.
 LARGEST = 3.3895313892515355e38
-# A bound above this says nothing: bfloat16 has no digit of exp(-tau) for tau above 100.
+# Cases with a bound above this are meaningless: bfloat16 has no digit of exp(-tau) for tau above 100.
 MEANINGLESS = 0.25
 
 
@@ -42,7 +42,7 @@ class Group:
     """Rays that are hard for the same reason.
 
     Args:
-        name: what is hard about them.
+        name: the difficulty.
         rays: the rays.
     """
 
@@ -51,12 +51,12 @@ class Group:
 
 
 def coarse(value: float) -> float:
-    """Return the nearest number of bfloat16."""
+    """Round to the nearest bfloat16 number."""
     return torch.tensor(value, dtype=torch.float64).to(torch.bfloat16).item()
 
 
 def fog(optical_depth: float, samples: int) -> Segments:
-    """Intervals of about one optical depth; neither densities nor lengths are all equal."""
+    """Return intervals of about the same optical depth, with varying densities and lengths."""
     density = tuple(coarse(optical_depth * 64 * (3 + k % 5) / 4) for k in range(samples))
     return Segments(density, tuple(2.0 ** -(6 + k % 3) for k in range(samples)))
 
@@ -120,7 +120,7 @@ def groups() -> tuple[Group, ...]:
 
 
 def lit(rays: list[Segments], precision: Precision) -> tuple[int, float]:
-    """Return the most intervals that light comes to, and the optical depth it comes through."""
+    """Return the largest number of intervals on a ray that light reaches, and the largest optical depth it passes."""
     counts, depths = [0], [0.0]
     for ray in rays:
         depth, count = 0.0, 0
@@ -134,7 +134,7 @@ def lit(rays: list[Segments], precision: Precision) -> tuple[int, float]:
 
 
 def even(name: str, density: list[float], near: float, length: float) -> Ray:
-    """Intervals of one length, side by side."""
+    """Return a ray of adjacent intervals of equal length."""
     edges = [near + length * i for i in range(len(density) + 1)]
     return Ray(name, density, edges[:-1], edges[1:])
 
@@ -158,7 +158,7 @@ def depth_rays() -> list[Ray]:
     ]
 
 
-# Pixels of two rays each: what hits something and what does not, near and far, thin and opaque.
+# Pixels of two rays each: hit and miss, near and far, thin and opaque.
 PIXELS: tuple[tuple[Ray, Ray], ...] = (
     (even("wall", [2.0**20], 1.0, 0.5), even("wall", [2.0**20], 3.0, 0.5)),
     (even("fog", [0.125] * 8, 1.0, 0.125), Ray("nothing", [], [], [])),
@@ -170,13 +170,13 @@ PIXEL_SHARES = (0.04, 0.25, 0.75)
 
 
 def thick_and_thin(precision: Precision) -> list[Segments]:
-    """Fog in as many intervals as the precision can add up, and a wall between thin fogs."""
+    """Return fog in as many intervals as the precision can add up, and walls next to thin fog."""
     counts = (1, 16) if precision.dtype == torch.bfloat16 else (1, 16, 1024, 4096)
     walls = [Segments((2.0**-10, 2.0**27, 1.0), (1.0,) * 3), Segments((2.0**-30, 2.0**-30, 2.0**40), (1.0, 0.0, 1.0))]
     return [fog(x, n) for x in (1e-12, 1e-3, 1.0, 1e6) for n in counts] + [*walls, Segments((), ())]
 
 
-# Light of a surface far away: all of it within 1e-3 at 0.98 of the way to infinity.
+# Weights of a far surface: all within 1e-3, from 0.984 of the way to infinity.
 FAR_SURFACE = {
     "starts": [0.984375 + k * 2.0**-16 for k in range(64)],
     "ends": [0.984375 + (k + 1) * 2.0**-16 for k in range(64)],
@@ -184,21 +184,21 @@ FAR_SURFACE = {
 }
 
 Point = tuple[float, float, float]
-# Places on borders and corners of cells and outside the cube; times a power of two, all are exact in float32.
+# Points on borders and corners of cells, and outside the cube; multiplied by a power of two, all are exact in float32.
 BORDERS: tuple[Point, ...] = (
     *((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1.0, 0.0, 0.5), (-0.5, 2.0, 0.3125), (0.25, 0.5, 0.75)),
     *((1 - 2.0**-24, 2.0**-30, 2.0**-100), (0.5, 0.5 - 2.0**-12, 0.5 + 2.0**-12), (-(2.0**-100), 2.0**100, 0.0)),
 )
 BETWEEN: tuple[Point, ...] = tuple(((k * 0.37) % 1, (k * 0.61 + 0.2) % 1, (k * 0.83 + 0.4) % 1) for k in range(64))
-# Cells per axis of the levels of hash grids.
+# Cells per axis at each level of the hash grids.
 EXACT_GRIDS, FINE_GRIDS = (4, 16, 64, 1024), (5, 41, 700, 2048)
 ROWS, FEATURES = 512, 4
-# What the loss gains by each feature: half precision rounds the last to nothing.
+# Gradients of the loss by each feature; half precision rounds the last to 0.
 GAINS = (1.0, 2.0**-6, -(2.0**-12), 2.0**-26)
 
 
 def hash_table(levels: int) -> list[list[list[float]]]:
-    """Features of many sizes in either sign, down to 2^-14, which half precision holds as well."""
+    """Return features of many magnitudes and either sign, down to 2^-14, all exact in half precision."""
     return [
         [
             [((7 * row + 3 * j) % 17 - 8) * 2.0 ** -(3 + (row + level) % 12) for j in range(FEATURES)]
@@ -208,21 +208,21 @@ def hash_table(levels: int) -> list[list[list[float]]]:
     ]
 
 
-# Unit directions with coordinates that every precision holds, up to their length, which need not be 1.
+# Directions with coordinates that every precision holds exactly; their length need not be 1.
 DIRECTIONS = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.5, -0.75, 1.0), (-1.0, 0.25, 2.0**-10))
 CONTRACTED = (
     ("contraction at its centre and its border", (0.0, 2.0**-100, 2.0**-10, 0.5, 1.0, 1.25, 2.0)),
     ("contraction far away, radius 1e3 to 1e37", (2.0**10, 2.0**33, 2.0**60, 2.0**66, 2.0**122)),
 )
-# Numbers of bfloat16, to beyond where exp overflows in every precision.
+# Numbers exact in bfloat16, up to beyond where exp overflows in every precision.
 LOGARITHMS = (-1000.0, -89.0, -15.0, -1.0, 2.0**-20, 1.0, 14.5, 15.0, 16.0, 89.0, 720.0, 3e38)
 GRADIENTS = tuple(10.0**e for e in (-17, -15, -12, -8, -4, 0, 4, 10))
 
-# Largest line integrals of a small volume: thin ones have all their digits, thick ones do not overflow.
+# Largest line integrals of a small volume: thin ones must keep all their digits, thick ones must not overflow.
 THICKNESSES = (1e-12, 1e-6, 1e-3, 1.0, 1e3, 1e6)
 VOLUME_SHAPE, VOLUME_FIRST, VOXEL = (6, 7, 9), (-2.0, -1.5, -1.25), 0.5
-# Points on lines and their directions: along axes, through centres and between them, oblique, past the volume, and from
-# a source 4e6 voxels away, whose place float32 holds to a quarter of a voxel.
+# Points on lines and directions: along axes, through voxel centres and between them, oblique, past the volume, and from
+# a source 4e6 voxels away, whose position float32 holds to a quarter of a voxel.
 LINES: tuple[tuple[Point, Point], ...] = (
     *(((0.0, 0.0, 0.0), d) for d in ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 2.0))),
     *(((0.125, -0.25, 0.375), d) for d in ((1.0, 0.25, -0.125), (0.5, -1.0, 0.75), (-0.25, 0.125, -1.0))),
@@ -232,7 +232,7 @@ LINES: tuple[tuple[Point, Point], ...] = (
 
 
 def attenuations(thickness: float) -> list[list[list[float]]]:
-    """Return a volume (Z, Y, X) whose line integrals are at most about a thickness."""
+    """Return a volume (Z, Y, X) whose line integrals are at most about `thickness`."""
     z, y, x = VOLUME_SHAPE
     largest = thickness / (x * VOXEL)
     values = [((3 * i + 5 * j + 7 * k) % 13 + 1) / 13 for k in range(z) for j in range(y) for i in range(x)]

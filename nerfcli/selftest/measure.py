@@ -1,4 +1,4 @@
-"""Rows of the selftest, and the definition of errors."""
+"""Rows of the selftest, and the definition of errors and precisions."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ MET, NOT_MET = "met", "not met"
 
 @dataclass(frozen=True)
 class Precision:
-    """An arithmetic that an operation is tried in: plain torch on the device, or the compiled kernels of CPU or GPU."""
+    """An arithmetic for an operation: plain torch on the device, or the compiled kernels of the CPU or the GPU."""
 
     name: str
     dtype: torch.dtype
@@ -27,7 +27,7 @@ class Precision:
 
     @property
     def parts(self) -> ModuleType:
-        """The single operations in this arithmetic."""
+        """Module of the single operations in this arithmetic."""
         if self.for_gpu:
             from nerfcli.kernels.triton_cuda import operations
 
@@ -40,12 +40,12 @@ class Precision:
 
     @property
     def unit(self) -> float:
-        """The largest relative error of one rounding."""
+        """Largest relative error of one rounding."""
         return torch.finfo(self.dtype).eps / 2
 
     @property
     def tiny(self) -> float:
-        """The smallest number with all its digits; below, errors are absolute."""
+        """Smallest normal number; below it, errors are absolute."""
         return float(torch.finfo(self.dtype).tiny)
 
     @property
@@ -54,13 +54,13 @@ class Precision:
         return -math.log(self.tiny)
 
     def tensor(self, values: Any) -> Tensor:
-        """Numbers in this precision on its device."""
+        """Return values in this precision, on its device."""
         return torch.tensor(values, dtype=torch.float64).to(self.device, self.dtype)
 
 
 @dataclass(frozen=True)
 class Errors:
-    """The largest relative error of a value, and that of a gradient where there is one."""
+    """Largest relative error of the values, and of the gradients if there are any."""
 
     value: float
     gradient: float | None = None
@@ -71,16 +71,16 @@ class Row:
     """One hard case in one precision.
 
     Args:
-        case: what is hard.
-        operation: which operation it is tried on.
+        case: the difficulty.
+        operation: the operation under test.
         precision: name of the arithmetic.
-        errors: of the program.
-        bounds: what they may be.
-        reason: where the bounds come from.
-        formula: what textbooks do; "" where there is none.
-        textbook: its errors on the same numbers; None also for the compiled kernels, whose float32 has its own row.
-        seconds: one run of the operation, forward and backward.
-        no_gradient: why an operation that others take the gradient of has none here.
+        errors: errors of nerfcli.
+        bounds: largest permitted errors.
+        reason: derivation of the bounds.
+        formula: the textbook formula; "" if there is none.
+        textbook: its errors on the same inputs; None also for compiled kernels, as plain float32 has its own row.
+        seconds: time of one run of the operation, forward and backward.
+        no_gradient: reason why this implementation has no gradient; "" if it has one, or none is needed.
     """
 
     case: str
@@ -96,21 +96,21 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """Verdict on the bounds; NaN exceeds all."""
+        """Verdict on the errors against the bounds; NaN exceeds any bound."""
         return MET if self.holds(self.errors) else NOT_MET
 
     def holds(self, errors: Errors) -> bool:
-        """Return whether errors are within the bounds of this row."""
+        """Return True if the errors are within the bounds of this row."""
         pairs = ((errors.value, self.bounds.value), (errors.gradient, self.bounds.gradient))
         return all(error <= bound for error, bound in pairs if error is not None and bound is not None)
 
     @property
     def textbook_fails(self) -> bool:
-        """Whether the textbook formula exceeds the bounds of this row."""
+        """True if the textbook formula exceeds the bounds of this row."""
         return self.textbook is not None and not self.holds(self.textbook)
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain numbers; non-finite ones by name, since JSON has none."""
+        """Return plain values; non-finite numbers as strings, since JSON cannot hold them."""
 
         def plain(value: Any) -> Any:
             if isinstance(value, dict):
@@ -121,9 +121,7 @@ class Row:
 
 
 def by_formula(rows: Sequence[Row]) -> list[Row]:
-    """Return one row for each textbook formula:
-    where it is farthest beyond the bounds, in float32 if it has such rows.
-    """
+    """Return one row per textbook formula: the one farthest beyond its bounds, in float32 if there are such rows."""
     formulas: dict[str, list[Row]] = {}
     for row in rows:
         if row.textbook is not None:
@@ -133,7 +131,7 @@ def by_formula(rows: Sequence[Row]) -> list[Row]:
 
 
 def _beyond(row: Row) -> float:
-    """Return how many times its bounds the textbook's errors are."""
+    """Return the largest ratio of the textbook's errors to the bounds."""
     assert row.textbook is not None
     pairs = ((row.textbook.value, row.bounds.value), (row.textbook.gradient, row.bounds.gradient))
     bounded = [(error, bound) for error, bound in pairs if error is not None and bound is not None]
@@ -144,13 +142,13 @@ def largest_error(values: Any, wanted: Any, *, tiny: float, scale: Any = None) -
     """Return the largest |value - wanted| / max(|wanted|, tiny).
 
     Args:
-        values: tensor, array or numbers, as all that follow.
+        values: tensor, array or numbers, like `wanted` and `scale`.
         wanted: the answers; NaN where undefined.
-        tiny: below, errors are relative to it.
-        scale: what errors are relative to, in place of |wanted|.
+        tiny: errors of smaller answers are relative to this.
+        scale: magnitudes that errors are relative to, instead of |wanted|.
 
     Returns:
-        0 for nothing at all; infinite where only one of the two is a number.
+        The error: 0 for empty values, infinite if only one of a value and its answer is NaN.
     """
     got = _plain(values)
     want = _plain(wanted).reshape(got.shape)

@@ -1,1 +1,1 @@
-"""Geometry taken out of a field: depths seen from the photos, fused into surfaces, points and volumes."""
+"""Geometry extracted from a field: depths seen from the photos, fused into surfaces and points; and volumes."""

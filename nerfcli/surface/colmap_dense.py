@@ -1,9 +1,9 @@
-"""A folder as COLMAP's dense reconstruction leaves it: undistorted photos, their cameras, depth and normal maps.
+"""A workspace in the format of COLMAP's dense reconstruction: undistorted photos, cameras, depth and normal maps.
 
     images/, sparse/, stereo/depth_maps/NAME.geometric.bin, stereo/normal_maps/NAME.geometric.bin, stereo/fusion.cfg
 
-Depth is along the optical axis, 0 where there is none; normals are in the camera's axes, towards it. Fusion compares a
-photo with those that share points with it: the sparse model has points of the field's surfaces, with their tracks.
+Depth is along the optical axis, 0 where there is none; normals are in camera coordinates and face the camera. COLMAP's
+fusion compares photos that share points, so the sparse model contains points of the field's surfaces with their tracks.
 
 Source: COLMAP, mvs/workspace.cc and mvs/mat.h; the format of its documentation, "Output format".
 """
@@ -25,7 +25,7 @@ _QUALITY = 95
 
 
 def write_map(path: Path, values: np.ndarray) -> None:
-    """Write a map (H, W) or (H, W, C) in COLMAP's format: sizes as text, then float32, channel after channel."""
+    """Write a map (H, W) or (H, W, C) in COLMAP's format: sizes as text, then float32, channel by channel."""
     stacked = values[..., None] if values.ndim == 2 else values
     height, width, channels = stacked.shape
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -41,12 +41,12 @@ def read_map(path: Path) -> np.ndarray:
 
 
 def photo_name(name: str) -> str:
-    """Return the name of a photo in the folder: its own where COLMAP reads such files, else with .png behind it."""
+    """Return the name of a photo in the folder: unchanged if COLMAP reads its format, else with .png appended."""
     return name if Path(name).suffix.lower() in _READABLE else f"{name}.png"
 
 
 def write_photo(path: Path, pixels: np.ndarray) -> None:
-    """Write a photo (H, W, 3) uint8 sRGB as its suffix says.
+    """Write a photo (H, W, 3) uint8 sRGB in the format of its suffix.
 
     Raises:
         UserError: it cannot be encoded.
@@ -60,7 +60,7 @@ def write_photo(path: Path, pixels: np.ndarray) -> None:
 
 
 def write_stereo(folder: Path, views: Sequence[DepthView]) -> None:
-    """Write the depth and normal maps of views, and the list of them that fusion reads."""
+    """Write the depth and normal maps of views, and the list of views that fusion reads."""
     for view in views:
         normals = view.normals
         defined = np.isfinite(view.depth) & np.isfinite(normals).all(-1)
@@ -75,7 +75,7 @@ def write_sparse(folder: Path, frames: Sequence[Frame], points: Points) -> None:
     """Write the pinhole cameras and the points with their tracks.
 
     Raises:
-        UserError: a name that a COLMAP model cannot hold.
+        UserError: a COLMAP model cannot hold a name.
     """
     frame_index, point_index, pixels = [], [], []
     for index, frame in enumerate(frames):

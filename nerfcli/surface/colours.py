@@ -1,4 +1,4 @@
-"""Colours of a field at points of space, from where they are looked at."""
+"""Colours of a field at points, seen along surface normals or averaged over directions."""
 
 import numpy as np
 import torch
@@ -7,23 +7,23 @@ from nerfcli.render.model import Model
 from nerfcli.render.tracing import render_cut_rays
 
 _BLOCK = 2**15
-# Nothing is left out of colours that end in 8 bits.
+# Rendering tolerance, far below a level of 8-bit colours.
 _TOLERANCE = 1e-4
-# Directions from which a point without a surface is looked at.
+# Viewing directions of a point without a surface.
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
-# A surface is looked at over so many voxels before and behind it, in so many steps.
+# Rays to a surface cover this many voxels before and behind it, in this many steps.
 _REACH_VOXELS, _STEPS = 3.0, 24
 
 
 def surface_colours(model: Model, points: np.ndarray, normals: np.ndarray, *, voxel_size: float) -> np.ndarray:
-    """Return the colours (N, 3) uint8 of points of a surface, looked at along its normals from outside.
+    """Return the colours (N, 3) uint8 of surface points, seen from outside along the normals.
 
-    What a ray through a few voxels around the surface sees, without what is behind it. Where it meets nothing, the
-    colour is that of the field at the point.
+    The colour is that of a ray through a few voxels around the surface, excluding everything farther behind. If the
+    ray is nearly transparent, it is the field's colour at the point.
 
     Args:
         model: the trained model.
-        points, normals: (N, 3) scene's frame; normals unit, outwards.
+        points, normals: (N, 3) in the scene's frame; normals of unit length, outwards.
         voxel_size: scene units.
     """
     to_training = model.training_from_scene
@@ -39,13 +39,13 @@ def surface_colours(model: Model, points: np.ndarray, normals: np.ndarray, *, vo
 
 
 def point_colours(model: Model, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours (N, 3) in [0, 1] of points, the mean over six directions, and densities (N,) per scene unit.
+    """Return colours (N, 3) in [0, 1] of points, averaged over six directions, and densities (N,) per scene unit.
 
-    Both are 0 in cells that hold nothing.
+    Both are 0 in unoccupied cells.
     """
     scale = model.training_from_scene.scale
     places = model.training_from_scene.apply(points)
-    # A ray of a single interval has its colour evaluated in its middle, and nothing else.
+    # A ray of a single interval evaluates the field only at its middle, which is the point.
     cuts = torch.tensor([0.0, 2.0])
     total = np.zeros((len(points), 3))
     density = np.zeros(len(points))
@@ -60,7 +60,7 @@ def point_colours(model: Model, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _looked_at(
     model: Model, starts: np.ndarray, directions: np.ndarray, cuts: torch.Tensor
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (N, 3) of what rays see between the cuts, and opacities (N,)."""
+    """Render rays between the first and last cut: colours (N, 3) without background, and opacities (N,)."""
     colours, opacities = [], []
     for first in range(0, len(starts), _BLOCK):
         part = slice(first, first + _BLOCK)

@@ -1,4 +1,4 @@
-"""Extent of the photos' subject, and the resolution at which they show it."""
+"""Extent of the photos' subject, and the resolution at which the photos show it."""
 
 from collections.abc import Sequence
 
@@ -9,27 +9,27 @@ from nerfcli.errors import UserError
 from nerfcli.render.model import Model
 from nerfcli.surface.views import DepthView, depth_views, spread_frames
 
-# Cameras and pixels along the longer side that a first look takes.
+# Number of cameras, and pixels along the longer side, for finding the extent.
 LOOK_VIEWS, LOOK_PX = 24, 64
-# Of the points seen, those that the box leaves out at each of its sides, and by how much it is then made larger.
+# Fraction of the seen points outside each side of the box, and margin by which the box is then enlarged.
 _OUTSIDE, _MARGIN = 0.01, 0.05
-# Where the ball holds less of the points seen than this, cameras look out of it.
+# Cameras look out of the ball if it contains less than this fraction of the seen points.
 _LEAST_INSIDE = 0.05
-# Voxels along the longest side of a box, at most and at least, by default.
+# Largest and smallest default number of voxels along the longest side of a box.
 FINEST_CELLS, COARSEST_CELLS = 384, 64
-# Pixels that a voxel is wide.
+# Default width of a voxel in pixels.
 _PIXELS_PER_VOXEL = 1.5
 
 
 def scene_box(model: Model, frames: Sequence[Frame]) -> tuple[float, ...]:
-    """Return the box x0, y0, z0, x1, y1, z1 along the axes of the scene's frame that holds what the photos are about.
+    """Return the axis-aligned box x0, y0, z0, x1, y1, z1 of the photos' subject in the scene's frame.
 
-    It holds the median depths that some cameras see inside the unit ball of the training frame, where space is not
-    contracted, but for the outermost; the far background is left out. Where cameras look out of the ball, it is what
-    lies beyond twice the typical distance.
+    It contains the median-depth points that some cameras see inside the unit ball of the training frame, where space is
+    not contracted, except for the outermost 1 % at each side; the far background is left out. If cameras look out of
+    the ball, points up to twice the median distance are used instead.
 
     Raises:
-        UserError: no ray meets anything.
+        UserError: no ray sees a surface.
     """
     views = depth_views(model, spread_frames(frames, LOOK_VIEWS), max_size=LOOK_PX)
     points = np.concatenate([view.points()[np.isfinite(view.depth)] for view in views])
@@ -49,7 +49,7 @@ def scene_box(model: Model, frames: Sequence[Frame]) -> tuple[float, ...]:
 
 
 def automatic_voxel(views: Sequence[DepthView], box: tuple[float, ...]) -> float:
-    """Return the voxel size at which the photos resolve what is in a box: 1.5 pixels of the median view, in bounds."""
+    """Return the voxel size that the photos resolve in a box: 1.5 pixels of the median view, within limits."""
     low, high = np.array(box[:3]), np.array(box[3:])
     longest = float((high - low).max())
     widths = []

@@ -1,9 +1,10 @@
-"""A truncated signed distance to the surfaces that depth maps see, averaged over the maps, in blocks near surfaces.
+"""Fuse depth maps into a truncated signed distance, averaged over the maps, in blocks near surfaces.
 
-A voxel's signed distance by a view is that of its centre to the plane of the surface at its pixel, positive on the
-camera's side: (depth - z) / cosine_axis * cosine_surface. It is cut at the truncation on the free side; behind the
-surface by more than that, the view says nothing. Views count by the pixel's weight, less and less behind the surface,
-where there may be another side (Bylow et al. 2013, Real-time camera tracking and 3D reconstruction using SDFs).
+In a view, the signed distance of a voxel is that from its centre to the tangent plane of the surface at its pixel,
+positive on the camera's side: (depth - z) / cosine_axis * cosine_surface. It is clamped to the truncation on the free
+side; voxels farther than that behind the surface get nothing from the view. Views are averaged by the pixel's weight,
+which decreases behind the surface, where there may be another side (Bylow et al. 2013, Real-time camera tracking and 3D
+reconstruction using SDFs).
 
 Source: Curless and Levoy 1996, A volumetric method for building complex models from range images, eq. 3 and 4; blocks
 as in Nießner et al. 2013, Real-time 3D reconstruction at scale using voxel hashing.
@@ -22,13 +23,13 @@ from nerfcli.surface.views import DepthView, plane_rays
 
 # Voxels along a side of a block.
 SIDE = 8
-# How far from a surface its distance is kept, in voxels.
+# Truncation of the signed distance, in voxels.
 TRUNCATION = 4.0
-# Blocks whose voxels are worked on at a time.
+# Blocks processed at a time.
 _CHUNK = 2048
-# Rays through which nearly all light passes see free space all along; those between are not used.
+# Rays with an opacity below the first see free space only; those between the two opacities are not used.
 _CLEAR, _OPAQUE = 0.02, 0.5
-# Surfaces that are seen flatter than by this cosine are not used.
+# Surfaces seen at a smaller cosine between normal and ray are not used.
 _FLATTEST = 0.1
 # A depth beyond every voxel, for rays that see free space only.
 _FAR = 1e9
@@ -39,9 +40,9 @@ class Fused:
     """Signed distances in the blocks of a grid.
 
     Args:
-        grid: of all voxels.
+        grid: grid of all voxels.
         index: (Bx, By, Bz) int32, the row of each block; -1 where there is none.
-        distance: (blocks, 8, 8, 8) float32, scene units, at most the truncation; 0 where the weight is.
+        distance: (blocks, 8, 8, 8) float32, scene units, at most the truncation; 0 where the weight is 0.
         weight: (blocks, 8, 8, 8) float32, the sum of the views' weights.
     """
 
@@ -52,11 +53,11 @@ class Fused:
 
     @property
     def truncation(self) -> float:
-        """Scene units."""
+        """Truncation in scene units."""
         return TRUNCATION * self.grid.voxel_size
 
     def dense(self, first: tuple[int, int, int], shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Distance and weight of voxels (x, y, z) from `first` on, which is the corner of a block; 0 beyond blocks."""
+        """Return distance and weight of `shape` voxels (x, y, z) from a block's corner `first`; 0 outside blocks."""
         low = [value // SIDE for value in first]
         counts = [-(-length // SIDE) for length in shape]
         rows = np.full(counts, -1, np.int32)
@@ -77,9 +78,9 @@ def fuse(
     """Fuse depth maps.
 
     Args:
-        views: what the cameras see.
+        views: the depth maps.
         grid: the voxels.
-        on_progress: called with how much is done.
+        on_progress: called with the fraction done.
     """
     index = _blocks_near(views, grid)
     corners = np.stack(np.nonzero(index >= 0), axis=-1)[np.argsort(index[index >= 0], kind="stable")] * SIDE
@@ -94,7 +95,7 @@ def fuse(
 
 
 def pixel_weights(view: DepthView, voxel_size: float) -> np.ndarray:
-    """(H, W) how much a depth counts: opacity times cosine over 1 + (spread / truncation)^2; 0 where it is not used."""
+    """Return the weights of depths (H, W): opacity * cosine / (1 + (spread / truncation)^2); 0 for unused depths."""
     cosine = view.cosines()
     with np.errstate(invalid="ignore"):
         narrow = 1.0 / (1.0 + (view.spread / (TRUNCATION * voxel_size)) ** 2)
@@ -103,9 +104,7 @@ def pixel_weights(view: DepthView, voxel_size: float) -> np.ndarray:
 
 
 def _blocks_near(views: Sequence[DepthView], grid: Grid) -> np.ndarray:
-    """Return which blocks come within the truncation of a surface,
-    numbered in the order of memory; -1 for the others.
-    """
+    """Number the blocks within the truncation of a surface in memory order; -1 for other blocks."""
     counts = tuple(-(-length // SIDE) for length in grid.shape)
     near = np.zeros(counts, dtype=bool)
     reach = TRUNCATION * grid.voxel_size
@@ -128,7 +127,7 @@ def _add(view: DepthView, grid: Grid, corners: np.ndarray, *, inside: Tensor, di
     """Average a view into the blocks, in place."""
     camera, pose = view.frame.camera, view.frame.world_from_cam
     rotation = pose[:3, :3].T
-    # From voxel numbers to the camera's axes; the offset in float64, as a scene may lie far from its origin.
+    # From voxel indices to camera coordinates; the offset in float64, as a scene may be far from its origin.
     turn = torch.from_numpy((rotation * grid.voxel_size).astype(np.float32))
     offset = rotation @ (grid.low + 0.5 * grid.voxel_size - pose[:3, 3])
     middles = (rotation * grid.voxel_size) @ (corners + (SIDE - 1) / 2).T + offset[:, None]
@@ -148,14 +147,14 @@ def _add(view: DepthView, grid: Grid, corners: np.ndarray, *, inside: Tensor, di
         places = torch.stack([2 * u / width - 1, 2 * v / height - 1], dim=-1)
         smooth = _sampled(maps[:1], places, "bilinear")[0]
         depth, slant, counts, nearest = _sampled(maps, places, "nearest")
-        # Between two surfaces there is none: a mean of their depths is worse than one of them.
+        # Do not interpolate across a depth edge: a mean of two surfaces' depths is worse than either.
         depth = torch.where((smooth - depth).abs() < truncation, smooth, depth)
         off = (depth - z) * slant
         behind = (z - depth) * torch.sqrt(1 + ((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2)
         used = ahead & (u >= 0) & (u <= width) & (v >= 0) & (v <= height) & (counts > 0) & (behind < truncation)
-        # Beside an outline a pixel may look past what the voxel belongs to: its neighbours have to leave it free, too.
+        # Beside an outline a pixel may look past the voxel's surface, so its neighbours must see free space there, too.
         used &= (off < truncation) | ((nearest - z) * slant > truncation)
-        # What lies behind a surface is known the less the farther it is: there may be another side.
+        # The weight decreases with the distance behind a surface, where another side may follow.
         added = torch.where(used, counts * (1 - behind / truncation).clamp(0.0, 1.0), 0.0)
         before, total = weight[rows], weight[rows] + added
         mean = distance[rows] * before + off.clamp(-truncation, truncation) * added
@@ -164,8 +163,8 @@ def _add(view: DepthView, grid: Grid, corners: np.ndarray, *, inside: Tensor, di
 
 
 def _maps(view: DepthView, voxel_size: float) -> Tensor:
-    """(4, H, W): depth, from a difference along the axis to the distance from the surface's plane, weight, and the
-    smallest depth of a pixel and its neighbours, 0 where one of them has none."""
+    """Return maps (4, H, W): depth, factor from axial difference to distance from the tangent plane, weight, and the
+    smallest depth of a pixel and its neighbours, 0 if one of them has none."""
     weights = pixel_weights(view, voxel_size)
     lengths = np.linalg.norm(plane_rays(view.frame.camera), axis=-1)
     slant = lengths * view.cosines()
@@ -177,7 +176,7 @@ def _maps(view: DepthView, voxel_size: float) -> Tensor:
 
 
 def _sampled(maps: Tensor, places: Tensor, mode: str) -> Tensor:
-    """(C, blocks, 512) values of maps (C, H, W) at places in [-1, 1]."""
+    """Sample maps (C, H, W) at positions in [-1, 1], returning (C, blocks, 512)."""
     found = torch.nn.functional.grid_sample(
         maps[None], places[None], mode=mode, padding_mode="border", align_corners=False
     )
@@ -185,9 +184,7 @@ def _sampled(maps: Tensor, places: Tensor, mode: str) -> Tensor:
 
 
 def _may_see(params: tuple[float, ...], size: tuple[int, int], middles: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Return whether blocks with middles (3, N) in the camera's axes may be in the picture:
-    their balls against its sides.
-    """
+    """Mark blocks, with centres (3, N) in camera coordinates, whose bounding spheres may be in the picture."""
     fx, fy, cx, cy = params
     radius = np.sqrt(3.0) * SIDE / 2 * voxel_size
     x, y, z = middles

@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfcli.errors import UserError
 
-# Voxels along a side at most: beyond, not even the index of the blocks fits into memory.
+# Most voxels along a side; beyond, not even the index of the blocks fits into memory.
 MOST_CELLS = 2048
 
 
@@ -16,7 +16,7 @@ class Grid:
     """Voxel (i, j, k) is a cube of side `voxel_size` whose centre is low + voxel_size * (i + 1/2, j + 1/2, k + 1/2).
 
     Args:
-        low: (3,) the corner of the first voxel.
+        low: (3,) low corner of the first voxel.
         voxel_size: > 0, scene units.
         shape: voxels along x, y and z.
     """
@@ -27,7 +27,7 @@ class Grid:
 
     @staticmethod
     def over(box: tuple[float, ...], voxel_size: float) -> "Grid":
-        """Return the grid that covers a box, from its low corner on.
+        """Return the grid that covers a box, starting at its low corner.
 
         Raises:
             UserError: it would have too many voxels.
@@ -43,20 +43,20 @@ class Grid:
         return Grid(low, voxel_size, (shape[0], shape[1], shape[2]))
 
     def centres(self, indices: np.ndarray) -> np.ndarray:
-        """Centres (..., 3) of voxels (..., 3)."""
+        """Return the centres (..., 3) of voxels with indices (..., 3)."""
         return self.low + self.voxel_size * (indices + 0.5)
 
     @property
     def high(self) -> np.ndarray:
-        """(3,) the corner opposite to `low`."""
+        """The corner (3,) opposite to `low`."""
         return self.low + self.voxel_size * np.array(self.shape)
 
 
 def check_box(box: tuple[float, ...]) -> tuple[float, ...]:
-    """Return a box whose corners are in order.
+    """Return the box after checking that its low corner is below its high corner.
 
     Raises:
-        UserError: they are not, or a number is not finite.
+        UserError: the corners are not in order, or a number is not finite.
     """
     values = np.array(box, dtype=np.float64)
     if values.shape != (6,) or not np.isfinite(values).all() or not (values[:3] < values[3:]).all():

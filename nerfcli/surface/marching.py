@@ -1,4 +1,4 @@
-"""Turn signed distances into triangles: marching cubes where all corners were seen, without small pieces."""
+"""Turn signed distances into triangles by marching cubes, where all corners were seen; remove small pieces."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from skimage.measure import marching_cubes
 
 from nerfcli.surface.fusion import SIDE, Fused
 
-# Voxels along a side of a brick, which is marched through at a time.
+# Voxels along a side of a brick, the unit of marching.
 _BRICK = 8 * SIDE
-# Weight at which views have seen a voxel; cubes with a corner below it hold no surface.
+# A voxel counts as seen from this weight on; cubes with an unseen corner have no surface.
 SEEN = 0.5
-# Pieces of a surface that are smaller than this share of it are noise.
+# Connected pieces with a smaller fraction of the faces are noise.
 _SMALLEST_PIECE = 0.002
 
 
@@ -24,8 +24,8 @@ class Mesh:
 
     Args:
         vertices: (V, 3) float64, the scene's frame and unit.
-        faces: (F, 3) int64 vertices, anticlockwise as seen from outside.
-        normals: (V, 3) unit, outwards; 0 where a vertex has no face of an area.
+        faces: (F, 3) int64 vertex indices, anticlockwise as seen from outside.
+        normals: (V, 3) unit, outwards; 0 if all faces of a vertex have zero area.
         colours: (V, 3) uint8 sRGB, or None.
     """
 
@@ -36,11 +36,11 @@ class Mesh:
 
 
 def surface_of(fused: Fused, *, on_progress: Callable[[float], None] = lambda fraction: None) -> Mesh:
-    """Return where the signed distance is 0, between voxels that were seen.
+    """Return the mesh on which the signed distance is 0, between seen voxels.
 
     Args:
         fused: the distances.
-        on_progress: called with how much is done.
+        on_progress: called with the fraction done.
     """
     keys, vertices, faces, count = [], [], [], 0
     bricks = np.argwhere(_any_block(fused.index)) * _BRICK
@@ -50,7 +50,7 @@ def surface_of(fused: Fused, *, on_progress: Callable[[float], None] = lambda fr
         if found is None:
             continue
         places, triangles = found
-        # A vertex lies on an edge of the grid: two of its coordinates are whole, to the last bit. That names it.
+        # A vertex is on a grid edge: two of its coordinates are exact integers. Edges are unique keys of vertices.
         whole = places == np.round(places)
         keys.append(np.where(whole, 2 * np.round(places), 2 * np.floor(places) + 1).astype(np.int64) + 2 * first)
         vertices.append(places + first)
@@ -65,12 +65,12 @@ def surface_of(fused: Fused, *, on_progress: Callable[[float], None] = lambda fr
 
 
 def mesh_of(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = None) -> Mesh:
-    """Return the mesh of triangles without those of two equal corners, with its normals and no unused vertices."""
+    """Return a mesh with normals, without degenerate triangles (two equal corners) and unused vertices."""
     proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     used, packed = np.unique(faces[proper], return_inverse=True)
     vertices, faces = vertices[used], packed.reshape(-1, 3)
     corners = vertices[faces]
-    # Twice the area long: large triangles count more.
+    # The length is twice the area, so large triangles count more.
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = np.zeros_like(vertices)
     for corner in range(3):
@@ -95,7 +95,7 @@ def without_small_pieces(mesh: Mesh, share: float = _SMALLEST_PIECE) -> Mesh:
 
 
 def _any_block(index: np.ndarray) -> np.ndarray:
-    """Return which bricks of 8^3 blocks hold a block."""
+    """Mark the bricks of 8^3 blocks that contain a block."""
     size = _BRICK // SIDE
     padded = np.pad(index >= 0, [(0, -length % size) for length in index.shape])
     x, y, z = (length // size for length in padded.shape)
@@ -103,7 +103,7 @@ def _any_block(index: np.ndarray) -> np.ndarray:
 
 
 def _march(fused: Fused, first: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices in voxels from `first` on, and triangles of a brick; None where there is no surface."""
+    """Return the vertices of a brick, in voxels from `first`, and its triangles; None if it has no surface."""
     shape = tuple(int(min(_BRICK + 1, total - at)) for at, total in zip(first, fused.grid.shape, strict=True))
     if min(shape) < 2:
         return None
@@ -118,6 +118,6 @@ def _march(fused: Fused, first: np.ndarray) -> tuple[np.ndarray, np.ndarray] | N
     if not (cubes & (negative > 0) & (negative < 8)).any():
         return None
     mask = np.zeros(shape, dtype=bool)
-    mask[1:, 1:, 1:] = cubes  # the library looks at a cube's last corner
+    mask[1:, 1:, 1:] = cubes  # the library reads the mask at a cube's last corner
     vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=mask, allow_degenerate=False)
     return vertices.astype(np.float64), faces

@@ -1,4 +1,4 @@
-"""Points of the surfaces that photos agree on: thinned, with normals, and with how well each is known."""
+"""Surface points that photos agree on: thinned, with normals, and with measures of their accuracy."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,26 +9,26 @@ from nerfcli.render.visibility import largest_angle_deg, sees
 from nerfcli.surface.grid import Grid
 from nerfcli.surface.views import DepthView
 
-# A depth counts where the pixel is this opaque, and median and mean are within this share of it of each other.
+# A depth counts if the pixel is at least this opaque, and median and mean differ by at most this fraction of it.
 _OPAQUE, _AGREEING = 0.9, 0.02
-# From the side a depth is another one within a pixel: the cosine between normal and ray at least.
+# Smallest cosine between normal and ray: at grazing angles the depth changes too much within a pixel.
 _FLATTEST = 0.1
-# Photos that have to see a point.
+# Fewest photos that must see a point.
 LEAST_PHOTOS = 2
 
 
 @dataclass(frozen=True)
 class Points:
-    """N points of surfaces.
+    """N surface points.
 
     Args:
         places: (N, 3) float64, scene's frame.
         normals: (N, 3) float32 unit, towards the camera that saw the point best.
         colours: (N, 3) uint8 sRGB, as that camera sees it.
-        photos: (N,) how many see it.
-        parallax_deg: (N,) the largest angle between the rays of two photos that do.
-        spread: (N,) standard deviation of where light ends, scene units.
-        seen: (N, views) bool.
+        photos: (N,) number of photos that see the point.
+        parallax_deg: (N,) the largest angle between the rays of two photos that see it.
+        spread: (N,) standard deviation of the depth distribution, scene units.
+        seen: (N, views) bool, True where a photo sees the point.
     """
 
     places: np.ndarray
@@ -43,12 +43,12 @@ class Points:
 def agreed_points(
     views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda fraction: None
 ) -> Points:
-    """Return one point at most for each voxel of a grid: of all depths in it the narrowest, if two photos see it.
+    """Return at most one point per voxel: the one with the smallest spread of depth, if two photos see it.
 
     Args:
-        views: what the photos' cameras see.
-        grid: whose voxels thin the points out.
-        on_progress: called with how much is done.
+        views: depth views of the photos.
+        grid: voxels that thin out the points.
+        on_progress: called with the fraction done.
     """
     candidates = _thinned(views, grid)
     seen = np.zeros((len(candidates.places), len(views)), dtype=bool)
@@ -82,7 +82,7 @@ class _Candidates:
 
 
 def _thinned(views: Sequence[DepthView], grid: Grid) -> _Candidates:
-    """Return, of all depths that are sure, the one of each voxel with the smallest spread."""
+    """Return the point with the smallest spread in each voxel, among reliable depths."""
     parts: list[tuple[np.ndarray, ...]] = []
     for view in views:
         with np.errstate(invalid="ignore"):
@@ -95,7 +95,7 @@ def _thinned(views: Sequence[DepthView], grid: Grid) -> _Candidates:
         levels = np.rint(255 * np.clip(view.rgb[sure][inside], 0, 1)).astype(np.uint8)
         keys = np.asarray(np.ravel_multi_index(tuple(cells[inside].T), grid.shape))
         spread = np.nan_to_num(view.spread[sure][inside], nan=np.inf)
-        # Within a view first: most of a view's pixels share voxels with their neighbours.
+        # Thin out each view first: most of its pixels share voxels with their neighbours.
         best = _best(keys, spread)
         parts.append((keys[best], places[inside][best], normals[best], levels[best], spread[best]))
     keys, places, normals, levels, spread = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -104,6 +104,6 @@ def _thinned(views: Sequence[DepthView], grid: Grid) -> _Candidates:
 
 
 def _best(keys: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Return where the smallest spread of each key is, in the order of the keys."""
+    """Return the index of the smallest spread of each key, in the order of the keys."""
     order = np.lexsort((spread, keys))
     return order[np.unique(keys[order], return_index=True)[1]]

@@ -1,20 +1,21 @@
-"""Settings of an exported geometry: region, resolution, size."""
+"""Settings of exported geometry: region, resolution, size."""
 
 from dataclasses import dataclass
 
-# Sides of the pictures whose depths are fused, in pixels, and how many photos are looked through.
+# Longer side in pixels of the pictures whose depths are fused, and most photos to render.
 MAX_SIZE, MOST_VIEWS = 480, 150
 FACES = 300_000
 
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """Settings of extracting a geometry from a field.
+    """Settings for extracting geometry from a field.
 
     Args:
-        box: low and high corner x0, y0, z0, x1, y1, z1 in the scene's frame and unit; None for what the photos see.
-        voxel_size: scene units; None for what the photos resolve.
-        faces: triangles at most.
+        box: low and high corner x0, y0, z0, x1, y1, z1 in the scene's frame and unit; None for the photos'
+            subject.
+        voxel_size: scene units; None for the resolution of the photos.
+        faces: most triangles.
         max_size: longer side of the pictures whose depths are fused, pixels.
     """
 

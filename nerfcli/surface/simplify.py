@@ -11,13 +11,13 @@ from nerfcli.surface.marching import Mesh, mesh_of
 
 
 def simplified(mesh: Mesh, faces: int, *, threads: int) -> Mesh:
-    """Return the mesh with at most about so many faces; as it is where it has no more.
+    """Simplify a mesh to about `faces` faces; one with no more than that is returned unchanged.
 
     Source: Garland and Heckbert 1997, Surface simplification using quadric error metrics; COLMAP's implementation.
     """
     if len(mesh.faces) <= faces:
         return mesh
-    # COLMAP's files hold positions in single precision: of a scene far from its origin they would lose millimetres.
+    # COLMAP's files have float32 positions, which would lose millimetres in a scene far from its origin.
     middle = mesh.vertices.mean(axis=0)
     with tempfile.TemporaryDirectory() as folder:
         given, made = Path(folder) / "given.ply", Path(folder) / "made.ply"

@@ -1,4 +1,4 @@
-"""Depths of a field as the cameras of its photos see them: what surfaces and points are made from."""
+"""Depths of a field as seen by the cameras of its photos, from which surfaces and points are made."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from nerfcli.render.normals import normals_of_points
 from nerfcli.render.pictures import render_picture
 from nerfcli.render.visibility import DepthMap
 
-# The depth of half of all light: it does not move with what little of it ends before or behind a surface.
+# The median depth: a little light that ends before or behind a surface does not change it.
 DEPTH = DepthRequest("median", "z")
 
 
@@ -25,10 +25,10 @@ class DepthView:
     Args:
         frame: the camera and its pose.
         rgb: (H, W, 3) sRGB on the background.
-        opacity: of each pixel, in [0, 1].
-        depth: the median, where at least half of the light ends.
-        spread, disagreement: as `Picture` has them.
-        normals: (H, W, 3) unit, towards the camera, in its axes; NaN where the depths around are no surface.
+        opacity: opacity of each pixel, in [0, 1].
+        depth: the requested depth, by default the median, which needs an opacity of at least 0.5.
+        spread, disagreement: as in `RenderedPicture`.
+        normals: (H, W, 3) unit, towards the camera, in its axes; NaN where the depths around form no surface.
     """
 
     frame: Frame
@@ -40,7 +40,7 @@ class DepthView:
     normals: np.ndarray
 
     def points(self) -> np.ndarray:
-        """(H, W, 3) in the scene's frame; NaN where there is no depth."""
+        """Return the points (H, W, 3) in the scene's frame; NaN where there is no depth."""
         pose = self.frame.world_from_cam
         return (plane_rays(self.frame.camera) * self.depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
 
@@ -49,7 +49,7 @@ class DepthView:
         return DepthMap(self.frame, self.depth * np.linalg.norm(plane_rays(self.frame.camera), axis=-1))
 
     def cosines(self) -> np.ndarray:
-        """(H, W) between the surface's normal and the way to the camera; 0 where there is no normal."""
+        """Return cosines (H, W) between surface normal and direction to the camera; 0 where there is no normal."""
         rays = plane_rays(self.frame.camera)
         return np.nan_to_num(-(self.normals * rays).sum(-1) / np.linalg.norm(rays, axis=-1)).clip(0.0, 1.0)
 
@@ -62,14 +62,14 @@ def depth_views(
     depth: DepthRequest = DEPTH,
     on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[DepthView]:
-    """Render what the pinhole cameras of frames see.
+    """Render the views of frames with pinhole cameras.
 
     Args:
         model: the trained model.
-        frames: as the photos have them.
-        max_size: longer side of the pictures at most, pixels.
-        depth: which depth, along the optical axis.
-        on_progress: called with how much is done.
+        frames: frames of the photos, with any lens.
+        max_size: largest longer side of the pictures, pixels.
+        depth: definition of the depth, along the optical axis.
+        on_progress: called with the fraction done.
     """
     views = []
     for frame in frames:
@@ -85,26 +85,26 @@ def depth_views(
 
 
 def small_pinhole(camera: Camera, max_size: int) -> Camera:
-    """Return the pinhole camera of a lens, with a longer side of `max_size` pixels at most."""
+    """Return the pinhole camera for a lens, with a longer side of at most `max_size` pixels."""
     factor = max(1.0, max(camera.width, camera.height) / max_size)
     pinhole = pinhole_of(camera)
     return pinhole.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
 
 
 def spread_frames(frames: Sequence[Frame], count: int) -> list[Frame]:
-    """At most `count` frames, evenly spread in their order."""
+    """Choose at most `count` frames, evenly spread in their order."""
     if len(frames) <= count:
         return list(frames)
     return [frames[index] for index in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
 
 
 def plane_rays(camera: Camera) -> np.ndarray:
-    """(H, W, 3) directions of a pinhole camera's pixel centres with z = 1, in its axes."""
+    """Return directions (H, W, 3) with z = 1 through a pinhole camera's pixel centres, in its axes."""
     fx, fy, cx, cy = camera.params
     x, y = (np.arange(camera.width) + 0.5 - cx) / fx, (np.arange(camera.height) + 0.5 - cy) / fy
     return np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], axis=-1)
 
 
 def normals_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the normals of a pinhole camera's depth map along the optical axis: see `normals_of_points`."""
+    """Return the normals of a pinhole camera's depth map along the optical axis; see `normals_of_points`."""
     return normals_of_points(plane_rays(camera) * depth[..., None], depth)

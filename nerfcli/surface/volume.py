@@ -1,4 +1,4 @@
-"""A field on a grid: its density and its colour at the centres of voxels."""
+"""Sample a field on a grid: density and colour at the centres of voxels."""
 
 from collections.abc import Callable
 
@@ -10,25 +10,25 @@ from nerfcli.render.model import Model
 from nerfcli.surface.colours import point_colours
 from nerfcli.surface.grid import Grid
 
-# Voxels along the longest side by default.
+# Default number of voxels along the longest side.
 CELLS = 160
 _LAYERS_AT_A_TIME = 8
-# Voxels that take less of the light than this have no colour: it would not be seen.
+# Voxels with a smaller optical depth get no colour, since it would not be visible.
 _VISIBLE = 1e-3
 
 
 def automatic_volume_voxel(box: tuple[float, ...]) -> float:
-    """Return the voxel size that makes `CELLS` along the longest side of a box."""
+    """Return the voxel size that gives `CELLS` voxels along the longest side of a box."""
     return float(np.max(np.array(box[3:]) - np.array(box[:3]))) / CELLS
 
 
 def sample_volume(
     model: Model, grid: Grid, *, on_progress: Callable[[float], None] = lambda fraction: None
 ) -> dict[str, np.ndarray]:
-    """Return the maps of a grid: density (X, Y, Z) float32 in 1 / scene unit, and colour (X, Y, Z, 3) uint8 sRGB.
+    """Return arrays on a grid: density (X, Y, Z) float32 in 1 / scene unit, and colour (X, Y, Z, 3) uint8 sRGB.
 
-    The density is that of the field at the centre, 0 in cells that rays pass over. The colour is the mean over six
-    directions, where a voxel takes a thousandth of the light.
+    The density is the field's at the voxel's centre, 0 in cells that rays skip. The colour is averaged over six
+    directions, and 0 if the optical depth of the voxel is at most a thousandth.
     """
     density = np.zeros(grid.shape, np.float32)
     colour = np.zeros((*grid.shape, 3), np.uint8)
@@ -48,7 +48,7 @@ def sample_volume(
 
 @torch.no_grad()
 def density_at(model: Model, points: np.ndarray) -> np.ndarray:
-    """Density (N,) float32 of the field at points of the scene's frame, per scene unit; 0 in cells that rays skip."""
+    """Return the field's density (N,) float32 per scene unit at points in the scene's frame; 0 in skipped cells."""
     places = torch.as_tensor(model.training_from_scene.apply(points), dtype=torch.float32, device=model.device)
     coordinates = grid_coordinates(places, model.contraction)
     inside = ((coordinates >= 0) & (coordinates <= 1)).all(-1)

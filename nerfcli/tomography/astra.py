@@ -15,14 +15,14 @@ _TYPES = {"cone": "cone_vec", "parallel": "parallel3d_vec"}
 def write_astra(scan: Scan, path: Path) -> Path:
     """Write vectors (views x 12) as .npy or .txt, and the other parameters of `astra_create_proj_geom` as .json.
 
-    Source or direction, detector's centre, column step, row step, in the unit of the scan. ASTRA counts in voxels of
-    side 1: divide all but directions by the side of a voxel.
+    A row holds source or direction, detector's centre, column step and row step, in the unit of the scan. ASTRA assumes
+    voxels of side 1: divide all but directions by the side of a voxel.
 
     Returns:
         The path of the JSON.
 
     Raises:
-        UserError: another suffix, or it cannot be written.
+        UserError: the suffix is neither .npy nor .txt, or a file cannot be written.
     """
     if path.suffix not in SUFFIXES:
         raise UserError(f"{path}: vectors are not written as {path.suffix or 'a folder'}", "name a .npy or .txt file")

@@ -1,7 +1,7 @@
-"""Reconstructions to compare with: filtered back-projection, and SART with total variation.
+"""Baseline reconstructions: filtered back-projection, and SART with total variation.
 
-Both use the views and the projector that the fit uses. Line integrals are logarithms of the data here, as they are in
-programs that do this for a living.
+Both use the same views as the fit, and SART also its projector. Line integrals are logarithms of the data here, as in
+established reconstruction programs.
 """
 
 import numpy as np
@@ -15,14 +15,14 @@ from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid
 from nerfcli.tomography.reconstruct import Projector
 
-# Rounds over all views, the relaxation of the first one and its decay.
+# Number of rounds over all views; relaxation of the first round and its decay per round.
 SART_ROUNDS = 8
 RELAXATION, DECAY = 0.3, 0.9
-# Total variation of SART: this over the number of views, as a share of the largest attenuation. It was found on a
-# tooth at 60, 30 and 15 views (0.004, 0.008, 0.015).
+# Threshold of SART's total variation, as a fraction of the largest attenuation, times the number of views. It was found
+# on a tooth at 60, 30 and 15 views (0.004, 0.008, 0.015).
 TV_OF_VIEWS = 0.24
 TV_STEPS = 20
-# How far a geometry may be from a circle around z, in shares of its radius and in cosines.
+# Largest deviation of a geometry from a circle around z, as a fraction of its radius and in cosines.
 _CIRCULAR = 1e-3
 
 
@@ -32,13 +32,13 @@ def filtered_back_projection(geometry: ScanGeometry, integrals: np.ndarray, grid
     Args:
         geometry: views at equal steps, over a full turn, or half a turn for parallel beams.
         integrals: (V, rows, columns) line integrals.
-        grid: of the volume.
+        grid: grid of the volume.
 
     Returns:
         (Z, Y, X) attenuation in 1 / unit.
 
     Raises:
-        UserError: the scan is no circle around z.
+        UserError: the scan is not a circle around z.
 
     Source: Feldkamp, Davis and Kress 1984, Practical cone-beam algorithm, JOSA A 1(6), equation 28.
     """
@@ -92,10 +92,10 @@ def sart_total_variation(
     """Reconstruct by SART with positivity and total variation denoising after each round over the views.
 
     Args:
-        geometry: of the views.
+        geometry: geometry of the views.
         integrals: (V, rows, columns) line integrals.
-        grid: of the volume.
-        rounds: over all views.
+        grid: grid of the volume.
+        rounds: number of rounds over all views.
 
     Returns:
         (Z, Y, X) attenuation, >= 0.
@@ -124,7 +124,7 @@ def sart_total_variation(
 
 
 def _ramp(projections: np.ndarray, width: float) -> np.ndarray:
-    """Projections filtered along their rows by the ramp, sampled in space (Kak and Slaney 1988, equation 3.61)."""
+    """Filter projections along their rows by the ramp, sampled in space (Kak and Slaney 1988, equation 3.61)."""
     count = projections.shape[-1]
     length = 1 << int(np.ceil(np.log2(2 * count)))
     place = np.arange(length) - length // 2
@@ -137,7 +137,7 @@ def _ramp(projections: np.ndarray, width: float) -> np.ndarray:
 
 
 def _turn(outward: np.ndarray) -> float:
-    """Return the angle that the views go around, with one more step."""
+    """Return the angle that the views span, plus one step."""
     angle = np.unwrap(np.arctan2(outward[:, 1], outward[:, 0]))
     return float(abs(angle[-1] - angle[0]) * len(angle) / max(len(angle) - 1, 1))
 

@@ -1,4 +1,4 @@
-"""Corrections that a scan's own measurements give: the detector's tilt and the brightness of each view.
+"""Corrections estimated from a scan's own measurements: the detector's tilt and the brightness of each view.
 
 The tilt is judged by prediction: a volume fitted to every second view has to explain the others. See `centre` for the
 centre of rotation.
@@ -20,22 +20,22 @@ from nerfcli.tomography.scan import Scan
 # Passes of the trial reconstructions, and the weight of their total variation.
 TRIAL_PASSES = 6
 TRIAL_STRENGTH = 0.3
-# Most views of a trial.
+# A trial uses fewer than twice this many views.
 TRIAL_VIEWS = 120
 TILT_RANGE = np.deg2rad(2.0)
-# Standard errors by which the views that were not fitted have to be explained better for a correction to be taken.
+# A correction is taken if it improves the prediction of views that were not fitted by this many standard errors.
 SIGNIFICANT = 3.0
-# Photons of air that weigh as much as the belief that a view's open beam is the scan's: it drifts by some 1 %.
+# Weight, in photons of air, of the prior that a view's open beam is that of the scan: it drifts by about 1 %.
 PRIOR_PHOTONS = 1e4
 
 
 @dataclass(frozen=True)
 class Correction:
-    """A corrected number of the geometry.
+    """A correction of one parameter of the geometry.
 
     Args:
-        value: in pixels, or radians.
-        gain: mean drop of the deviance per pixel of the views that were not fitted, against 0.
+        value: the correction, in pixels or radians.
+        gain: mean decrease of the deviance per pixel of the views that were not fitted, compared with the value 0.
         error: standard error of the gain, over views.
     """
 
@@ -45,12 +45,12 @@ class Correction:
 
     @property
     def holds(self) -> bool:
-        """Whether it predicts the views that were not fitted significantly better."""
+        """True if the correction predicts the views that were not fitted significantly better."""
         return self.gain > SIGNIFICANT * self.error
 
 
 def detector_tilt(scan: Scan) -> Correction:
-    """Estimate the rotation of the detector in its plane, see `ScanGeometry.tilted`; 0 for a single row."""
+    """Estimate the rotation of the detector in its plane, see `ScanGeometry.tilted`; 0 for fewer than 8 rows."""
     if scan.geometry.rows < 8:
         return Correction(0.0, 0.0, 0.0)
     binning = max(1, scan.geometry.columns // 64)
@@ -64,12 +64,12 @@ def detector_tilt(scan: Scan) -> Correction:
 def air_factors(likelihood: Poisson, integrals: torch.Tensor, *, margin: float = 0.01) -> torch.Tensor:
     """Estimate the brightness of each view relative to the open beam, from pixels beside the object.
 
-    Formula: sum of counts over sum of expected counts, of pixels whose line integral is below `margin`, with
+    Formula: sum of counts over sum of expected counts, for pixels whose line integral is below `margin`, with
     `PRIOR_PHOTONS` added to both. Views without such pixels get 1.
 
     Args:
-        likelihood: of (views, pixels).
-        integrals: (views, pixels) of a first reconstruction.
+        likelihood: counts, open beam and background, (views, pixels).
+        integrals: (views, pixels) line integrals of a first reconstruction.
         margin: the largest line integral that counts as air.
     """
     air = (integrals < margin) & (likelihood.open_beam > 0)
@@ -79,7 +79,7 @@ def air_factors(likelihood: Poisson, integrals: torch.Tensor, *, margin: float =
 
 
 def _search(misfit: Callable[[float], np.ndarray], *, bound: float, steps: int, precise: float) -> Correction:
-    """Minimise the misfit: by steps over the whole range, then between the neighbours of the best."""
+    """Minimise the misfit: on a grid over the whole range, then between the neighbours of the best value."""
     grid = np.linspace(-bound, bound, steps)
     means = [float(np.nanmean(misfit(float(value)))) for value in grid]
     best = int(np.argmin(means))

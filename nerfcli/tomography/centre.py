@@ -7,9 +7,9 @@ import numpy as np
 
 from nerfcli.tomography.quick import Row, misfit
 
-# Columns of the row on which the centre is searched, and on which it is refined.
+# Largest number of columns of the binned row for the search of the centre, and for its refinement.
 COARSE, FINE = 80, 200
-# The search goes this part of the detector's width to either side.
+# The search covers this fraction of the detector's width to either side.
 RANGE = 0.12
 # Standard errors by which one hypothesis has to predict better than another.
 SIGNIFICANT = 3.0
@@ -25,8 +25,8 @@ class Centre:
 
     Args:
         shift: columns that the detector has to be moved by.
-        errors: (views,) mean squares of the views that were not fitted, at the best shift.
-        at_stated: likewise without a shift.
+        errors: (views // 2,) mean squared errors of the views that were not fitted, at the best shift.
+        at_stated: the same without a shift.
         error: standard error of the shift, in columns.
     """
 
@@ -37,7 +37,7 @@ class Centre:
 
     @property
     def is_off(self) -> bool:
-        """Whether the shift predicts other views better than none, beyond chance, and is larger than its error."""
+        """True if the shift predicts other views significantly better and exceeds `LEAST_PX` and twice its error."""
         by, _ = margin(self.errors, self.at_stated)
         return by > SIGNIFICANT and abs(self.shift) > max(LEAST_PX, 2 * self.error)
 
@@ -45,7 +45,8 @@ class Centre:
 def centre_of(row: Row, *, mirrored: bool = False) -> Centre:
     """Estimate the shift of the detector.
 
-    By whole columns of a coarse row over the whole range, then by a parabola through the best of a finer one.
+    Whole columns of a coarse row are searched over the whole range; then a finer row refines the best shift by halving
+    steps, and by a parabola at the end.
     """
     coarse, fine = row.binned(COARSE), row.binned(FINE)
     columns = row.geometry.columns
@@ -93,7 +94,9 @@ def _parabola(best: float, step: float, errors: Callable[[float], np.ndarray]) -
 def margin(better: np.ndarray, worse: np.ndarray) -> tuple[float, float]:
     """Compare two predictions: the difference in standard errors over views, and the ratio of rms.
 
-    The larger of two tests: of the mean gain, and of signed ranks, which a few views with large gains do not weaken.
+    The difference is the larger of two test statistics: of the mean gain, and of signed ranks, which a few views with
+    large gains do not weaken.
+
     Source of the second: Wilcoxon 1945, Individual comparisons by ranking methods, Biometrics Bulletin 1(6).
     """
     gain = worse - better

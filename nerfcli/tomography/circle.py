@@ -1,7 +1,7 @@
 """Circular scans as most scanners describe them: a source and a flat detector around an axis.
 
-`Circle.geometry` makes vectors of the statement, `circle_of` makes the statement of vectors, by other formulas: what
-was converted is proved by going there and back.
+`Circle.geometry` turns such a description into vectors, and `circle_of` turns vectors into a description by independent
+formulas, so that a round trip verifies a conversion.
 """
 
 from collections.abc import Mapping
@@ -19,15 +19,15 @@ class Circle:
 
     Args:
         beam: "cone" (a fan is a cone with one row) or "parallel".
-        angles: (V,) radians at which the source stands, counter-clockwise seen from +z, where rows of the detector run
-            to the right, seen from the source.
-        pixel_width, pixel_height: of the detector.
-        rows, columns: of the detector.
+        angles: (V,) angles of the source in radians, counter-clockwise seen from +z. Rows of the detector run to the
+            right, seen from the source, unless `mirrored`.
+        pixel_width, pixel_height: size of a detector pixel.
+        rows, columns: number of pixels of the detector.
         source_origin, source_detector: distances along the normal of the detector; 0 for parallel beams.
-        lateral: how far to the right of the axis the source stands, seen from the source; the detector goes with it.
-        column_shift, row_shift: by how many pixels the detector's middle stands to the right of, and below, the foot
-            of the source's perpendicular.
-        tilt: radians, from the columns towards the rows, see `ScanGeometry.tilted`.
+        lateral: distance of the source to the right of the axis, seen from the source; the detector moves with it.
+        column_shift, row_shift: pixels by which the detector's centre is to the right of, and below, the foot of the
+            perpendicular from the source.
+        tilt: rotation of the detector in radians, from columns towards rows, see `ScanGeometry.tilted`.
         mirrored: whether columns are numbered from right to left, seen from the source.
     """
 
@@ -79,21 +79,21 @@ class Circle:
         return replace(self, **{name: factor * getattr(self, name) for name in lengths})
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the circle as plain values."""
         return asdict(self) | {"angles": list(self.angles)}
 
 
 def circle_from_json(content: Mapping[str, Any]) -> Circle:
-    """Return what `Circle.to_json` wrote."""
+    """Restore a circle from the output of `Circle.to_json`."""
     return Circle(**{**content, "angles": tuple(content["angles"])})
 
 
 def circle_of(geometry: ScanGeometry) -> tuple[Circle, float]:
-    """Fit a circle to a geometry; also return the distance of its vectors from it.
+    """Fit a circle to a geometry; also return its distance from the geometry.
 
     Returns:
-        The circle, medians over views of all but the angles; and the largest distance between its vectors and the
-        geometry's, in widths of a pixel at the detector, over corners of the detector and the source.
+        The circle, with medians over views for all but the angles; and the largest distance between its detector
+        corners or source and those of the geometry, in widths of a detector pixel.
     """
     normal = np.cross(geometry.column_step, geometry.row_step)
     to_source = -geometry.emitter if geometry.beam == "parallel" else geometry.emitter - geometry.centre
@@ -156,7 +156,7 @@ def differences(one: Circle, other: Circle) -> dict[str, float]:
 
 
 def _distance(one: ScanGeometry, other: ScanGeometry) -> float:
-    """Return the largest distance between detectors' corners and sources; of parallel beams across the rays."""
+    """Return the largest distance between detector corners, or sources; for parallel beams only across the rays."""
     worst = 0.0
     for along in (-0.5, 0.5):
         for down in (-0.5, 0.5):

@@ -1,8 +1,8 @@
 """Geometry of a scan: one description for parallel, fan and cone beams.
 
-Per view: where rays come from, the detector's centre, and the two vectors from a pixel to its neighbours. These are
-the vectors of ASTRA (`parallel3d_vec`, `cone_vec`); every other description of a scan converts into them. The object
-stands still, and its frame is the one of the volume: lengths in the unit of the scan, z along the usual rotation axis.
+Each view states where its rays come from, the detector's centre, and the two vectors from a pixel to its neighbours.
+These are ASTRA's vectors (`parallel3d_vec`, `cone_vec`); every other description of a scan is converted into them. The
+object is fixed, and its frame is that of the volume: lengths in the scan's unit, z along the usual rotation axis.
 """
 
 from dataclasses import dataclass, replace
@@ -20,10 +20,10 @@ class ScanGeometry:
 
     Args:
         beam: whether rays meet in a point ("cone") or are parallel.
-        emitter: (V, 3) float64, where the source stands ("cone"), or the unit direction of the rays ("parallel").
+        emitter: (V, 3) float64 position of the source ("cone"), or unit direction of the rays ("parallel").
         centre: (V, 3) centre of the detector.
-        column_step: (V, 3) from a pixel to the next one of its row.
-        row_step: (V, 3) from a pixel to the one below it.
+        column_step: (V, 3) vector from a pixel to the next one in its row.
+        row_step: (V, 3) vector from a pixel to the one below it.
         rows, columns: number of pixels of the detector.
 
     Raises:
@@ -66,10 +66,9 @@ class ScanGeometry:
         )
 
     def binned(self, factor: int) -> "ScanGeometry":
-        """Return the detector with pixels `factor` times as large;
-        pixels that fill no larger one are cut off at the end.
+        """Return the scan with detector pixels `factor` times as large.
 
-        Rows are kept as they are where there are fewer of them than `factor`.
+        Leftover rows and columns at the end are cut off. With fewer than `factor` rows, rows are not binned.
         """
         row_factor = factor if self.rows >= factor else 1
         rows, columns = self.rows // row_factor, max(self.columns // factor, 1)
@@ -86,13 +85,11 @@ class ScanGeometry:
         )
 
     def shifted(self, columns: float, rows: float = 0.0) -> "ScanGeometry":
-        """Return the detector moved by some pixels along its rows and columns,
-        as a wrong centre of rotation moves it.
-        """
+        """Return the scan with its detector moved by `columns` and `rows` pixels, as by a wrong centre of rotation."""
         return replace(self, centre=self.centre + columns * self.column_step + rows * self.row_step)
 
     def tilted(self, angle: float) -> "ScanGeometry":
-        """Return the detector turned in its plane about its centre, from its columns towards its rows, in radians."""
+        """Return the scan with its detector turned in its plane about its centre, in radians, from columns to rows."""
         width = np.linalg.norm(self.column_step, axis=1, keepdims=True)
         height = np.linalg.norm(self.row_step, axis=1, keepdims=True)
         along, down = self.column_step / width, self.row_step / height
@@ -102,24 +99,24 @@ class ScanGeometry:
         )
 
     def mirrored(self) -> "ScanGeometry":
-        """Return the detector whose columns are numbered from the other side."""
+        """Return the scan with the detector's columns numbered from the other side."""
         return replace(self, column_step=-self.column_step)
 
     def rays(self, views: ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and unit directions of the rays through the centres of all pixels.
+        """Return origins and unit directions of the rays through the centres of all pixels.
 
         Args:
             views: indices of the views; all if not given.
 
         Returns:
-            Two arrays (views, rows, columns, 3), float64. A ray of a parallel beam begins at its pixel's foot on the
-            plane through the frame's origin.
+            Two arrays (views, rows, columns, 3), float64. The origin of a parallel ray is its point closest to the
+            frame's origin.
         """
         index = np.arange(self.views) if views is None else np.asarray(views)
         return self._through(index[:, None, None], np.arange(self.rows)[:, None], np.arange(self.columns))
 
     def rays_of_pixels(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and directions (N, 3), as `rays` has them, of pixels (N,) counted through all views, row by row."""
+        """Return origins and directions (N, 3), as `rays` does, for flat indices (N,) of pixels in all views."""
         line, column = np.divmod(pixels, self.columns)
         return self._through(*np.divmod(line, self.rows), column)
 
@@ -135,13 +132,13 @@ class ScanGeometry:
         return emitter.copy(), along_ray / np.linalg.norm(along_ray, axis=-1, keepdims=True)
 
     def pixel_of(self, view: int, points: np.ndarray) -> np.ndarray:
-        """Project points into a view: (N, 2) column and row, 0 at the centre of the first pixel.
+        """Project points into a view: return (N, 2) column and row, with 0 at the centre of the first pixel.
 
-        Formula: the point where the ray through the point meets the detector's plane, in units of its steps. The unit
-        is pixels; points in the plane of the source give numbers that are not finite.
+        Formula: the intersection of the ray through the point with the detector's plane, in pixels. Points in the plane
+        through the source that is parallel to the detector give numbers that are not finite.
 
         Args:
-            view: its index.
+            view: index of the view.
             points: (N, 3).
         """
         normal = np.cross(self.column_step[view], self.row_step[view])
@@ -159,7 +156,7 @@ class ScanGeometry:
 
     @property
     def magnification(self) -> np.ndarray:
-        """(V,) how many times larger the detector shows what stands at the frame's origin."""
+        """(V,) magnification on the detector of an object at the frame's origin."""
         if self.beam == "parallel":
             return np.ones(self.views)
         normal = np.cross(self.column_step, self.row_step)
@@ -169,13 +166,13 @@ class ScanGeometry:
 
     @property
     def pixel_at_origin(self) -> tuple[float, float]:
-        """Height and width of a pixel where the object stands, in the scan's unit: medians over views."""
+        """Height and width of a pixel at the frame's origin, in the scan's unit: medians over views."""
         height = np.linalg.norm(self.row_step, axis=1) / self.magnification
         width = np.linalg.norm(self.column_step, axis=1) / self.magnification
         return float(np.median(height)), float(np.median(width))
 
     def vectors(self) -> np.ndarray:
-        """(V, 12) as ASTRA has them: source or direction, detector's centre, column step, row step."""
+        """Return ASTRA's vectors (V, 12): source or direction, detector's centre, column step, row step."""
         return np.concatenate([self.emitter, self.centre, self.column_step, self.row_step], axis=1)
 
 
@@ -207,19 +204,19 @@ def circular_cone(
     rows: int,
     columns: int,
 ) -> ScanGeometry:
-    """Return a source and a flat detector on a circle around z, on opposite sides of the origin.
+    """Return the geometry of a source and a flat detector that circle around z, on opposite sides of the origin.
 
-    The source of a view with angle a stands at (cos a, sin a, 0) * source_origin. Seen from there, columns run to the
+    The source of a view with angle a is at (cos a, sin a, 0) * source_origin. Seen from the source, columns run to the
     right and rows down, with +z up.
 
     Args:
         angles: (V,) radians, counter-clockwise seen from +z.
-        source_origin, source_detector: distances.
-        pixel_width, pixel_height: of the detector's pixels.
+        source_origin, source_detector: distances from the source.
+        pixel_width, pixel_height: size of the detector's pixels.
         rows, columns: number of pixels.
 
     Raises:
-        ValueError: source_detector is not larger than 0, or source_origin is not.
+        ValueError: source_origin or source_detector is not above 0.
     """
     if not (source_origin > 0 and source_detector > 0):
         raise ValueError(f"source_origin {source_origin} and source_detector {source_detector} must be above 0")
@@ -238,11 +235,11 @@ def circular_cone(
 def circular_parallel(
     angles: ArrayLike, *, pixel_width: float, pixel_height: float, rows: int, columns: int
 ) -> ScanGeometry:
-    """Return a parallel beam around z: `circular_cone` with a source infinitely far away.
+    """Return the geometry of a parallel beam around z: `circular_cone` with a source infinitely far away.
 
     Args:
         angles: (V,) radians, counter-clockwise seen from +z: rays of a view come from (cos a, sin a, 0).
-        pixel_width, pixel_height: of the detector's pixels.
+        pixel_width, pixel_height: size of the detector's pixels.
         rows, columns: number of pixels.
     """
     outward, right, down = _circle(angles)

@@ -1,4 +1,4 @@
-"""The grid of voxels a volume is stored on, and where its voxels stand."""
+"""The voxel grid of a volume: number, position and size of its voxels."""
 
 from dataclasses import dataclass
 
@@ -36,7 +36,7 @@ class VoxelGrid:
         return self.first[index] + self.size * np.arange(self.shape[2 - index])
 
     def coarser(self, factor: int) -> "VoxelGrid":
-        """Return a grid over the same box with voxels `factor` times as large, rounded up."""
+        """Return a grid over the same box with voxels `factor` times as large, their number rounded up."""
         shape = tuple(-(-count // factor) for count in self.shape)
         half = self.size * (factor - 1) / 2
         first = (self.first[0] + half, self.first[1] + half, self.first[2] + half)
@@ -51,14 +51,14 @@ def centred_grid(extent: tuple[float, float, float], size: float) -> VoxelGrid:
 
 
 def grid_of_scan(geometry: ScanGeometry, size: float | None = None) -> VoxelGrid:
-    """Return the box that the detector sees in some view, in voxels of a pixel's size at the object.
+    """Return a grid over the region that any view sees, with voxels of a pixel's size at the object.
 
-    Across the axis it is the square around the circle that the widest ray of any view touches; along z it is what the
-    detector's first and last row see at the axis. A detector of one row gets one layer.
+    Across the axis, the grid is the square around the circle that the outermost ray of any view touches; along z, it
+    spans the detector's height at the axis. A detector of one row gets one layer.
 
     Args:
-        geometry: of the scan.
-        size: of a voxel; the smaller side of a pixel where the object stands if not given.
+        geometry: geometry of the scan.
+        size: side of a voxel; by default the smaller side of a pixel at the object, or its width for a single row.
     """
     height, width = geometry.pixel_at_origin
     size = min(height, width) if size is None and geometry.rows > 1 else (width if size is None else size)
@@ -74,9 +74,7 @@ def grid_of_scan(geometry: ScanGeometry, size: float | None = None) -> VoxelGrid
 
 
 def layers_of_rays(grid: VoxelGrid, geometry: ScanGeometry) -> VoxelGrid:
-    """Return the layers of a grid that the rays of a scan pass,
-    for a detector of fewer rows than the grid was made for.
-    """
+    """Return the layers of a grid that the rays of a scan cross, for a scan with fewer rows than the grid's."""
     origins, directions = geometry.rays()
     across = np.linalg.norm(directions[..., :2], axis=-1)
     nearest = -(origins[..., :2] * directions[..., :2]).sum(-1) / across**2

@@ -1,7 +1,7 @@
-"""Fit a hash grid to a scan: attenuation as a function of position, with line integrals summed over samples of rays.
+"""Fit a hash grid to a scan: attenuation as a function of position, with line integrals as sums over samples of rays.
 
-The objective is that of `reconstruct`, by stochastic gradients: random pixels for the likelihood, random points for the
-total variation. No contraction, no early stop, no dependence on the direction: every sample of a ray counts.
+It minimises the objective of `reconstruct` by stochastic gradient descent, with random pixels for the likelihood and
+random points for the total variation. There is no contraction, early stop or view dependence: every sample counts.
 
 Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989; Zha et al. 2022, NAF, arXiv:2209.14540, for X-rays.
 """
@@ -23,10 +23,10 @@ from nerfcli.tomography.reconstruct import Problem, curvature_bound
 LEVELS, FEATURES, WIDTH = 8, 4, 32
 LOG2_ROWS = 16
 COARSEST = 16
-# Samples are this many voxels apart, each at a random place in its interval.
+# Largest length in voxels of the intervals along a ray; each has one sample at a random place.
 STEP_VOXELS = 1.5
-# At most about so many samples a step, at least so many steps a pass; points of total variation, per sample.
-SAMPLES, STEPS_OF_PASS = 2**16, 64
+# Samples per step (about, at most) and steps per pass (at least); points of total variation per sample.
+SAMPLES, MIN_STEPS_PER_PASS = 2**16, 64
 SMOOTHED = 1 / 16
 RATE, LAST_RATE = 1e-2, 1e-4
 BETAS, EPS = (0.9, 0.99), 1e-15
@@ -39,13 +39,13 @@ class HashVolume:
     """Attenuation start * exp(network(code of the position)), on the cube around a grid.
 
     Args:
-        table: (L, T, F).
-        layers: (H, L * F) and (1, H).
-        start: attenuation of a code of 0, in 1 / unit.
-        low: (x, y, z) corner of the cube.
-        side: of the cube.
-        finest: cells along the cube of the last level.
-        passes: how many times all pixels have been looked at.
+        table: (L, T, F) hash table: levels, rows, features.
+        layers: weights of the network's two layers, (H, L * F) and (1, H).
+        start: attenuation where the code is 0, in 1 / unit.
+        low: (x, y, z) lowest corner of the cube.
+        side: side of the cube, in the scan's unit.
+        finest: number of cells along the cube at the last level.
+        passes: number of passes over all pixels so far.
     """
 
     table: Tensor
@@ -61,18 +61,18 @@ class HashVolume:
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """Learned arrays by the names of their files."""
+        """Learned arrays, keyed by file name."""
         tensors = zip(ARRAYS, (self.table, *self.layers), strict=True)
         return {name: tensor.detach().numpy() for name, tensor in tensors}
 
     @property
     def resolutions(self) -> tuple[int, ...]:
-        """Cells along the cube of each level, in geometric progression."""
+        """Number of cells along the cube at each level, in geometric progression."""
         growth = math.log(max(self.finest, COARSEST) / COARSEST) / (LEVELS - 1)
         return tuple(round(COARSEST * math.exp(growth * level)) for level in range(LEVELS))
 
     def attenuation(self, points: Tensor, *, sink: Tensor | None = None) -> Tensor:
-        """(N,) attenuation at points (N, 3); gradients of the table are added to the sink."""
+        """Return the attenuation (N,) at points (N, 3); gradients of the table are added to the sink."""
         places = ((points - torch.tensor(self.low)) / self.side).float()
         code = self.backend.hash_encode(places, self.table, self.resolutions, sink=sink)
         hidden = torch.relu(code @ self.layers[0].t())
@@ -80,7 +80,7 @@ class HashVolume:
 
     @torch.no_grad()
     def on_grid(self, grid: VoxelGrid) -> Tensor:
-        """(Z, Y, X) attenuation at the centres of voxels."""
+        """Return the attenuation (Z, Y, X) at the voxel centres of a grid."""
         axes = [torch.from_numpy(grid.axis(name)).float() for name in "zyx"]
         out = torch.empty(grid.shape)
         for layer, z in enumerate(axes[0]):
@@ -91,7 +91,7 @@ class HashVolume:
 
 
 def new_arrays(seed: int) -> dict[str, np.ndarray]:
-    """Return what a volume of one value has learned."""
+    """Return random initial arrays; the volume that they describe is nearly constant."""
     generator = torch.Generator().manual_seed(seed)
     shapes = ((LEVELS, 2**LOG2_ROWS, FEATURES), (WIDTH, LEVELS * FEATURES), (1, WIDTH))
     bounds = (1e-4, math.sqrt(6 / (LEVELS * FEATURES)), math.sqrt(6 / WIDTH))
@@ -102,7 +102,7 @@ def new_arrays(seed: int) -> dict[str, np.ndarray]:
 
 
 def hash_volume(grid: VoxelGrid, start: float, arrays: Mapping[str, np.ndarray], *, passes: float = 0.0) -> HashVolume:
-    """Return a volume around a grid, by what it has learned; its finest level has a cell per voxel."""
+    """Build a hash volume around a grid from its learned arrays; its finest level has one cell per voxel."""
     table, one, two = (torch.from_numpy(np.array(arrays[name])).requires_grad_() for name in ARRAYS)
     x, y, z = (centre - grid.size / 2 for centre in grid.first)
     return HashVolume(table, (one, two), start, (x, y, z), max(grid.shape) * grid.size, max(grid.shape), passes)
@@ -111,13 +111,13 @@ def hash_volume(grid: VoxelGrid, start: float, arrays: Mapping[str, np.ndarray],
 def line_integrals(
     volume: HashVolume, rays: tuple[Tensor, Tensor], grid: VoxelGrid, *, jitter: Tensor, sink: Tensor | None = None
 ) -> Tensor:
-    """(R,) sums over samples between the points where rays enter and leave the grid's box; 0 for those that miss it.
+    """Return line integrals (R,) of rays inside the grid's box, as sums over samples; 0 for rays that miss the box.
 
     Args:
-        volume: what is summed.
+        volume: attenuation to integrate.
         rays: (R, 3) origins and unit directions, float64.
-        grid: whose box ends the rays, and whose voxels the step is stated in.
-        jitter: numbers in [0, 1), repeated along the samples.
+        grid: its box bounds the rays, and `STEP_VOXELS` refers to its voxels.
+        jitter: offsets of samples within their intervals, in [0, 1), repeated along the samples.
         sink: see `HashVolume.attenuation`.
     """
     origins, directions = rays
@@ -139,7 +139,7 @@ def line_integrals(
 
 
 def total_variation(volume: HashVolume, points: Tensor, size: float, *, sink: Tensor | None = None) -> Tensor:
-    """Mean over points (N, 3) of the length of the difference to neighbours a voxel away along x, y and z."""
+    """Return the mean over points (N, 3) of the norm of the differences to neighbours `size` away along x, y and z."""
     steps = torch.cat([torch.zeros(1, 3), size * torch.eye(3)])
     values = volume.attenuation((points[:, None] + steps).view(-1, 3), sink=sink).view(-1, 4)
     return ((values[:, 1:] - values[:, :1]).square().sum(1) + 1e-12 * volume.start**2).sqrt().mean()
@@ -155,16 +155,16 @@ def fit_hash(
     seconds: float | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> None:
-    """Fit a hash volume in place until the passes are done or the time is over.
+    """Fit a hash volume in place until the passes are done or the time is up.
 
     Args:
-        problem: what to fit to.
-        volume: where to begin.
-        strength: of total variation, as in `reconstruct`.
-        seed: of pixels and samples.
-        passes: how many times to look at all pixels.
-        seconds: how long to work; None for no limit, 0 for no step.
-        progress: takes the share done and a few words.
+        problem: the data to fit.
+        volume: start of the fit, changed in place.
+        strength: weight of total variation, as in `reconstruct`.
+        seed: seed for the choice of pixels and samples.
+        passes: number of passes over all pixels; None for no limit.
+        seconds: time limit; None for no limit, 0 for no step.
+        progress: called with the fraction done and a short text.
     """
     begun = time.perf_counter()
     likelihood, grid = problem.likelihood.by_ray(), problem.grid
@@ -172,7 +172,7 @@ def fit_hash(
     geometry = problem.geometry
     count = geometry.views * geometry.rows * geometry.columns
     samples_of_ray = max(grid.shape) / STEP_VOXELS
-    rays_of_step = math.ceil(min(SAMPLES / samples_of_ray, count / STEPS_OF_PASS))
+    rays_of_step = math.ceil(min(SAMPLES / samples_of_ray, count / MIN_STEPS_PER_PASS))
     smoothed = math.ceil(SMOOTHED * rays_of_step * samples_of_ray)
     sink = torch.zeros_like(volume.table)
     first, second = torch.zeros_like(volume.table), torch.zeros_like(volume.table)

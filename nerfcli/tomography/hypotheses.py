@@ -1,8 +1,8 @@
 """Rank hypotheses about a scan by its data: direction of rotation, mirrored detector, centre of rotation.
 
-A wrong answer still gives a picture that looks right. So each hypothesis has to predict views that it was not fitted
-to, and the margin between hypotheses is reported, as is what no data can decide: mirroring the detector and reversing
-the direction together only mirror the object, and parallel beams allow each of them alone.
+A wrong hypothesis still gives a picture that looks right. So each hypothesis has to predict views that it was not
+fitted to, and the margin between hypotheses is reported. So is the ambiguity that no data can resolve: mirroring the
+detector and reversing the direction together only mirror the object; parallel beams cannot reveal even one of them.
 """
 
 from collections.abc import Callable
@@ -13,12 +13,12 @@ import numpy as np
 from nerfcli.errors import UserError
 from nerfcli.tomography.centre import FEWEST_VIEWS, SIGNIFICANT, centre_of, margin
 from nerfcli.tomography.formats.assemble import axis_column
-from nerfcli.tomography.quick import telling_row
+from nerfcli.tomography.quick import highest_contrast_row
 from nerfcli.tomography.scan import Scan
 
 Progress = Callable[[float, str], None]
 
-# By how much the rms has to differ besides: below this, a class differs by what a fit does to noise.
+# Least ratio of the rms for a verdict, besides significance: smaller differences come from how a fit treats noise.
 LEAST_RATIO = 1.05
 
 
@@ -27,11 +27,11 @@ class Hypothesis:
     """One hypothesis about a scan.
 
     Args:
-        reversed: whether the object turned the other way than the scan says.
+        reversed: whether the object turned in the direction opposite to the one that the scan states.
         mirrored: whether columns are numbered from the other side.
-        centre_column: that the axis is projected to, the best one for this reading.
-        rms: of line integrals that were predicted, in views that were not fitted.
-        as_stated: whether this is how the scan says.
+        centre_column: column that the axis is projected to, as estimated under this hypothesis.
+        rms: rms error of predicted line integrals, in views that were not fitted.
+        as_stated: whether this is the hypothesis that the scan states.
     """
 
     reversed: bool
@@ -47,14 +47,14 @@ class Judgement:
 
     Args:
         hypotheses: the best first.
-        verdict: "holds" (as stated), "mirrored" (that, or reversed), or "undecided".
-        ratio: how much worse the rms of the other reading is; 1 where they are the same.
-        margin: by how many standard errors.
-        stated_column, centre_column: of the axis, as the scan says and as the data do.
+        verdict: "holds" (as stated), "mirrored" (either mirrored or reversed), or "undecided".
+        ratio: rms of the worse reading over that of the better one; 1 where they are the same.
+        margin: difference between the two readings in standard errors.
+        stated_column, centre_column: column of the axis, as the scan states it and as estimated from the data.
         centre_error: standard error of the centre in columns.
         centre_ratio: rms at the stated centre over that at the best one.
         centre_holds: whether the stated centre is as good as the best one.
-        ambiguity: what the data cannot decide.
+        ambiguity: an explanation of what the data cannot decide, for the user.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -70,7 +70,7 @@ class Judgement:
 
     @property
     def options(self) -> str:
-        """Options of `nerfcli convert` that read the scan as the data say; empty if it is so already."""
+        """Options of `nerfcli convert` that correct the scan according to the data; empty if none are needed."""
         options = ["--mirrored"] if self.verdict == "mirrored" else []
         if not self.centre_holds:
             options.append(f"--centre-of-rotation {self.centre_column:.2f}")
@@ -87,7 +87,7 @@ def judge(scan: Scan, *, progress: Progress = lambda share, detail: None) -> Jud
         raise UserError(
             f"{scan.geometry.views} views are too few to judge the geometry", f"at least {FEWEST_VIEWS} are needed"
         )
-    row = telling_row(scan).thinned()
+    row = highest_contrast_row(scan).thinned()
     stated = axis_column(scan.geometry)
     progress(0.0, "as stated")
     plain = centre_of(row, mirrored=False)

@@ -1,6 +1,6 @@
 """Likelihoods of measurements given line integrals: Poisson for counts, least squares for line integrals.
 
-No logarithm of data is taken where there are counts: with few photons it is biased, and of none it does not exist.
+The likelihood of counts takes no logarithm of the data: it is biased for few photons and undefined for none.
 """
 
 from dataclasses import dataclass, replace
@@ -18,37 +18,37 @@ _MEDIAN_DEVIATION = 0.6745
 
 
 class Likelihood(Protocol):
-    """Negative log likelihood of line integrals, view by view: tensors are (views, pixels), in the order of pixels."""
+    """Negative log likelihood of line integrals, view by view; tensors are (views, pixels), with pixels row by row."""
 
     def slope(self, integrals: Tensor, views: Tensor) -> Tensor:
-        """Derivative of the negative log likelihood by each line integral; 0 where nothing usable was measured."""
+        """Return the derivative of the negative log likelihood by each line integral; 0 for unusable pixels."""
         ...
 
     def curvature(self, views: Tensor) -> Tensor:
-        """Second derivative at the line integrals that the data themselves suggest, >= 0."""
+        """Return the second derivative, >= 0, at the line integrals that the data themselves suggest."""
         ...
 
     def deviance(self, integrals: Tensor, views: Tensor) -> Tensor:
-        """Squared misfit in units of the noise: 1 is expected of each pixel. NaN where nothing usable was measured."""
+        """Return the squared misfit over the noise variance, 1 on average for a correct model; NaN if unusable."""
         ...
 
     def suggested(self, views: Tensor) -> Tensor:
-        """Line integrals that the data suggest, for a start; NaN where nothing usable was measured."""
+        """Return line integrals estimated directly from the data, to start a fit; NaN for unusable pixels."""
         ...
 
     def by_ray(self) -> "Likelihood":
-        """Return the same with each pixel as a view of its own."""
+        """Return the same likelihood with each pixel as a separate view."""
         ...
 
 
 @dataclass(frozen=True)
 class Poisson:
-    """Counts of photons: N ~ Poisson(O exp(-p) + B), for a model whose line integrals p are themselves a little off.
+    """Photon counts: N ~ Poisson(O exp(-p) + B), for a model whose line integrals p have small errors of their own.
 
-    Voxels cannot follow sharp edges, and no scanner is what its description says. A line integral that is off by some
-    `model_error` k moves the expected signal S by k S, so that counts scatter with the variance E + k^2 S^2: bright
-    rays weigh no more than the model deserves. Slopes, curvatures and deviances are those of the Poisson likelihood
-    over 1 + k^2 S^2 / E (a quasi-likelihood).
+    Voxels cannot represent sharp edges, and no scanner matches its description exactly. An error of a line integral of
+    about `model_error` k changes the expected signal S by k S, so that counts of expectation E have the variance
+    E + k^2 S^2: bright rays get no more weight than the model's accuracy justifies. Slopes, curvatures and deviances
+    are those of the Poisson likelihood over 1 + k^2 S^2 / E (a quasi-likelihood).
 
     Args:
         counts, open_beam, background: (views, pixels) photons N, O and B; O is 0 for pixels that are not usable.
@@ -70,13 +70,13 @@ class Poisson:
         return torch.where(signal > 0, signal * (self.counts[views] / expected - 1) / inflation, 0)
 
     def curvature(self, views: Tensor) -> Tensor:
-        """(N - B)^2 / N, at least of one photon. Source: as for `slope`, equation 17, precomputed curvatures."""
+        """Return (N - B)^2 / N with N - B >= 1. Source: as for `slope`, equation 17, precomputed curvatures."""
         signal = (self.counts[views] - self.background[views]).clamp_min(1)
         curvature = torch.minimum(signal.square() / self.counts[views].clamp_min(1), signal)
         return torch.where(self.open_beam[views] > 0, curvature / (1 + self.model_error**2 * curvature), 0)
 
     def deviance(self, integrals: Tensor, views: Tensor) -> Tensor:
-        """Pearson's: (N - E)^2 over its variance E + k^2 S^2, whose mean is 1 whatever the count."""
+        """Return Pearson's (N - E)^2 over the variance E + k^2 S^2, which has mean 1 for any count."""
         signal = self.open_beam[views] * torch.exp(-integrals)
         expected = signal + self.background[views]
         variance = expected + self.model_error**2 * signal * signal
@@ -87,20 +87,20 @@ class Poisson:
         return torch.where(self.open_beam[views] > 0, torch.log(self.open_beam[views] / signal), torch.nan)
 
     def by_ray(self) -> "Poisson":
-        """Return the same with each pixel as a view of its own."""
+        """Return the same likelihood with each pixel as a separate view."""
         counts, open_beam, background = (x.reshape(-1, 1) for x in (self.counts, self.open_beam, self.background))
         return replace(self, counts=counts, open_beam=open_beam, background=background)
 
     def scaled(self, factors: Tensor) -> "Poisson":
-        """Return the same counts behind an open beam that is multiplied by a factor per view (views,)."""
+        """Return the same counts with the open beam multiplied by one factor per view (views,)."""
         return replace(self, open_beam=self.open_beam * factors[:, None])
 
     def with_model_error(self, error: float) -> "Poisson":
-        """Return the same counts for a model whose line integrals are off by about so much."""
+        """Return the same counts for a model whose line integrals have this standard error."""
         return replace(self, model_error=error)
 
     def found_model_error(self, integrals: Tensor, views: Tensor) -> float:
-        """Estimate the model error that makes the mean deviance 1; 0 if it is below 1 without."""
+        """Estimate the model error, at most 1, that makes the mean deviance 1; 0 if no error is needed."""
         low, high = 0.0, 1.0
 
         def excess(error: float) -> float:
@@ -113,7 +113,7 @@ class Poisson:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """Line integrals with noise of one size: y ~ Normal(p, 1 / weight).
+    """Line integrals with normal noise: y ~ Normal(p, 1 / weight).
 
     Args:
         measured: (views, pixels) y.
@@ -137,24 +137,24 @@ class Gaussian:
         return torch.where(self.weight[views] > 0, self.measured[views], torch.nan)
 
     def by_ray(self) -> "Gaussian":
-        """Return the same with each pixel as a view of its own."""
+        """Return the same likelihood with each pixel as a separate view."""
         return Gaussian(self.measured.reshape(-1, 1), self.weight.reshape(-1, 1))
 
 
 def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Poisson | Gaussian:
     """Build the likelihood of some views of a scan.
 
-    Transmissions are counts of an open beam of 1 in photons. Where the number of photons per value is unknown,
-    it is estimated from the noise between neighbouring pixels, see `photons_per_value`.
+    Transmissions are treated as counts with an open beam of 1, scaled to photons. If the number of photons per value
+    is unknown, it is estimated from the noise between neighbouring pixels, see `photons_per_value`.
 
     Args:
         scan: the scan.
         views: indices of its views.
-        binning: so many rows and columns are put together, as in `ScanGeometry.binned`: photons are added, line
+        binning: number of rows and columns to combine, as in `ScanGeometry.binned`: photons are added, line
             integrals averaged.
 
     Returns:
-        Of float32 tensors.
+        A likelihood with float32 tensors.
     """
     values = np.asarray(scan.values[views], dtype=np.float32)
     usable = scan.of_views("usable", views)
@@ -171,7 +171,7 @@ def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Poisson
     if photons is None:
         photons = photons_per_value(np.where(good, values - background, np.nan))
     good = good & (beam > 0)
-    # Detector values below the dark ones are noise of the electronics; a Poisson likelihood has no negative counts.
+    # Negative detector values are noise of the electronics; a Poisson likelihood has no negative counts.
     parts = (np.maximum(values, 0), beam, np.maximum(background, 0))
     counts, beam, background = (
         _flat(_binned(np.where(good, part, 0) * np.float32(photons), binning)) for part in parts
@@ -183,7 +183,7 @@ def photons_per_value(values: np.ndarray) -> float:
     """Estimate the photons per detector value from the noise: mean / variance.
 
     Args:
-        values: (views, rows, columns) above the dark ones; NaN where not usable.
+        values: (views, rows, columns) detector values minus the dark ones; NaN where not usable.
     """
     spread = noise(values)
     mean = float(np.nanmean(values))
@@ -209,7 +209,7 @@ def noise(values: np.ndarray) -> float:
 
 
 def _binned(values: np.ndarray, factor: int) -> np.ndarray:
-    """Sums over factor x factor pixels; what fills no larger pixel is left out at the end."""
+    """Sum over factor x factor pixels; leftover rows and columns at the end are dropped."""
     views, rows, columns = values.shape
     row_factor = factor if rows >= factor else 1
     rows, columns = rows // row_factor, max(columns // factor, 1)

@@ -1,8 +1,8 @@
 """Marks of voxels that the views of a scan do not determine: their values come from the regularisation.
 
-A mark is a sum: `UNSEEN` (no view sees the voxel), `TRUNCATED` (above or below the detector in some views: its value
-holds up to a smooth offset), `WEDGE` (directions are missing from the scan: edges along them are not seen) and
-`OUTSIDE` (beside the detector in some views, so that directions are missing there: the corners of the grid).
+A mark is a sum of flags: `UNSEEN` (no view sees the voxel), `TRUNCATED` (above or below the detector in some views: its
+value is right up to a smooth offset), `WEDGE` (the scan lacks directions: edges along them are not seen) and `OUTSIDE`
+(beside the detector in some views, so that directions are missing there: the corners of the grid).
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ MEANINGS = {
     OUTSIDE: "beside the detector in some views",
 }
 
-# A gap between directions counts as a wedge when it is this many times the usual step, and this many degrees.
+# A gap between directions counts as a wedge if it exceeds this many usual steps, and this many degrees.
 WEDGE_STEPS = 4
 WEDGE_DEG = 10.0
 # Number of bins of directions over half a turn, one for each bit of an integer.
@@ -28,20 +28,20 @@ _BINS = 60
 def marks(geometry: ScanGeometry, grid: VoxelGrid) -> np.ndarray:
     """Compute the marks (Z, Y, X) uint8 for the fitted views.
 
-    A voxel is seen by a view when its centre falls on the detector. The wedge is that of the middle of the grid: it
-    differs little between voxels.
+    A voxel is seen by a view if its centre projects onto the detector. The missing wedge is computed at the origin, as
+    it differs little between voxels.
 
     Args:
-        geometry: of the views that were fitted.
-        grid: of the volume.
+        geometry: geometry of the views that were fitted.
+        grid: grid of the volume.
     """
     seen, beside = np.zeros(grid.shape, dtype=np.int32), np.zeros(grid.shape, dtype=np.int32)
     y, x = np.meshgrid(grid.axis("y"), grid.axis("x"), indexing="ij")
     ends = grid.axis("z")[[0, -1]]
     all_directions, directions = np.zeros(x.shape, dtype=np.int64), np.zeros(x.shape, dtype=np.int64)
     for view in range(geometry.views):
-        # Columns and rows of a voxel are linear in z, as detectors are flat and lines straight: for a detector along
-        # the axis exactly, else nearly; both ends of each vertical line are computed, and the layers between.
+        # A voxel's column and row are linear in z, exactly for a detector parallel to the axis, else nearly: both ends
+        # of each vertical line are projected, and the layers between them are interpolated.
         layers = [
             geometry.pixel_of(view, np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], axis=1)).reshape(*x.shape, 2)
             for z in ends
@@ -49,13 +49,13 @@ def marks(geometry: ScanGeometry, grid: VoxelGrid) -> np.ndarray:
         across = np.zeros(x.shape, dtype=bool)
         for k, share in enumerate(np.linspace(0, 1, grid.shape[0])):
             pixel = (1 - share) * layers[0] + share * layers[1]
-            # A voxel whose centre is half a pixel beyond the last pixel's centre is still met by its rays.
+            # A voxel centred less than half a pixel beyond the detector's edge still counts as seen.
             with np.errstate(invalid="ignore"):
                 across = (pixel[..., 0] > -1) & (pixel[..., 0] < geometry.columns)
                 along = (pixel[..., 1] > -1) & (pixel[..., 1] < geometry.rows) | (geometry.rows == 1)
             seen[k] += across & along
             beside[k] += ~across
-        # The bin of a direction, and the two that it lies between: the same direction may be rounded otherwise.
+        # `all_directions` gets the nearest bin, `directions` both bins around it: rounding may differ between views.
         place = _directions(geometry, view, x, y)
         low = np.floor(place)
         all_directions |= _bit(np.rint(place))
@@ -76,7 +76,7 @@ def marks_in_words(found: np.ndarray, chosen: tuple[int, ...] = tuple(MEANINGS))
 
 
 def _directions(geometry: ScanGeometry, view: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Directions of the rays through points, as lines, in bins: rays from both ends are the same."""
+    """Return directions of the rays through points, in bins; opposite rays are the same line, `_BINS` bins apart."""
     emitter = geometry.emitter[view]
     if geometry.beam == "parallel":
         return np.full(x.shape, np.arctan2(emitter[1], emitter[0]) / np.pi * _BINS)
@@ -88,13 +88,13 @@ def _bit(place: np.ndarray) -> np.ndarray:
 
 
 def missing_wedge_deg(geometry: ScanGeometry) -> float:
-    """Return the largest gap between directions of rays through the origin, as lines around z, in degrees.
+    """Return the largest gap in degrees between rays through the origin, as undirected lines around z.
 
-    0 where it is less than a few times the usual step: then the views go all around. A fan of rays fills gaps at the
-    object's border that are left at the origin, so that this is the gap at the middle.
+    0 if the gap is below the thresholds of a wedge: then the views go all around. Only the origin is considered; at the
+    object's border, the fan of rays fills some of the gaps.
 
     Args:
-        geometry: of the views.
+        geometry: geometry of the views.
     """
     direction = geometry.emitter if geometry.beam == "parallel" else -geometry.emitter
     angle = np.sort(np.rad2deg(np.arctan2(direction[:, 1], direction[:, 0])) % 180)

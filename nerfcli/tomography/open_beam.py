@@ -8,11 +8,11 @@ from nerfcli.errors import UserError
 
 # A frame's pixel that is further from the median over frames than this many robust deviations is left out.
 OUTLIER = 5.0
-# A pixel with less of the median open beam than this sees next to nothing.
+# A pixel below this fraction of the median open beam is dead.
 DEAD_BELOW = 0.05
-# Median of |x - median| of a normal distribution, as a part of its deviation.
+# Median of |x - median| of a normal distribution, as a fraction of its standard deviation.
 _MAD = 0.6745
-# Pixels that the noise of flats has to be averaged over.
+# Least number of pixels for an estimate of the noise of flats.
 _ENOUGH = 200
 
 
@@ -21,10 +21,10 @@ class OpenBeam:
     """The beam without an object.
 
     Args:
-        values: (1, rows, columns) float32 detector values above the dark ones; 1 where the pixel is not usable.
+        values: (1, rows, columns) float32 detector values minus the dark ones; 1 where the pixel is not usable.
         dark: (1, rows, columns) float32 values without beam; None where there are none.
         usable: (1, rows, columns) bool.
-        photons_per_value: photons that a detector value stands for; None where flats cannot say.
+        photons_per_value: number of photons per detector value; None if the flats do not determine it.
     """
 
     values: np.ndarray
@@ -59,7 +59,7 @@ def open_beam_of(flats: np.ndarray, darks: np.ndarray | None) -> OpenBeam:
             "flats are frames with the beam on and without the object; check that they are not swapped with the darks",
         )
     usable = finite & (beam > DEAD_BELOW * middle)
-    if len(flats) >= 4:  # a stuck pixel gives the same value whatever comes
+    if len(flats) >= 4:  # a stuck pixel has the same value in all frames
         usable &= np.ptp(flats, axis=0) > 0 if np.ptp(flats, axis=0).any() else True
     photons = _photons_per_value(flats, darks, beam, usable)
     return OpenBeam(
@@ -71,18 +71,18 @@ def open_beam_of(flats: np.ndarray, darks: np.ndarray | None) -> OpenBeam:
 
 
 def robust_mean(frames: np.ndarray) -> np.ndarray:
-    """(rows, columns) mean over frames, in float64, without outliers; plain for fewer than three frames."""
+    """Return the mean over frames, (rows, columns) float64, without outliers if there are at least three frames."""
     frames = np.asarray(frames, dtype=np.float64)
     if len(frames) < 3:
         return frames.mean(0)
-    # Whole frames may be lighter or darker: outliers are looked for after that is divided out.
+    # Whole frames may be brighter or darker; this is divided out before outliers are looked for.
     scale = np.median(frames.reshape(len(frames), -1), axis=1)
     middle = float(np.median(scale))
     level = np.where((scale > 0) & (middle > 0), scale / middle if middle > 0 else 1.0, 1.0)
     frames = frames / level[:, None, None]
     centre = np.median(frames, axis=0)
     apart = np.abs(frames - centre)
-    # A pixel's own deviation is known badly from few frames: that of all pixels together is its least.
+    # Few frames give a poor estimate of a pixel's own deviation: the median over all pixels is its lower bound.
     deviation = np.median(apart, axis=0) / _MAD
     deviation = np.maximum(deviation, float(np.nanmedian(deviation)))
     kept = apart <= OUTLIER * deviation + 1e-12 * np.abs(centre)
@@ -103,11 +103,11 @@ def _photons_per_value(
 
 
 def _variance(frames: np.ndarray, *, divided: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Variance over frames per pixel, and the pixels without outliers; with the drift of frames divided out or not."""
+    """Return the variance per pixel over frames, with their drift divided out or not, and the mask of normal pixels."""
     if divided:
         level = np.median(frames, axis=1, keepdims=True)
         frames = frames * (np.median(level) / np.where(level > 0, level, 1))
     variance = frames.var(axis=0, ddof=1)
-    # Of n frames the variance of pure noise is within a factor 1 + 8 sqrt(2 / (n - 1)) of what it should be.
+    # The variance of pure noise, estimated from n frames, is below 1 + 8 sqrt(2 / (n - 1)) times the true one.
     limit = float(np.median(variance)) * (1 + 8 * np.sqrt(2 / (len(frames) - 1)))
     return variance, variance <= limit

@@ -1,6 +1,6 @@
 """Quick reconstruction of one detector row, to test geometries.
 
-A volume fitted to every second view has to predict the others. It can only if rays meet where the geometry says.
+A volume fitted to every second view has to predict the others, which it can only do if the geometry is right.
 """
 
 from dataclasses import dataclass, replace
@@ -14,21 +14,21 @@ from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid
 from nerfcli.tomography.scan import Scan
 
-# Steps of the reconstruction, accelerated; more fit noise.
+# Number of accelerated steps of the reconstruction; more steps fit noise.
 STEPS = 15
 MOST_VIEWS = 96
-# Rows of a cone beam within this part of the detector's height from the plane of the source count as fan beams.
+# Rows of a cone beam within this fraction of the detector's height from the plane of the source count as fan beams.
 FAN_PART = 0.05
 
 
 @dataclass(frozen=True)
 class Row:
-    """Line integrals of one row, as a scan in the plane.
+    """Line integrals of one detector row, as a scan in a plane.
 
     Args:
         geometry: with one row, everything at z = 0.
         integrals: (V, columns) float32.
-        number: of the row in the detector.
+        number: index of the row in the detector.
     """
 
     geometry: ScanGeometry
@@ -36,24 +36,24 @@ class Row:
     number: int
 
     def binned(self, columns: int) -> "Row":
-        """Return the row with at most so many columns, each a mean of neighbours."""
+        """Return the row with at most `columns` columns, each a mean of neighbours."""
         factor = -(-self.geometry.columns // columns)
         kept = self.geometry.columns // factor
         means = self.integrals[:, : kept * factor].reshape(len(self.integrals), kept, factor).mean(2)
         return Row(self.geometry.binned(factor), means, self.number)
 
     def thinned(self, views: int = MOST_VIEWS) -> "Row":
-        """Return the row with at most so many views, at equal steps."""
+        """Return the row with at most `views` views, at equal steps."""
         index = np.unique(np.linspace(0, len(self.integrals) - 1, min(views, len(self.integrals))).round().astype(int))
         return Row(self.geometry.select(index), self.integrals[index], self.number)
 
 
-def telling_row(scan: Scan, views: np.ndarray | None = None) -> Row:
-    """Choose the row with the most contrast; for a cone beam near the plane of the source.
+def highest_contrast_row(scan: Scan, views: np.ndarray | None = None) -> Row:
+    """Choose the row with the most contrast; for a cone beam, only among rows near the plane of the source.
 
     Args:
         scan: the scan.
-        views: indices of those to read; all if not given.
+        views: indices of the views to read; all if not given.
     """
     views = np.arange(scan.geometry.views) if views is None else views
     geometry = scan.geometry.select(views)
@@ -92,7 +92,7 @@ def filled(scan: Scan, views: np.ndarray, row: int | None = None) -> np.ndarray:
 
 
 def misfit(row: Row, *, shift: float = 0.0, mirrored: bool = False) -> np.ndarray:
-    """Measure how well a reconstruction from every second view predicts the others: mean squares, (views // 2,).
+    """Return mean squared errors (views // 2,) with which a reconstruction from every second view predicts the others.
 
     Args:
         row: line integrals.
@@ -110,7 +110,7 @@ def misfit(row: Row, *, shift: float = 0.0, mirrored: bool = False) -> np.ndarra
 
 
 def predicted(volume: np.ndarray, row: Row, grid: VoxelGrid) -> np.ndarray:
-    """Line integrals (V, columns) of a volume (Y, X) along the rays of a row."""
+    """Return line integrals (V, columns) of a volume (Y, X) along the rays of a row."""
     return _forward(torch.from_numpy(volume[None]), _rays(row.geometry), grid).reshape(row.integrals.shape).numpy()
 
 
@@ -121,7 +121,7 @@ def reconstructed(row: Row) -> tuple[np.ndarray, VoxelGrid]:
 
 
 def _reconstructed(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid) -> Tensor:
-    """SIRT with positivity and Nesterov's momentum, (1, Y, X)."""
+    """Reconstruct a volume (1, Y, X) by SIRT with positivity and Nesterov's momentum."""
     measured = torch.from_numpy(np.ascontiguousarray(integrals, dtype=np.float32).reshape(-1))
     rays = _rays(geometry)
     ones = torch.ones(grid.shape)
@@ -161,7 +161,7 @@ def _rays(geometry: ScanGeometry) -> tuple[Tensor, Tensor]:
 
 
 def _grid(geometry: ScanGeometry) -> VoxelGrid:
-    """Return the square around all that some ray passes through, in voxels of a pixel's size at the object."""
+    """Return a square grid around the circle that the outermost ray touches, with voxels of a pixel's size."""
     _, width = geometry.pixel_at_origin
     origins, directions = geometry.rays()
     across = np.abs(origins[..., 0] * directions[..., 1] - origins[..., 1] * directions[..., 0]).max()
@@ -171,7 +171,7 @@ def _grid(geometry: ScanGeometry) -> VoxelGrid:
 
 
 def _row_of_source(geometry: ScanGeometry) -> float:
-    """Return the row that the plane of the source across z crosses, median over views."""
+    """Return the detector row at the height of the source, median over views."""
     lift = geometry.emitter[:, 2] - geometry.centre[:, 2]
     down = np.where(geometry.row_step[:, 2] == 0, -1.0, geometry.row_step[:, 2])
     return (geometry.rows - 1) / 2 + float(np.median(lift / down))

@@ -2,8 +2,8 @@
 
     minimise over volumes mu >= 0:   sum over rays of -log likelihood(line integral of mu)  +  beta * TV(mu)
 
-A step looks at a subset of the views. It moves each voxel by its gradient over a bound on the curvature, denoises the
-result in the metric of that bound (`denoise_total_variation`), and goes on in the direction of the last move.
+Each step uses a subset of the views. It moves each voxel by its gradient over a bound on the curvature, denoises the
+result in the metric of that bound (`denoise_total_variation`), and extrapolates in the direction of the last move.
 
 Source: Erdogan and Fessler 1999, Ordered subsets algorithms for transmission tomography, Phys. Med. Biol. 44; Kim,
 Ramani and Fessler 2015, Combining ordered subsets and momentum, IEEE TMI 34(1); the proximal step as in Beck and
@@ -27,19 +27,19 @@ from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid
 from nerfcli.tomography.likelihood import Likelihood
 
-# About how many views a subset has: fewer make more steps of a pass, and each of them a worse likeness of all views.
+# Approximate number of views per subset: with fewer, a pass has more steps, but each approximates all views less well.
 VIEWS_OF_SUBSET = 5
-# More subsets diverge with momentum: on a scan of 90 degrees 30 did, 11 did not.
+# Largest number of subsets: with more, momentum diverges (on a scan of 90 degrees 30 subsets did, 11 did not).
 MOST_SUBSETS = 12
-# The objective of a pass may be this many times that of the best one; beyond, subsets are halved and the fit restarts.
+# Above this multiple of the best objective, the number of subsets is halved and the fit restarts at the best volume.
 RISE = 1.05
-# Steps of the dual of total variation per step: it goes on from where the last step left it.
+# Iterations on the dual of total variation per step; they start from the dual of the step before.
 DENOISING_STEPS = 3
-# Voxels that few rays meet would move far at once; their curvature counts as this share of the median at least.
+# Lower bound of the curvature as a fraction of its median: voxels that few rays meet would move too far otherwise.
 LEAST_CURVATURE = 0.1
-# The last part of a time budget goes on without momentum, which settles what subsets disagree about.
+# Last fraction of a time budget, without momentum, in which the disagreement between subsets settles.
 SETTLING = 0.25
-# A volume has settled when a pass changes it by less than this share of its own length.
+# A volume has settled when a pass changes it by at most this fraction of its norm.
 SETTLED = 3e-4
 
 
@@ -48,9 +48,9 @@ class Problem:
     """Data and grid of a fit.
 
     Args:
-        geometry: of the views that are fitted.
-        likelihood: of their pixels.
-        grid: of the volume.
+        geometry: geometry of the views that are fitted.
+        likelihood: likelihood of their pixels.
+        grid: grid of the volume.
     """
 
     geometry: ScanGeometry
@@ -64,10 +64,10 @@ class Fit:
 
     Args:
         volume: (Z, Y, X) attenuation, float32.
-        dual: (3, Z, Y, X) of its total variation.
-        passes: how many times all views have been looked at.
-        seconds: spent on it.
-        settled: whether the last pass changed it by less than `SETTLED`.
+        dual: (3, Z, Y, X) dual variable of its total variation.
+        passes: number of passes over all views so far.
+        seconds: seconds spent so far.
+        settled: whether the last pass changed the volume by at most `SETTLED`.
     """
 
     volume: Tensor
@@ -81,8 +81,8 @@ class Projector:
     """Rays of a scan through a grid, view by view.
 
     Args:
-        geometry: of the views.
-        grid: of the volumes.
+        geometry: geometry of the views.
+        grid: grid of the volumes.
     """
 
     def __init__(self, geometry: ScanGeometry, grid: VoxelGrid, backend: Backend | None = None):
@@ -90,13 +90,13 @@ class Projector:
         self._backend = backend or kernels.backend_for(torch.device("cpu"), torch.float32)
 
     def forward(self, volume: Tensor, views: np.ndarray) -> Tensor:
-        """Line integrals (len(views), pixels)."""
+        """Return line integrals (len(views), pixels) of a volume."""
         origins, directions = self._rays(views)
         integrals = self._backend.project(volume, origins, directions, first=self._grid.first, size=self._grid.size)
         return integrals.view(len(views), -1)
 
     def backward(self, values: Tensor, views: np.ndarray) -> Tensor:
-        """Return the transpose: a volume from values (len(views), pixels)."""
+        """Apply the transpose of `forward`: return a volume from values (len(views), pixels)."""
         origins, directions = self._rays(views)
         return self._backend.back_project(
             values.reshape(-1),
@@ -118,7 +118,7 @@ def start(problem: Problem) -> Fit:
 
 
 def mean_attenuation(problem: Problem) -> float:
-    """Return the sum of line integrals over the sum of chords, >= 0."""
+    """Estimate the mean attenuation: the sum of line integrals over the sum of chord lengths, >= 0."""
     views = torch.arange(problem.geometry.views)
     projector = Projector(problem.geometry, problem.grid)
     ones = torch.ones(problem.grid.shape)
@@ -132,7 +132,7 @@ def mean_attenuation(problem: Problem) -> float:
 
 
 def finer(fit: Fit, grid: VoxelGrid) -> Fit:
-    """Interpolate a fit on another grid over the same box."""
+    """Interpolate a fit onto another grid over the same box, with a dual of 0."""
     volume = interpolate(fit.volume[None, None], grid.shape, mode="trilinear")[0, 0]
     return Fit(volume, torch.zeros(3, *grid.shape), fit.passes, fit.seconds)
 
@@ -150,17 +150,17 @@ def reconstruct(
     """Continue a fit until the passes or the time are used up, or it has converged.
 
     Args:
-        problem: what to fit to.
-        fit: where to begin.
-        strength: of total variation: beta = strength * sqrt(median over voxels of sum over rays of curvature *
-            length), so that 1 is about the noise of a voxel that no neighbour helps, whatever the scan's dose and unit.
-        passes: how many times to look at all views.
-        seconds: how long to work; at least one pass is done.
-        progress: takes the share done and a few words after every step.
-        keep: takes the fit after every pass, for one that is interrupted.
+        problem: the data to fit.
+        fit: start of the fit.
+        strength: weight of total variation: beta = strength * sqrt(median over voxels of sum over rays of curvature *
+            length), so that 1 is about the noise of a voxel without regularisation, for any dose and unit of the scan.
+        passes: number of passes over all views; None for no limit.
+        seconds: time limit, but at least one pass is done; None for no limit.
+        progress: called after every step with the fraction done and a short text.
+        keep: called after every pass with the fit, so that an interruption does not lose it.
 
     Returns:
-        The fit; the one given is not changed.
+        A new fit; the given one is not changed.
     """
     begun = time.perf_counter()
     projector = Projector(problem.geometry, problem.grid)
@@ -233,7 +233,7 @@ def curvature_bound(problem: Problem, strength: float) -> tuple[Tensor, float]:
 
 
 def _subsets(count: int, number: int) -> list[np.ndarray]:
-    """Views in subsets that each go all around, in an order in which neighbours are far apart."""
+    """Split views into subsets that each go all around, in an order that keeps successive subsets far apart."""
     number = max(1, number)
     order = sorted(range(number), key=lambda s: int(format(s, "016b")[::-1], 2))
     return [np.arange(s, count, number) for s in order]

@@ -1,7 +1,7 @@
-"""A reconstruction: the volume that was fitted to a scan, and the run folder it is kept in.
+"""A reconstruction: the volume that was fitted to a scan, and the run folder that holds it.
 
-RUN/reconstruction.json says what was fitted, how, and what was decided; RUN/volume.npy holds the attenuation and
-RUN/marks.npy what the views cannot determine, see `marks`.
+RUN/reconstruction.json records what was fitted, how, and the decisions taken; RUN/volume.npy holds the attenuation, and
+RUN/marks.npy marks the voxels that the views do not determine, see `marks`.
 """
 
 from collections.abc import Mapping
@@ -22,28 +22,28 @@ VOLUME = "volume.npy"
 MARKS = "marks.npy"
 
 FIELDS = ("voxels", "hash")
-# What is rendered of a reconstruction.
+# Outputs that can be rendered from a reconstruction.
 OUTPUTS = ("projection", "transmission", "residual")
 
 
 @dataclass(frozen=True)
 class ReconstructionSettings:
-    """Settings of fitting a volume to a scan.
+    """Settings for fitting a volume to a scan.
 
     Args:
-        budget_seconds: for everything, trials included; None for none.
-        passes: how many times to look at all views; None for no limit.
+        budget_seconds: time limit for everything, trials included; None for no limit.
+        passes: number of passes over all views; None for no limit.
         field: one of `FIELDS`.
         voxel_size: in the scan's unit; None for the size of a pixel at the object.
-        strength: of total variation; None to choose it on training views that are left out.
-        centre: columns by which the detector stands off; None to find out.
-        tilt: radians by which the detector is turned in its plane; None to find out.
-        air: whether the open beam of each view is measured in its pixels beside the object; None to find out.
-        seed: of a hash grid's first values, pixels and samples.
-        threads: of the CPU; 0 for all.
+        strength: weight of total variation; None to choose it by predicting training views that are left out.
+        centre: offset of the detector in columns; None to estimate it.
+        tilt: rotation of the detector in its plane in radians; None to estimate it.
+        air: whether the open beam of each view is measured in its pixels beside the object; None to decide by the data.
+        seed: seed for a hash grid's initial values and its choice of pixels and samples.
+        threads: number of CPU threads; 0 for all.
 
     Raises:
-        UserError: there is neither a budget nor a number of passes, or a number makes no sense.
+        UserError: there is neither a budget nor a number of passes, or a number is out of range.
     """
 
     budget_seconds: float | None = None
@@ -77,18 +77,18 @@ class Reconstruction:
     Args:
         volume: (Z, Y, X) attenuation in 1 / unit, float32.
         marks: (Z, Y, X) uint8, see `marks`.
-        grid: where its voxels stand.
-        unit: of lengths.
-        scan: the folder of the scan, as it was named.
-        scan_digest: of what was measured, see `Scan.digest`.
+        grid: position and size of its voxels.
+        unit: unit of lengths.
+        scan: folder of the scan, as the user named it.
+        scan_digest: digest of the measurements, see `Scan.digest`.
         settings: as given.
-        used: strength, centre, tilt and the factors of the open beam that were used.
-        decisions: a sentence for each thing that the scan decided.
-        passes, seconds: of the fit and of everything.
-        settled: whether the last pass changed next to nothing.
-        missing_wedge_deg: directions that no ray has, see `missing_wedge_deg`.
-        versions: of programs.
-        learned: arrays of a hash grid by the names of their files, of which `volume` holds samples; empty for voxels.
+        used: the strength, centre, tilt and factors of the open beam that were used.
+        decisions: a sentence for each setting that was decided by the data.
+        passes, seconds: passes of the fit, and seconds in total.
+        settled: whether the last pass hardly changed the volume.
+        missing_wedge_deg: range of directions without rays, see `marks.missing_wedge_deg`.
+        versions: versions of the programs used.
+        learned: arrays of a hash grid, keyed by file name, which `volume` samples; empty for voxels.
     """
 
     volume: np.ndarray
@@ -117,7 +117,7 @@ def is_reconstruction(run: Path) -> bool:
 
 
 def save_reconstruction(run: Path, result: Reconstruction) -> None:
-    """Write a run's folder; reconstruction.json comes last, and names the arrays by their digests.
+    """Write a run's folder; reconstruction.json is written last and lists the digests of the arrays.
 
     Raises:
         UserError: it cannot be written.

@@ -1,7 +1,7 @@
-"""A scan: what a detector measured behind an object, with the geometry of its rays, and the folder it is kept in.
+"""A scan: a detector's measurements behind an object, the geometry of their rays, and the folder that holds them.
 
-SCAN/scene.json holds geometry, unit and provenance; the arrays stand beside it as .npy files, which are mapped into
-memory when they are read. `nerfcli convert` writes such folders from the formats of scanners.
+SCAN/scene.json holds geometry, unit and provenance; the arrays are .npy files beside it, which are memory-mapped when
+they are read. `nerfcli convert` writes such folders from the formats of scanners.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ SCENE_FILE = "scene.json"
 MEASUREMENT = "transmission"
 FORMAT = "nerfcli scan 1"
 
-# Every how many views one is held out where the scan does not say.
+# One in this many views is held out if the scan does not state which.
 HELD_OUT_EVERY = 6
 
 Kind = Literal["counts", "transmission", "line_integral"]
@@ -35,18 +35,18 @@ class Scan:
     """The measurements of a scan, I = I0 exp(-line integral) + dark.
 
     Args:
-        geometry: of all views.
-        kind: what `values` are: "counts" (detector values, dark included), "transmission" ((I - dark) / I0) or
-            "line_integral" (-log of that).
+        geometry: geometry of all views.
+        kind: type of `values`: "counts" (detector values, dark included), "transmission" ((I - dark) / I0) or
+            "line_integral" (-log of the transmission).
         values: (V, rows, columns) float32.
-        open_beam: detector values without object, above the dark ones, that can be broadcast to `values`; counts only.
-        dark: detector values without beam, likewise; counts only.
-        photons_per_value: how many photons one detector value stands for; None where unknown. For "transmission",
-            how many photons a transmission of 1 stands for.
-        usable: bool, broadcast to `values`: False for dead pixels and what else must not be believed; None for all.
+        open_beam: detector values without object minus the dark ones, broadcastable to `values`; counts only.
+        dark: detector values without beam, broadcastable to `values`; counts only.
+        photons_per_value: number of photons per detector value, or for "transmission" per transmission of 1; None if
+            unknown.
+        usable: bool, broadcastable to `values`: False for dead pixels and other invalid values; None if all are usable.
         held_out: sorted indices of the views that no reconstruction reads.
-        unit: of lengths, "mm" where it is known, else "voxel"; attenuation is in its inverse.
-        history: where the scan comes from: plain values.
+        unit: unit of lengths: "mm", "voxel" (pixels), or "unit" if unknown; attenuation is in its inverse.
+        history: provenance of the scan, as plain values.
     """
 
     geometry: ScanGeometry
@@ -78,7 +78,7 @@ class Scan:
 
     @property
     def digest(self) -> str:
-        """A hash of geometry and measurements: another scan has another one."""
+        """Hash of geometry and measurements, which identifies the scan."""
         hasher = hashlib.blake2b(digest_size=16)
         hasher.update(self.geometry.vectors().tobytes())
         for name in _ARRAYS:
@@ -93,7 +93,7 @@ class Scan:
         return array if array is None or len(array) == 1 else array[views]
 
     def only_rows(self, first: int, end: int) -> "Scan":
-        """Return the scan by some rows of its detector, `first` up to `end`."""
+        """Return the scan with only the detector rows from `first` to before `end`."""
         middle = (first + end - 1) / 2 - (self.geometry.rows - 1) / 2
 
         def cut(array: np.ndarray | None) -> np.ndarray | None:
@@ -109,10 +109,10 @@ class Scan:
         )
 
     def line_integrals(self, views: np.ndarray) -> np.ndarray:
-        """-log of the transmission of some views, (len(views), rows, columns) float32: for pictures and baselines.
+        """Return -log of the transmission of views, (len(views), rows, columns) float32, for pictures and baselines.
 
-        At most a transmission of half a photon, or of 1e-4 where photons are not known, is taken for 0 or less: a
-        logarithm of noise is biased, so that no likelihood is computed from this.
+        Smaller transmissions are raised to that of half a photon, or to 1e-4 if photons are unknown. The logarithm of
+        noise is biased, so no likelihood is computed from the result.
         """
         values = np.asarray(self.values[views], dtype=np.float32)
         if self.kind == "line_integral":
@@ -138,7 +138,7 @@ def is_scan(path: Path) -> bool:
 
 
 def save_scan(folder: Path, scan: Scan) -> None:
-    """Write a scan's folder, whole or not at all; a folder that stands there is replaced.
+    """Write a scan's folder atomically; an existing folder is replaced.
 
     Raises:
         UserError: it cannot be written.
@@ -203,12 +203,12 @@ def load_scan(folder: Path) -> Scan:
 
 
 def held_out_views(views: int, every: int = HELD_OUT_EVERY) -> tuple[int, ...]:
-    """Return the views held out by default: every `HELD_OUT_EVERY`-th, beginning with the first."""
+    """Return the views held out by default: every `every`-th from the first; none if there are too few views."""
     return tuple(range(0, views, every)) if views > every else ()
 
 
 def read_array(path: Path, digest: str) -> np.ndarray:
-    """Map an array of a .npy file into memory; ValueError where it is not the one of this digest."""
+    """Memory-map the array of a .npy file; raise ValueError if its digest differs."""
     array = np.load(path, mmap_mode="r", allow_pickle=False)
     if array_digest(array) != digest:
         raise ValueError(f"{path.name} is not what was written")

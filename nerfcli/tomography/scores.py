@@ -13,20 +13,20 @@ from nerfcli.tomography.likelihood import likelihood_of
 from nerfcli.tomography.reconstruct import Projector
 from nerfcli.tomography.scan import Scan
 
-# Layers through which SSIM is averaged along each axis.
+# Number of layers along each axis over which SSIM is averaged.
 SSIM_LAYERS = 24
 
 
 @dataclass(frozen=True)
 class ProjectionScores:
-    """Held-out views against their predictions.
+    """Comparison of held-out views with their predictions.
 
     Args:
-        rms: root mean square difference of line integrals, all views as one.
+        rms: root mean square difference of line integrals, over all views together.
         psnr: 20 log10(peak / rms) in dB.
-        peak: the line integral that the dB refer to: the largest of the fitted views, a hundred-thousandth left out.
-        chi_square: mean squared misfit in units of the counting noise: 1 is all that can be had; below 1, noise was
-            seen that should not have been.
+        peak: reference line integral of the PSNR: the quantile 1 - 1e-5 of the training views.
+        chi_square: mean squared misfit in units of the counting noise: 1 is the best possible; below 1, the fit has
+            used held-out measurements.
         chi_square_of_view: the same for each held-out view.
     """
 
@@ -39,7 +39,7 @@ class ProjectionScores:
 
 @dataclass(frozen=True)
 class VolumeScores:
-    """A volume against the true one, on the true one's voxels.
+    """Comparison of a volume with the true one, on the voxels of the true one.
 
     Args:
         psnr: 20 log10(largest true value / rms difference) in dB.
@@ -55,11 +55,11 @@ class VolumeScores:
 def score_projections(
     scan: Scan, geometry: ScanGeometry, volume: torch.Tensor, grid: VoxelGrid, *, air: np.ndarray | None = None
 ) -> ProjectionScores | None:
-    """Compare the projections of a volume with the held-out views; None where no view is held out.
+    """Compare the projections of a volume with the held-out views; return None if no view is held out.
 
     Args:
         scan: the measurements.
-        geometry: of all its views, corrected.
+        geometry: corrected geometry of all its views.
         volume, grid: the reconstruction.
         air: factor on the open beam of each held-out view; 1 if not given.
     """
@@ -90,7 +90,7 @@ def score_projections(
 
 
 def score_volume(volume: np.ndarray, grid: VoxelGrid, true: np.ndarray, true_grid: VoxelGrid) -> VolumeScores:
-    """Compare a volume with the true one, interpolated at the true one's voxel centres; 0 outside its grid."""
+    """Compare a volume, interpolated at the voxel centres of the true one, with the true one; 0 outside its grid."""
     seen = volume if grid == true_grid else resampled(volume, grid, true_grid)
     difference = seen.astype(np.float64) - true
     peak = float(true.max())

@@ -1,8 +1,8 @@
-"""Choice of the total variation weight and the model error, by training views that a trial leaves out.
+"""Choose the weight of total variation and the model error by predicting training views that a trial leaves out.
 
-Predicting noisy projections rewards fitting their noise and the model's own errors for too long: where the prediction
-is best, the volume has been past its best by 1 to 4 dB on phantoms. The scale of `strength` already takes dose, unit
-and model error out of it, so that 1 is right for most scans; another value is taken only where it predicts far better.
+Prediction of noisy projections favours fits that follow noise and model errors too far: at the best prediction, volumes
+of phantoms were already 1 to 4 dB below their best. The scale of `strength` already accounts for dose, unit and model
+error, so that 1 is right for most scans; another value is taken only where it predicts far better.
 """
 
 from collections.abc import Callable
@@ -17,26 +17,26 @@ from nerfcli.tomography.likelihood import Poisson, likelihood_of
 from nerfcli.tomography.reconstruct import Problem, Projector, reconstruct, start
 from nerfcli.tomography.scan import Scan
 
-# The usual one first, then those that may be better, in the order in which they are tried.
+# Strengths in the order in which they are tried: the default first, then the alternatives.
 STRENGTHS = (1.0, 0.3, 3.0, 0.1, 10.0)
-# By how much another strength has to lower the deviance of views that were not fitted.
+# Fraction by which another strength has to lower the deviance of views that were not fitted.
 FAR_BETTER = 0.25
-# Every how many training views one is left out of the trial.
+# One in this many training views is left out of the trial.
 LEFT_OUT_EVERY = 5
 TRIAL_PASSES = 10
-# Rows of the detector that a trial looks at. Pixels and voxels keep their size: larger ones are wrong by more than
-# noise, and ask for another weight.
+# Number of detector rows that a trial uses. Pixels and voxels keep their size: larger ones have errors beyond the
+# noise, and need another weight.
 TRIAL_ROWS = 12
 
 
 @dataclass(frozen=True)
 class StrengthTrial:
-    """Trials of total variation.
+    """Result of trials of total variation.
 
     Args:
-        strength: the one that was chosen.
+        strength: the chosen strength.
         tried: strengths and, for each, the mean deviance per pixel of views that were not fitted; 1 is noise alone.
-        model_error: see `Poisson`, as the views that were not fitted show it; 0 for line integrals.
+        model_error: see `Poisson`; estimated from the views that were not fitted, 0 for line integrals.
     """
 
     strength: float
@@ -49,18 +49,18 @@ def choose_strength(
     geometry: ScanGeometry,
     grid: VoxelGrid,
     *,
-    most_seconds: float | None,
+    max_seconds: float | None,
     progress: Callable[[float, str], None] | None = None,
 ) -> StrengthTrial:
-    """Try strengths on the middle rows of the detector, and take the usual one unless another predicts far better.
+    """Try strengths on the middle rows of the detector, and take the default unless another predicts far better.
 
     Args:
-        scan: of whose training views every fifth is predicted.
-        geometry: of all views, corrected.
-        grid: of the reconstruction.
-        most_seconds: for all trials together, of which each gets a quarter at most; None tries the usual strength
-            alone, so that the result does not depend on the machine.
-        progress: takes the share done and a few words.
+        scan: the scan; every fifth of its training views is predicted.
+        geometry: corrected geometry of all views.
+        grid: grid of the reconstruction.
+        max_seconds: time limit for all trials together, each of which gets at most a quarter; None tries the default
+            strength alone, so that the result does not depend on the machine.
+        progress: called with the fraction done and a short text.
     """
     views = scan.training_views
     left = views[2::LEFT_OUT_EVERY]
@@ -72,7 +72,7 @@ def choose_strength(
     projector, judge = Projector(part.geometry.select(left), layers), likelihood_of(part, left)
     every = np.arange(len(left))
     error = 0.0
-    quarter = None if most_seconds is None else most_seconds / 4
+    quarter = None if max_seconds is None else max_seconds / 4
     fit = start(problem)
     if isinstance(judge, Poisson) and isinstance(problem.likelihood, Poisson):
         fit = reconstruct(problem, fit, strength=STRENGTHS[0], passes=TRIAL_PASSES, seconds=quarter)
@@ -80,8 +80,8 @@ def choose_strength(
         judge = judge.with_model_error(error)
         problem = replace(problem, likelihood=problem.likelihood.with_model_error(error))
     deviances = []
-    for number, strength in enumerate(STRENGTHS if most_seconds is not None else STRENGTHS[:1]):
-        if number > 0 and most_seconds is not None and fit.seconds * (number + 2) / (number + 1) > most_seconds:
+    for number, strength in enumerate(STRENGTHS if max_seconds is not None else STRENGTHS[:1]):
+        if number > 0 and max_seconds is not None and fit.seconds * (number + 2) / (number + 1) > max_seconds:
             break
         if progress is not None:
             progress(number / len(STRENGTHS), f"total variation {strength:g}")

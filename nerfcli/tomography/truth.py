@@ -1,4 +1,4 @@
-"""The true volume of a computed scan."""
+"""The true volume of a simulated scan."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,13 +11,13 @@ from nerfcli.tomography.grid import VoxelGrid
 
 
 def load_truth(history: Mapping[str, Any]) -> tuple[VoxelGrid, np.ndarray] | None:
-    """Load the true volume that a scan names.
+    """Load the true volume that a scan's history refers to.
 
     Returns:
-        Its grid and (Z, Y, X) float32 attenuation in the inverse of the scan's unit; None if the input had none.
+        Its grid and (Z, Y, X) float32 attenuation in the inverse of the scan's unit; None if the history has none.
 
     Raises:
-        UserError: it is not where it was, or has another shape.
+        UserError: its file cannot be read, or has another shape.
     """
     stated = history.get("truth")
     if not isinstance(stated, Mapping):

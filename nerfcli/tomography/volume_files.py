@@ -1,7 +1,7 @@
-"""Volumes as files of other programs: NRRD, MetaImage, NIfTI-1, and TIFF stacks as ImageJ reads them.
+"""Volumes in file formats of other programs: NRRD, MetaImage, NIfTI-1, and TIFF stacks for ImageJ.
 
 All are float32 (or uint8 for marks), little-endian, x fastest, with spacing, origin and unit. The frame
-is the one of the scan: x and y across the rotation axis, z along it.
+is that of the scan: x and y across the rotation axis, z along it.
 """
 
 import json
@@ -30,9 +30,9 @@ class VolumeFile:
 
     Args:
         values: (Z, Y, X).
-        grid: where its voxels stand.
-        unit: of lengths; "" where the file does not say.
-        quantity: what the values are, such as "1/mm"; "" where the file does not say.
+        grid: position and size of the voxels.
+        unit: unit of lengths; "" if the file does not state it.
+        quantity: unit of the values, such as "1/mm"; "" if the file does not state it.
     """
 
     values: np.ndarray
@@ -50,7 +50,7 @@ def write_volume(path: Path, volume: VolumeFile) -> None:
 
     Raises:
         UserError: the suffix is none of these, or the file cannot be written.
-        ValueError: another type of values.
+        ValueError: the values have another type.
     """
     if volume.values.dtype not in _WORDS:
         raise ValueError(f"volumes are float32 or uint8, not {volume.values.dtype}")
@@ -107,7 +107,7 @@ def is_volume_file(path: Path) -> bool:
 
 
 def map_of(volume: VolumeFile) -> Volume:
-    """Return the volume indexed [x, y, z], under the name of what it is."""
+    """Return the volume indexed [x, y, z], named "marks" or "attenuation"."""
     name = "marks" if volume.values.dtype == np.uint8 else "attenuation"
     description = {"unit": volume.unit, "quantity": volume.quantity}
     values = np.ascontiguousarray(volume.values).transpose(2, 1, 0)
@@ -180,7 +180,7 @@ def _write_nifti(path: Path, volume: VolumeFile) -> None:
     struct.pack_into(
         "<80s", header, 148, f"unit {volume.unit or '-'} quantity {volume.quantity or '-'}".encode("ascii")
     )
-    struct.pack_into("<2h", header, 252, 0, 1)  # a scanner's frame, in the rows below
+    struct.pack_into("<2h", header, 252, 0, 1)  # no qform; sform: the scanner's frame, in the rows below
     for row in range(3):
         axis = [0.0] * 4
         axis[row], axis[3] = size, first[row]

@@ -27,19 +27,17 @@ from nerfcli.scene import Scene
 from nerfcli.train.preparation import Begun, Prepared
 
 STATE_FORMAT = "nerfcli training 2"
-# Photos without alpha fill the frame; what the field lets through is black, and little does.
+# Photos without alpha fill the frame; behind the field is black, and little of it shows through.
 OPAQUE_BACKGROUND = (0.0, 0.0, 0.0)
 ALPHA_BACKGROUND = (1.0, 1.0, 1.0)
-# Steps along the rays of pictures of detailed fields, in those of the training, where as many samples in longer steps
-# belong to more rays.
+# Length of ray steps in pictures of detailed fields, relative to those of the training, where longer steps allow more
+# rays for the same number of samples.
 DETAILED_STEP = 0.5
 
 
 @dataclass
 class Totals:
-    """Totals over the whole training, including resumed parts; `searched` is the time spent on the selection of
-    components.
-    """
+    """Totals over the whole training, including resumed parts; `searched` is the time spent selecting components."""
 
     seconds: float = 0.0
     searched: float = 0.0
@@ -51,9 +49,9 @@ class Checkpoints:
     """The files of one training.
 
     Args:
-        run: the folder.
-        fitting, totals: are read when a checkpoint is written.
-        prepared: what the fitting was made from.
+        run: the run folder.
+        fitting, totals: read when a checkpoint is written.
+        prepared: the data that the fitting was made from.
         scene: gives the unit of length.
     """
 
@@ -81,7 +79,7 @@ class Checkpoints:
         )
 
     def _learned_gains(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the places (P,) of the training photos in the capture and their learned gains (P, 3), if any."""
+        """Return the places (P,) of the training photos in the capture and their learned log gains (P, 3), if any."""
         exposure = self._fitting.parts.exposure
         if exposure is None or self._fitting.components.exposure != "learned":
             return None
@@ -102,14 +100,14 @@ class Checkpoints:
         return log_exposures(self._scene.train_frames)
 
     def _held_out_exposures(self) -> dict[str, tuple[float, ...]]:
-        """Return what the exposures that were learned tell of held-out photos, by name."""
+        """Return by name the log gains of held-out photos, interpolated from the learned exposures."""
         learned = self._learned_gains()
         if learned is None:
             return {}
         return self._by_name(gains_between(*learned, self._places(self._scene.test_frames)))
 
     def _beyond_exif(self) -> dict[str, tuple[float, ...]]:
-        """Return the offsets to the gains that EXIF predicts for held-out photos, by name."""
+        """Return by name the offsets to the log gains that EXIF predicts for held-out photos."""
         learned = self._learned_gains()
         if learned is None or self._prepared.log_exposure is None:
             return {}
@@ -120,7 +118,7 @@ class Checkpoints:
         return {frame.name: tuple(row) for frame, row in zip(self._scene.test_frames, gains.tolist(), strict=True)}
 
     def frames(self) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
-        """Return the training photos and those held out, with their cameras as they are now."""
+        """Return the training frames and the held-out frames with their current cameras."""
         given = (self._scene.train_frames, self._scene.test_frames)
         refinement = self._fitting.parts.cameras
         if refinement is None:
@@ -142,8 +140,8 @@ class Checkpoints:
             self._write_field,
             lambda: save_tensors(self._run / STATE, tensors, description),
         ]
-        # A kill may come between the two. The state is all that resuming needs, and never ahead of the field; the first
-        # time it is written first, so that there is no field which one can neither go on from nor replace.
+        # The process may be killed between the two. The state is all that resuming needs and must never be ahead of the
+        # field. The first time it is written first, so that no field exists that can neither be resumed nor replaced.
         for write in writing if (self._run / FIELD).exists() else reversed(writing):
             write()
 
@@ -157,7 +155,7 @@ def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]
     """Return the decisions of an earlier call, from its last checkpoint and its settings.
 
     Raises:
-        UserError: another version wrote it, or it was begun with another contraction than is requested.
+        UserError: another version wrote the checkpoint, or it has another contraction than requested.
     """
     if description.get("format") != STATE_FORMAT:
         raise UserError(f"{run / STATE} was written by another version of nerfcli", "train again with --overwrite")
@@ -174,7 +172,7 @@ def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description
     """Restore `fitting` from the run's last checkpoint.
 
     Raises:
-        UserError: it is of another field or of other components, or holds numbers that are not finite.
+        UserError: the checkpoint has another field or other components, or numbers that are not finite.
     """
     if settings_from_json(description["field"]) != fitting.field.settings:
         raise UserError(

@@ -1,4 +1,4 @@
-"""Evidence of training photos before training: pixels at known distances, relative exposures, the sky."""
+"""Evidence from the training photos before training: pixels at known distances, relative exposures, the sky."""
 
 import time
 from collections.abc import Callable
@@ -21,22 +21,22 @@ from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.search.selection import LEAST_SKY_SHARE
 
-# Of the budget, what stereo matching may take.
+# Fraction of the budget that stereo matching may take.
 STEREO_SHARE = 0.06
-# The same where there is no budget but of steps.
+# Seconds that it may take if the budget is one of steps only.
 MOST_SECONDS = 60.0
-# Fewer photos with EXIF do not confirm exposures.
+# Fewer photos with EXIF exposures cannot confirm the matched ones.
 FEWEST_EXIF = 5
 
 
 class Evidence:
-    """Depth, exposures and sky as estimated from the training photos alone, each on first use.
+    """Depth, exposures and sky, estimated from the training photos alone, each on first use.
 
     Args:
         shared: features and points of the photos.
         album, pool: the photos, and their pixels in the training frame.
         extent: of the field.
-        settings: of the training; its budget decides the size of the pictures that are matched.
+        settings: of the training; its budget determines the size of the pictures that are matched.
         notify: takes lines for the user.
     """
 
@@ -53,13 +53,13 @@ class Evidence:
         self._similarity, self.notify = extent.training_from_scene, notify
         self.stereo_seconds = 0.0
         budget = settings.budget_seconds
-        # Steps have to be the same on all machines: without a budget, threads do not count.
+        # A training by steps must give the same result on all machines: without a time budget, ignore the threads.
         seconds, threads = (MOST_SECONDS, 1) if budget is None else (STEREO_SHARE * budget, settings.threads)
         self.side_px = affordable_side_px(album.photos, seconds=seconds, threads=threads)
 
     @cached_property
     def of_tracks(self) -> PointDepths:
-        """Of points of structure from motion, or of matched features."""
+        """Depths of points from structure from motion, or of matched features."""
         return point_depths(self._shared.tracks, self._pool, self._similarity)
 
     @cached_property
@@ -76,10 +76,10 @@ class Evidence:
 
     @cached_property
     def log_gains(self) -> np.ndarray:
-        """(photos, 3) logarithms of exposures by pixels that several photos share; NaN where unknown.
+        """Logarithms of exposures from pixels that several photos share, (photos, 3); NaN where unknown.
 
-        All are unknown where EXIF does not confirm them: what looks brighter from one side differs from photo to
-        photo as exposures do, and adds up along a ring.
+        All are NaN if EXIF does not confirm them: surfaces that look brighter from one side differ between photos just
+        as exposures do, and their differences add up along a ring of cameras.
         """
         dense = self._dense
         began = time.perf_counter()
@@ -92,13 +92,13 @@ class Evidence:
         return found
 
     def gains_or(self, others: Tensor) -> Tensor:
-        """Return (photos, 3) logarithms of exposures, or others where these are unknown."""
+        """Return `log_gains` (photos, 3), with the values of `others` where unknown."""
         known = torch.from_numpy(self.log_gains).to(others)
         return torch.where(known.isfinite(), known, others)
 
     @property
     def exposure_spread(self) -> float:
-        """Standard deviation of the photos' brightness by matched pixels; 0 where nothing is known."""
+        """Standard deviation of the photos' log brightness in matched pixels; 0 if nothing is known."""
         known = self.log_gains[np.isfinite(self.log_gains).all(1)]
         return float(known.mean(1).std()) if len(known) else 0.0
 
@@ -109,17 +109,17 @@ class Evidence:
 
     @property
     def sky_share(self) -> float:
-        """Of the pixels, those that look like a sky."""
+        """Fraction of the pixels that look like a sky."""
         return float(self._plain.float().mean())
 
     @property
     def sky(self) -> Tensor | None:
-        """(pixels,) bool, those of the pool that look like a sky; None where they are too few to be one."""
+        """Pixels of the pool that look like a sky, (pixels,) bool; None if they are too few to be one."""
         return self._plain if self.sky_share > LEAST_SKY_SHARE else None
 
     @cached_property
     def of_stereo(self) -> PointDepths:
-        """Of stereo matching."""
+        """Depths from stereo matching."""
         found = stereo_depths(self._dense, self._pool, self._similarity)
         self.notify(
             f"stereo matching: the depth of {len(found.numbers)} pixels of the training photos, "
@@ -128,5 +128,5 @@ class Evidence:
         return found
 
     def sets(self, components: Components) -> list[PointDepths]:
-        """Return those that a model with points uses."""
+        """Return the sets of depths that a model with points uses."""
         return [self.of_tracks, self.of_stereo] if components.stereo else [self.of_tracks]

@@ -1,4 +1,4 @@
-"""What the other ranks of a training do: rank 0 decides, announces each step and writes; they take the same steps."""
+"""The other ranks of a training: rank 0 decides, announces each step and writes files; they take the same steps."""
 
 import time
 from collections.abc import Sequence
@@ -21,11 +21,11 @@ from nerfcli.scene import Scene
 from nerfcli.train.preparation import Prepared, load_training_photos
 from nerfcli.train.sentinel import Sentinel
 
-# What rank 0 announces besides the shares of the budget, each of which is a step.
+# Announcements of rank 0 other than a fraction of the budget, which announces a step.
 WAIT, SETTLE, END = -1.0, -2.0, -3.0
-# Ctrl-C and SIGTERM come to all ranks, and rank 0 announces the end: one that hears nothing for so long leaves.
+# Ctrl-C and SIGTERM reach all ranks, and rank 0 announces the end. A rank that does not hear it in this time leaves.
 GRACE_SECONDS = 5.0
-# Steps from whose time efficiency is computed.
+# Steps from whose duration the efficiency is computed.
 TIMED_STEPS = 20
 
 
@@ -42,10 +42,10 @@ class Decided:
 
 
 def start_others(fitting: Fitting, prepared: Prepared) -> None:
-    """Send decisions and the state of rank 0 to the others, and wait until these are ready.
+    """Send the decisions and the state of rank 0 to the other ranks, and wait until they are ready.
 
     Raises:
-        UserError: one of them has ended.
+        UserError: another rank has ended.
     """
     ranks, points = fitting.ranks, prepared.points
     if ranks.count == 1:
@@ -63,18 +63,18 @@ def start_others(fitting: Fitting, prepared: Prepared) -> None:
 
 
 def follow(scene: Scene, run: Path, settings: TrainSettings, ranks: Alone, *, memory_bytes: int | None) -> None:
-    """Take part in the training of rank 0 until this ends.
+    """Take part in the training of rank 0 until it ends.
 
     Args:
         scene: photos, cameras and split, as rank 0 has them.
-        run: where temporary files may stand that hold photos; nothing else is written.
-        settings: as for rank 0, but for threads and device.
-        ranks: of which this is not the first.
+        run: folder for temporary files that hold photos; nothing else is written.
+        settings: as for rank 0, except for threads and device.
+        ranks: the processes that train together; this is not the first.
         memory_bytes: see `loop.train`.
 
     Raises:
         UserError: see `loop.train`; or another rank has ended.
-        KeyboardInterrupt: Ctrl-C or SIGTERM came, and rank 0 goes on or is gone.
+        KeyboardInterrupt: Ctrl-C or SIGTERM came, but rank 0 continues or has ended.
     """
     torch.set_num_threads(settings.threads)
     kernels.prepare(_silent, settings.device)
@@ -117,16 +117,16 @@ def follow(scene: Scene, run: Path, settings: TrainSettings, ranks: Alone, *, me
                     sentinel.advance(said)
                     storage.release_pages()
         except UserError:
-            interrupts.raise_if_pending()  # which may be why rank 0 has ended
+            interrupts.raise_if_pending()  # an interrupt may be why rank 0 has ended
             raise
 
 
 def describe_efficiency(fitting: Fitting, seconds: Sequence[float]) -> str:
-    """Take a few steps alone when the training is over, and compare their time.
+    """Describe the efficiency of the ranks: compare their step time with that of a few more steps on rank 0 alone.
 
     Args:
-        fitting: of rank 0; the others have ended.
-        seconds: of the last steps of all ranks together.
+        fitting: of rank 0, after the training; the other ranks have ended.
+        seconds: durations of the last steps of all ranks together.
     """
     count, fitting.ranks = fitting.ranks.count, ALONE
     fitting.advance(1.0)
@@ -145,7 +145,7 @@ def describe_efficiency(fitting: Fitting, seconds: Sequence[float]) -> str:
 
 def _copy_state(fitting: Fitting) -> None:
     ranks = fitting.ranks
-    ranks.gathered(None)  # when all have loaded their photos
+    ranks.gathered(None)  # wait until all have loaded their photos
     tensors, description = fitting.state()
     ranks.copy_from_first(*tensors.values())
     fitting.restore(tensors, ranks.from_first(description))
@@ -156,4 +156,4 @@ def _moved(depths: PointDepths, device: torch.device | str) -> PointDepths:
 
 
 def _silent(text: str) -> None:
-    """Rank 0 reports for all."""
+    """Drop a line for the user: rank 0 reports for all."""

@@ -1,4 +1,4 @@
-"""A quick look at held-out pixels during training; the full numbers are the business of `evaluate`."""
+"""A quick PSNR on a sample of held-out pixels, for waypoints; `evaluate` computes the full metrics."""
 
 from collections.abc import Sequence
 
@@ -18,17 +18,17 @@ from nerfcli.render.tracing import render_rays
 
 PIXELS = 4096
 SEED = 1
-# All at once would take half a gigabyte while space is still full of fog.
+# All rays at once would take half a gigabyte while space is still full of fog.
 RAYS_AT_A_TIME = 512
 
 
 class HeldoutPixels:
-    """A fixed sample of a few thousand different pixels of the held-out photos, or most of them where they have fewer.
+    """A fixed sample of a few thousand distinct pixels of the held-out photos, or most of them if there are fewer.
 
     Args:
-        photos: held out.
+        photos: the held-out photos.
         training_from_scene: the normalisation.
-        device: where to keep them.
+        device: for the pixels.
         colours, storage: see `PixelPool`.
     """
 
@@ -50,11 +50,11 @@ class HeldoutPixels:
 
     @torch.no_grad()
     def psnr(self, model: Model, *, log_gains: np.ndarray) -> float:
-        """PSNR in dB over these pixels together, clipped to [0, 1], on the model's background.
+        """Return the PSNR in dB over all these pixels, clipped to [0, 1], on the model's background.
 
         Args:
-            model: what is measured.
-            log_gains: (photos, 3) of the photos relative to its pictures; see `held_out_exposure`.
+            model: to be measured.
+            log_gains: (photos, 3) of the photos relative to the model's pictures; see `held_out_exposure`.
         """
         background = colours_behind(model.background, self.directions)
         parts = zip(

@@ -1,4 +1,4 @@
-"""A training that somebody looks at: its field every few seconds, pause and stop."""
+"""Live view of a training: its field every few seconds, pause and stop."""
 
 import time
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from nerfcli.runs.live import (
     write_status,
 )
 
-# How often a training looks for viewers, how often they get a field, and what share of the time that may take.
+# Interval at which a training looks for viewers, interval at which they get a field, and fraction of time for that.
 LOOK_SECONDS, FIELD_SECONDS, MOST_OF_TIME = 0.5, 2.0, 0.03
 _PAUSED_SECONDS = 0.1
 
@@ -26,8 +26,8 @@ class LiveTraining:
     """Answers the viewers of a training, see `runs.live`.
 
     Args:
-        run: the folder.
-        model: gives the field as it is.
+        run: the run folder.
+        model: returns the current field.
         still_wanted: called while the training is paused; raises to end it.
         notify: takes lines for the user.
     """
@@ -47,7 +47,7 @@ class LiveTraining:
         self._watched = self._failed = False
 
     def after_step(self, *, fraction: float, step: int, seconds: float, loss: float) -> None:
-        """Write what viewers want, and wait while they have the training paused.
+        """Write what viewers request, and wait while they have the training paused.
 
         Raises:
             KeyboardInterrupt: somebody stopped the training.
@@ -74,7 +74,7 @@ class LiveTraining:
         self._next_look = time.monotonic() + LOOK_SECONDS
 
     def end(self, *, seconds: float = 0.0) -> None:
-        """Remove the files; a viewer that looks has some seconds to take the last checkpoint."""
+        """Remove the live files; wait some seconds if a viewer is there, so that it can load the last checkpoint."""
         if not self._watched:
             return
         end_training(self._run)
@@ -83,7 +83,7 @@ class LiveTraining:
             time.sleep(seconds)
 
     def _request(self) -> Request | None:
-        """Return what viewers want; None without a viewer.
+        """Return the request of a viewer; None without a live viewer.
 
         Raises:
             KeyboardInterrupt: somebody wants the training to end.
@@ -104,7 +104,7 @@ class LiveTraining:
         self._next_field = began + max(FIELD_SECONDS, took / MOST_OF_TIME)
 
     def _wait(self, write: Callable[[], None]) -> None:
-        """Wait as long as a viewer that lives wants a pause."""
+        """Wait as long as a live viewer requests a pause."""
         next_status = 0.0
         while (request := self._request()) is not None and request.paused:
             if time.monotonic() >= next_status:

@@ -32,7 +32,7 @@ from nerfcli.train.sentinel import FAILURES, Sentinel
 from nerfcli.train.waypoints import SHARES, forget_waypoints, keep_waypoint, measure_waypoints
 
 CHECKPOINT_SECONDS = 30.0
-# A page that is open when the training ends has so long to take the last checkpoint.
+# Time that a page that is open when the training ends has to load the last checkpoint.
 _LAST_LOOK_SECONDS = 2.0
 
 
@@ -60,16 +60,16 @@ def train(
 ) -> None:
     """Fit a field to the scene's training photos and write the run folder.
 
-    The held-out photos are opened when the last checkpoint is written, and not before.
+    The held-out photos are not opened before the last checkpoint has been written.
 
     Args:
         scene: photos, cameras and split.
         run: the folder to write; must not hold a run unless `resume`.
         settings: budget, resolution, seed, device.
         resume: go on from the run's last checkpoint to the budget or step count of `settings`, which count from 0.
-        memory_bytes: that may be resident; photos that do not fit stand in files, and the result is the same. On a GPU,
-            that may be used there, and all has to fit.
-        ranks: of which this is the first; the others follow, see `following`.
+        memory_bytes: limit of resident memory; photos that do not fit are kept in files, and the result is the same. On
+            a GPU, limit of its memory, into which everything has to fit.
+        ranks: the processes that train together; this is the first, and the others run `following.follow`.
         notify: takes lines for the user.
         on_progress: called after every step.
 
@@ -82,7 +82,7 @@ def train(
     kernels.prepare(notify, settings.device)
     saved = load_tensors(run / STATE, settings.device) if resume else None
     begun = decisions_of(run, settings, saved[1]) if saved is not None else None
-    # A training that goes on to a larger budget keeps the rows that it has.
+    # A training resumed with a larger budget keeps its number of rows.
     rows = settings.log2_rows or (saved[1]["field"].get("log2_rows") if saved is not None else None)
     of_all_ranks = replace(settings, threads=ranks.count * settings.threads)
     settings = replace(settings, log2_rows=rows or of_all_ranks.chosen_log2_rows)
@@ -127,7 +127,7 @@ def train(
             live.end()
             raise
         except UserError as error:
-            if error.exit_code == LOST_RANK:  # before anything was learned from that step
+            if error.exit_code == LOST_RANK:  # nothing has been learned from that step
                 checkpoints.write()
             live.end()
             raise
@@ -144,7 +144,7 @@ def train(
 
 
 def _clear(run: Path) -> None:
-    """Make the folder, and remove what stands there and would not fit to what comes."""
+    """Create the run folder, and remove files of an earlier training from it."""
     try:
         run.mkdir(parents=True, exist_ok=True)
         for old in (run / STATE, run / FIELD, run / LOG, *run.glob(FAILURES)):
@@ -177,9 +177,9 @@ def _run(
     run: Path,
     on_progress: Callable[[Progress], None],
 ) -> Sequence[float]:
-    """Step until the budget is used up, and return the seconds of the last steps.
+    """Step until the budget is used up, and return the seconds that each of the last steps took.
 
-    The clock stands still while waypoints and checkpoints are written.
+    The clock is stopped while waypoints and checkpoints are written.
     """
     settings = fitting.settings
     last_saved = totals.seconds
@@ -236,16 +236,14 @@ def _run(
                 checkpoints.write()
                 last_saved = totals.seconds
     finally:
-        # An interruption may come before the last steps are in the log, and nothing be left to do when it goes on.
+        # An interrupt may come before the last steps are logged, and a resumed training may have no step left to log.
         if totals.seconds > logged_seconds:
             log()
     return last_steps
 
 
 def _share(settings: TrainSettings, step: int, totals: Totals) -> float:
-    """Return how much of the budget is used:
-    the larger of the shares of time, that of the search aside, and of steps.
-    """
+    """Return the used fraction of the budget: the larger of that of time, without the search, and that of steps."""
     left = settings.budget_seconds - totals.searched if settings.budget_seconds else 0.0
     by_time = (totals.seconds - totals.searched) / left if left > 0 else 0.0
     by_steps = step / settings.steps if settings.steps else 0.0
@@ -253,6 +251,6 @@ def _share(settings: TrainSettings, step: int, totals: Totals) -> float:
 
 
 def peak_memory_bytes() -> int:
-    """Return the largest resident size this process has had."""
+    """Return the peak resident memory of this process."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere else

@@ -1,4 +1,4 @@
-"""What moves in the training photos, as masks to look at and to edit."""
+"""Write masks of what moves in the training photos, to look at and to edit."""
 
 import shutil
 from collections.abc import Callable
@@ -11,15 +11,15 @@ from nerfcli.photos.mask_files import write_masks
 from nerfcli.photos.pool import PixelPool
 
 FOLDER = "movers"
-# So many photos are named.
+# Number of photos named in the message.
 _NAMED = 3
 
 
 def write_moving_masks(run: Path, movers: Movers, pool: PixelPool, *, notify: Callable[[str], None]) -> None:
-    """Write RUN/movers/PHOTO.png for each photo in which something moves, black there, and say how much it is.
+    """Write RUN/movers/PHOTO.png, black where something moves, for each photo with movers; report how much it is.
 
     Raises:
-        UserError: they cannot be written.
+        UserError: the masks cannot be written.
     """
     masks = {frame.name: movers.mask(photo).cpu().numpy() for photo, frame in enumerate(pool.frames)}
     moving = {name: 100.0 * float(1.0 - mask.mean()) for name, mask in masks.items()}

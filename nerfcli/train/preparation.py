@@ -1,6 +1,6 @@
 """Prepare a training: load photos and rays, choose the extent of the field, and select components.
 
-Nothing of held-out photos is read here except the image sizes of their cameras.
+Of held-out photos, only the image sizes of their cameras are read here.
 """
 
 import time
@@ -47,9 +47,9 @@ from nerfcli.search.selection import (
 from nerfcli.search.trials import Trials
 from nerfcli.train.evidence import Evidence
 
-# A search that has no time left has this.
+# Budget of a search that has no time left.
 LEAST_SECONDS = 1e-3
-# Of a search, what the comparison of photos may take.
+# Fraction of a search that matching photos may take.
 MATCHING_SHARE = 0.5
 
 
@@ -66,18 +66,19 @@ class Prepared:
     """The data of a training, and the decisions made for it.
 
     Args:
-        settings: with the components that are taken.
-        factor: photos are averaged over squares of this many pixels.
-        storage: where arrays of the size of the photos go.
+        settings: with the components that were chosen.
+        factor: photos are averaged over squares of this side in pixels.
+        storage: where arrays of the size of the photos are kept.
         extent: of the field.
         pool: the training photos.
-        selection: how the scene decided on the components; None where it did not.
-        log_exposure: the mean of the training photos by EXIF; None where exposures are not learned or unknown.
-        log_gains: (photos, 3) logarithms of their exposures relative to it, as the trials found them or as far as EXIF
-            tells; else 0.
-        log_focal: logarithm of the factor of focal lengths to start from.
-        points: pixels whose distance is known, where the components ask for them.
-        seconds: of the budget that were spent on all this.
+        selection: result of the automatic selection of components; None if there was none.
+        log_exposure: mean log exposure of the training photos by EXIF; None if unknown or not used.
+        log_gains: (photos, 3) logarithms of their exposures relative to it: from the trials, from stereo matching, or
+            from EXIF; 0 where unknown.
+        log_focal: logarithm of the initial factor of focal lengths.
+        points: pixels whose distance is known, if the components use them.
+        seconds: of the budget, spent on all this.
+        sky: (pixels,) bool, the pixels of the pool that look like a sky; None if no sky is learned or known.
     """
 
     settings: TrainSettings
@@ -94,7 +95,7 @@ class Prepared:
     sky: Tensor | None
 
     def fitting(self, ranks: Alone = ALONE) -> Fitting:
-        """Return the training at its first step, for one of some ranks."""
+        """Return the training before its first step, for this one of the ranks."""
         return Fitting(
             self.pool,
             self.extent.marching,
@@ -111,7 +112,7 @@ class Prepared:
         )
 
     def covered(self) -> Tensor | None:
-        """Return the cells that may be filled; None for all."""
+        """Return the grid cells that may be filled; None for all."""
         if not self.settings.components.overlap:
             return None
         depths = reduce(PointDepths.joined, self.points.sets) if self.points is not None else None
@@ -126,7 +127,7 @@ def load_training_photos(
     memory_bytes: int | None,
     notify: Callable[[str], None],
 ) -> tuple[int, PhotoStorage, Album]:
-    """Load the training photos; return also by what factor they are reduced, and where further arrays go.
+    """Load the training photos; return the factor of reduction, the storage for further arrays, and the photos.
 
     Args and raises: see `prepare`.
     """
@@ -159,9 +160,9 @@ def prepare(
     Args:
         scene: photos, cameras and split.
         settings: as requested.
-        run: where files may stand that hold what does not fit into memory.
-        memory_bytes: that may be resident, or be used on a GPU.
-        begun: decisions of a training that goes on; None for a new one.
+        run: folder for temporary files that hold what does not fit into memory.
+        memory_bytes: limit of resident memory, or of GPU memory.
+        begun: decisions of a training that is resumed; None for a new one.
         notify: takes lines for the user.
 
     Raises:
@@ -225,7 +226,7 @@ def _points(scene: Scene, settings: TrainSettings, evidence: Evidence, *, pool: 
             f"--with points: no 3D point could be triangulated from the photos of {scene.root}",
             "use a scene written by nerfcli poses or a COLMAP model, or remove --with points",
         )
-    if settings.model != "auto" or "points" in settings.fixed:  # else the decision on points has said it
+    if settings.model != "auto" or "points" in settings.fixed:  # else the decision on points reports it
         evidence.notify(f"points: {len(evidence.of_tracks.numbers):,} pixels see a 3D point at a known distance")
     return points
 
@@ -338,14 +339,14 @@ def _exif(scene: Scene) -> np.ndarray:
 
 
 def _known(scene: Scene) -> str | None:
-    """Return why the cameras can be trusted; None if they may be wrong."""
+    """Return in words why the cameras can be trusted; None if they may be wrong."""
     if scene.kind == "blender":
         return "these cameras are exact: the pictures were rendered with them"
     return "structure from motion has already optimized the cameras" if len(scene.points) else None
 
 
 def _exposures(scene: Scene, components: Components, *, notify: Callable[[str], None]) -> tuple[float | None, Tensor]:
-    """Return the mean exposure of the training photos, and the (photos, 3) logarithms relative to it."""
+    """Return the mean log exposure of the training photos by EXIF, and theirs relative to it, (photos, 3)."""
     frames = scene.train_frames
     reference = None if components.exposure == "none" else mean_log_exposure(frames)
     if reference is not None:

@@ -1,4 +1,4 @@
-"""How the processes that torchrun has started for one training meet."""
+"""Join the processes that torchrun has started for one training."""
 
 import atexit
 import functools
@@ -10,20 +10,20 @@ import torch.distributed as dist
 from nerfcli.fit.ranks import ALONE, Alone, Ranks, lost_ranks_reported
 from nerfcli.torchrun import is_one_of_several
 
-# Photos are loaded and components are selected while others wait; the wait to meet, or for a step, is short. A process
-# that ends later is noticed at once, by its closed connections: only a machine that falls silent takes so long.
+# Timeouts: long while photos are loaded and components selected, short for joining and for steps. A process that ends
+# is noticed at once by its closed connections; only a machine that goes silent takes this long.
 PREPARATION, STEP = timedelta(hours=12), timedelta(minutes=5)
 
 
 @functools.cache  # they meet once, and stay together as long as they live
 def joined_ranks(device: str) -> Alone:
-    """Join the processes that torchrun has started; `ALONE` where it has started one, or none.
+    """Join the processes that torchrun has started; return `ALONE` if it has started one, or none.
 
     Args:
         device: of this process.
 
     Raises:
-        UserError: another process has ended before.
+        UserError: another process has ended already.
     """
     if not is_one_of_several():
         return ALONE

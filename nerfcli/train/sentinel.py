@@ -1,12 +1,12 @@
-"""Guards a training against numbers that are not finite: they are found, named, kept for replay, and stepped around.
+"""Guard a training against numbers that are not finite: find them, name them, keep them for replay, and recover.
 
-Every step looks at its loss and the gradients of its weights, which costs microseconds; on a GPU, at those of the step
-before, so that the host does not wait. The whole state is looked at and copied every few hundred steps. When something
-is not finite, the training goes back to the copy and repeats its steps, now looking at every number of every tensor:
-where the backend is deterministic the steps are the same bit for bit, so the first tensor that turns bad is found, with
-its step and its pixels. The state before that step goes into a file, the training back to the copy, with half the
-learning rate. Where sums are added up in any order, a repeated step may stay finite: nothing is then known of the
-failure, and smaller steps are no answer to it; the training goes on.
+Every step checks its loss and the gradients of its weights, which costs microseconds; on a GPU, those of the previous
+step, so that the host does not wait. Every few hundred steps, the whole state is checked and copied. If something is
+not finite, the training goes back to the copy and repeats its steps, now checking every number of every tensor. With a
+deterministic backend the steps are the same bit for bit, so this finds the first bad tensor, with its step and its
+pixels. The state before that step is saved to a file, and the training continues from the copy with half the learning
+rate. If sums are added up in varying order, a repeated step may stay finite: then the cause is unknown, smaller steps
+would not help, and the training simply continues.
 """
 
 import math
@@ -36,12 +36,12 @@ PIXELS_NAMED = 8
 
 
 class Sentinel:
-    """Takes the steps of a training for it.
+    """Takes the steps of a training, and handles non-finite numbers.
 
     Args:
         fitting: the training, in a state that is finite.
-        pool: where its pixels come from.
-        run: where states before failures are kept.
+        pool: the source of its pixels.
+        run: folder for states before failures.
         notify: takes lines for the user.
     """
 
@@ -50,14 +50,14 @@ class Sentinel:
         self._pool = pool
         self._run = run
         self._notify = notify
-        self._shares: list[float] = []  # of the steps since the copy
+        self._shares: list[float] = []  # budget fractions of the steps since the copy
         self._tensors, self._description = _copied(*fitting.state())
 
     def advance(self, share: float) -> StepResult:
-        """Take one step, see `Fitting.advance`; after a failure, the first step on the way again.
+        """Take one step, see `Fitting.advance`; after a failure, it may be the repetition of an earlier one.
 
         Raises:
-            UserError: numbers become non-finite although the steps are small, exit code 5.
+            UserError: numbers become non-finite despite smaller steps, exit code 5.
         """
         self._shares.append(share)
         try:
@@ -68,7 +68,7 @@ class Sentinel:
             return self._answer()
 
     def settle(self) -> None:
-        """Make sure that the last step was finite, too, which `advance` may not know of a GPU yet.
+        """Make sure that the last step was finite, too, which `advance` does not know yet on a GPU.
 
         Raises:
             UserError: as for `advance`.
@@ -83,9 +83,9 @@ class Sentinel:
         tensors, description = self._fitting.state()
         if not all(map(is_finite, that_must_be_finite(tensors).values())):
             raise NonFiniteError
-        # From equal sums, processors of two kinds may take steps that differ in the last bit.
+        # Given equal sums, two kinds of processors may take steps that differ in the last bit.
         self._fitting.ranks.copy_from_first(*tensors.values())
-        if self._tensors.keys() == tensors.keys():  # into the same memory, which is there already
+        if self._tensors.keys() == tensors.keys():  # reuse the memory of the last copy
             for name, tensor in tensors.items():
                 self._tensors[name].copy_(tensor)
             self._description = description
@@ -97,14 +97,14 @@ class Sentinel:
         self._fitting.restore(*_copied(self._tensors, self._description))
 
     def _answer(self) -> StepResult:
-        """Find the failure by repeating the steps since the copy; go back, with smaller steps from there on."""
+        """Find the failure by repeating the steps since the copy; then continue from the copy with smaller steps."""
         fitting = self._fitting
         self._go_back()
         deterministic = fitting.field.backend.deterministic
         before = self._tensors, self._description
         done, bad, result = 0, None, None
         while bad is None and done < len(self._shares):
-            if not deterministic:  # there is no second way to this state
+            if not deterministic:  # this state cannot be reproduced
                 before = _copied(*fitting.state())
             result, bad = _watched_step(fitting, self._shares[done])
             bad = _first_of_ranks(fitting, bad)
@@ -139,12 +139,12 @@ class Sentinel:
             f"{text}; continuing from step {fitting.step} with {fitting.rate_factor:g} of the learning rate ("
             f"{fitting.rollbacks} of {MOST_ROLLBACKS} retries); {path} has the state before the failure"
         )
-        self._description = fitting.state()[1]  # a later failure goes back to these smaller steps
+        self._description = fitting.state()[1]  # a later failure keeps these smaller steps
         first, self._shares = self._shares[0], []
         return self.advance(first)
 
     def _keep(self, fraction: float, bad: BadTensor) -> tuple[Path, str]:
-        """Write the state before a step with its batch, and say in words what the step will meet."""
+        """Save the state before a step with its batch; return the path and a description of the failure to come."""
         fitting = self._fitting
         tensors, description = fitting.state()
         before = {name: tensor.clone() for name, tensor in tensors.items()}
@@ -180,7 +180,7 @@ class Sentinel:
 
 
 class _SavedBatch:
-    """A pool of pixels that has one batch to give."""
+    """A pool of pixels that holds a single batch."""
 
     def __init__(self, tensors: dict[str, Tensor], cameras: Sequence[dict[str, Any]]):
         self.colours, self.first_pixel = tensors["batch.colours"], tensors["batch.first_pixel"]
@@ -204,13 +204,13 @@ class _SavedBatch:
 
 
 def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
-    """Take the step of a failure again, from its file alone.
+    """Repeat the step of a failure from its file alone.
 
     Returns:
-        The file's description, and what is not finite this time; None if nothing is.
+        The file's description, and the tensor that is not finite this time; None if all are.
 
     Raises:
-        UserError: the file cannot be read, or is something else.
+        UserError: the file cannot be read, or is not a saved failure.
     """
     tensors, description = load_tensors(path, "cpu")
     if description.get("format") != FAILURE_FORMAT:
@@ -233,18 +233,18 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
 
 
 def _watched_step(fitting: Fitting, fraction: float) -> tuple[StepResult | None, BadTensor | None]:
-    """Return a step that looks at every number, and the first tensor that is not finite."""
+    """Take a step that checks every number; return its result and the first tensor that is not finite."""
     watch = FirstBad()
     try:
         result = fitting.advance(fraction, watch)
     except NonFiniteError:
-        # Where no number is bad, numbers are so large that their sum is.
+        # If no number is bad, the numbers are so large that their sum is.
         return None, watch.found or BadTensor("sum of the gradients", 1, 1, ())
     return result, watch.found
 
 
 def _first_of_ranks(fitting: Fitting, bad: BadTensor | None) -> BadTensor | None:
-    """Return the bad tensor of the first rank that has one, with the numbers of its rays among those of all ranks."""
+    """Return the bad tensor of the first rank that has one, with its rays numbered among those of all ranks."""
     ranks = fitting.ranks
     if bad is not None:
         bad = replace(bad, rays=tuple(ranks.rank + ranks.count * ray for ray in bad.rays))

@@ -1,6 +1,6 @@
-"""The field at a few moments of its training, measured when that is over: no held-out photo is opened before.
+"""Waypoints: copies of the field during training, measured on held-out photos once the training is over.
 
-What training cannot read, it cannot learn from, nor be stopped or steered by.
+No held-out photo is opened before, so training can neither learn from them nor be stopped or steered by them.
 """
 
 import shutil
@@ -24,7 +24,7 @@ FOLDER = "waypoints"
 
 
 def keep_waypoint(run: Path, step: int, model: Model) -> None:
-    """Write the field as it is after a step.
+    """Write the field after a step.
 
     Raises:
         UserError: it cannot be written.
@@ -37,7 +37,7 @@ def keep_waypoint(run: Path, step: int, model: Model) -> None:
 
 
 def forget_waypoints(run: Path, *, after: int = -1) -> None:
-    """Remove those of later steps than `after`: a killed training has come farther than its last checkpoint."""
+    """Remove waypoints of steps later than `after`: a killed training has come farther than its last checkpoint."""
     for step in _kept(run):
         if step > after:
             _path(run, step).unlink(missing_ok=True)
@@ -50,7 +50,7 @@ def measure_waypoints(
 ) -> None:
     """Add the PSNR of a sample of held-out pixels to the waypoint entries of RUN/log.jsonl, and remove the waypoints.
 
-    Held-out photos that cannot be read are reported, and nothing is measured: the training is done without them.
+    If held-out photos cannot be read, report this and measure nothing: the training itself is complete without them.
     """
     settings, device = prepared.settings, prepared.settings.device
     steps = _kept(run)
@@ -81,7 +81,7 @@ def measure_waypoints(
 
 
 def _kept(run: Path) -> list[int]:
-    """Return the steps of which there are waypoints, in order."""
+    """Return the steps that have waypoints, in order."""
     return sorted(int(path.stem) for path in (run / FOLDER).glob("*.safetensors") if path.stem.isdecimal())
 
 

@@ -1,1 +1,1 @@
-"""The field itself in one HTML file: its numbers, the shader that renders them, and what a visitor does with them."""
+"""Interactive viewer: a field's parameters, the shader that renders them, and the controls, in one HTML page."""

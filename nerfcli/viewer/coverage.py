@@ -9,22 +9,22 @@ from nerfcli.kernels import grid_coordinates
 from nerfcli.render.model import Model
 from nerfcli.render.visibility import DepthMap, coverage_and_parallax
 
-# Cells along each axis of the unit cube. Large cells mix what no photo sees with what is seen; of small ones, some that
-# are seen lie between the pixels of all depths. The first with so many pixels per cell on average is taken.
+# Candidate numbers of cells along each axis of the unit cube: the first with at least this many pixels per occupied
+# cell is used. Large cells mix seen and unseen places; small ones may fall between the pixels of all depth maps.
 SIDES, _LEAST_PIXELS = (192, 128, 96, 64, 48, 32), 10
 _MOST_PIXELS = 4_000_000
 _MOST_PHOTOS = 255
 
 
 def seen_cells(model: Model, photos: Sequence[DepthMap]) -> np.ndarray:
-    """Return coverage and parallax of the surface in the cells of the unit cube: those of one of its points per cell.
+    """Return coverage and parallax of the surface in the cells of the unit cube, measured at one point per cell.
 
     Args:
-        model: whose contraction maps the scene to the cube.
+        model: its contraction maps the scene to the cube.
         photos: depths of all training photos.
 
     Returns:
-        uint16 (side, side, side), indexed [z, y, x], with a side of `SIDES`: coverage, 255 at most, + 256 times the
+        uint16 (side, side, side), indexed [z, y, x], side from `SIDES`: coverage, at most 255, + 256 times the
         parallax in whole degrees; 0 where no photo sees a surface.
     """
     step = 1 + sum(int(np.isfinite(view.distances).sum()) for view in photos) // _MOST_PIXELS
@@ -42,7 +42,7 @@ def seen_cells(model: Model, photos: Sequence[DepthMap]) -> np.ndarray:
 
 
 def _cells_of(places: np.ndarray, side: int) -> np.ndarray:
-    """Return the numbers (N,) of the cells that points (N, 3) of the unit cube lie in."""
+    """Return the indices (N,) of the cells that contain points (N, 3) of the unit cube."""
     x, y, z = np.minimum((places * side).astype(np.int64), side - 1).T
     return (z * side + y) * side + x
 

@@ -12,17 +12,17 @@ from nerfcli.viewer.proof import Proof
 
 
 def field_bytes(packed: Packed, version: int) -> bytes:
-    """Return the numbers of a field; `version` is that of the status."""
+    """Encode the parameters of a field; `version` is the field version in the server's status."""
     return _bytes({"version": version, "field": packed.field, "march": packed.march}, packed.arrays)
 
 
 def proof_bytes(proof: Proof) -> bytes:
-    """Return the pictures that a page compares itself with."""
+    """Encode the reference pictures that a page compares its own rendering with."""
     return _bytes({"proof": proof.description}, {"expected": proof.expected})
 
 
 def _bytes(description: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Length of the JSON as uint32, the JSON, then the arrays in the order of its list "arrays" of [name, bytes]."""
+    """Return the JSON length as uint32, the JSON, and the arrays in the order of its list "arrays" of [name, bytes]."""
     listed = [[name, array.nbytes] for name, array in arrays.items()]
     head = json.dumps({**description, "arrays": listed}, allow_nan=False).encode()
     body = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays.values())

@@ -1,8 +1,7 @@
-"""The numbers of a field as the page holds them: rows as 16-bit levels, weights as blocks of 4 x 4, cells as bits.
+"""Pack the parameters of a field for the page: rows as 16-bit levels, weights as 4 x 4 blocks, cells as bits.
 
-A level is worth 2^-11, or the largest number of its grid divided by 32,767 where that is more. Vertices that a grid
-does not have are left out, and rows that no occupied cell reaches are 0: nothing reads them, and zeros take no room in
-the compressed page.
+The quantization step is 2^-11, or the largest magnitude in the grid divided by 32,767 if that is more. Rows beyond the
+vertices of a small grid are left out, and rows that no occupied cell reads are set to 0, which compresses to nothing.
 """
 
 from dataclasses import dataclass
@@ -22,14 +21,14 @@ from nerfcli.kernels.reference.encoding import corner_rows
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import uniform_cuts
 
-# Numbers in a texel of the table, and neurons in a block of the networks.
+# Features per texel of the table, and neurons along a side of a block of the networks.
 FOUR = 4
 LEVELS = 32767
-# Changes colours by 5e-5 (rms) and keeps the page of 2^18 rows below 10 MB; see docs/figures.md for other levels.
+# This step changes colours by 5e-5 (rms) and keeps a page of 2^18 rows below 10 MB; see docs/figures.md for others.
 FINEST_LEVEL = 2.0**-11
-# Grids with more vertices than this are hashed so densely that occupied cells reach every row.
+# Occupied cells of hashed grids with more vertices than this are taken to reach every row.
 MOST_VERTICES = 2**24
-# What every device that draws WebGL2 has room for in a block of uniforms: 16 KiB of 64 bytes each.
+# Every WebGL2 device has room for this many in a uniform block: 16 KiB, 64 bytes each.
 MOST_BLOCKS = 256
 
 
@@ -38,8 +37,8 @@ class Packed:
     """A field ready for the page.
 
     Args:
-        field, march: what the shader is made from, plain values.
-        arrays: by the name of its element, in the byte order of browsers (little endian).
+        field, march: plain values from which the shader is generated.
+        arrays: by the name of the page element, little endian, as browsers read them.
     """
 
     field: dict[str, Any]
@@ -48,10 +47,10 @@ class Packed:
 
 
 def pack_model(model: Model) -> Packed:
-    """Return the field of a model with all that rendering needs.
+    """Pack the field of a model with everything that rendering needs.
 
     Raises:
-        UserError: a kind or a size of field that the page cannot draw.
+        UserError: the page cannot draw this kind or size of field.
     """
     resolutions, table, networks, more = _numbers(model)
     rows = table.shape[1]
@@ -90,18 +89,18 @@ def pack_model(model: Model) -> Packed:
 
 
 def quantised(values: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return 16-bit levels of numbers and what a level is worth; off by half a level at most."""
+    """Return 16-bit levels of values and the size of one level; the error is at most half a level."""
     scale = max(FINEST_LEVEL, float(np.abs(values).max(initial=0.0)) / LEVELS)
     return np.rint(values / scale).astype("<i2"), scale
 
 
 def reached_rows(occupied: Tensor, side: int, rows: int) -> Tensor:
-    """Return which rows of a table interpolation in occupied cells reads.
+    """Mark the rows of a table that interpolation in occupied cells reads.
 
     Args:
         occupied: (G, G, G) bool, indexed [z, y, x].
-        side: cells per axis of the grid that the table holds; 0 for none.
-        rows: of the table.
+        side: cells per axis of the grid in the table; 0 for none.
+        rows: number of rows of the table.
 
     Returns:
         (rows,) bool; all true for grids of more than 2^24 vertices.
@@ -113,7 +112,7 @@ def reached_rows(occupied: Tensor, side: int, rows: int) -> Tensor:
     touches = ((first <= vertex) & (vertex <= last)).float()
     vertices = occupied.float()
     for _ in range(3):
-        # Along the slowest axis, which then becomes the fastest: after three turns the axes are as before.
+        # Works along the slowest axis and moves it to the end; after three rounds the axes are in their original order.
         vertices = torch.tensordot(touches, vertices, 1).clamp_max(1.0).movedim(0, -1)
     reached = torch.zeros(rows, dtype=torch.bool)
     reached[corner_rows(vertices.nonzero().flip(-1), side, rows)] = True
@@ -121,13 +120,13 @@ def reached_rows(occupied: Tensor, side: int, rows: int) -> Tensor:
 
 
 def _numbers(model: Model) -> tuple[tuple[int, ...], Tensor, np.ndarray, dict[str, Any]]:
-    """Cells per axis of each grid, their rows, the blocks of the networks, and the constants of the shader."""
+    """Return cells per axis of each grid, the table, the blocks of the networks, and constants of the shader."""
     field = model.field
     if isinstance(field, HashField):
         settings = field.settings
         _refuse_sizes(settings.features, settings.width)
         layers = [layer.detach().cpu().numpy().astype(np.float32) for layer in field.weights]
-        # Harmonics above the degree have no part in colours.
+        # Harmonics above the view degree do not affect colours.
         layers[2] = layers[2].copy()
         layers[2][:, GEOMETRY + (settings.view_degree + 1) ** 2 :] = 0.0
         layers[4] = np.pad(layers[4], ((0, FOUR - len(layers[4])), (0, 0)))
@@ -153,7 +152,7 @@ def _numbers(model: Model) -> tuple[tuple[int, ...], Tensor, np.ndarray, dict[st
 
 
 def blocks_of(layer: np.ndarray) -> np.ndarray:
-    """(blocks, 4, 4) of a layer (outputs, inputs): four inputs of four outputs each, as columns; outputs go slowest."""
+    """Split a layer (outputs, inputs) into (blocks, 4, 4), indexed [input, output]; groups of outputs vary slowest."""
     outputs, inputs = (size // FOUR for size in layer.shape)
     return layer.reshape(outputs, FOUR, inputs, FOUR).transpose(0, 2, 3, 1).reshape(-1, FOUR, FOUR)
 

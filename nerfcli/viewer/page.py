@@ -1,4 +1,4 @@
-"""The page that renders a field: one HTML file by itself, opened from a disk; or live, from a server of ours."""
+"""The page that renders a field: a self-contained HTML file, or a live page from nerfcli's own server."""
 
 import base64
 import zlib
@@ -29,11 +29,11 @@ LIVE_SCRIPTS = ("remote.js", "live.js")
 
 @dataclass(frozen=True)
 class PageNumbers:
-    """The field and the proof as the page holds them.
+    """The field and the proof as stored in the page.
 
     Args:
         description: plain values.
-        elements: HTML elements of compressed arrays.
+        elements: HTML elements with the compressed arrays.
     """
 
     description: dict[str, Any]
@@ -41,7 +41,7 @@ class PageNumbers:
 
     @classmethod
     def of(cls, packed: Packed, proof: Proof, seen: np.ndarray) -> "PageNumbers":
-        """Return the numbers of a field, with its proof and its `seen_cells`."""
+        """Encode a packed field with its proof and its `seen_cells`."""
         description = {"field": packed.field, "march": packed.march, "proof": proof.description, "seen": len(seen)}
         arrays = {**packed.arrays, "expected": proof.expected, "seen": seen}
         return cls(description, "\n".join(starmap(array_element, arrays.items())))
@@ -59,12 +59,12 @@ def page_html(
     """Return the text of a page that needs no server.
 
     Args:
-        model: what it shows.
-        numbers: of its field, and what the page compares itself with.
-        run: the folder; its name stands on the page.
-        frames: pinhole ones, at least one; the page begins at the middle one.
-        photos: what it holds of photos.
-        box: low and high corner that the crop box begins with, scene units.
+        model: the model to show.
+        numbers: its field, and the proof that the page compares its rendering with.
+        run: the folder; the page shows its name.
+        frames: pinhole frames, at least one; the first view is that of the middle one.
+        photos: the photos on the page.
+        box: low and high corner of the initial crop box, scene units.
     """
     scene = _scene(model, run=run, frames=frames, photos=photos.entries, box=box) | numbers.description
     return _html(scene, numbers.elements, run=run, connect=False)
@@ -80,13 +80,13 @@ def live_page_html(
     version: int,
     refusal: str | None,
 ) -> str:
-    """Return the text of a page that fetches its field and pictures from the server it came from.
+    """Return the text of a page that fetches its field and pictures from the server that sent it.
 
     Args:
         model, run, frames, box: as for `page_html`.
         photos: see `pictures.fetched_photos`.
-        version: of the field, see `server.Show.status`.
-        refusal: why the page cannot draw this field by itself; None if it can.
+        version: version of the field, see `server.Show.status`.
+        refusal: reason why the page cannot draw this field itself; None if it can.
     """
     scene = _scene(model, run=run, frames=frames, photos=photos, box=box)
     scene |= {"live": {"refusal": refusal, "version": version}, "march": {"far": model.marching.far}}
@@ -96,7 +96,7 @@ def live_page_html(
 def _scene(
     model: Model, *, run: Path, frames: Sequence[Frame], photos: Sequence[dict[str, Any]], box: Sequence[float]
 ) -> dict[str, Any]:
-    """Return what both kinds of page have, plain values."""
+    """Return the plain values that both kinds of page contain."""
     size = 1.0 / model.training_from_scene.scale
     home = view_of(frames[len(frames) // 2])
     unit = {"metre": "metres", "arbitrary": "arbitrary units"}.get(model.unit, model.unit)
@@ -120,7 +120,7 @@ def _scene(
 
 
 def _html(scene: dict[str, Any], numbers: str, *, run: Path, connect: bool) -> str:
-    """Return the page around a scene."""
+    """Assemble the HTML page around a scene description."""
     shaders = "".join(_element(part, "x-shader/x-fragment", _text(f"{part}.glsl")) for part in ("trace", "show"))
     body = "\n".join(
         [
@@ -150,7 +150,7 @@ def _element(name: str, kind: str, text: str) -> str:
 def array_element(name: str, values: np.ndarray) -> str:
     """Return an element that holds an array, see `bytesOf` in field.js.
 
-    The bytes of equal significance stand together, which deflate makes shorter; then base64.
+    Bytes of equal significance are grouped, which compresses better; then deflate and base64.
     """
     significance = np.ascontiguousarray(values).view(np.uint8).reshape(-1, values.itemsize).T
     text = base64.b64encode(zlib.compress(significance.tobytes(), 9)).decode()
@@ -159,5 +159,5 @@ def array_element(name: str, values: np.ndarray) -> str:
 
 @cache
 def _text(name: str) -> str:
-    """Return the text of a part of the page that stands beside this file."""
+    """Read a part of the page from the file of that name beside this one."""
     return Path(__file__).with_name(name).read_text(encoding="utf-8")

@@ -1,6 +1,6 @@
-"""Pictures by the kernels for a page: coarse first, then finer, tiles from the middle out, until a newer view comes.
+"""Render pictures for a page: coarse first, then finer, in tiles from the middle out, until the view changes.
 
-One thread renders for all clients, tile by tile in turn, so that no tile waits for more than one of each other client.
+One thread renders for all clients, one tile each in turn, so a tile waits for at most one tile of each other client.
 """
 
 import math
@@ -25,18 +25,18 @@ from nerfcli.render.model import Model
 from nerfcli.render.rays import CENTRES, pixel_rays
 from nerfcli.render.tracing import render_rays
 
-# A view moves on within two tiles; the first picture of a motion is as coarse as this time demands.
+# Target times of a tile, and of the first picture of a view, which is as coarse as needed to be done in that time.
 TILE_SECONDS = 0.02
 COARSE_SECONDS = 0.03
 COARSEST, SMALLEST_SIDE = 16, 32
-# What a tile costs besides its rays, in rays; without it, small tiles look slow and are made smaller still.
+# Fixed cost of a tile, in rays; without it, small tiles would seem slow and be made even smaller.
 _TILE_RAYS = 400
-# From one picture to the next finer one.
+# Ratio of strides from one picture to the next finer one.
 FINER = 4
-# Seconds per ray before anything was measured, and how many tiles count: their median, as a few have to wait.
+# Seconds per ray before any measurement, and number of recent tiles whose median is used, as some have to wait.
 _FIRST_RATE, _RATES = 1e-5, 9
 LARGEST_PX = 8192
-# Numbers of a pixel: rgb, opacity; mean, spread, median, heaviest; quantiles 5 %, 95 %, the chosen one; unused.
+# Values per pixel: rgb, opacity; mean, spread, median, heaviest; quantiles 5 %, 95 %, the requested one; unused.
 NUMBERS = 12
 _HEAD = struct.Struct("<8I")
 
@@ -47,14 +47,14 @@ class View:
 
     Args:
         frame: pinhole camera and pose in the scene's frame.
-        quantile: of the light, in (0, 1).
+        quantile: fraction of the light for the requested quantile depth, in (0, 1).
     """
 
     frame: Frame
     quantile: float
 
     def coarse(self, stride: int) -> Frame:
-        """Return the frame with one pixel for stride x stride; its rays are those of their middles."""
+        """Return the frame with one pixel per stride x stride pixels, with a ray through the middle of each block."""
         camera = self.frame.camera
         width, height = (-(-size // stride) for size in (camera.width, camera.height))
         lens = tuple(value / stride for value in camera.params)
@@ -63,7 +63,7 @@ class View:
 
 @dataclass(frozen=True)
 class Tile:
-    """A rectangle of a picture with one pixel for stride x stride of the view."""
+    """A rectangle of a picture that has one pixel per stride x stride pixels of the view."""
 
     stride: int
     x: int
@@ -96,7 +96,7 @@ def view_from_json(content: Any) -> View:
 
 @torch.no_grad()
 def render_tile(model: Model, view: View, tile: Tile) -> np.ndarray:
-    """Return what the rays of a tile see: (height, width, NUMBERS) float32.
+    """Render the rays of a tile: (height, width, NUMBERS) float32.
 
     Colours and opacities are those of `render_picture`; distances are along the ray in the training frame, -1 where
     undefined.
@@ -127,7 +127,7 @@ def render_tile(model: Model, view: View, tile: Tile) -> np.ndarray:
 
 
 def strides_of(width: int, height: int, seconds_per_ray: float) -> list[int]:
-    """Return the strides of the pictures of a view, coarse to fine, the first one quick enough for a motion."""
+    """Return the strides of a view's pictures, coarse to fine; the first is quick enough while the camera moves."""
     stride = 1
     while stride < COARSEST and width * height / stride**2 * seconds_per_ray > COARSE_SECONDS:
         stride *= 2
@@ -138,7 +138,7 @@ def strides_of(width: int, height: int, seconds_per_ray: float) -> list[int]:
 
 
 def tiles_of(view: View, stride: int, seconds_per_ray: float) -> list[Tile]:
-    """Return the tiles of a picture, from its middle out; the whole where that is quick."""
+    """Return the tiles of a picture, from its middle out; a single one if the whole picture is quick."""
     small = view.coarse(stride).camera
     width, height = small.width, small.height
     camera = view.frame.camera
@@ -155,7 +155,7 @@ def tiles_of(view: View, stride: int, seconds_per_ray: float) -> list[Tile]:
 
 @dataclass
 class _Job:
-    """A view of one client on its way: what is still to render, and what was rendered."""
+    """A requested view of one client: the tiles still to render, and the finished records."""
 
     client: str
     view: View
@@ -166,11 +166,11 @@ class _Job:
 
 
 class Painter:
-    """Renders views for clients; a new view of a client ends the one before, between two tiles.
+    """Renders views for clients; a new view of a client replaces its previous one after the current tile.
 
     Args:
-        model: gives the newest model with its number.
-        threads: of the CPU.
+        model: returns the version number of the newest model, and the model.
+        threads: CPU threads.
     """
 
     def __init__(self, model: Callable[[], tuple[int, Model]], *, threads: int):
@@ -183,9 +183,9 @@ class Painter:
         threading.Thread(target=self._work, daemon=True).start()
 
     def paint(self, client: str, view: View) -> Iterator[bytes]:
-        """Yield the tiles of a view as they come: a head of 8 numbers, then three times four numbers a pixel.
+        """Yield the finished tiles of a view: a header of 8 numbers, then three planes of four values per pixel.
 
-        The head is stride, x, y, width, height, width and height of the picture, number of the model.
+        The header is stride, x, y, width, height, width and height of the picture, version of the model.
 
         Raises:
             UserError: the field cannot be read.
@@ -209,7 +209,7 @@ class Painter:
                     del self._newest[client]
 
     def _work(self) -> None:
-        torch.set_num_threads(self._threads)  # OpenMP counts the threads of each thread that calls it
+        torch.set_num_threads(self._threads)  # OpenMP keeps a thread count for each calling thread
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting)
@@ -218,7 +218,7 @@ class Painter:
                 continue
             try:
                 job.records.put(self._step(job))
-            except Exception as error:  # it belongs to the client, not to this thread
+            except Exception as error:  # raised again in the thread of the client
                 job.records.put(error)
                 continue
             if job.tiles or job.strides:

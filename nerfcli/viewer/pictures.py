@@ -1,4 +1,4 @@
-"""The photos of a run for its page: cameras of all, pictures of as many and as large as there is room for."""
+"""The photos of a run for its page: all cameras, and pictures of as many and as large as space permits."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,12 +16,12 @@ from nerfcli.photos.loading import load_photo
 from nerfcli.photos.undistorted import pinhole_of, undistorted
 from nerfcli.render.model import Model
 
-# Longer sides that are tried, in pixels, and the quality of the JPEG.
+# Longer sides to try, in pixels, and the JPEG quality.
 LONGEST_PX = (800, 640, 480, 360, 280, 200, 140)
 QUALITY = 80
-# More cameras than these have no pictures; they are drawn all the same.
+# Most photos with a picture; cameras beyond are still drawn.
 MOST_PICTURES = 200
-# Photos whose size decides on that of all.
+# Number of photos that are encoded to choose the size of all.
 _SAMPLE = 4
 _WHITE = 255.0
 
@@ -31,9 +31,9 @@ class PagePhotos:
     """Photos of a page.
 
     Args:
-        entries: of each frame, plain values for the page.
-        longest_px: of the pictures; 0 where there are none.
-        missing: how many photos are not where the run looks for them.
+        entries: plain values of each frame.
+        longest_px: longer side of the pictures; 0 if there are none.
+        missing: number of photos that are not where the run expects them.
     """
 
     entries: list[dict[str, Any]]
@@ -50,14 +50,14 @@ def page_photos(
     threads: int = 1,
     on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> PagePhotos:
-    """Return the photos of a run, as pinhole cameras took them, in the order of their names.
+    """Return the photos of a run, undistorted to pinhole cameras, sorted by name.
 
     Args:
-        model: whose exposures of photos are given.
+        model: the trained model, for the exposures of the photos.
         train, test: the frames.
-        room_bytes: for the pictures in all, as text of the page.
-        threads: to read photos with.
-        on_progress: called with how much is done.
+        room_bytes: budget for all pictures, as text in the page.
+        threads: threads that read photos.
+        on_progress: called with the fraction done.
     """
     frames = _sorted(train, test)
     there = [index for index, (frame, _) in enumerate(frames) if frame.image is not None and frame.image.exists()]
@@ -75,7 +75,7 @@ def page_photos(
 
 
 def fetched_photos(model: Model, train: Sequence[Frame], test: Sequence[Frame]) -> list[dict[str, Any]]:
-    """Return the entries of `page_photos` with addresses of pictures at the page's server, for `photo_jpeg`."""
+    """Return the entries of `page_photos` with server addresses of the pictures, which `photo_jpeg` answers."""
     frames = _sorted(train, test)
     there = [frame.image is not None and frame.image.exists() for frame, _ in frames]
     return [
@@ -85,7 +85,7 @@ def fetched_photos(model: Model, train: Sequence[Frame], test: Sequence[Frame]) 
 
 
 def photo_jpeg(train: Sequence[Frame], test: Sequence[Frame], index: int, *, longest_px: int) -> bytes:
-    """Return the photo of an entry of `fetched_photos`.
+    """Return the JPEG of the photo of an entry of `fetched_photos`.
 
     Raises:
         LookupError: there is no such photo.
@@ -98,14 +98,14 @@ def photo_jpeg(train: Sequence[Frame], test: Sequence[Frame], index: int, *, lon
 
 
 def frustum_depth(frames: Sequence[Frame], size: float) -> float:
-    """Return how deep frusta are drawn: half the distance between typical neighbours, a tenth of the scene at most."""
+    """Return the drawn depth of frusta: half the median distance between neighbours, at most a tenth of the scene."""
     centres = centres_of(frames)
     gap = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1])) if len(frames) > 1 else size
     return min(0.5 * gap, 0.1 * size) or 0.1 * size
 
 
 def view_of(frame: Frame) -> dict[str, Any]:
-    """Return place, turn and lens of a pinhole frame as the page has them."""
+    """Return position, rotation and intrinsics of a pinhole frame in the page's format."""
     return {
         "place": frame.centre.tolist(),
         "turn": frame.world_from_cam[:3, :3].tolist(),
@@ -116,13 +116,13 @@ def view_of(frame: Frame) -> dict[str, Any]:
 
 
 def _sorted(train: Sequence[Frame], test: Sequence[Frame]) -> list[tuple[Frame, str]]:
-    """Return the frames with their split, in the order of their names."""
+    """Return the frames with their split, sorted by name."""
     frames = [*((frame, "train") for frame in train), *((frame, "test") for frame in test)]
     return sorted(frames, key=lambda entry: entry[0].name)
 
 
 def _entries(model: Model, frames: Sequence[tuple[Frame, str]]) -> list[dict[str, Any]]:
-    """Return the entry of each frame in a page, without its picture."""
+    """Return the page entry of each frame, without its picture."""
     gains = log_gains_of([frame for frame, _ in frames], model)
     return [
         {
@@ -136,11 +136,11 @@ def _entries(model: Model, frames: Sequence[tuple[Frame, str]]) -> list[dict[str
 
 
 def _longest(frames: Sequence[tuple[Frame, str]], shown: Sequence[int], room_bytes: int) -> int:
-    """Return the largest size at which all pictures fit, judged by a few; 0 where none does."""
+    """Return the largest size at which all pictures fit, estimated from a few; 0 if none fits."""
     if not shown:
         return 0
     sample = shown[:: max(1, len(shown) // _SAMPLE)][:_SAMPLE]
-    # Read once at the largest size; the smaller ones are made of that.
+    # Read once at the largest size, then scaled down.
     largest = [_small_photo(frames[index][0], LONGEST_PX[0]) for index in sample]
     for longest in LONGEST_PX:
         mean = np.mean([4 * len(jpeg_bytes(photo, longest_px=longest, quality=QUALITY)) / 3 for photo in largest])
@@ -150,7 +150,7 @@ def _longest(frames: Sequence[tuple[Frame, str]], shown: Sequence[int], room_byt
 
 
 def _small_photo(frame: Frame, longest_px: int) -> np.ndarray:
-    """Return a photo as its pinhole camera took it, its longer side at most so many pixels; white where it is clear."""
+    """Return an undistorted photo, its longer side at most about `longest_px`; on white where it is transparent."""
     factor = max(1.0, max(frame.camera.width, frame.camera.height) / longest_px)
     photo = load_photo(frame, factor, "ignore")
     small = photo.frame.camera

@@ -1,4 +1,4 @@
-"""Small pictures of three cameras by the kernels, for a page to compare with what a visitor's device draws."""
+"""Reference pictures of up to three cameras, rendered by the kernels, for the page to check the visitor's device."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from nerfcli.viewer.pictures import view_of
 WIDTH, HEIGHT = 64, 48
 CAMERAS = 3
 SHARE = 0.25
-# Of the proof, besides the colour, in this order; see `compare` in check.js.
+# Maps of the proof after the colour, in this order; see `compare` in check.js.
 MAPS = (
     *("opacity", "conditional", "median", "max-weight", "moment", "background", "quantile"),
     *("spread", "disagreement"),
@@ -25,12 +25,12 @@ MAPS = (
 
 @dataclass(frozen=True)
 class Proof:
-    """Pictures that the page is compared with.
+    """Reference pictures for the page.
 
     Args:
         description: cameras and maps, plain values.
-        expected: float32, camera by camera, map by map, row by row; depths along the optical axis in scene units, NaN
-            where undefined.
+        expected: float32, by camera, then map, then row; depths along the optical axis in scene units, NaN where
+            undefined.
     """
 
     description: dict[str, Any]
@@ -38,11 +38,11 @@ class Proof:
 
 
 def make_proof(model: Model, frames: Sequence[Frame]) -> Proof:
-    """Render the proof of a model: some of the frames as small pinhole pictures with half of their focal length's view.
+    """Render the proof of a model: small pinhole pictures of a few frames, spread evenly.
 
     Args:
-        model: of the page.
-        frames: pinhole ones, at least one.
+        model: the model of the page.
+        frames: pinhole frames, at least one.
     """
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, CAMERAS).astype(int))]
     small = [Frame(frame.name, _small(frame.camera), frame.world_from_cam) for frame in chosen]
@@ -58,13 +58,13 @@ def make_proof(model: Model, frames: Sequence[Frame]) -> Proof:
 
 
 def _small(camera: Camera) -> Camera:
-    """Return a picture of 64 x 48 that shows as much as fits into it."""
+    """Return a 64 x 48 pinhole camera with the view cropped to that aspect ratio."""
     scale = max(WIDTH / camera.width, HEIGHT / camera.height)
     return Camera.pinhole(WIDTH, HEIGHT, camera.focal_px * scale)
 
 
 def _maps(model: Model, frame: Frame) -> list[np.ndarray]:
-    """Return the picture of one camera, pixel by pixel inside a map: as `nerfcli render` makes it."""
+    """Render the colour and `MAPS` of one camera as `nerfcli render` does, each flattened."""
     farthest = model.marching.far / model.training_from_scene.scale
     pictures = {}
     for name in MAPS[1:-2]:

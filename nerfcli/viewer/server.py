@@ -1,4 +1,4 @@
-"""The server of the interactive page: one address with a token, events for every client, pictures by the painter."""
+"""The server of the interactive page: an address with a token, status events for clients, rendered pictures."""
 
 import hmac
 import json
@@ -15,9 +15,9 @@ from urllib.parse import parse_qs, urlsplit
 
 from nerfcli.errors import UserError
 
-# The first port that is tried, and how many after it.
+# The first port to try, and the number of ports to try.
 FIRST_PORT, PORTS_TRIED = 8123, 50
-# A client that has gone is noticed when this is written to it.
+# Longest time between writes to a client; a lost connection is noticed at the next write.
 EVENT_SECONDS = 1.0
 MOST_REQUEST_BYTES = 65536
 ACTIONS = ("pause", "continue", "stop")
@@ -25,51 +25,51 @@ _HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Co
 
 
 class Show(Protocol):
-    """Data source of the page; called from several threads. A UserError becomes a message in the page."""
+    """Data source of the page, called from several threads. A UserError becomes a message on the page."""
 
     def page(self) -> str:
-        """HTML of the page; it is loaded again where there is no field yet."""
+        """Return the HTML of the page; browsers retry after a UserError, as when there is no field yet."""
         ...
 
     def field(self) -> bytes:
-        """Return the newest numbers of the field, see `live_data.field_bytes`."""
+        """Return the parameters of the newest field, see `live_data.field_bytes`."""
         ...
 
     def proof(self) -> bytes:
-        """Small pictures by the kernels of the newest field, see `live_data.proof_bytes`."""
+        """Return reference pictures of the newest field, see `live_data.proof_bytes`."""
         ...
 
     def photo(self, index: int, longest_px: int) -> bytes:
-        """JPEG of a photo; LookupError where there is none."""
+        """Return the JPEG of a photo; raise LookupError if there is none."""
         ...
 
     def picture(self, client: str, view: Any) -> Iterator[bytes]:
-        """Parts of a picture, see `Painter.paint`; ValueError for something that is no view."""
+        """Yield the parts of a picture, see `Painter.paint`; raise ValueError for an invalid view."""
         ...
 
     def status(self) -> dict[str, Any]:
-        """State of the training and number of the newest field."""
+        """Return the state of the training and the version of the newest field."""
         ...
 
     def control(self, action: str) -> None:
-        """Pass on one of `ACTIONS`."""
+        """Pass one of `ACTIONS` to the training."""
         ...
 
 
 class PageServer(ThreadingHTTPServer):
-    """Serves a show; `clients` is the number of pages that are open.
+    """Serves a show; `clients` is the number of open pages.
 
     Args:
-        show: what is served.
+        show: the data source.
         host: the address to listen on.
-        port: of that address; None for the first free one from `FIRST_PORT` on.
+        port: the port; None for the first free one from `FIRST_PORT` on.
 
     Raises:
-        UserError: the port is taken, or there is no such address.
+        UserError: the port is taken, or the address does not exist.
     """
 
     daemon_threads = True
-    # On Windows this option means something else: that a second server may take the port of a first.
+    # On Windows this option would let a second server take the port of the first.
     allow_reuse_address = sys.platform != "win32"
 
     def __init__(self, show: Show, *, host: str, port: int | None):
@@ -96,18 +96,18 @@ class PageServer(ThreadingHTTPServer):
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self.token}/"
 
     def announce(self) -> None:
-        """Wake the event streams: the status has changed."""
+        """Wake the event streams after a change of the status."""
         with self.changed:
             self.changed.notify_all()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Pass over clients that went away; show everything else."""
+        """Ignore lost connections; report all other errors."""
         if not isinstance(sys.exc_info()[1], ConnectionError):
             super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
-    timeout = 60.0  # of a client that sends nothing
+    timeout = 60.0  # seconds, for a client that sends nothing
 
     @property
     def _of(self) -> PageServer:
@@ -147,7 +147,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _page(self) -> None:
         try:
             text = self._of.show.page()
-        except UserError as error:  # the field of a training may be there soon
+        except UserError as error:  # a training may write its field soon
             text = f"{error.message}: {error.hint}\n"
             self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", text.encode(), {"Refresh": "2"})
             return
@@ -164,7 +164,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.OK, "image/jpeg", content, {"Cache-Control": "private, max-age=3600"})
 
     def _events(self) -> None:
-        """Send the status whenever it changes, and now and then; the client counts as open until this ends."""
+        """Send the status when it changes, and a keep-alive otherwise; the client counts as open until this ends."""
         server = self._of
         with server.changed:
             server.clients += 1
@@ -187,7 +187,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _picture(self) -> None:
         content = self._body()
         parts = self._of.show.picture(str(content.get("client")), content.get("view"))
-        first = next(parts, None)  # what is wrong with the view or the field is found here, before the answer begins
+        first = next(parts, None)  # errors of the view or the field appear here, before the response begins
         self._begin("application/octet-stream")
         try:
             if first is not None:
@@ -228,14 +228,14 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing of each request."""
+        """Log nothing for each request."""
 
 
 def serve(server: PageServer, *, tick: float, on_tick: Any) -> None:
     """Serve until interrupted, calling `on_tick` every `tick` seconds in this thread.
 
     Raises:
-        KeyboardInterrupt: passed on when the server has stopped.
+        KeyboardInterrupt: raised again after the server has stopped.
     """
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
     thread.start()

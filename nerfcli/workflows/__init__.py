@@ -1,1 +1,1 @@
-"""Whole steps from input to result: do, keep, resume or refuse; what the command line and Python programs call."""
+"""Complete steps from input to result (do, keep, resume or refuse), called by the command line and Python programs."""

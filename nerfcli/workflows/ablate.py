@@ -26,7 +26,7 @@ from nerfcli.workflows.train import train_scene, was_interrupted
 
 _SAME = "; the same pixels for all variants of a seed, other pixels for each seed"
 
-# Takes a run, its variant's name and its settings, and whether to measure anew.
+# Arguments: a run, its variant's name, its settings, and whether to measure it again.
 Measure = Callable[[Run, str, TrainSettings, bool], MeasuredTraining]
 
 
@@ -45,26 +45,26 @@ def ablate_scene(
     warn: Notify = warn_python,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
-    """Train every variant with every seed, or what is left of it, measure it, and write the table after each.
+    """Train and measure every variant with every seed, continue an earlier call, and write the table after each.
 
     Args:
         path: the scene.
-        folder: takes the table and the runs.
-        settings: of all trainings; `model` "auto" has the scene decide first.
-        seeds: how many, from that of the settings on.
-        only: components to vary; all where there are none.
+        folder: the folder to write the table and the runs into.
+        settings: of all trainings; with `model` "auto", the components are first selected for the scene.
+        seeds: number of seeds, counted up from the seed of the settings.
+        only: components to vary; all if empty.
         whole: measure whole held-out photos as `evaluate_run` does, not random pixels of them.
         holdout: see `train_scene`.
-        memory_bytes: that a training may have resident, or use on a GPU.
-        overwrite: train and measure again what is there.
-        notify, warn: take lines for the user.
-        progress: takes the share of the trainings that is done.
+        memory_bytes: limit of a training's resident memory, or of the memory that it uses on a GPU.
+        overwrite: train and measure existing runs again.
+        notify, warn: called with lines for the user.
+        progress: called with the fraction of the trainings that is done and a short text.
 
     Returns:
         The content of ablation.json.
 
     Raises:
-        UserError: see `nerfcli.train.loop.train`; nothing is held out, or something else stands at the folder.
+        UserError: see `nerfcli.train.loop.train`; or no photos are held out, or the folder holds something else.
     """
     scene = scenes.load(path, holdout=holdout)
     if not scene.test_frames:
@@ -86,7 +86,7 @@ def ablate_scene(
             holdout=holdout,
             warn=warn,
         )
-        # Three times as large as the field, and an ablation never resumes from it.
+        # The training state is three times as large as the field, and complete trainings are not resumed.
         (target / STATE).unlink(missing_ok=True)
         return run
 
@@ -119,7 +119,7 @@ def ablate_scene(
 
 
 def _capture(scene: Scene) -> CaptureTraits:
-    """Return what the scene offers to components."""
+    """Return the traits of a scene that decide which components can be varied."""
     first, sparse = scene.train_frames[0].image, model_folder(scene.root)
     seen = parse_colmap(sparse).observations if sparse is not None else None
     exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
@@ -131,7 +131,7 @@ def _capture(scene: Scene) -> CaptureTraits:
 
 
 def _measured_whole(run: Run, name: str, settings: TrainSettings, overwrite: bool) -> MeasuredTraining:
-    """Whole photos, by the protocol of `evaluate_run`: now, or by an earlier call."""
+    """Return a training measured on whole photos with `evaluate_run`, now or by an earlier call."""
     metrics = evaluate_run(run.path, device=settings.device, threads=settings.threads, overwrite=overwrite).metrics
     mean, training, protocol = metrics["mean"], metrics["training"], metrics["protocol"]
     return MeasuredTraining(
@@ -140,7 +140,7 @@ def _measured_whole(run: Run, name: str, settings: TrainSettings, overwrite: boo
 
 
 def _measured_pixels(run: Run, name: str, settings: TrainSettings, overwrite: bool) -> MeasuredTraining:
-    """Random pixels of the held-out photos: the same for all models of a seed."""
+    """Return a training measured on random pixels of the held-out photos, the same for all variants of a seed."""
     model, last = run.model(settings.device), run.log[-1]
     photos = held_out_photos_of(run.config, run.cameras.test, model, threads=settings.threads)
     sample = SampledPixels.drawn(photos, seed=settings.seed)

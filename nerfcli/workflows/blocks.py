@@ -1,4 +1,4 @@
-"""Train a large scene in blocks, one after another or each by a process of its own, and join them."""
+"""Train a large scene in blocks, one after another or each in its own process, and join them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,15 +18,15 @@ from nerfcli.scene import Scene
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.workflows.train import train_or_continue
 
-# What the blocks could only find out together, and would choose differently: the automatic selection leaves it alone.
+# Components left out of the automatic selection: blocks must agree on them, but would select them separately.
 _SHARED = ("background", "exposure", "cameras")
 
 
 def block_settings(settings: TrainSettings, number: int, count: int) -> TrainSettings:
-    """Return the settings of one of some blocks, or of all together if the number is 0.
+    """Return the settings of block `number` of `count`, or of the joined run if the number is 0.
 
     Raises:
-        UserError: settings that do not work with blocks.
+        UserError: the settings do not work with blocks.
     """
     return replace(settings, blocks=count, block=number, fixed=tuple(dict.fromkeys((*settings.fixed, *_SHARED))))
 
@@ -48,8 +48,8 @@ def train_blocks(
 ) -> Path:
     """Train the blocks of a scene into RUN/blocks/1, 2, ..., each with the whole budget, and join them in RUN.
 
-    Blocks that are there and complete are kept, interrupted ones are resumed. Processes that train one block each need
-    no communication: whichever finds all of them complete joins them.
+    Complete blocks are kept and interrupted ones are resumed. Processes that train one block each need no
+    communication: the one that finds all blocks complete joins them.
 
     Example:
         >>> from nerfcli.runs.settings import TrainSettings
@@ -58,16 +58,16 @@ def train_blocks(
 
     Args:
         scene, run, settings, memory_bytes, overwrite, holdout, notify, warn: see `train_scene`.
-        count: of the blocks.
-        only: the block to train, from 1 on; None for all.
-        resume: continue complete blocks to a larger budget.
-        progress: takes the share of the blocks' training that is done and a few words.
+        count: number of blocks.
+        only: the block to train, counted from 1; None for all.
+        resume: also continue complete blocks to a larger budget.
+        progress: called with the fraction of the blocks' training that is done and a short text.
 
     Returns:
-        The run; the folder of the block if others are not complete.
+        The run; or, if some blocks are not complete, the folder of the first block trained here.
 
     Raises:
-        UserError: see `train_scene` and `runs.blocks.divide`; or `run` is the run of one field.
+        UserError: see `train_scene` and `runs.blocks.divide`; or `run` exists with another number of blocks.
     """
     folder, run = Path(scene), Path(run)
     if (run / CONFIG).exists() and Run(run).config.settings.blocks != count and not overwrite:
@@ -122,7 +122,7 @@ def train_blocks(
 
 
 def _write(run: Path, scene: Scene, blocks: Sequence[Run], settings: TrainSettings) -> None:
-    """Write what a run has besides its field: cameras, configuration, and a log of the sums over the blocks."""
+    """Write the files of a joined run besides its field: cameras, configuration, and a combined log of the blocks."""
     write_cameras(run, scene.train_frames, scene.test_frames)
     write_config(run, RunConfig.describing(scene, settings, factor=blocks[0].config.downscale, contraction="l2"))
     last = [block.log[-1] for block in blocks]

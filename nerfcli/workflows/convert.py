@@ -40,12 +40,12 @@ def convert_capture(
         target: the file or folder to write.
         wanted: format and conventions of the target.
         given: photos and cameras that the source does not name.
-        doubt: conventions of the source, where they are not those of its format.
+        doubt: conventions of the source that differ from those of its format.
         world: the world frame of the target.
-        notify, warn: take lines for the user.
+        notify, warn: called with lines for the user.
 
     Raises:
-        UserError: it cannot be read or written, the format cannot hold it, or what was written is not the same.
+        UserError: the capture cannot be read or written, the format cannot hold it, or the verification fails.
     """
     to = wanted.form.name
     form, found, capture = load(source, given, doubt)
@@ -80,10 +80,10 @@ def detect_convention(
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> tuple[Format, detect.Detection]:
-    """Return the format of a capture, and which convention its numbers follow.
+    """Detect the format of a capture, and the convention that its numbers follow.
 
     Raises:
-        UserError: it cannot be read, or there is too little to judge by.
+        UserError: the capture cannot be read, or there is too little evidence.
     """
     form, found, capture = load(source, given, doubt)
     notify(f"{found}: {form.name}, {contents(capture)}")
@@ -91,7 +91,7 @@ def detect_convention(
 
 
 def options_of(found: detect.Detection) -> str:
-    """Return the options that make `nerfcli convert` read the capture in the convention that was found."""
+    """Return the options that make `nerfcli convert` read the capture in the detected convention."""
     convention, declared = found.convention, found.declared
     options = [] if convention.axes == declared.axes else [f"--from-axes {convention.axes}"]
     options += ["--from-inverted"] if convention.inverted else []
@@ -101,7 +101,7 @@ def options_of(found: detect.Detection) -> str:
 
 
 def detection_record(found: detect.Detection, form: str) -> dict[str, Any]:
-    """Return what was found as plain values."""
+    """Return a detection as plain values."""
     return {
         "format": form,
         "evidence": found.evidence,
@@ -132,7 +132,7 @@ def detection_record(found: detect.Detection, form: str) -> dict[str, Any]:
 
 
 def contents(capture: Capture) -> str:
-    """Return what a capture holds, in a few words."""
+    """Describe the content of a capture in a few words."""
     cameras = len({frame.camera for frame in capture.frames})
     return f"{len(capture.frames)} images, {cameras} camera{'s' * (cameras != 1)}, {len(capture.points)} points"
 

@@ -1,6 +1,6 @@
 """Describe a folder or file as plain values: scenes, runs, renders, depth, pictures, videos, training states.
 
-Imports stand where they are needed: a depth file is described without torch.
+Imports are local, so that a depth file can be described without importing torch.
 """
 
 from pathlib import Path
@@ -15,10 +15,10 @@ from nerfcli.tomography.volume_files import is_volume_file, map_of, read_volume
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Return the facts of a file of depth, pictures, video, mesh or volume, of renders, or of a run; else of a scene.
+    """Return the facts of a scan, a reconstruction, a run, renders, a single file of data, or else of a scene.
 
     Raises:
-        UserError: it is none of these, or damaged.
+        UserError: the path is none of these, or damaged.
     """
     folder = Path(path)
     if not folder.exists():
@@ -56,7 +56,7 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 
 def _is_scan_to_describe(path: Path) -> bool:
-    """Return whether it is a scan; depth and pictures of one projection are none, whatever stands beside them."""
+    """Return whether the path is a scan; single depth files and pictures are not, even if they are beside a scan."""
     if path.is_file() and path.suffix.lower() in (".npy", ".npz", ".tif", ".tiff", ".png", ".safetensors"):
         return False
     from nerfcli.tomography.formats.read import recognise

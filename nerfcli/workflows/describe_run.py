@@ -5,7 +5,7 @@ from typing import Any
 
 from nerfcli.field.blocks_field import BlocksField
 from nerfcli.field.checkpoint import load_tensors
-from nerfcli.field.comparison import described_cost, others_of_equal_storage
+from nerfcli.field.comparison import described_cost, other_kinds_with_equal_storage
 from nerfcli.field.cost import field_bytes
 from nerfcli.photos.footprint import pixel_footprint
 from nerfcli.render.model import Model
@@ -56,7 +56,7 @@ def describe_run(run: Run) -> dict[str, Any]:
 
 
 def _blocks(run: Run, field: BlocksField) -> list[dict[str, Any]]:
-    """Return photos, bytes and PSNR of the blocks of a run, as far as they are there."""
+    """Return photos, bytes and PSNR of each block of a run, with None for what is missing."""
     blocks = []
     for number, own in enumerate(field.fields, start=1):
         block = Run(block_path(run.path, number))
@@ -74,14 +74,14 @@ def _blocks(run: Run, field: BlocksField) -> list[dict[str, Any]]:
 
 
 def costs_of_run(run: Run, model: Model) -> dict[str, dict[str, Any]]:
-    """Return what the field costs, beside fields of the other kinds of equal storage; see `comparison.described_cost`.
+    """Return the cost of the field and of other kinds of field with equal storage; see `comparison.described_cost`.
 
     Args:
-        run: its settings, cameras and how many samples a ray had at last.
+        run: provides settings, cameras and the last number of samples per ray.
         model: of the run.
 
     Returns:
-        By kind, the run's own first: size, bytes, operations and memory traffic.
+        Size, bytes, operations and memory traffic by kind of field, with the run's own kind first.
     """
     factor, log = run.config.downscale, run.log
     camera = run.cameras.train[0].camera
@@ -100,12 +100,12 @@ def costs_of_run(run: Run, model: Model) -> dict[str, dict[str, Any]]:
                 picture_px=(camera.width // factor) * (camera.height // factor),
             ),
         }
-        for size in (own, *others_of_equal_storage(own, footprint).values())
+        for size in (own, *other_kinds_with_equal_storage(own, footprint).values())
     }
 
 
 def describe_tensors(path: Path) -> dict[str, Any]:
-    """Return a field, the state of a training, or the state before a failure, whose step is taken again."""
+    """Describe a file of tensors: a field, a training state, or the state before a failure, whose step is repeated."""
     tensors, description = load_tensors(path, "cpu")
     facts: dict[str, Any] = {
         "kind": description.get("format"),

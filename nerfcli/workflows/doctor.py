@@ -28,11 +28,11 @@ def examine_capture(
     Args:
         path: a folder of photos, or a scene.
         page: the file to write.
-        threads: of the CPU.
-        overwrite: replace whatever stands at `page`.
-        intrinsics: a file with the cameras, if they are known.
-        notify: takes lines for the user.
-        progress: takes the share that is done and a few words.
+        threads: number of CPU threads.
+        overwrite: replace any existing file at `page`.
+        intrinsics: a file with the intrinsics of the cameras, if they are known.
+        notify: called with lines for the user.
+        progress: called with the fraction done and a short text.
 
     Raises:
         UserError: see `find_subject`, `read_calibration` and `refuse_foreign`; or the page cannot be written.
@@ -46,7 +46,7 @@ def examine_capture(
     refuse_read_only(page)
     count = len(subject.sources)
     notify(f"{path}: {count} photos, about {_time(estimated_seconds(count, threads))}")
-    cv2.setNumThreads(1)  # photos and pairs are worked on in parallel; threads within them only wait for each other
+    cv2.setNumThreads(1)  # photos and pairs are processed in parallel; OpenCV's threads would only wait for each other
     diagnosis = examine(subject, threads=threads, progress=progress, calibration=calibration)
     write_page(diagnosis, page)
     return diagnosis

@@ -33,12 +33,12 @@ from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Numbers of a run.
+    """Metrics of a run.
 
     Args:
         path: RUN/metrics.json.
-        metrics: its content: protocol, means, values per photo, and what else `nerfcli evaluate --help` lists.
-        is_kept: whether the file was there already.
+        metrics: its content: protocol, means, values per photo, and the rest that `nerfcli evaluate --help` lists.
+        is_kept: whether the file already existed.
     """
 
     path: Path
@@ -58,7 +58,7 @@ def evaluate_run(
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> Evaluation:
-    """Write RUN/metrics.json, or keep the one that this very checkpoint already has.
+    """Write RUN/metrics.json, or keep an existing one of the same checkpoint.
 
     Example:
         >>> import nerfcli
@@ -68,17 +68,17 @@ def evaluate_run(
     Args:
         run: the folder that `train_scene` wrote.
         device: "auto", "cpu", "cuda" or "cuda:1".
-        threads: of the CPU; 0 for all.
+        threads: number of CPU threads; 0 for all.
         overwrite: measure again.
-        align_poses: also from a pose refined on the left half of each photo, measured on the right.
-        align_colours: also with gains fitted on the left half of each photo, measured on the right.
-        predictions: "png" saves what was compared in RUN/predictions, "float" unrounded, too; None saves nothing.
-        notify: takes lines for the user.
-        progress: takes the share of the photos that is done, and a few words.
+        align_poses: also refine each pose on the left half of its photo and measure on the right half.
+        align_colours: also fit gains on the left half of each photo and measure on the right half.
+        predictions: "png" saves the compared pictures in RUN/predictions, "float" also unrounded ones; None saves none.
+        notify: called with lines for the user.
+        progress: called with the fraction of the rays that is done, and a short text.
 
     Raises:
-        UserError: the folder is no run, its split is not the one it was trained with, a photo cannot be read, or
-            metrics of another state or without what is wanted stand there.
+        UserError: the folder is not a run, its split is not the one it was trained with, a photo cannot be read, or
+            existing metrics are of another checkpoint or lack a requested measurement.
     """
     trained = Run(Path(run))
     cores, torch_device = thread_count(threads), device_name(device)
@@ -131,7 +131,7 @@ def check_requirements(run: Run, metrics: dict[str, Any], requirements: Sequence
     """Raise if a requirement is not met.
 
     Raises:
-        UserError: with the exit code of gates.
+        UserError: a requirement is not met; its exit code is `GATE_NOT_MET`.
     """
     if not requirements:
         return
@@ -153,7 +153,7 @@ def check_requirements(run: Run, metrics: dict[str, Any], requirements: Sequence
 def saved_predictions(
     run: Path, frames: Sequence[Frame], kind: str | None, *, checkpoint: str
 ) -> Iterator[Callable[[Compared], None]]:
-    """Yield what takes each comparison and writes it below RUN/predictions, which appears when all are there.
+    """Yield a function that saves one comparison in RUN/predictions; the folder appears when all are saved.
 
     Args:
         run: the run's folder.
@@ -179,7 +179,7 @@ def saved_predictions(
 def _kept(
     path: Path, checkpoint: str, *, align_poses: bool, align_colours: bool, predictions: str | None
 ) -> dict[str, Any]:
-    """Return the metrics that are there, if they are of this checkpoint and have all that is wanted."""
+    """Return existing metrics; raise if they are of another checkpoint or lack a requested measurement."""
     metrics = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to evaluate again")
     if metrics.get("checkpoint_sha256") != checkpoint:
         raise UserError(f"{path} belongs to an earlier checkpoint of this run", "add --overwrite to replace it")

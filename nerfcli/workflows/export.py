@@ -29,9 +29,9 @@ from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 from nerfcli.workflows.photo_depths import photo_depths
 
-# What a page may take in all; what the field leaves of it is for photos.
+# Maximum size of a page; the field comes first, and photos get the rest.
 PAGE_BYTES = 9_700_000
-# By what is exported: the suffixes of its file, the usual one first; "" is a folder.
+# File suffixes by type of export, the default first; "" is a folder.
 TARGETS = {
     "page": (".html",),
     "mesh": (".ply", ".glb", ".obj"),
@@ -65,18 +65,18 @@ def export_run(
         run: the folder that `train_scene` wrote.
         target: the file to write, whose suffix chooses among the formats of `to`; beside the run by default.
         to: one of `TARGETS`.
-        settings: where and how fine a geometry is.
+        settings: region and resolution of a geometry.
         device: "auto", "cpu", "cuda" or "cuda:1".
-        threads: of the CPU; 0 for all.
-        overwrite: replace what stands at `target`.
-        notify: takes lines for the user.
-        progress: takes the share of the work that is done, and a few words.
+        threads: number of CPU threads; 0 for all.
+        overwrite: replace an existing export at `target`.
+        notify: called with lines for the user.
+        progress: called with the fraction of the work that is done, and a short text.
 
     Returns:
         The path that was written.
 
     Raises:
-        UserError: no such run, something stands at `target`, or the field has nothing of the kind.
+        UserError: the run does not exist, `target` exists, or the field cannot be exported this way.
     """
     trained, torch_device = Run(Path(run)), device_name(device)
     path = Path(target) if target is not None else default_target(trained.path, to)
@@ -107,7 +107,7 @@ def suffix_of(path: Path, to: str) -> str:
     """Return the suffix of a target, "" for a folder.
 
     Raises:
-        UserError: it is none of the formats of `to`.
+        UserError: the suffix is not one of the formats of `to`.
     """
     suffixes = TARGETS[to]
     if "" in suffixes:
@@ -118,10 +118,10 @@ def suffix_of(path: Path, to: str) -> str:
 
 
 def refuse_existing(path: Path, *, overwrite: bool, folder: bool) -> None:
-    """Refuse a place that is taken.
+    """Refuse an output path that exists, unless it may be replaced; create its parent folder.
 
     Raises:
-        UserError: something stands there that is not to be replaced.
+        UserError: the path exists, or cannot be written.
     """
     if path.is_dir() and not folder:
         raise UserError(f"{path} is a folder", "give a file name with -o")
@@ -138,7 +138,7 @@ def refuse_existing(path: Path, *, overwrite: bool, folder: bool) -> None:
 def _export_page(
     run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
 ) -> None:
-    """Write the page."""
+    """Write the run as a page."""
     packed = pack_model(model)
     cameras = run.cameras
     frames = [pinhole_frame(frame) for frame in (*cameras.train, *cameras.test)]

@@ -38,7 +38,7 @@ from nerfcli.workflows.notices import Notify, Progress
 FORMAT = "nerfcli geometry 1"
 FRAME = "of the scene, as its cameras have it"
 PARALLAX = "largest angle between the rays of two photos that see the point"
-# The share of the work that rendering depths takes.
+# Fraction of the work that is spent on rendering depths.
 _DEPTHS = 0.7
 
 
@@ -75,7 +75,7 @@ def export_points(
     """Write points of the surfaces as .ply, .las or .laz."""
     las = path.suffix.lower() in LAS_SUFFIXES
     if las:
-        las_module()  # before the work, not after it
+        las_module()  # fails before the work if laspy is missing, not after it
     views, grid = _seen(run, model, settings, progress)
     points = agreed_points(views, grid, on_progress=_part(progress, _DEPTHS, 1.0, "compares"))
     if not len(points.places):
@@ -96,7 +96,7 @@ def export_points(
 def export_volume(
     run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
 ) -> None:
-    """Write density and colour on a grid as .npz, the density alone as .nrrd."""
+    """Write density and colour on a grid as .npz, or only the density as .nrrd."""
     box = settings.box or scene_box(model, run.cameras.train)
     grid = Grid.over(box, settings.voxel_size or automatic_volume_voxel(box))
     maps = sample_volume(model, grid, on_progress=_part(progress, 0.05, 1.0, "evaluating the field"))
@@ -112,7 +112,7 @@ def export_volume(
 def export_tsdf(
     run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
 ) -> None:
-    """Write the signed distances that the mesh is made from: with their weights as .npz, alone as .nrrd."""
+    """Write the signed distances that the mesh is made from, with their weights as .npz or without them as .nrrd."""
     views, grid = _seen(run, model, settings, progress)
     fused = fuse(views, grid, on_progress=_part(progress, _DEPTHS, 1.0, "fuses"))
     distance, weight = fused.dense((0, 0, 0), grid.shape)
@@ -156,7 +156,7 @@ def export_colmap_dense(
 def _seen(
     run: Run, model: Model, settings: SurfaceSettings, progress: Progress, *, frames: Sequence[Frame] | None = None
 ) -> tuple[list[DepthView], Grid]:
-    """Depths of the training cameras, and the grid that they are fused in."""
+    """Return depth maps of the training cameras, and the grid to fuse them in."""
     chosen = spread_frames(run.cameras.train, MOST_VIEWS) if frames is None else frames
     box = settings.box or scene_box(model, run.cameras.train)
     views = depth_views(
@@ -170,7 +170,7 @@ def _part(progress: Progress, start: float, end: float, words: str) -> Callable[
 
 
 def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any]:
-    """Return what a file says of itself."""
+    """Return the description that an exported file contains."""
     return {
         "format": FORMAT,
         "holds": kind,
@@ -227,9 +227,9 @@ def _write_volume(path: Path, volume: Volume, name: str) -> None:
 
 
 def _y_up_from_scene(run: Run) -> np.ndarray:
-    """Return the rotation after which up, as the cameras have it, is +y."""
+    """Return the rotation that turns the up direction of the cameras to +y."""
     up = up_direction(run.cameras.train)
     aside = np.eye(3)[np.argmin(np.abs(up))]
-    # A camera whose picture's down is -up: its axes are right, down, ahead.
+    # The axes (right, down, ahead) of a camera whose down direction is -up.
     right, down, ahead = look_at(np.zeros(3), np.cross(up, aside), up)[:3, :3].T
     return np.stack([right, -down, -ahead])

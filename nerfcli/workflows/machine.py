@@ -1,28 +1,29 @@
-"""The processors and the device to work with."""
+"""Choose the number of CPU threads and the torch device."""
 
 import os
 import re
 
 from nerfcli.errors import UserError
-from nerfcli.torchrun import place_on_machine
+from nerfcli.torchrun import local_rank_and_size
 
 
 def thread_count(threads: int) -> int:
-    """Return the number of CPU threads to use: as given, or for 0 the processors this process may run on, which the
-    processes that torchrun has started on this machine divide among them.
+    """Return the number of CPU threads to use: as given or, for 0, the number of processors this process may run on.
+
+    The processors are divided among the processes that torchrun has started on this machine.
     """
     if threads:
         return threads
-    # Not every system has the first.
+    # Not every system has sched_getaffinity.
     processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, processors // place_on_machine()[1])
+    return max(1, processors // local_rank_and_size()[1])
 
 
 def device_name(device: str) -> str:
-    """Return the torch device for "auto", "cpu", "cuda" or "cuda:1"; with torchrun, each process has a GPU of its own.
+    """Return the torch device for "auto", "cpu", "cuda" or "cuda:1"; with torchrun, each process gets its own GPU.
 
     Raises:
-        UserError: CUDA or this number of its devices is wanted and not there, or the name is unknown.
+        UserError: the name is unknown, the CUDA device does not exist, or torchrun started more processes than GPUs.
     """
     import torch
 
@@ -38,7 +39,7 @@ def device_name(device: str) -> str:
         raise UserError(f"--device {device}: there is no such device", f"the last one is cuda:{last}")
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
-    number, count = place_on_machine()
+    number, count = local_rank_and_size()
     if device != "cuda" or count == 1:
         return device
     if count > torch.cuda.device_count():

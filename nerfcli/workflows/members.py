@@ -21,9 +21,9 @@ from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, war
 from nerfcli.workflows.train import train_again
 
 VARIED = ("seeds", "photos", "prior", "field")
-# Of the training photos, what each member uses. A bootstrap draws 63 %, which costs each field more.
+# Fraction of the training photos that each member uses. A bootstrap sample has 63 % of them, which costs more quality.
 PHOTO_FRACTION = 0.8
-# See `TrainSettings.random_start`; it costs 0.2 dB on the spheres, 0.3 would cost 1 dB.
+# See `TrainSettings.random_start`. This value costs 0.2 dB on the spheres scene; 0.3 would cost 1 dB.
 RANDOM_START = 0.1
 
 
@@ -31,11 +31,11 @@ def member_settings(first: TrainSettings, count: int, *, vary: str) -> list[Trai
     """Return the settings of the members of a run.
 
     Args:
-        first: of the run.
-        count: of the members.
-        vary: one of `VARIED`. "seeds": seeds alone, which follow the run's own; they vary in all other kinds, too.
+        first: settings of the run.
+        count: number of members.
+        vary: one of `VARIED`. "seeds": only the seeds, which follow the run's seed; they also vary in all other kinds.
             "photos": `PHOTO_FRACTION` of the training photos, drawn without replacement. "prior": a smooth random
-            field to start from. "field": every kind of field in turn.
+            field to start from. "field": each kind of field in turn.
     """
     members = []
     for number in range(1, count + 1):
@@ -66,21 +66,21 @@ def train_members(
     warn: Notify = warn_python,
     progress: Progress = no_progress,
 ) -> list[Run]:
-    """Train the members of a run, each with the run's whole budget, and return those trained here or kept.
+    """Train the members of a run, each with the run's whole budget, and return the members trained or kept.
 
-    Members that are there and complete are kept, interrupted ones are resumed.
+    Complete members are kept and interrupted ones are resumed.
 
     Args:
         run: a complete run.
-        count: of the members.
-        only: the member to train, from 1 on; None for all. Processes that train one each need no communication.
+        count: number of members.
+        only: the member to train, counted from 1; None for all. Processes that train one each need no communication.
         vary: one of `VARIED`, see `member_settings`.
         device, threads: as for `TrainSettings`.
         memory_bytes, resume, overwrite, notify, warn: see `train_again`.
-        progress: takes the share of all members that is done and a few words.
+        progress: called with the fraction of all members' training that is done and a short text.
 
     Raises:
-        UserError: see `train_again`; or a member of another kind stands there.
+        UserError: see `train_again`; or a member with other settings exists.
     """
     first = replace(run.config.settings, device=device, threads=threads)
     budgets = [f"{first.budget_seconds:g} s"] if first.budget_seconds else []
@@ -111,21 +111,21 @@ def train_members(
 def evaluate_members(
     run: Run, *, device: str, threads: int, overwrite: bool = False, notify: Notify, progress: Progress = no_progress
 ) -> dict[str, Any]:
-    """Measure the members of a run and the mean of their pictures on the held-out photos, or keep what is there.
+    """Measure a run's members and the mean of their pictures on the held-out photos, or keep existing metrics.
 
     Args:
-        run: with members.
+        run: a run with members.
         device, threads: to render with.
         overwrite: measure again.
-        notify: takes lines for the user.
-        progress: takes the share of the pictures that is done and a few words.
+        notify: called with lines for the user.
+        progress: called with the fraction of the pictures that is done and a short text.
 
     Returns:
-        RUN/members/metrics.json: "members", the mean over photos of each measure for each member; "mean_picture", the
-        same of the mean of their pictures; "checkpoints_sha256" of the members.
+        Content of RUN/members/metrics.json: "members", each member's measures averaged over the photos; "mean_picture",
+        the same for the mean of the members' pictures; "checkpoints_sha256", the hashes of the members' fields.
 
     Raises:
-        UserError: see `members_of`; nothing was held out, or photos cannot be read.
+        UserError: see `members_of`; or no photos were held out, or photos cannot be read.
     """
     members, path = members_of(run), run.path / MEMBERS / METRICS
     torch.set_num_threads(threads)

@@ -1,4 +1,4 @@
-"""Examine a run: how much of the surface its photos have seen, and where further photos would see most of the rest."""
+"""Examine a run: how much of the surface its photos see, and where further photos would see most of the rest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ from nerfcli.workflows.views import refuse_frames, write_frames
 CANDIDATE_PX, CELLS = 96, 128
 # The page, and the longer side of its pictures in pixels.
 PAGE, PICTURE_PX = "next_views.html", 480
-# Coverage from which each part of the surface begins.
+# Parts of the surface by coverage: the smallest number of photos that see each part.
 STRATA = {"none": 0, "one": 1, "two or three": 2, "four or more": 4}
 
 
@@ -38,12 +38,12 @@ class RunCoverage:
     """Coverage of the surface by the photos of a run.
 
     Args:
-        photos: training photos.
-        box: x0, y0, z0, x1, y1, z1 in the scene's frame; the surface in it counts.
-        shares: of the surface, by how many photos see it; the keys of `STRATA`.
+        photos: number of training photos.
+        box: x0, y0, z0, x1, y1, z1 in the scene's frame; only the surface inside it counts.
+        shares: fractions of the surface by the number of photos that see it, with the keys of `STRATA`.
         views: where to take further photos, best first.
-        gains: of each, the share of the surface that it would be the first or second to see.
-        seen_twice: the share that two photos or more see, before and after them.
+        gains: for each view, the fraction of the surface that it would be the first or second to see.
+        seen_twice: fraction of the surface that at least two photos see, without and with the suggested views.
     """
 
     photos: int
@@ -54,7 +54,7 @@ class RunCoverage:
     seen_twice: tuple[float, float]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; a view has its pose."""
+        """Return plain values; views are given by name, gain and pose."""
         views = [
             {"name": view.name, "gain": gain, "world_from_cam": view.world_from_cam.tolist()}
             for view, gain in zip(self.views, self.gains, strict=True)
@@ -82,16 +82,16 @@ def examine_run(
 
     Args:
         run: the folder that training wrote.
-        target: the folder to write: next_views.html, cameras.json and camera_path.json; the page alone where there is
-            no view to suggest.
-        count: how many views to suggest.
-        threads: of the CPU; 0 for all.
+        target: the folder to write: next_views.html, cameras.json and camera_path.json; only the page if there is no
+            view to suggest.
+        count: maximum number of views to suggest.
+        threads: number of CPU threads; 0 for all.
         overwrite: replace the files at `target`.
-        notify: takes lines for the user.
-        progress: takes the share that is done and a few words.
+        notify: called with lines for the user.
+        progress: called with the fraction done and a short text.
 
     Raises:
-        UserError: no such run, nothing to be seen, or the files exist.
+        UserError: the run does not exist, its cameras see no surface, or the files exist.
     """
     refuse_frames(target, overwrite=overwrite)
     trained = Run(run)
@@ -136,7 +136,7 @@ def examine_run(
 
 
 def _write_page(found: RunCoverage, path: Path, run: Run, model: Model, photos: Sequence[DepthMap]) -> None:
-    """Write the page about the coverage of a run, with what the field shows from each of the views."""
+    """Write the page about the coverage of a run, with a rendering and a coverage map of each suggested view."""
     views = []
     for frame, gain in zip(found.views, found.gains, strict=True):
         picture = render_picture(model, small_frame(frame, PICTURE_PX), background=model.background)

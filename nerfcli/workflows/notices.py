@@ -3,14 +3,14 @@
 import warnings
 from collections.abc import Callable
 
-# Takes a line for the user.
+# Called with a line of text for the user.
 Notify = Callable[[str], None]
-# Takes how much is done, in [0, 1], and a few words about it, as often as one likes.
+# Called with the fraction done, in [0, 1], and a short text about it, as often as desired.
 Progress = Callable[[float, str], None]
 
 
 def silent(text: str) -> None:
-    """Drop a line."""
+    """Discard a line."""
 
 
 def no_progress(fraction: float, detail: str) -> None:
@@ -18,5 +18,5 @@ def no_progress(fraction: float, detail: str) -> None:
 
 
 def warn_python(text: str) -> None:
-    """Warn as Python programs do, by `warnings.warn`."""
+    """Issue a Python warning with `warnings.warn`."""
     warnings.warn(text, stacklevel=3)

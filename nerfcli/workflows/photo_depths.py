@@ -17,21 +17,21 @@ from nerfcli.runs.photo_depths import photo_depths_digest, read_photo_depths, wr
 from nerfcli.runs.run import Run
 from nerfcli.workflows.notices import Notify
 
-# Of the pixels of held-out photos. Measured: with 60 % matched, 89 % of the depths lie inside 90 % intervals; with
-# 3.5 %, 69 %.
+# Fraction of held-out pixels that must be matched for reliable intervals. Measured: with 60 % matched, 89 % of the
+# depths are inside 90 % intervals; with 3.5 %, 69 %.
 LEAST_MATCHED = 0.2
 
 
 def photo_depths(
     run: Run, model: Model, *, on_progress: Callable[[float], None], notify: Notify
 ) -> tuple[DepthMap, ...]:
-    """Return the depth maps of all training photos, from the run if they belong to this field.
+    """Return the depth maps of all training photos, read from the run if they were saved for this field.
 
     Args:
         run: the run.
-        model: its field, with the steps of the training.
-        on_progress: called with how much is done.
-        notify: takes a line for the user.
+        model: its model, with the step lengths of the training.
+        on_progress: called with the fraction done.
+        notify: called with a line for the user.
     """
     frames = run.cameras.train
     expected = photo_depths_digest(model.sha256, frames, max_size=MAX_SIZE)
@@ -46,7 +46,7 @@ def photo_depths(
         ]
     try:
         write_photo_depths(run.path, maps, digest=expected)
-    except UserError as error:  # a run of somebody else can be rendered, too
+    except UserError as error:  # runs in read-only folders can be rendered, too
         notify(f"the depths of the training photos are not kept: {error.message}")
     return tuple(maps)
 
@@ -60,7 +60,7 @@ def depth_errors(
     on_progress: Callable[[float], None],
     notify: Notify,
 ) -> DepthErrors:
-    """Return the errors of the field's depth, from the run if they belong to this field.
+    """Return the errors of the field's depth, read from the run if they were saved for this field.
 
     Raises:
         UserError: see `measure_depth_errors`.
@@ -87,12 +87,12 @@ def depth_errors(
 
 
 def _without_masked(view: DepthMap, frame: Frame, notify: Notify) -> DepthMap:
-    """Return the map without the pixels whose photo was not used there."""
+    """Return the depth map with NaN where the mask excludes the photo's pixels."""
     assert frame.mask is not None
     assert frame.image is not None
     try:
         mask = read_mask(frame.mask, frame.image)
-    except UserError as error:  # runs outlive their photos
+    except UserError as error:  # the photos of a run may be gone
         notify(f"{frame.name} counts without its mask: {error.message}")
         return view
     height, width = view.distances.shape

@@ -40,7 +40,7 @@ def estimate_poses(
     warn: Notify = warn_python,
     progress: Progress = no_progress,
 ) -> Path:
-    """Estimate the poses of one scene, or keep the one that was made from the same photos with the same settings.
+    """Estimate the poses of one scene, or keep a scene that was made from the same photos with the same settings.
 
     Example:
         >>> import nerfcli
@@ -51,17 +51,17 @@ def estimate_poses(
         photos: a folder of photos; for a video see `folder_of_photos`.
         scene: the folder to write.
         settings: features, pairs, seed, threads; by default those of `nerfcli poses`.
-        limits: of memory and time.
-        intrinsics: of the cameras, where they are known; see `given_intrinsics`.
-        overwrite: replace another scene at `scene`.
-        notify, warn: take lines for the user.
-        progress: takes the share that is done and a few words.
+        limits: on memory and time.
+        intrinsics: known intrinsics of the cameras, see `given_intrinsics`; None to estimate them.
+        overwrite: replace an existing scene at `scene`.
+        notify, warn: called with lines for the user.
+        progress: called with the fraction done and a short text.
 
     Returns:
         The folder of the scene.
 
     Raises:
-        UserError: see `nerfcli.poses.structure_from_motion.estimate_poses`; or something else stands at `scene`.
+        UserError: see `nerfcli.poses.structure_from_motion.estimate_poses`; or a different scene exists at `scene`.
     """
     folder, target = Path(photos), Path(scene)
     if (target / SCENE_FILE).exists() and not overwrite:
@@ -114,7 +114,7 @@ def plan_scene(
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> Plan:
-    """Return what `estimate_poses` would do with a folder of photos, and how long it takes.
+    """Plan what `estimate_poses` would do with a folder of photos, and how long it would take.
 
     Raises:
         UserError: see `plan_poses`.
@@ -131,7 +131,7 @@ def plan_scene(
 
 
 def without_suffix(source: Path) -> Path:
-    """Return what results are named after: clip for clip.mp4, the folder itself for a folder."""
+    """Return the path that results are named after: clip for clip.mp4, the folder itself for a folder."""
     return source.with_suffix("") if source.is_file() else source
 
 
@@ -144,7 +144,7 @@ def folder_of_photos(
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> Path:
-    """Return the folder of photos: `source` itself, or the one beside `scene` with the frames of the video that it is.
+    """Return the folder of photos: `source` itself or, for a video, the extracted frames beside `scene`.
 
     Raises:
         UserError: see `extract_frames`.
@@ -159,10 +159,10 @@ def folder_of_photos(
 
 
 def folder_with_frames(source: Path, scene: Path) -> Path:
-    """Return the folder of photos, `source` itself, or the one with the frames of a video that were written before.
+    """Return the folder of photos: `source` itself or, for a video, the folder with the frames extracted earlier.
 
     Raises:
-        UserError: a video's frames are not there.
+        UserError: the frames of a video have not been extracted.
     """
     folder = frames_folder(scene) if source.is_file() else source
     if source.is_file() and not folder.exists():
@@ -174,7 +174,7 @@ def folder_with_frames(source: Path, scene: Path) -> Path:
 
 
 def given_intrinsics(file: Path | None, photos: Path, *, use: str = USES[0]) -> GivenIntrinsics | None:
-    """Return the intrinsics of a file, for the photos of a folder; None without a file.
+    """Read the intrinsics of the photos in a folder from a file; None without a file.
 
     Raises:
         UserError: see `read_calibration`.

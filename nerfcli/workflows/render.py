@@ -17,7 +17,7 @@ from nerfcli.runs.run import Run
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 from nerfcli.workflows.photo_depths import depth_errors, photo_depths
-from nerfcli.workflows.views import Views, chosen_frames, refuse_z_all_around
+from nerfcli.workflows.views import Views, chosen_frames, refuse_z_depth_for_equirectangular
 
 RENDERS = "renders"
 HELD_OUT = Views("test")
@@ -26,7 +26,7 @@ USUAL = ExportSettings(outputs=OUTPUTS[:3], depth=DepthRequest(convention="condi
 
 
 def folder_name(views: Views, settings: ExportSettings) -> str:
-    """Return the folder's name in RUN/renders: the cameras and, so that conventions never mix, the kind of depth."""
+    """Return the name of the folder in RUN/renders: the views and, so that conventions never mix, the kind of depth."""
     if not settings.measured:
         return views.name
     return f"{views.name}-{settings.depth.convention.replace(':', '-')}-{settings.depth.axis}"
@@ -47,7 +47,7 @@ def render_run(
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> list[Path]:
-    """Render views of a run into a folder, or keep what stands there if it is the same.
+    """Render views of a run into a folder, or keep a complete folder with the same views and settings.
 
     Example:
         >>> import nerfcli
@@ -58,21 +58,21 @@ def render_run(
         run: the folder that `train_scene` wrote.
         target: the folder to write; in RUN/renders by default, named after views and depth.
         views: which cameras; the held-out ones by default.
-        settings: outputs, depth, files, videos, and how much work goes into a picture.
+        settings: outputs, depth, file formats, videos, and quality of the pictures.
         device: "auto", "cpu", "cuda" or "cuda:1".
-        threads: of the CPU; 0 for all.
-        step: length of the steps along rays, in those of the training.
-        jobs: processes; 0 for `automatic_workers`.
-        part: render these views alone, for a later call to find them.
-        overwrite: replace what stands at `target`.
-        notify: takes lines for the user.
-        progress: takes the share of the pixels that is done, and a few words.
+        threads: number of CPU threads; 0 for all.
+        step: length of the steps along rays, relative to training.
+        jobs: number of processes; 0 to let `automatic_workers` choose.
+        part: render only these views, for a later call to complete; None for all.
+        overwrite: replace existing renders at `target`.
+        notify: called with lines for the user.
+        progress: called with the fraction of the rays that is done, and a short text.
 
     Returns:
-        The paths to show: videos, or the folders of the outputs; the unfinished folder where only a part is rendered.
+        The paths to show: videos, or the folders of the outputs; the unfinished folder if only a part is rendered.
 
     Raises:
-        UserError: no such run, no such cameras, or other files stand at `target`.
+        UserError: the run or the cameras do not exist, or `target` holds other files.
     """
     trained, cores, torch_device = Run(Path(run)), thread_count(threads), device_name(device)
     folder = trained.path / RENDERS / folder_name(views, settings) if target is None else Path(target)
@@ -107,7 +107,7 @@ def render_run(
     # The unit of the training frame is about the distance between the cameras and what they look at.
     frames = chosen_frames(trained, views, depth_hint=1.0 / model.training_from_scene.scale)
     if "depth" in settings.outputs and settings.depth.axis == "z":
-        refuse_z_all_around(frames, notify=notify)
+        refuse_z_depth_for_equirectangular(frames, notify=notify)
     if step != 1.0:
         provenance["step"] = step
     order = Order(tuple(frames), settings, provenance, seen, errors, tuple(one.stretched(step) for one in members))

@@ -20,7 +20,7 @@ from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 from nerfcli.workflows.photo_depths import photo_depths
 
-# Held-out photos on a page, unless somebody says how many.
+# Default of the maximum number of held-out photos on a page.
 VIEWS = 8
 DEPTH = DepthRequest(convention="conditional", axis="z")
 
@@ -38,21 +38,21 @@ def report_runs(
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> Path:
-    """Write a page about one run or several, and return its path.
+    """Write a page about one or more runs, and return its path.
 
     Args:
         runs: folders that training wrote, at least one.
-        page: the file; RUN/report.html by default, beside the first run where there are several.
-        views: held-out photos of a capture to show at most, from the worst to the best.
-        depth: the depth that is shown.
+        page: the file to write; by default RUN/report.html, or report.html beside the first of several runs.
+        views: maximum number of held-out photos to show per capture, from the worst to the best.
+        depth: the depth to show.
         device, threads: to render with; 0 threads for all.
-        overwrite: replace whatever stands there.
+        overwrite: replace any existing file, even if it is not a report on these runs.
         keep: keep a page that was made from the same files with the same options.
-        notify: takes lines for the user.
-        progress: takes the share of the rendering that is done.
+        notify: called with lines for the user.
+        progress: called with the fraction of the rendering that is done and a label.
 
     Raises:
-        UserError: a folder is not a run, its photos cannot be read, or something else stands at the page's place.
+        UserError: a folder is not a run, its photos cannot be read, or the page's path holds something else.
     """
     target = page or (runs[0] / REPORT if len(runs) == 1 else runs[0].resolve().parent / REPORT)
     if target.is_dir():

@@ -21,7 +21,7 @@ from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 
 OWN, ASTRA = "nerfcli", "astra"
 WRITTEN = (OWN, ASTRA)
-# Suffixes of files of scans, none of which a folder should have.
+# Suffixes of scan files, which the name of a scan folder may not have.
 _FILE_SUFFIXES = (
     ".h5",
     ".hdf5",
@@ -36,18 +36,18 @@ _FILE_SUFFIXES = (
     ".xtekct",
     ".log",
 )
-# What a statement and what is recovered from stored vectors may differ by: rounding of float64.
+# Maximum differences between the geometry that a source states and the one recovered from stored vectors: rounding.
 TOLERANCES = {"angle_deg": 1e-9, "length": 1e-9, "shift_px": 1e-6, "tilt_deg": 1e-9}
 
 
 @dataclass(frozen=True)
 class ConvertedScan:
-    """A conversion.
+    """Result of converting a scan.
 
     Args:
-        path: what was written.
-        scan: as it was read back.
-        record: plain values.
+        path: the written folder or file.
+        scan: as read back from a written folder; as read from the source if only ASTRA's vectors were written.
+        record: plain values for JSON.
         lines: for the user.
     """
 
@@ -68,18 +68,18 @@ def convert_scan(
 ) -> ConvertedScan:
     """Write a scan as a scan folder, or its geometry as ASTRA's vectors.
 
-    What is written is read back, and angles, distances and pixel sizes that the source states are recovered from it.
+    A written folder is read back, and the angles, distances and pixel sizes stated by the source are recovered from it.
 
     Args:
         source: a file or folder in a known format.
         target: the folder, or the file of vectors.
         to: nerfcli or astra.
-        given: what the user says of the scan.
+        given: properties of the scan that the user states.
         overwrite: replace a scan folder, or a file of vectors.
-        notify: takes lines for the user.
+        notify: called with lines for the user.
 
     Raises:
-        UserError: it cannot be read or written, something else stands there, or what was written is not the same.
+        UserError: the scan cannot be read or written, `target` exists, or the written scan differs from its source.
     """
     if to not in WRITTEN:
         raise UserError(f"a scan cannot be written as {to}", f"scans are written as {' or '.join(WRITTEN)}")
@@ -113,10 +113,10 @@ def convert_scan(
 def detect_scan(
     source: Path, *, given: Given = Given(), notify: Notify = silent, progress: Progress = no_progress
 ) -> Judgement:
-    """Rank direction of rotation, mirroring and centre of rotation by the data.
+    """Judge direction of rotation, mirroring and centre of rotation by how well they predict the data.
 
     Raises:
-        UserError: it cannot be read, or has too few views.
+        UserError: the scan cannot be read, or has too few views.
     """
     scan = read_scan(source, given)
     notify(f"{source}: {scan.history.get('format')}, {in_words(scan)}")
@@ -126,10 +126,10 @@ def detect_scan(
 def examine_scan_input(
     source: Path, page: Path, *, overwrite: bool = False, notify: Notify = silent, progress: Progress = no_progress
 ) -> ScanDiagnosis:
-    """Make all checks of a scan, and write their page.
+    """Run all checks of a scan, and write a page of the findings.
 
     Raises:
-        UserError: it cannot be read, or something else stands where the page should go.
+        UserError: the scan cannot be read, or the page's path holds something else.
     """
     if page.is_dir():
         raise UserError(f"{page} is a folder", "give the page's file name with -o")
@@ -156,14 +156,14 @@ def describe_scan(path: Path) -> dict[str, Any]:
     """Describe a scan folder, or a scan in a supported format.
 
     Raises:
-        UserError: it cannot be read.
+        UserError: the scan cannot be read.
     """
     scan = load_scan(path) if is_scan(path) else read_scan(path)
     return {"kind": "scan", **facts_of(scan), "notes": list(scan.history.get("notes", ()))}
 
 
 def facts_of(scan: Scan) -> dict[str, Any]:
-    """Return a scan as plain values, those of `nerfcli info`."""
+    """Return the facts of a scan that `nerfcli info` shows, as plain values."""
     geometry = scan.geometry
     height, width = geometry.pixel_at_origin
     circle, apart = circle_of(geometry)
@@ -196,7 +196,7 @@ def _rounded(value: float) -> float:
 
 
 def in_words(scan: Scan) -> str:
-    """Return a scan in a few words."""
+    """Describe a scan in a few words."""
     geometry = scan.geometry
     beam = "fan" if geometry.beam == "cone" and geometry.rows == 1 else geometry.beam
     size = f"{geometry.columns} x {geometry.rows} pixels"
@@ -205,10 +205,10 @@ def in_words(scan: Scan) -> str:
 
 
 def _read_back(scan: Scan, stored: Scan) -> dict[str, float]:
-    """Differences of what the source states and what stands in the folder.
+    """Return the differences between a scan as its source states it and as stored in the folder.
 
     Raises:
-        UserError: they are larger than rounding.
+        UserError: a difference is larger than rounding.
     """
     checks = {"vector": float(np.abs(stored.geometry.vectors() - scan.geometry.vectors()).max())}
     checks["value"] = float(np.abs(np.asarray(stored.values) - scan.values).max())

@@ -1,4 +1,4 @@
-"""Reconstruction of a scan: corrections, choice of weights, fit."""
+"""Reconstruct a scan: correct its geometry, choose weights, fit a volume."""
 
 import math
 import platform
@@ -26,7 +26,7 @@ from nerfcli.tomography.grid import VoxelGrid, grid_of_scan
 from nerfcli.tomography.hash_fit import fit_hash, hash_volume, new_arrays
 from nerfcli.tomography.likelihood import Poisson, likelihood_of
 from nerfcli.tomography.marks import TRUNCATED, UNSEEN, marks, marks_in_words, missing_wedge_deg
-from nerfcli.tomography.quick import telling_row
+from nerfcli.tomography.quick import highest_contrast_row
 from nerfcli.tomography.reconstruct import Fit, Problem, Projector, finer, mean_attenuation, reconstruct, start
 from nerfcli.tomography.result import (
     Reconstruction,
@@ -40,17 +40,17 @@ from nerfcli.tomography.strength import choose_strength
 from nerfcli.workflows.machine import thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
-# Shares of a time budget for the choice of total variation, and for the coarse start.
-STRENGTH_SHARE = 0.15
-COARSE_SHARE = 0.1
-# The share of the budget that the fit gets even if the trials before it took longer than planned.
+# Fraction of the time budget for choosing the weight of total variation, and of the time left for the coarse start.
+STRENGTH_FRACTION = 0.15
+COARSE_FRACTION = 0.1
+# Minimum fraction of the budget for the fit, even if the trials before it took longer than planned.
 LEAST_SHARE = 0.25
 COARSE_PASSES = 6
-# Passes where only a number of seconds ends the fit, and the other way round.
+# Maximum number of passes of a fit that is limited only by time.
 MOST_PASSES = 200
-# Of a fit: volume, momentum, gradient, curvature, threshold, the best volume and the three duals, with copies.
+# Memory of a fit per voxel: volume, momentum, gradient, curvature, threshold, best volume and three duals, with copies.
 BYTES_OF_VOXEL = 52
-# Scatter of the open beam between views, in standard errors, from which it counts as drift.
+# The open beam drifts if its standard deviation between views exceeds this many standard errors.
 DRIFT = 3.0
 
 
@@ -65,19 +65,19 @@ def train_scan(
     warn: Notify = warn_python,
     progress: Progress = no_progress,
 ) -> Reconstruction:
-    """Fit a volume to a scan, keep one that already exists, or refuse to touch another one.
+    """Fit a volume to a scan, keep an existing one with the same settings, or refuse to touch another one.
 
     Args:
         scan: a folder that `nerfcli convert` wrote.
         run: the folder to write.
-        settings: budget, field, and what is not to be left to the scan.
-        resume: go on from the volume in `run`.
+        settings: budget, field, and values that are not to be estimated from the scan.
+        resume: continue from the volume in `run`.
         overwrite: replace another run at `run`.
-        notify, warn: take lines for the user.
-        progress: takes the share of the budget and a few words.
+        notify, warn: called with lines for the user.
+        progress: called with the fraction of the budget and a short text.
 
     Raises:
-        UserError: the scan cannot be read, or something else stands at `run`.
+        UserError: the scan cannot be read, or `run` holds something else.
         KeyboardInterrupt: passed on; the volume fitted so far has been written.
     """
     folder, run = Path(scan), Path(run)
@@ -111,18 +111,18 @@ def train_scan(
 
 
 def corrected_by(geometry: ScanGeometry, centre: float, tilt: float) -> ScanGeometry:
-    """Return the geometry with its centre moved by some columns and its detector turned."""
+    """Return the geometry with its centre shifted by `centre` columns and its detector turned by `tilt` radians."""
     shifted = geometry.shifted(centre) if centre else geometry
     return shifted.tilted(tilt) if tilt else shifted
 
 
 def _holds_something(run: Path) -> bool:
-    """Return whether a folder has more in it than what an interrupted reconstruction leaves."""
+    """Return whether a folder has more than the hidden files that an interrupted reconstruction leaves."""
     return run.is_dir() and any(not path.name.startswith(".") for path in run.iterdir())
 
 
 def _wanted(settings: ReconstructionSettings) -> ReconstructionSettings:
-    """Return what of settings makes another result."""
+    """Return the settings without the number of threads, which does not make a different reconstruction."""
     return replace(settings, threads=0)
 
 
@@ -134,11 +134,11 @@ def _fit(
     earlier: Reconstruction | None,
     progress: Progress,
 ) -> tuple[Reconstruction, bool]:
-    """Fit the reconstruction, and whether it was interrupted after some passes; before that, `KeyboardInterrupt`."""
+    """Fit the volume, and return whether the fit was interrupted; before the fit, `KeyboardInterrupt` is passed on."""
     begun = time.perf_counter()
     decisions: list[str] = []
     views = scan.training_views
-    # Correcting the geometry takes seconds, and hardly changes the number of voxels.
+    # Check memory first: correcting the geometry takes seconds, and hardly changes the number of voxels.
     _fits_memory(grid_of_scan(scan.geometry, settings.voxel_size) if earlier is None else earlier.grid)
     centre, tilt = _geometry(scan, settings, earlier, decisions, progress)
     geometry = corrected_by(scan.geometry, centre, tilt)
@@ -146,8 +146,8 @@ def _fit(
     if earlier is not None:
         strength, model_error = float(earlier.used["strength"]), float(earlier.used["model_error"])
     else:
-        most = None if settings.budget_seconds is None else STRENGTH_SHARE * settings.budget_seconds
-        trial = choose_strength(scan, geometry, grid, most_seconds=most, progress=progress)
+        most = None if settings.budget_seconds is None else STRENGTH_FRACTION * settings.budget_seconds
+        trial = choose_strength(scan, geometry, grid, max_seconds=most, progress=progress)
         strength, model_error = trial.strength, trial.model_error
         if settings.strength is None:
             tried = ", ".join(f"{value:g}: {deviance:.3f}" for value, deviance in sorted(trial.tried))
@@ -212,9 +212,9 @@ class Limit:
     """Stopping criterion of a fit.
 
     Args:
-        total_passes, total_seconds: of everything; None for no limit.
-        begun: when the clock started.
-        done: passes of an earlier run.
+        total_passes, total_seconds: limits including earlier passes and the time before the fit; None for no limit.
+        begun: `time.perf_counter` at the start.
+        done: number of passes of an earlier run.
     """
 
     total_passes: int | None
@@ -224,12 +224,12 @@ class Limit:
 
     @property
     def passes(self) -> int | None:
-        """Passes that are left, at least one."""
+        """Number of passes left, at least one."""
         return None if self.total_passes is None else max(self.total_passes - self.done, 1)
 
     @property
     def seconds(self) -> float | None:
-        """Seconds that are left, at least a quarter of all."""
+        """Seconds left, at least `LEAST_SHARE` of the total."""
         if self.total_seconds is None:
             return None
         return max(self.total_seconds - (time.perf_counter() - self.begun), LEAST_SHARE * self.total_seconds)
@@ -261,7 +261,7 @@ def _fit_hash(
     seed: int,
     progress: Progress,
 ) -> tuple[Fit, dict[str, np.ndarray], bool]:
-    """Fit the volume at the centres of voxels, what the hash grid has learned, and whether it was interrupted."""
+    """Fit a hash grid; return its volume on the voxel grid, its learned arrays, and whether it was interrupted."""
     learned = new_arrays(seed) if earlier is None else earlier.learned
     volume = hash_volume(problem.grid, used["start"], learned, passes=limit.done)
     interrupted = False
@@ -294,7 +294,7 @@ def _geometry(
         centre = 0.0
     if centre is None:
         progress(0.0, "centre of rotation")
-        found = centre_of(telling_row(scan, scan.training_views).thinned())
+        found = centre_of(highest_contrast_row(scan, scan.training_views).thinned())
         centre = found.shift if found.is_off else 0.0
         if found.is_off:
             decisions.append(f"centre of rotation: shifted by {found.shift:+.2f} ± {found.error:.2f} columns")
@@ -319,7 +319,7 @@ def _air(
     forced: bool,
     decisions: list[str],
 ) -> list[float] | None:
-    """Factors on the open beam of each training view; None where they do not differ by more than their noise."""
+    """Estimate factors on the open beam of each training view; None if, unless forced, they vary no more than noise."""
     views = scan.training_views
     binning = max(1, geometry.columns // 96)
     coarse, small = geometry.binned(binning).select(views), grid.coarser(binning)
@@ -350,7 +350,7 @@ def _coarse_start(
     weights: tuple[float, float],
     seconds: float | None,
 ) -> Fit:
-    """Return a start for the fine grid from one with voxels and pixels twice as large."""
+    """Return a start for the fine grid, interpolated from a fit with voxels and pixels twice as large."""
     views = scan.training_views
     small = grid.coarser(2)
     likelihood = likelihood_of(scan, views, binning=2)
@@ -359,7 +359,7 @@ def _coarse_start(
         likelihood = likelihood.with_model_error(model_error)
         likelihood = likelihood if factors is None else likelihood.scaled(torch.tensor(factors))
     problem = Problem(geometry.binned(2).select(views), likelihood, small)
-    limit = None if seconds is None else COARSE_SHARE * seconds
+    limit = None if seconds is None else COARSE_FRACTION * seconds
     return finer(reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES, seconds=limit), grid)
 
 

@@ -18,7 +18,7 @@ from nerfcli.workflows.machine import thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 from nerfcli.workflows.tomography_scores import corrected, scan_of
 
-# Residuals are shown from so many standard deviations of the noise below to so many above.
+# Residuals are shown from minus to plus this many standard deviations of the noise.
 RESIDUAL_RANGE = 4.0
 
 
@@ -41,17 +41,17 @@ def render_scan(
         target: the folder to write.
         outputs: some of `OUTPUTS`: line integrals, transmissions, and (measured - predicted) in units of the noise.
         views: "test" for the held-out ones, "train" for the fitted ones.
-        slices: axis and position in the scan's unit, with their marks beside them; projections are not written then.
-        threads: of the CPU; 0 for all.
-        overwrite: replace files that are there.
-        notify: takes lines for the user.
-        progress: takes the share done and a few words.
+        slices: (axis, position in the scan's unit); if given, slices and their marks replace the projections.
+        threads: number of CPU threads; 0 for all.
+        overwrite: replace existing files.
+        notify: called with lines for the user.
+        progress: called with the fraction done and a short text.
 
     Returns:
-        The float files.
+        The paths of the float files.
 
     Raises:
-        UserError: there is no reconstruction, or a slice lies outside of it.
+        UserError: there is no reconstruction or no held-out view, a slice is outside the volume, or a file exists.
     """
     run, target = Path(run), Path(target)
     torch.set_num_threads(thread_count(threads))
@@ -60,7 +60,7 @@ def render_scan(
         cuts = {target / f"{name}.tif": cut for axis, at in slices for name, cut in _slice(result, axis, at).items()}
         _refuse_existing(*cuts, overwrite=overwrite)
         for path, (values, high) in cuts.items():
-            # Rows go down on screens, and up along the second axis.
+            # Picture rows run downwards, but the vertical axis of a slice points up.
             _write_picture(path, values[::-1].copy(), 0.0, high)
         return list(cuts)
     scan = scan_of(result, run)
@@ -94,17 +94,18 @@ def export_scan(
 ) -> list[Path]:
     """Write the volume of a reconstruction as .nrrd, .mha, .nii or .tif, and its marks beside it.
 
-    Voxels that no view sees are NaN. What else the views cannot determine stands in TARGET-marks, see `marks`.
+    Voxels that no view sees are NaN. TARGET-marks has the marks of all voxels that the views do not determine, see
+    `marks`; it is written only if there are any.
 
     Args:
         run: the folder that `train_scan` wrote.
-        target: the file; its suffix says the format.
-        water: attenuation of water in 1 / unit: values are Hounsfield units, 1000 (mu / water - 1).
-        overwrite: replace files that are there.
-        notify: takes lines for the user.
+        target: the file; its suffix determines the format.
+        water: attenuation of water in 1 / unit, to write Hounsfield units, 1000 (mu / water - 1); None for attenuation.
+        overwrite: replace existing files.
+        notify: called with lines for the user.
 
     Raises:
-        UserError: there is no reconstruction, or a file is in the way.
+        UserError: there is no reconstruction, or a file exists.
     """
     target = Path(target)
     result = load_reconstruction(Path(run))
@@ -127,10 +128,10 @@ def export_scan(
 
 
 def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
-    """Interpolate a slice across an axis at a position in the scan's unit; NaN where no view sees.
+    """Interpolate a slice across an axis at a position in the scan's unit; NaN where no view sees the volume.
 
     Raises:
-        UserError: it lies outside the volume.
+        UserError: the position is outside the volume.
     """
     grid: VoxelGrid = result.grid
     positions = grid.axis(axis)
@@ -153,13 +154,13 @@ def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
 
 
 def residual_of(likelihood: Likelihood, integrals: torch.Tensor, views: torch.Tensor) -> torch.Tensor:
-    """Measured minus predicted line integrals in units of their noise."""
-    # The likelihood rises with a line integral where more was measured than predicted, so its negative falls there.
+    """Return measured minus predicted line integrals in units of their noise."""
+    # The slope is that of the negative log likelihood: negative where the measured integral exceeds the predicted one.
     return -torch.sign(likelihood.slope(integrals, views)) * likelihood.deviance(integrals, views).sqrt()
 
 
 def _slice(result: Reconstruction, axis: str, at: float) -> dict[str, tuple[np.ndarray, float]]:
-    """Return a slice and the marks of its nearest layer, if there are any: values and the largest one, by name."""
+    """Return a slice and, if it has any, the marks of the nearest layer: values and upper display limit, by name."""
     top = float(np.nanquantile(np.asarray(result.volume), 0.999))
     layer = int(np.argmin(np.abs(result.grid.axis(axis) - at)))
     found = np.take(result.marks, layer, "zyx".index(axis)).astype(np.float32)

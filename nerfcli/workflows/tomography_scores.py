@@ -1,4 +1,4 @@
-"""Evaluation of a reconstruction: held-out projections, true volume, other methods on the same views."""
+"""Evaluate a reconstruction on held-out projections and the true volume, next to other methods on the same views."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,12 +26,12 @@ from nerfcli.workflows.tomography import corrected_by
 
 @dataclass(frozen=True)
 class ScanEvaluation:
-    """Numbers of a reconstruction.
+    """Metrics of a reconstruction.
 
     Args:
         path: RUN/metrics.json.
         metrics: its content.
-        is_kept: whether the file was there already.
+        is_kept: whether the file already existed.
     """
 
     path: Path
@@ -49,20 +49,21 @@ def evaluate_scan(
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> ScanEvaluation:
-    """Write RUN/metrics.json: held-out projections, a true volume if the scan names one, and other methods beside it.
+    """Write RUN/metrics.json: errors of held-out projections and, if the scan names its true volume, of the volume.
 
     Args:
         run: the folder that `train_scan` wrote.
-        threads: of the CPU; 0 for all.
+        threads: number of CPU threads; 0 for all.
         overwrite: measure again.
-        baselines: whether filtered back-projection and SART with total variation are computed from the same views.
-        reference: folder of another reconstruction, usually from more views, to compare volumes with. It is no truth:
-            it has errors of its own, and errors that both share do not show.
-        notify: takes lines for the user.
-        progress: takes the share done and a few words.
+        baselines: also measure filtered back-projection and SART with total variation on the same views.
+        reference: folder of another reconstruction, usually from more views, to compare volumes with. It is not the
+            truth: it has errors too, and errors common to both do not show.
+        notify: called with lines for the user.
+        progress: called with the fraction done and a short text.
 
     Raises:
-        UserError: there is no reconstruction, its scan is no longer what it was, or the reference has another unit.
+        UserError: there is no reconstruction, its scan has changed, or the reference has another unit or is not the one
+            of the existing metrics.
     """
     run = Path(run)
     torch.set_num_threads(thread_count(threads))
@@ -139,7 +140,7 @@ def scan_of(result: Reconstruction, run: Path) -> Scan:
     """Load the scan of a reconstruction.
 
     Raises:
-        UserError: it is no longer there, or was changed.
+        UserError: the scan no longer exists, or has changed.
     """
     if not result.scan.exists():
         raise UserError(
@@ -158,8 +159,9 @@ def corrected(geometry: ScanGeometry, result: Reconstruction) -> ScanGeometry:
 
 
 def _held_out_air(scan: Scan, result: Reconstruction) -> np.ndarray | None:
-    """Return the factor on the open beam of each held-out view,
-    from its own pixels beside the object, as everywhere.
+    """Estimate the factor on the open beam of each held-out view from its pixels beside the object, as in the fit.
+
+    None if the reconstruction did not use such factors.
     """
     if result.used.get("air") is None:
         return None

@@ -39,9 +39,9 @@ def train_scene(
     warn: Notify = warn_python,
     progress: Progress = no_progress,
 ) -> Run:
-    """Train one scene, keep a run that is already what is wanted, or refuse to touch another one.
+    """Train one scene, keep a complete run with the same settings, or refuse to touch another one.
 
-    In processes that torchrun has started, all train this scene together; see docs/many-devices.md.
+    Processes that torchrun has started train the scene together; see docs/many-devices.md.
 
     Example:
         >>> import nerfcli
@@ -53,19 +53,19 @@ def train_scene(
         scene: a folder that `estimate_poses` wrote, or of another format that `load_scene` reads.
         run: the folder to write.
         settings: budget, components, resolution, seed, device, threads.
-        memory_bytes: that may be resident, or be used on the GPU that trains; None for no limit.
-        resume: go on from the last checkpoint of `run`.
+        memory_bytes: limit of resident memory, or of memory on the GPU that trains; None for no limit.
+        resume: continue from the last checkpoint of `run`.
         overwrite: replace another run at `run`.
-        holdout: photos to hold out, "every:8", "block:0.15" or a file of names; None as the scene says.
+        holdout: photos to hold out, "every:8", "block:0.15" or a file of names; None for the scene's own split.
         view: serve the interactive page during the training, see `workflows.view`; `notify` gets its address.
-        notify, warn: take lines for the user.
-        progress: takes the share of the budget and a few words, after every step.
+        notify, warn: called with lines for the user.
+        progress: called with the fraction of the budget and a short text, after every step.
 
     Returns:
         The run, complete.
 
     Raises:
-        UserError: see `nerfcli.train.loop.train`; or a different run stands at `run`.
+        UserError: see `nerfcli.train.loop.train`; or a different run exists at `run`.
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     folder, run = Path(scene), Path(run)
@@ -121,7 +121,7 @@ def _trained(
     def is_kept() -> bool:
         if not _keeps(run, loaded, settings, resume=resume, overwrite=overwrite):
             return False
-        ranks.from_first(None)  # nothing to do for the others, either
+        ranks.from_first(None)  # tells the other ranks that there is nothing to do
         complete = "it is complete and has these settings; add --overwrite to train again"
         used = "its training has used this budget; give a larger --budget or --steps"
         notify(f"{run} is kept: {used if resume else complete}")
@@ -130,11 +130,11 @@ def _trained(
     if is_kept():
         return Run(run)
     with exclusive(run / LOCK, f"nerfcli train is working on {run}"):
-        if is_kept():  # by one that has just ended
+        if is_kept():  # another process has just completed it
             return Run(run)
         clear_leftovers(run)
         if overwrite:
-            (run / METRICS).unlink(missing_ok=True)  # they belong to the field that goes
+            (run / METRICS).unlink(missing_ok=True)  # they belong to the field that is replaced
         with viewer_beside(run, threads=settings.threads, notify=notify) as start_viewer:
             _fit(
                 loaded,
@@ -172,17 +172,17 @@ def train_again(
 ) -> None:
     """Train the scene of a run again with other settings, one training after the other.
 
-    Runs that are there and complete are kept, interrupted ones are resumed.
+    Complete runs are kept and interrupted ones are resumed.
 
     Args:
         run: a complete run.
         others: the folders to write, and the settings of each.
-        resume: go on from their last checkpoints to the budget or step count of their settings.
+        resume: also continue complete runs to the budget or step count of their settings.
         overwrite: replace other runs.
         memory_bytes, notify, warn, progress: see `train_scene`.
 
     Raises:
-        UserError: the scene is no longer where it was, or is another one by now.
+        UserError: the scene no longer exists or has changed, or the run joins blocks.
     """
     config = run.config
     folder = config.scene
@@ -229,8 +229,8 @@ def train_or_continue(
     """Train one of several runs: keep a complete one, resume an interrupted one, else start; see `train_scene`.
 
     Args:
-        folder, path: of the scene and of the run.
-        resume: go on with a complete run, too, if the settings have a larger budget.
+        folder, path: folders of the scene and of the run.
+        resume: also continue a complete run if the settings have a larger budget.
     """
     interrupted = was_interrupted(folder, path, settings, holdout=holdout)
     try:
@@ -252,11 +252,11 @@ def train_or_continue(
 
 
 def other_seeds(run: Run, count: int, *, device: str, threads: int) -> dict[Path, TrainSettings]:
-    """Return the folders RUN/seeds/SEED and settings that differ from those of a run in their seeds.
+    """Return the folders RUN/seeds/SEED, each with the settings of a run but another seed.
 
     Args:
         run: a complete run.
-        count: how many; their seeds follow the run's own.
+        count: number of seeds, which follow the run's own.
         device, threads: as for `TrainSettings`.
     """
     first = replace(run.config.settings, device=device, threads=threads)
@@ -265,7 +265,7 @@ def other_seeds(run: Run, count: int, *, device: str, threads: int) -> dict[Path
 
 
 def scene_for(settings: TrainSettings, folder: Path, *, holdout: str | None) -> Scene:
-    """Load a scene with the training photos that a training of these settings uses."""
+    """Load a scene with only the photos of the settings' block and fraction of training photos."""
     loaded = scenes.load(folder, holdout=holdout)
     if settings.block:
         loaded = divide(loaded, settings.blocks).scenes[settings.block - 1]
@@ -273,10 +273,10 @@ def scene_for(settings: TrainSettings, folder: Path, *, holdout: str | None) -> 
 
 
 def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:
-    """Return whether the run at `path` is already what is wanted.
+    """Return whether the run at `path` is complete with these settings and can be kept.
 
     Raises:
-        UserError: it is something else, which is not ours to replace; or nothing to resume.
+        UserError: `path` holds something else that may not be replaced, or there is nothing to resume.
     """
     run = Run(path)
     if resume and not run.is_trained and not (path / STATE).exists():
@@ -291,7 +291,7 @@ def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, o
         )
     if resume and run.config.scene_fingerprint != scenes.fingerprint(scene):
         raise UserError(f"{path} was trained on a different scene than {scene.root}", "choose another folder with -o")
-    if resume and run.is_complete(settings):  # before stereo matching is repeated for nothing
+    if resume and run.is_complete(settings):  # decided before stereo matching is repeated needlessly
         before = run.config.settings
         same = replace(settings, budget_seconds=before.budget_seconds, steps=before.steps)
         return run.is_trained_from(scene, same)
@@ -319,7 +319,7 @@ def _fit(
     notify: Notify,
     progress: Progress,
 ) -> None:
-    """Train; `on_begin` is called when cameras and configuration are written, and perhaps again."""
+    """Train; `on_begin` is called after every step, when cameras and configuration have been written."""
 
     def on_progress(state: loop.Progress) -> None:
         on_begin()

@@ -1,4 +1,4 @@
-"""Memory, disk space and time of a training before it starts, for people and for schedulers of clusters."""
+"""Estimate memory, disk space and time of a training before it starts, for users and for cluster schedulers."""
 
 import tempfile
 from dataclasses import asdict, dataclass
@@ -10,7 +10,7 @@ from nerfcli.photos.storage import InFiles, field_bytes, needs_of, storage_for
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.workflows.train import scene_for
 
-# The field (1), the state with both moments of the optimiser (3), and the previous state until the next is whole (3).
+# The field (1), the state with both moments of the optimiser (3), and the previous state until the next is written (3).
 _FIELDS_ON_DISK = 7
 
 
@@ -19,14 +19,13 @@ class TrainingPlan:
     """Cost of a training.
 
     Args:
-        train_photos, held_out_photos: how many.
+        train_photos, held_out_photos: numbers of photos.
         downscale: factor by which photos are reduced.
-        pixels: of the training photos, after that.
-        memory_bytes: of the process, at its peak.
-        disk_bytes: of the run folder at its largest, with photos in it that memory cannot hold.
-        seconds: the budget, which includes the automatic selection but not the reading of photos; None for a training
-            by steps.
-        steps: of a training by steps; None for one by time.
+        pixels: number of pixels of the reduced training photos.
+        memory_bytes: peak memory of the process.
+        disk_bytes: largest size of the run folder, including photos that do not fit into memory.
+        seconds: the budget, which includes the automatic selection but not the reading of photos; None without one.
+        steps: limit on the number of steps; None without one.
     """
 
     train_photos: int
@@ -55,7 +54,7 @@ class TrainingPlan:
 def plan_training(
     scene: str | Path, settings: TrainSettings, *, memory_bytes: int | None = None, holdout: str | None = None
 ) -> TrainingPlan:
-    """Return what `train_scene` would take. Photos are not opened, and nothing is written.
+    """Estimate the cost of `train_scene` without opening photos or writing anything.
 
     Example:
         >>> from nerfcli.runs.settings import TrainSettings

@@ -1,6 +1,6 @@
-"""Serve the interactive page of a run: fields of its training as they come, pictures by the CPU for who has no GPU.
+"""Serve the interactive page of a run: new fields during its training, and CPU renderings for browsers without a GPU.
 
-Nothing heavy is imported before a page is opened: a server without a viewer costs a training next to nothing.
+No heavy module is imported before a page is opened: a server without a viewer costs a training next to nothing.
 """
 
 import getpass
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from nerfcli.render.model import Model
 
 LOCAL = "127.0.0.1"
-# How often the server looks at the run, and how long it asks a training for a field after a page was loaded.
+# Interval between the server's checks of the run; time for which it requests fields from a training after a page load.
 TICK_SECONDS, LOADING_SECONDS = 0.5, 10.0
 
 
@@ -49,14 +49,14 @@ def view_run(
 
     Args:
         run: the folder that `train_scene` wrote, or is writing.
-        host: address to listen on; only this machine reaches the default.
+        host: address to listen on; the default can be reached only from this machine.
         port: to listen on; None for the first free one from 8123 on.
-        threads: of the CPU for pictures; 0 for all.
+        threads: number of CPU threads for pictures; 0 for all.
         browser: open the page in this machine's browser.
-        on_ready: takes the page's address, and what to do on another machine.
+        on_ready: called with the page's address and the command that makes it work on another machine ("" for none).
 
     Raises:
-        UserError: no such run, or the port is taken.
+        UserError: the run does not exist, or the port is taken.
         KeyboardInterrupt: Ctrl-C; the server has stopped.
     """
     path = Path(run)
@@ -75,7 +75,7 @@ def view_run(
 
 
 def open_browser(url: str) -> None:
-    """Open a page where somebody sits in front of this machine."""
+    """Open a page in a browser, if this machine has a screen and is not used over SSH."""
     has_screen = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if has_screen and "SSH_CONNECTION" not in os.environ:
         webbrowser.open(url)
@@ -90,7 +90,7 @@ class RunShow:
 
     Args:
         path: of the run.
-        threads: of the CPU for pictures; 0 for all.
+        threads: number of CPU threads for pictures; 0 for all.
     """
 
     def __init__(self, path: Path, *, threads: int):
@@ -109,10 +109,10 @@ class RunShow:
         self._opened: Any = None
 
     def check(self) -> None:
-        """Refuse what is no run.
+        """Refuse a folder that is not a run.
 
         Raises:
-            UserError: it is none.
+            UserError: the folder is not a run.
         """
         if not (self._path / CONFIG).exists():
             from nerfcli.runs.config import no_run
@@ -120,7 +120,7 @@ class RunShow:
             raise no_run(self._path)
 
     def tick(self, server: PageServer) -> None:
-        """Check the run, and report to its training whether a page is open; in the thread that serves."""
+        """Check the run, and tell its training whether a page is open; called in the server's thread."""
         with self._lock:
             loading = time.monotonic() < self._loaded_until
             if server.clients > 0 or loading or self._request.paused or self._request.stop:
@@ -140,7 +140,7 @@ class RunShow:
             server.announce()
 
     def close(self) -> None:
-        """Cancel a request to a training."""
+        """Withdraw the request to a training."""
         with self._lock:
             end_request(self._path)
 
@@ -222,10 +222,10 @@ class RunShow:
             self._ask()
 
     def model(self) -> "tuple[int, Model]":
-        """Return the newest field with its number.
+        """Return the version number of the newest field, and its model.
 
         Raises:
-            UserError: there is none that can be read.
+            UserError: there is no field yet, or it cannot be read.
         """
         from nerfcli.render.model import load_model
 
@@ -246,13 +246,13 @@ class RunShow:
         write_request(self._path, self._request)
 
     def _field_path(self) -> Path:
-        """Return the newer one of the last checkpoint and what a training wrote for viewers."""
+        """Return the last checkpoint or the field that a training wrote for viewers, whichever is newer."""
         live, saved = live_field(self._path), self._path / FIELD
         return live if _stamp(live)[0] > _stamp(saved)[0] else saved
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """When a file was written, and which one it is, as clocks of file systems are coarse; zeros where there is none."""
+    """Return a file's modification time and, as that is coarse, its inode number; zeros if the file does not exist."""
     try:
         status = path.stat()
     except OSError:
@@ -261,7 +261,7 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 def _refusal(model: "Model") -> str | None:
-    """Why a page cannot draw a field by itself."""
+    """Return the reason why a page cannot draw a field by itself; None if it can."""
     from nerfcli.viewer.packing import pack_model
 
     try:
@@ -272,9 +272,7 @@ def _refusal(model: "Model") -> str | None:
 
 
 def _box(model: "Model", frames: Any, *, trained: bool) -> tuple[float, ...]:
-    """Return the box around what the photos are about;
-    of a field in training, the cube around the training frame's ball.
-    """
+    """Return the box around the subject of the photos; during training, the cube around the training frame's ball."""
     import numpy as np
 
     from nerfcli.surface.extent import scene_box
@@ -282,7 +280,7 @@ def _box(model: "Model", frames: Any, *, trained: bool) -> tuple[float, ...]:
     if trained:
         try:
             return scene_box(model, frames)
-        except UserError:  # it shows nothing, which a viewer may well want to see
+        except UserError:  # the cameras see no surface; viewers may want to see that
             pass
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     placed = model.training_from_scene.inverse().apply(corners)

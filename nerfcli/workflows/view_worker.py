@@ -1,6 +1,6 @@
-"""The server of `train --view`, a process of its own: `python -m nerfcli.workflows.view_worker RUN`.
+"""The server of `train --view` in a separate process: `python -m nerfcli.workflows.view_worker RUN`.
 
-A training then computes the same, in the same time, with or without a viewer.
+Training therefore gives the same result in the same time with or without a viewer.
 """
 
 import os
@@ -18,18 +18,18 @@ from nerfcli.workflows.notices import Notify
 from nerfcli.workflows.view import view_run
 
 MODULE = "nerfcli.workflows.view_worker"
-# Of the threads of a training, while both work.
-_THREADS_SHARE = 2
+# The viewer gets one thread for this many threads of the training.
+_TRAINING_THREADS_PER_VIEWER_THREAD = 2
 
 
 @contextmanager
 def viewer_beside(run: Path, *, threads: int, notify: Notify) -> Iterator[Callable[[], None]]:
-    """Yield a function that starts the server of a run, once; it ends with the context.
+    """Yield a function that starts the server of a run, once; the server ends with the context.
 
     Args:
-        run: the folder, which need not be there before the start.
-        threads: of the training.
-        notify: takes the address.
+        run: the run folder, which need not exist before the server starts.
+        threads: number of threads of the training.
+        notify: called with the address.
     """
     with ExitStack() as ending:
         log = ending.enter_context(open(os.devnull, "wb"))
@@ -38,7 +38,7 @@ def viewer_beside(run: Path, *, threads: int, notify: Notify) -> Iterator[Callab
         def start() -> None:
             nonlocal child
             if child is None:
-                child = spawn(MODULE, run, log=log, threads=max(1, threads // _THREADS_SHARE))
+                child = spawn(MODULE, run, log=log, threads=max(1, threads // _TRAINING_THREADS_PER_VIEWER_THREAD))
                 listener = threading.Thread(target=_announce, args=(child, notify), daemon=True)
                 listener.start()
                 ending.callback(end_request, run)
@@ -55,7 +55,7 @@ def _announce(child: subprocess.Popen[bytes], notify: Notify) -> None:
 
 
 def main() -> None:
-    """Serve the run of the first argument."""
+    """Serve the run given as the first argument."""
     send = take_stdout()
 
     def on_ready(url: str, from_elsewhere: str) -> None:

@@ -1,4 +1,4 @@
-"""The views to render of a run: its own, a path through or around them, or those of a file."""
+"""Views of a run to render: its own cameras, a path through or around them, or the cameras of a file."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,11 +24,11 @@ from nerfcli.runs.run import Run
 from nerfcli.workflows.notices import Notify, warn_python
 
 PATHS = ("orbit", "ellipse", "spiral", "interpolate")
-# From this field of view on, a lens sees behind the camera.
+# A lens with a larger field of view sees behind the camera.
 BEHIND_FROM_DEG = 180.0
-# What `write_frames` writes.
+# Files that `write_frames` writes.
 _FRAME_FILES = ("cameras.json", "camera_path.json")
-# Formats whose folders `nerfcli train` takes.
+# Formats whose folders `nerfcli train` accepts.
 SCENES = ("nerfcli", "colmap", "transforms", "blender", "llff")
 
 
@@ -37,10 +37,11 @@ class Look:
     """Size, lens and crop of the pictures, where they differ from training or from the file of cameras.
 
     Args:
-        width, height: in pixels; with one of them the other follows, and with both the picture is cut, never stretched.
+        width, height: in pixels; if only one is given, the other follows from it; with both, the picture is cropped,
+            never stretched.
         lens: "pinhole", "fisheye" or "equirectangular" instead of the camera's own.
         fov_deg: of that lens, between the left and the right edge.
-        crop: X,Y,WIDTH,HEIGHT of the part to render, in pixels of the picture that the others give.
+        crop: X,Y,WIDTH,HEIGHT of the part to render, in pixels of the picture after the other settings.
     """
 
     width: int | None = None
@@ -51,16 +52,16 @@ class Look:
 
     @property
     def words(self) -> list[str]:
-        """For the names of folders, so that pictures of two kinds do not meet."""
+        """Parts of the name of a folder, so that pictures of different looks do not share one."""
         size = [] if self.width is None and self.height is None else [f"{self.width or ''}x{self.height or ''}"]
         lens = [] if self.lens is None else [self.lens + ("" if self.fov_deg is None else f"{self.fov_deg:g}")]
         return [*size, *lens, *([] if self.crop is None else ["crop", *map(str, self.crop)])]
 
     def of(self, camera: Camera) -> Camera:
-        """Return the camera for such a picture in place of another one.
+        """Return a camera with this size, lens and crop.
 
         Raises:
-            UserError: a part outside of the picture, or a size or an angle that the lens does not have.
+            UserError: the crop is outside the picture, or the lens cannot have this size or field of view.
         """
         if self.lens == "equirectangular" and self.fov_deg is None and (self.width or self.height):
             width = self.width or 2 * (self.height or 0)
@@ -78,11 +79,11 @@ class Views:
 
     Args:
         cameras: test, train, a path, or a file or folder of cameras.
-        count: of the views of a path.
-        through: names of photos, with commas between them, that a path is made from; all training photos if None.
-        nerfstudio_frame: dataparser_transforms.json of the nerfstudio run in whose world the file's cameras are.
-        max_size: of the longer side of the pictures, in pixels; as trained if None.
-        look: size, lens and part of the pictures.
+        count: number of views of a path.
+        through: comma-separated names of the photos that a path goes through or around; None for all training photos.
+        nerfstudio_frame: dataparser_transforms.json of the nerfstudio run whose world frame the file's cameras use.
+        max_size: maximum longer side of the pictures, in pixels; None for no maximum.
+        look: size, lens and crop of the pictures.
     """
 
     cameras: str
@@ -94,21 +95,21 @@ class Views:
 
     @property
     def name(self) -> str:
-        """A name for files of these views."""
+        """Name of these views for folders and messages."""
         name = self.cameras if self.cameras in ("test", "train", *PATHS) else Path(self.cameras).absolute().stem
         return "-".join([name, *self.look.words])
 
 
 def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
-    """Return the frames of a run that are to be seen.
+    """Return the frames to render.
 
     Args:
         run: the run.
-        views: which.
-        depth_hint: how far away the scene's middle is, for paths around it where the optical axes do not say.
+        views: which views to render.
+        depth_hint: distance to the scene's centre, for paths around it if the optical axes do not determine it.
 
     Raises:
-        UserError: no such cameras, or an option that makes no sense with them.
+        UserError: there are no such cameras, or an option cannot be used with them.
     """
     cameras, through = views.cameras, views.through
     if through is not None and cameras not in PATHS:
@@ -145,11 +146,11 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
     return [replace(frame, camera=look(frame.camera)) for frame in chosen]
 
 
-def refuse_z_all_around(frames: Sequence[Frame], *, notify: Notify) -> None:
-    """z is the distance along the optical axis, and half of a picture of all directions lies behind the camera.
+def refuse_z_depth_for_equirectangular(frames: Sequence[Frame], *, notify: Notify) -> None:
+    """Refuse depth along the optical axis, z, for pictures of all directions: half of them is behind the camera.
 
     Raises:
-        UserError: a picture is equirectangular. Lenses that see a little behind are only reported.
+        UserError: a picture is equirectangular. For other lenses that see behind the camera, only a note is shown.
     """
     if any(frame.camera.is_spherical for frame in frames):
         raise UserError(
@@ -163,7 +164,7 @@ def refuse_z_all_around(frames: Sequence[Frame], *, notify: Notify) -> None:
 
 
 def file_fps(cameras: str) -> float | None:
-    """Return the frame rate that a nerfstudio camera path gives; None of anything else."""
+    """Return the frame rate of a nerfstudio camera path; None for anything else."""
     path = Path(cameras)
     found = find_camera_path(path) if path.is_file() else None
     return None if found is None else read_path(found).fps
@@ -172,10 +173,10 @@ def file_fps(cameras: str) -> float | None:
 def write_frames(
     frames: Sequence[Frame], target: Path, *, fps: float, overwrite: bool = False, warn: Notify = warn_python
 ) -> None:
-    """Write views into a folder: cameras.json, a transforms.json, and camera_path.json for nerfstudio's viewer.
+    """Write views into a folder: cameras.json, in transforms format, and camera_path.json for nerfstudio's viewer.
 
     Raises:
-        UserError: one of them exists, or cannot be written.
+        UserError: one of the files exists, or cannot be written.
     """
     views = tuple(replace(frame, image=None, mask=None, split=None) for frame in frames)
     capture = Capture(views, np.zeros((0, 3)), (), None, "camera-path")
@@ -192,7 +193,7 @@ def write_frames(
 
 
 def refuse_frames(target: Path, *, overwrite: bool) -> None:
-    """Refuse a folder with what `write_frames` writes.
+    """Refuse a folder that already has a file that `write_frames` writes, unless it may be replaced.
 
     Raises:
         UserError: one of the files exists.
@@ -202,7 +203,7 @@ def refuse_frames(target: Path, *, overwrite: bool) -> None:
 
 
 def _frames_of(path: Path, nerfstudio_frame: Path | None) -> tuple[Frame, ...]:
-    """Return the cameras of a scene, fitted to its photos, or of any file or folder that `nerfcli convert` reads."""
+    """Return the cameras of a scene, rescaled to its photos, or of any file or folder that `nerfcli convert` reads."""
     if not path.exists():
         raise UserError(
             f"no cameras found at {path}",
@@ -221,5 +222,5 @@ def _frames_of(path: Path, nerfstudio_frame: Path | None) -> tuple[Frame, ...]:
 
 
 def _within(camera: Camera, max_size: int) -> Camera:
-    """Return the camera of the picture made smaller, if need be, until its longer side fits."""
+    """Return the camera, reduced if necessary so that its longer side is at most `max_size` pixels."""
     return downscaled_camera(camera, max(1.0, max(camera.width, camera.height) / max_size))

@@ -1,1 +1,1 @@
-"""Hard cases with answers in 60 digits or closed form, for the definitions and the compiled kernels."""
+"""Hard cases with 60-digit or closed-form answers, for the reference and the compiled kernels."""

@@ -1,4 +1,4 @@
-"""Where light ends, and how much lies before: depths, optical depths and line integrals of hard rays."""
+"""Depths, depth quantiles and optical depths of hard rays, against 60-digit answers."""
 
 import itertools
 import math
@@ -17,7 +17,7 @@ from nerfcli.selftest import textbook
 from nerfcli.selftest.cases import MEANINGLESS, PIXEL_SHARES, PIXELS, Ray, Segments, depth_rays, lit, thick_and_thin
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
-# Rays of the depths are either cut a few times or finely.
+# Rays with at most this many intervals form the coarse group; all others form the fine one.
 FEW = 15
 GRADIENT_BOUND = 3
 _SHARES = {quantile_name(share): share for share in SHARES}
@@ -25,7 +25,7 @@ VALUE_ONLY = "the compiled kernel has none: where one is wanted, plain torch giv
 
 
 def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
-    """Rows of everything about depth."""
+    """Yield the rows of all depth operations."""
     for precision in precisions:
         yield _before_row(precision)
         rays = [_rounded(ray, precision) for ray in depth_rays()]
@@ -34,7 +34,7 @@ def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
         yield _mixture_row(precision)
 
 
-# The depths, by what is hard about them: name of the group, columns.
+# The depths, grouped by what makes them hard: name of the group, columns.
 _DEPTHS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("opacity and transmittance from 1e-12 to opaque", ("opacity", "transmittance")),
     ("mean depth, of next to no light and of none", ("conditional",)),
@@ -49,7 +49,7 @@ _DEPTHS: tuple[tuple[str, tuple[str, ...]], ...] = (
 
 @dataclass(frozen=True)
 class _Measured:
-    """The largest error of a ray's depths, and what it may be."""
+    """The error of a depth and the bound on it, for the ray that comes nearest to its bound."""
 
     errors: Errors
     bounds: Errors
@@ -76,7 +76,7 @@ def _depth_rows(rays: list[Ray], precision: Precision, *, cut: str) -> Iterator[
         def nearest(
             values: dict[str, Tensor], slopes: dict[str, Tensor], columns: tuple[str, ...] = columns
         ) -> _Measured:
-            """Errors and bounds of the rays that come nearest to their bounds, or are farthest beyond."""
+            """Return the error and bound of the ray whose error is the largest fraction of its bound."""
             shown = [column for column in columns if column in values]
             return _nearest(rays, wanted, columns=shown, values=values, slopes=slopes, offsets=offsets, at=precision)
 
@@ -131,7 +131,7 @@ def _nearest(
 
 
 def _gradients(columns: dict[str, Tensor], density: Tensor) -> dict[str, Tensor]:
-    """The gradient of the sum of each column by density, where it is asked for; what is undefined counts nothing."""
+    """Return the density gradient of each column's sum without its NaNs, or {} if `density` requires no gradient."""
     if not density.requires_grad:
         return {}
     sums = {name: torch.where(values.isnan(), 0.0, values).sum() for name, values in columns.items()}
@@ -142,7 +142,7 @@ def _gradients(columns: dict[str, Tensor], density: Tensor) -> dict[str, Tensor]
 
 
 def _packed(rays: list[Ray], precision: Precision) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Density, starts, ends and offsets."""
+    """Return density, starts, ends and offsets."""
     density, starts, ends = (
         precision.tensor([x for values in column for x in values])
         for column in ([r.density for r in rays], [r.starts for r in rays], [r.ends for r in rays])
@@ -155,7 +155,7 @@ def _offsets(counts: list[int], precision: Precision) -> Tensor:
 
 
 def _bound(ray: Ray, precision: Precision) -> float:
-    """The largest relative error of a value along a ray; see `_depth_rows`."""
+    """Return the bound on the relative error of a ray's depth; see `_depth_rows`."""
     if precision.compiled:
         return 16 * precision.unit
     lengths = tuple(end - start for start, end in zip(ray.starts, ray.ends, strict=True))
@@ -170,14 +170,14 @@ def _columns(seen: LightEnds) -> dict[str, Tensor]:
 
 
 def _rounded(ray: Ray, precision: Precision) -> Ray:
-    """The ray with the numbers that both float32 and the precision hold."""
+    """Return the ray with its numbers rounded so that both float32 and the precision hold them exactly."""
     dtype = torch.bfloat16 if precision.dtype == torch.bfloat16 else torch.float32
     columns = (torch.tensor(v, dtype=dtype).double().tolist() for v in (ray.density, ray.starts, ray.ends))
     return Ray(ray.name, *columns)
 
 
 def _mixture_row(precision: Precision) -> Row:
-    """Quantiles of the light of two rays together; no share lies where the light of one has ended and none begins."""
+    """Measure quantiles of the combined light of two rays, at no fraction where the combined light has a gap."""
     rays = [_rounded(ray, precision) for pixel in PIXELS for ray in pixel]
     density, starts, ends, offsets = _packed(rays, precision)
     module = precision.parts
@@ -206,20 +206,20 @@ def _mixture_row(precision: Precision) -> Row:
 
 
 def _farthest(rays: list[Ray], wanted: list[float]) -> float:
-    """The largest share of a pixel's farthest distance by its answer."""
+    """Return the largest ratio of a pixel's farthest distance to its answer."""
     ends = [max((*a.ends, *b.ends)) for a, b in zip(rays[::2], rays[1::2], strict=True)]
     return max(ends[i % len(ends)] / place for i, place in enumerate(wanted) if not math.isnan(place))
 
 
 def _flat(rays: list[Segments], precision: Precision) -> tuple[Tensor, Tensor, Tensor]:
-    """Density, lengths and offsets."""
+    """Return density, lengths and offsets."""
     density = precision.tensor([x for ray in rays for x in ray.density])
     lengths = precision.tensor([x for ray in rays for x in ray.lengths])
     return density, lengths, _offsets([len(ray.density) for ray in rays], precision)
 
 
 def _by_density(answers: Tensor, density: Tensor, upstream: list[float]) -> Tensor | None:
-    """The gradient of a weighted sum of answers, where one is asked for."""
+    """Return the density gradient of a weighted sum of answers, or None if `density` requires no gradient."""
     if not density.requires_grad:
         return None
     (gradient,) = torch.autograd.grad(answers, density, grad_outputs=torch.tensor(upstream).to(answers))

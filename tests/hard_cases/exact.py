@@ -1,4 +1,4 @@
-"""The answers for rays in 60 decimal digits, by the definitions, from the very numbers that the kernels get."""
+"""Answers for rays in 60 decimal digits, by the definitions, from exactly the numbers that the kernels get."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,13 +31,13 @@ def composited(
     transmittance_gradient: float,
     weights_gradient: list[float],
 ) -> Composited:
-    """Weights, transmittance and colour of a ray, and the gradient of a weighted sum of them.
+    """Return weights, transmittance and colour of a ray, and the gradient of a weighted sum of them.
 
     loss = sum_c gc_c colour_c + gt T + sum_i gw_i w_i, with the gradient
     d loss / d density_k = length_k (T_(k+1) v_k - sum_(i>k) w_i v_i - T (gc . background + gt)),
     v_i = gc . rgb_i + gw_i.
 
-    `density_gradient_size` is the same sum with absolute values: what its rounding is proportional to.
+    `density_gradient_size` is the same sum with absolute values; the gradient's rounding error is proportional to it.
     """
     with localcontext() as context:
         context.prec = DIGITS
@@ -81,7 +81,7 @@ def composited(
 
 
 def optical_depths(ray: Segments) -> list[float]:
-    """The optical depth in front of each interval of a ray, and that of the whole ray."""
+    """Return the optical depth in front of each interval of a ray, and that of the whole ray."""
     with localcontext() as context:
         context.prec = DIGITS
         parts = (Decimal(sigma) * Decimal(length) for sigma, length in zip(ray.density, ray.lengths, strict=True))
@@ -89,7 +89,10 @@ def optical_depths(ray: Segments) -> list[float]:
 
 
 def mixture_quantile(rays: Sequence[Ray], share: float) -> float:
-    """Where the share of all light of the rays together has ended, by bisection; NaN where so much never does."""
+    """Return the distance at which a fraction of the rays' combined light has ended, by bisection.
+
+    NaN if less light than that ends anywhere.
+    """
     with localcontext() as context:
         context.prec = DIGITS
         columns = [
@@ -115,7 +118,7 @@ def mixture_quantile(rays: Sequence[Ray], share: float) -> float:
 
 
 def distortion(weights: list[float], starts: list[float], ends: list[float]) -> tuple[float, list[float]]:
-    """sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 length_i / 3 of one ray, and its gradient by the weights."""
+    """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 length_i / 3 of one ray, and its gradient by the weights."""
     with localcontext() as context:
         context.prec = DIGITS
         w = [Decimal(x) for x in weights]

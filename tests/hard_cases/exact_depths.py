@@ -1,7 +1,7 @@
-"""Where the light of a ray ends and how that changes with each density, in 60 decimal digits, by the definitions.
+"""Depths of a ray and their density gradients in 60 decimal digits, by the definitions.
 
-Letters: interval k has the density sigma_k, the length L_k, the weight w_k, the mean place m_k with the variance v_k;
-x = sigma_k L_k; T_k is what passes the first k intervals, W the sum of all weights.
+Notation: interval k has density sigma_k, length L_k, weight w_k, and mean depth m_k with variance v_k;
+x = sigma_k L_k; T_k is the transmittance of the first k intervals; W is the sum of all weights.
 """
 
 import functools
@@ -13,21 +13,22 @@ from hard_cases.exact import DIGITS
 from nerfcli.selftest.cases import Ray
 
 SHARES = (0.5, 0.05, 0.95)
-# Below these, sixty digits are not enough for the closed forms: of mean and variance, and of the variance's slope.
+# Optical depths below which sixty digits are too few for the closed forms: of mean and variance, and of the
+# variance's derivative.
 _THIN, _THIN_SLOPE = Decimal("1e-15"), Decimal("1e-6")
-# From here on kernels use the closed forms, whose parts are of these sizes: 1 / x^2 for a mean, 2 / x^3 for a variance.
+# Optical depths from which kernels use the closed forms, with terms of size 1 / x^2 for a mean, 2 / x^3 for a variance.
 _CLOSED_MEAN, _CLOSED_VARIANCE = Decimal("0.25"), Decimal(1)
 
 
 @dataclass(frozen=True)
 class Depth:
-    """A depth of a ray, or what goes with it.
+    """A depth of a ray, or its opacity, transmittance or spread.
 
     Args:
         value: NaN where undefined.
         gradient: by the density of each interval; zeros where the value is undefined.
-        size: the same sums with absolute values, of places counted from where most light ends: what their rounding is
-            proportional to.
+        size: the gradient's sums with absolute values, and distances measured from the mean of the interval in which
+            most light ends; the gradient's rounding error is proportional to them.
     """
 
     value: float
@@ -37,11 +38,11 @@ class Depth:
 
 @dataclass(frozen=True)
 class LightEnds:
-    """All depths of a ray by their names, and where the light is.
+    """All depths of a ray by name, and the start of its heaviest interval.
 
     Args:
         depths: opacity, transmittance, conditional, spread, max-weight, median and the quantiles of `SHARES`.
-        anchor: where the interval starts in which most light ends; NaN without light.
+        anchor: start of the interval in which most light ends; NaN without light.
     """
 
     depths: dict[str, Depth]
@@ -65,12 +66,12 @@ class _Interval:
 
 
 def light_ends(ray: Ray) -> LightEnds:
-    """Every depth of a ray and its gradient; the numbers of the ray are taken as they are."""
+    """Return every depth of a ray and its gradient; the ray's numbers are not rounded."""
     return _light_ends(_Numbers(ray))
 
 
 class _Numbers:
-    """A ray by its numbers, whatever it is called: each is looked at in several precisions and tests."""
+    """A cache key: a ray compared by its numbers, not its name, as several precisions and tests share rays."""
 
     def __init__(self, ray: Ray):
         self.ray, self._key = ray, (tuple(ray.density), tuple(ray.starts), tuple(ray.ends))
@@ -95,7 +96,7 @@ def _light_ends(numbers: _Numbers) -> LightEnds:
         depths["transmittance"] = _depth(left, [-x for x in slopes], slopes)
         mass = sum((one.weight for one in intervals), Decimal(0))
         heaviest = max((one.weight for one in intervals), default=Decimal(0))
-        # Equal weights are told apart by rounding alone; then the nearest counts.
+        # Weights this close are equal but for rounding; the nearest of them counts as the heaviest.
         near = [k for k, one in enumerate(intervals) if one.weight > 0 and one.weight >= heaviest * (1 - _THIN)]
         if mass:
             depths |= _moments(intervals, mass, intervals[near[0]].mean)
@@ -110,13 +111,15 @@ def _light_ends(numbers: _Numbers) -> LightEnds:
 
 
 def quantile_name(share: float) -> str:
-    """What the depth is called that counts a share of all light."""
+    """Return the name of the depth by which a fraction of all light has ended."""
     return "median" if share == 0.5 else f"quantile:{share:g}"
 
 
 def is_settled(ray: Ray, share: float, *, within: float) -> bool:
-    """Whether a relative error of optical depths leaves a quantile where it is; one that lies beside a gap, a denser
-    interval or the end of all light jumps there."""
+    """Return whether a quantile changes smoothly under a relative error `within` of the optical depths.
+
+    Beside a gap, an interval of another density or the end of the light, it would jump.
+    """
     with localcontext() as context:
         context.prec = DIGITS
         intervals, target = _intervals(_Numbers(ray)), _target(share)
@@ -148,7 +151,7 @@ def _intervals(numbers: _Numbers) -> list[_Interval]:
 
 
 def _moments(intervals: list[_Interval], mass: Decimal, place: Decimal) -> dict[str, Depth]:
-    """Mean m and spread S, with d w_i / d sigma_k = L_k (T_(k+1) for i = k, -w_i for i > k) and d m_k = -v_k.
+    """Return mean m and spread S, with d w_i / d sigma_k = L_k (T_(k+1) for i = k, -w_i for i > k) and d m_k = -v_k.
 
     d m / d sigma_k = sum_i d w_i (m_i - m) / W - w_k v_k / W
     d S^2 / d sigma_k = sum_i d w_i (v_i + (m_i - m)^2 - S^2) / W + w_k (d v_k - 2 (m_k - m) v_k) / W
@@ -176,7 +179,7 @@ def _moments(intervals: list[_Interval], mass: Decimal, place: Decimal) -> dict[
 
 
 def _by_weights(intervals: list[_Interval], values: list[Decimal], *, absolute: bool = False) -> list[Decimal]:
-    """sum_i values_i d w_i / d sigma_k for each k, or the sum of the terms' sizes."""
+    """Return sum_i values_i d w_i / d sigma_k for each k, or the sum of the terms' absolute values."""
     behind, found = Decimal(0), []
     for one, value in zip(reversed(intervals), reversed(values), strict=True):
         found.append(one.length * (one.passed * value + (behind if absolute else -behind)))
@@ -185,7 +188,7 @@ def _by_weights(intervals: list[_Interval], values: list[Decimal], *, absolute: 
 
 
 def _mean_slope_size(one: _Interval) -> Decimal:
-    """Of d m_k / d sigma_k = -v_k, whose closed form is a difference of parts of the size 1 / x^2."""
+    """Return the terms' size in d m_k / d sigma_k = -v_k, whose closed form subtracts terms of size 1 / x^2."""
     return one.variance if one.depth < _CLOSED_MEAN else (one.length / one.depth) ** 2
 
 
@@ -204,7 +207,7 @@ def _variance_slope_size(one: _Interval) -> Decimal:
 
 
 def _quantile(ray: Ray, intervals: list[_Interval], target: Decimal) -> Depth:
-    """t = start + (target - tau) / sigma in the interval k where it is crossed: nothing behind k counts."""
+    """Return t = start + (target - tau) / sigma in the interval k that crosses the target."""
     k = _crossed(intervals, target)
     if k is None:
         return _undefined(ray)
@@ -218,12 +221,12 @@ def _quantile(ray: Ray, intervals: list[_Interval], target: Decimal) -> Depth:
 
 
 def _target(share: float) -> Decimal:
-    """The optical depth at which the share of all light has ended."""
+    """Return the optical depth at which a fraction of all light has ended."""
     return -(1 - Decimal(share)).ln()
 
 
 def _crossed(intervals: list[_Interval], target: Decimal) -> int | None:
-    """The interval in which an optical depth is reached."""
+    """Return the index of the interval in which an optical depth is reached, or None if none reaches it."""
     return next((k for k, one in enumerate(intervals) if one.before + one.depth >= target), None)
 
 

@@ -1,4 +1,4 @@
-"""What training meets: densities at overflow, Adam's first steps, a grid poisoned by NaN."""
+"""Hard cases of training: densities at overflow, Adam's first steps, NaN in the occupancy grid."""
 
 import math
 import time
@@ -16,7 +16,7 @@ RATE, BETAS, EPS = 0.01, (0.9, 0.99), 1e-15
 
 
 def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
-    """Rows of everything about learning."""
+    """Yield the rows of all training operations."""
     for precision in precisions:
         yield _density_row(precision)
         if precision.dtype == torch.float32:
@@ -55,7 +55,10 @@ def _density_row(precision: Precision) -> Row:
 
 
 def _through_networks(logarithms: Tensor, precision: Precision) -> Tensor:
-    """Densities by the compiled networks, of which one path for each sign carries the number through."""
+    """Return densities from the compiled networks, with weights that pass each logarithm through unchanged.
+
+    One hidden unit carries positive numbers, another negative ones.
+    """
     shapes = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
     weights = tuple(precision.tensor([[0.0] * n] * m) for m, n in shapes)
     weights[0][0, 0], weights[0][1, 0], weights[1][0, 0], weights[1][0, 1] = 1.0, -1.0, 1.0, -1.0
@@ -65,7 +68,7 @@ def _through_networks(logarithms: Tensor, precision: Precision) -> Tensor:
 
 
 def _adam_row(precision: Precision) -> Row:
-    """The first step on rows with gradients from 1e-17 to 1e10: one step of the rate, whatever the gradient's size."""
+    """Measure the first step for gradients from 1e-17 to 1e10: its size is the rate for any gradient far above eps."""
     gradient = precision.tensor([[g, -g, g / 2, g] for g in GRADIENTS])
     # m / (1 - b1) = g and sqrt(v / (1 - b2)) = |g|: the step is rate g / (|g| + eps).
     wanted = [[-RATE * g / (abs(g) + EPS) for g in row] for row in gradient.double().tolist()]
@@ -91,7 +94,7 @@ def _adam_row(precision: Precision) -> Row:
 
 
 def _poison_row(precision: Precision) -> Row:
-    """Cells whose optical depth is NaN are looked into, where the loss finds the NaN; they are not taken for empty."""
+    """Check that cells with a NaN optical depth stay open, so that samples there carry the NaN into the loss."""
     start = time.perf_counter()
     grid = Occupancy(4, torch.device(precision.device))
     grid.optical_depth = precision.tensor([[[0.0, 1.0, math.nan, math.inf]] * 4] * 4)

@@ -15,7 +15,7 @@ from nerfcli.selftest import textbook
 from nerfcli.selftest.cases import FAR_SURFACE, MEANINGLESS, Group, Segments, groups, lit
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
-# In bfloat16 a sum of more terms than this has no digits left.
+# A bfloat16 sum of more terms than this has no correct digits.
 MOST_IN_BFLOAT16 = 16
 BACKGROUND = [1.0, 0.5, 0.25]
 COLOUR_GRADIENT = [1.0, 0.5, 0.25]
@@ -31,7 +31,7 @@ NERF = "1 - exp, cumulative product, 1 - sum of weights"
 
 @dataclass(frozen=True)
 class _Packed:
-    """Rays as the kernels take them."""
+    """Rays in the layout that the kernels expect."""
 
     density: Tensor
     rgb: Tensor
@@ -42,7 +42,7 @@ class _Packed:
 
 
 def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
-    """Rows of everything about light along rays."""
+    """Yield the rows of compositing and distortion."""
     for group in groups():
         answers = [_exact(ray) for ray in group.rays]
         for precision in precisions:
@@ -158,7 +158,7 @@ def _composite_errors(operation, rays, wanted, *, precision):  # type: ignore[no
 
 
 def _subtraction_rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
-    """The gradient behind an opaque interval, which a running sum from the front cannot give."""
+    """Measure the gradient behind an opaque interval, which is lost in colour minus a running sum from the front."""
     ray = Segments((2.0**-4,) * 64 + (32.0, 16.0, 8.0, 4.0), (2.0**-6,) * 64 + (1.0,) * 4)
     values = [(k % 5 + 1) / 8 for k in range(len(ray.density))]
     wanted = exact.composited(
@@ -203,7 +203,7 @@ def _subtraction_rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
 
 
 def _distortion_row(precision: Precision) -> Row:
-    """Light of a surface far away."""
+    """Measure the distortion of the light of a distant surface."""
     starts, ends, values = FAR_SURFACE.values()
     count = len(values)
     wanted, wanted_gradient = exact.distortion(values, starts, ends)
@@ -239,7 +239,7 @@ def _distortion_row(precision: Precision) -> Row:
 
 
 def _gradient_by_subtraction(density: Tensor, lengths: Tensor, values: Tensor, colour: Tensor) -> Tensor:
-    """d colour / d density of one ray: what lies behind a sample taken as the colour less the running sum."""
+    """Return d colour / d density of one ray, with the light behind a sample as the colour minus the running sum."""
     weights = textbook.weights_of_ray(density, lengths)
     after = torch.exp(-(density * lengths).cumsum(0))
     return lengths * (after * values - (colour - (weights * values).cumsum(0)))

@@ -1,4 +1,4 @@
-"""What is looked up: features between the vertices of hash grids, also in half precision, and pixels of many photos."""
+"""Hard cases of table look-ups: hash-grid features, also in half precision, and pixels of many photos."""
 
 import functools
 import itertools
@@ -26,14 +26,14 @@ from nerfcli.selftest.cases import (
 )
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
-# Samples in one cell of the grid, 256 of each: sums of gradients are far larger than any of their terms.
+# 16 samples in one grid cell, each repeated 256 times: gradient sums are far larger than any of their terms.
 CROWD: tuple[Point, ...] = tuple((0.5 + 2.0**-9 * (k % 8), 0.25, 0.125 * (1 + k // 8)) for k in range(16))
 CROWD_SIZE = 256
 HALF_GRIDS = (4, 16)
 
 
 def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
-    """Rows of everything that is looked up."""
+    """Yield the rows of all look-ups."""
     for precision in precisions:
         if precision.dtype == torch.bfloat16:
             yield _half_row(torch.bfloat16, precision.device)
@@ -46,7 +46,7 @@ def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
 
 @dataclass(frozen=True)
 class _Grids:
-    """Cells per axis of the levels, and whether places are rounded when they are counted in cells, 1 or 0."""
+    """Cells per axis of each level, and whether (1 or 0) scaling positions to cell units rounds them."""
 
     resolutions: tuple[int, ...]
     rounded: int
@@ -57,7 +57,7 @@ EXACT, FINE = _Grids(EXACT_GRIDS, 0), _Grids(FINE_GRIDS, 1)
 
 @dataclass(frozen=True)
 class _Encoded:
-    """Features, the gradient of the table, and what the rounding of each is proportional to."""
+    """Features and table gradient, each with the size to which its rounding error is proportional."""
 
     features: list[list[float]]
     features_size: list[list[float]]
@@ -66,7 +66,7 @@ class _Encoded:
 
 
 def _exact(points: tuple[Point, ...], grids: _Grids, *, times: int) -> _Encoded:
-    """Trilinear interpolation in fractions, and the gradient if every point comes a number of times."""
+    """Interpolate trilinearly in exact fractions; the gradient counts every point `times` times."""
     table = hash_table(len(grids.resolutions))
     largest = [max(abs(value) for row in level for value in row) for level in table]
     sums = [[[Fraction(0)] * 2 for _ in range(ROWS)] for _ in table]
@@ -93,7 +93,7 @@ def _exact(points: tuple[Point, ...], grids: _Grids, *, times: int) -> _Encoded:
 
 
 def _corners(point: Point, resolution: int) -> list[tuple[int, Fraction]]:
-    """The rows of the vertices around a point, and their weights."""
+    """Return the table row and the weight of each of the eight vertices around a point."""
     scaled = [min(max(Fraction(x), Fraction(0)), Fraction(1)) * resolution for x in point]
     cell = [min(math.floor(x), resolution - 1) for x in scaled]
     side, found = resolution + 1, []
@@ -115,7 +115,7 @@ def _errors(encoded: Tensor, gradient: Tensor | None, wanted: _Encoded, *, tiny:
 def _in_half(
     points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, half: torch.dtype
 ) -> tuple[Tensor, Tensor]:
-    """Features and gradient, all in half precision."""
+    """Return features and table gradient, both computed in half precision."""
     given = table.detach().to(half).requires_grad_()
     encoded = reference.hash_encode(points.to(half), given, resolutions)
     (encoded.view(len(points), -1, FEATURES) * torch.tensor(GAINS, dtype=half, device=points.device)).sum().backward()
@@ -151,7 +151,7 @@ def _encode_row(case: str, points: tuple[Point, ...], precision: Precision, *, g
 
 
 def _half_row(half: torch.dtype, device: str) -> Row:
-    """A table of half precision that learns through a float32 sink, as training does."""
+    """Measure a half-precision table whose gradients are summed in a float32 sink, as in training."""
     single = Precision("float32", torch.float32, device)
     grids = _Grids(HALF_GRIDS, 0)
     wanted = _exact(CROWD, grids, times=CROWD_SIZE)
@@ -177,20 +177,20 @@ def _half_row(half: torch.dtype, device: str) -> Row:
     )
 
 
-# Pixels in the first photo: from this number on, float32 does not tell neighbours apart.
+# Pixels in the first photo. From this number on, float32 cannot distinguish consecutive integers.
 MANY = 2**24
 
 
 @functools.cache
 def _photos() -> Tensor:
-    """The pixels of a photo of 16 megapixels, of one of one pixel and of one of six; black but for the last seven."""
+    """Return the pixels of three photos (16 megapixels, one pixel, six pixels); all but the last seven are black."""
     photos = torch.zeros(MANY + 7, 3, dtype=torch.uint8)
     photos[MANY:] = torch.arange(1, 22, dtype=torch.uint8).reshape(7, 3) * 12
     return photos
 
 
 def _pixel_row(precision: Precision) -> Row:
-    """First, last and only pixels of photos whose numbers go beyond 2^24."""
+    """Measure the rays of the first, last and only pixels of photos, with pixel numbers beyond 2^24."""
     chosen = torch.tensor([0, 7, MANY, MANY + 1, MANY + 3, MANY + 6])
     photo, place = (0, 0, 1, 2, 2, 2), (0, 7, 8, 9, 11, 14)
     first_pixel, first_bearing = torch.tensor([0, MANY, MANY + 1]), torch.tensor([0, 8, 9])

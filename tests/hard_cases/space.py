@@ -1,4 +1,4 @@
-"""Points and steps: contraction from its centre to infinity, world coordinates of 1e6, rays along axes, empty space."""
+"""Points and steps: contraction from the centre to infinity, world coordinates of 1e6, rays along axes, empty space."""
 
 import math
 import time
@@ -24,7 +24,7 @@ WORLD = 1e6
 
 
 def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
-    """Rows of everything about points and steps."""
+    """Yield the rows of all operations on points and steps."""
     for precision in precisions:
         if not precision.compiled:
             yield from _contraction_rows(precision)
@@ -35,7 +35,7 @@ def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
 
 
 def _contracted(point: tuple[float, ...]) -> tuple[list[float], list[float], list[float]]:
-    """The contracted point, the gradient of its product with GIVEN, and the size of that gradient's terms."""
+    """Return the contracted point, the gradient of its dot product with GIVEN, and the size of the gradient's terms."""
     norm = math.hypot(*point)
     if norm <= 1.0:
         return list(point), list(GIVEN), [1.0] * 3
@@ -98,7 +98,7 @@ def _contraction_rows(precision: Precision) -> Iterator[Row]:
 
 
 def _axis_row(precision: Precision) -> Row:
-    """Rays along axes through a full cube of side 2, some in the plane of its side and of its cells' borders."""
+    """Measure axis-parallel rays through a full cube of side 2, some in the plane of a side or of cell borders."""
     origins = [[-2.0, 0.25, 0.125], [0.25, 2.0, 0.0], [0.5, -0.5, -3.0], [-2.0, -1.0, 1.0], [0.0, 0.0, 0.0]]
     directions = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
     wanted = [2.0, 2.0, 2.0, 2.0, 1.0]  # the last starts in the middle
@@ -121,7 +121,7 @@ def _axis_row(precision: Precision) -> Row:
 
 
 def _empty_row(precision: Precision) -> Row:
-    """No cell is occupied: no samples, the background's colour, all light passes, no depth."""
+    """Measure rays without an occupied cell: no samples, the background colour, transmittance 1, undefined depth."""
     origins, directions = [[-2.0, 0.25, 0.125]] * 3, [[1.0, 0.0, 0.0]] * 3
     begin = time.perf_counter()
     starts, ends, offsets = _seen(origins, directions, precision=precision, full=False)
@@ -147,7 +147,7 @@ def _empty_row(precision: Precision) -> Row:
 def _seen(
     origins: list[list[float]], directions: list[list[float]], *, precision: Precision, full: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What is kept of rays cut into steps of 2^-7, in a bounded cube full of cells or without any."""
+    """Return starts, ends and offsets of the samples kept on rays cut into steps of 2^-7, in a full or empty cube."""
     side, levels = 16, 8
     make = torch.ones if full else torch.zeros
     module = precision.parts
@@ -161,7 +161,7 @@ def _seen(
 
 
 def _world_rows() -> Iterator[Row]:
-    """A scene of size 1 at 1e6 from the world's origin: the step of rays, 1.7e-3, in its training frame and without."""
+    """Measure ray steps of 1.7e-3 in a scene of size 1 at 1e6 from the origin, with and without a training frame."""
     centre = np.array([WORLD, -WORLD, WORLD])
     camera = Camera.pinhole(8, 6, 8.0)
     offset = np.array([0.25, 0.125, -0.5])

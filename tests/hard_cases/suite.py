@@ -1,4 +1,4 @@
-"""All rows, in all precisions of a machine."""
+"""All hard cases, in every precision that a machine supports."""
 
 from collections.abc import Callable, Iterator
 
@@ -10,7 +10,7 @@ from nerfcli.selftest.measure import Precision, Row
 
 
 def precisions(device: str) -> tuple[Precision, ...]:
-    """What can be tried on a device; the compiled kernels are the CPU's, and are tried wherever they work."""
+    """Return the precisions to test on a device, and the compiled CPU kernels where they work."""
     plain = tuple(
         Precision(name, dtype, device)
         for name, dtype in (("float64", torch.float64), ("float32", torch.float32), ("bfloat16", torch.bfloat16))
@@ -20,7 +20,7 @@ def precisions(device: str) -> tuple[Precision, ...]:
 
 
 def rows(device: str, notify: Callable[[str], None]) -> Iterator[Row]:
-    """Every row, one after the other as they are measured."""
+    """Yield every row as soon as it is measured."""
     kernels.prepare(notify)
     tried = precisions(device)
     yield from light.rows(tried)

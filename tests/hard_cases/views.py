@@ -20,7 +20,7 @@ NEAR_PI = (math.pi - 1e-3, math.pi - 1e-7, math.pi - 1e-12, math.pi)
 
 
 def rows() -> Iterator[Row]:
-    """Rows of everything about cameras, all in float64."""
+    """Yield the rows of all camera operations, in float64."""
     yield from _exp_rows()
     yield from _log_rows()
     yield from _lens_rows()
@@ -32,7 +32,7 @@ def _vectors(angles: tuple[float, ...]) -> np.ndarray:
 
 
 def _rodrigues(vector: np.ndarray, smallest_square: float = 0.0) -> np.ndarray:
-    """R = 1 + sin(a) / a W + (1 - cos a) / a^2 W^2 with 1 - cos as 2 sin^2(a / 2)."""
+    """Return R = 1 + sin(a) / a W + (1 - cos a) / a^2 W^2, with 1 - cos a as 2 sin^2(a / 2)."""
     square = max(float(vector @ vector), smallest_square)
     angle = math.sqrt(square)
     x, y, z = vector
@@ -49,7 +49,7 @@ def _exp_rows() -> Iterator[Row]:
         got = rigid.rotation_from_vector(vectors)
         seconds = time.perf_counter() - start
         clamped = np.array([_rodrigues(vector, 1e-4) for vector in vectors])
-        # Relative to the turn itself, not to the ones on the diagonal: what differs from the identity.
+        # Off-diagonal errors are relative to the angle, not to 1: those entries vanish with the rotation.
         sizes = np.maximum(np.linalg.norm(vectors, axis=1), TINY)[:, None, None]
 
         def error(rotations: np.ndarray, wanted: np.ndarray = wanted, sizes: np.ndarray = sizes) -> float:
@@ -99,7 +99,7 @@ def _log_rows() -> Iterator[Row]:
 
 
 def _around(found: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """How far apart they are as turns, where one goes the other way around."""
+    """Return the distance of rotation vectors if `found` turns the other way around; inf for angles up to 3."""
     angle = np.linalg.norm(found, axis=1, keepdims=True)
     other = found - 2 * math.pi * found / np.where(angle > 0, angle, 1.0)
     return np.where(angle[:, 0] > 3, np.linalg.norm(other - vectors, axis=1), np.inf)
@@ -115,11 +115,11 @@ def _log_by_acos(rotation: np.ndarray) -> np.ndarray:
 
 
 def _lens_rows() -> Iterator[Row]:
-    """A barrel lens, k1 = -0.3, that turns back at 46.5 degrees from the axis."""
+    """Measure a barrel lens, k1 = -0.3, whose radius stops growing at 46.5 degrees from the axis."""
     focal, k = 500.0, -0.3
     camera = Camera("OPENCV", 2000, 2000, (focal, focal, 1000.0, 1000.0, k, 0.0, 0.0, 0.0))
     turn = math.sqrt(-1 / (3 * k))
-    # Cubic by its trigonometric solution: r = rho + k rho^3.
+    # Distorted radii r = rho + k rho^3 of known rho, so that the inverse is known.
     inside = np.linspace(0.01, 0.999, 200) * turn
     images = inside * (1 + k * inside**2)
     start = time.perf_counter()
@@ -166,7 +166,7 @@ def _newton(images: np.ndarray, k: float) -> np.ndarray:
 
 
 def _fisheye_row() -> Row:
-    """An ideal fisheye: theta is the pixel's radius over the focal length, 60 to 179.9 degrees from the axis."""
+    """Measure an ideal fisheye (theta = pixel radius / focal length) at 60 to 179.9 degrees from the axis."""
     focal = 500.0
     camera = Camera("OPENCV_FISHEYE", 4000, 4000, (focal, focal, 2000.0, 2000.0, 0.0, 0.0, 0.0, 0.0))
     angles = np.radians([60.0, 89.0, 90.0, 90.0001, 91.0, 120.0, 150.0, 179.9])

@@ -1,4 +1,4 @@
-"""Line integrals through voxels, thin and thick, against closed forms in 60 digits, and against their transpose."""
+"""Line integrals through thin and thick voxels, against 60-digit closed forms and against their transpose."""
 
 import time
 from collections.abc import Iterator
@@ -11,13 +11,13 @@ from nerfcli.selftest import operations
 from nerfcli.selftest.cases import THICKNESSES, VOLUME_FIRST, VOXEL
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
-# Layers across x, of many sizes, that lines cross at slopes, far from the volume's other sides.
+# Number of layers along x, and the width in y and z, wide enough that sloped lines stay far from the sides.
 LAYERS, WIDE = 10, 33
 SLOPES = ((0.0, 0.0), (0.125, 0.0), (0.5, -0.25), (-0.75, 0.9375))
 
 
 def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
-    """Rows of everything about volumes."""
+    """Yield the rows of projection and back-projection."""
     for precision in precisions:
         if precision.dtype == torch.bfloat16:
             continue
@@ -27,7 +27,7 @@ def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
 
 
 def _slab_row(thickness: float, precision: Precision) -> Row:
-    """Layers of a value each, crossed at a slope (1, b, c): size sqrt(1 + b^2 + c^2) sum of values."""
+    """Measure lines along (1, b, c) through uniform layers: size sqrt(1 + b^2 + c^2) sum of values."""
     values = precision.tensor([thickness * (k + 1) / LAYERS**2 for k in range(LAYERS)])
     volume = values.expand(WIDE, WIDE, LAYERS).contiguous()
     directions = torch.tensor([(1.0, b, c) for b, c in SLOPES], dtype=torch.float64, device=precision.device)
@@ -54,7 +54,7 @@ def _slab_row(thickness: float, precision: Precision) -> Row:
 
 
 def _adjoint_row(thickness: float, precision: Precision) -> Row:
-    """<A x, y> = <x, A^T y>, by the two operations, both products in float64."""
+    """Measure <A x, y> = <x, A^T y> for `project` and `back_project`, with both products in float64."""
     given = operations.volume_inputs(thickness, precision)
     grid = {"first": VOLUME_FIRST, "size": VOXEL}
     lines = (given["origins"], given["directions"])

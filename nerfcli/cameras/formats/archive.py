@@ -2,7 +2,7 @@
 
 version                 1
 kind, unit              text
-unit_source             text, empty where the source of the scale is unknown; may be missing, as pixels may
+unit_source             text, empty if the source of the scale is unknown; may be missing, like pixels
 pixels                  text: "stored" or "upright", see `Capture`
 names                   (F,) text
 images, masks           (F,) text: paths relative to the file's folder; empty where a frame has none
@@ -33,7 +33,7 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.limits import plausible, stated_camera
+from nerfcli.cameras.formats.limits import checked_camera, plausible
 from nerfcli.cameras.formats.npy import array_from_npy
 from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.frame import Capture, Frame, Observations
@@ -47,7 +47,7 @@ _SPLITS = ("", "train", "val", "test")
 
 
 def losses_npz(capture: Capture) -> tuple[str, ...]:
-    """List what the file cannot hold of a capture: nothing."""
+    """List the parts of a capture that the file cannot hold: nothing."""
     return ()
 
 
@@ -183,7 +183,7 @@ class _Arrays:
         return array.astype(np.int64 if integer else np.float64)
 
     def texts(self, name: str, count: int | None = None) -> list[str]:
-        """Return the texts of this name; `count` of them if it is given."""
+        """Return the texts in the array of this name; there must be `count` of them if given."""
         array = self._array(name)
         if array.dtype.kind != "U" or array.ndim != 1 or (count is not None and len(array) != count):
             raise self.damaged(
@@ -192,12 +192,12 @@ class _Arrays:
         try:
             texts = array.tolist()
             "".join(texts).encode("utf-8")
-        except (ValueError, SystemError) as error:  # NumPy raises the second where a character is beyond Unicode's
+        except (ValueError, SystemError) as error:  # NumPy raises SystemError for a character beyond Unicode
             raise self.damaged(name, "invalid characters") from error
         return texts
 
     def text(self, name: str) -> str:
-        """Return the one text of this name."""
+        """Return the single text in the array of this name."""
         array = self._array(name)
         if array.dtype.kind != "U" or array.shape != ():
             raise self.damaged(name, f"{array.shape} values of type {array.dtype}, expected one text")
@@ -227,7 +227,7 @@ def _cameras(arrays: _Arrays) -> list[Camera]:
         length = int(np.argmax(np.isnan(row))) if np.isnan(row).any() else len(row)
         if not np.isnan(row[length:]).all():
             raise UserError(f"{where}: a parameter is NaN", _HINT)
-        cameras.append(stated_camera(model, width, height, tuple(row[:length].tolist()), where=where))
+        cameras.append(checked_camera(model, width, height, tuple(row[:length].tolist()), where=where))
     return cameras
 
 
@@ -272,9 +272,7 @@ def _observations(arrays: _Arrays, num_frames: int, *, num_points: int) -> Obser
 
 
 def _relative(path: Path | None, folder: Path) -> str:
-    """Return a path as seen from a folder, with forward slashes, or empty;
-    absolute where there is none (another drive).
-    """
+    """Return a path relative to a folder, with forward slashes; absolute if on another drive, empty for None."""
     if path is None:
         return ""
     try:

@@ -1,7 +1,7 @@
 """Blender captures of NeRF's synthetic scenes: transforms_train.json, transforms_val.json and transforms_test.json.
 
 Each file holds one horizontal field of view (camera_angle_x, radians) and the poses of its views; pixels are square,
-the principal point is the middle, and the picture's size is the one of the PNG file, whose suffix file_path leaves out.
+the principal point is the middle, and the picture's size is that of the PNG file, whose suffix file_path leaves out.
 Source: bmild/nerf load_blender.py.
 """
 
@@ -21,9 +21,9 @@ from nerfcli.cameras.formats.transforms import (
     SPLITS,
     Found,
     capture_on_disk,
+    check_unique_names,
     frames_on_disk,
     listed_frames,
-    refuse_twins,
     relative_path,
 )
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole
@@ -33,7 +33,7 @@ from nerfcli.errors import UserError
 
 
 def read_blender(folder: Path, measure: Measure) -> Capture:
-    """Read a Blender capture's views that are on disk, of train and test; val frames are left out.
+    """Read the train and test views of a Blender capture that are on disk; val views are left out.
 
     Raises:
         UserError: a file is malformed or lists no image that is on disk.
@@ -53,13 +53,13 @@ def read_blender(folder: Path, measure: Measure) -> Capture:
 
 
 def parse_blender(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
-    """Read all that the files of a Blender capture say: the views of all three splits that there are.
+    """Read all views of a Blender capture, from the file of every split that exists.
 
     Args:
         folder: holds at least one of the three files.
-        measure: tells an image's upright size and EXIF orientation: the files do not. An image that is not on disk has
-            the size of the other ones in its file.
-        images: where the images are, if not where the files say: under the paths that they list, or their last parts.
+        measure: returns an image's upright size and EXIF orientation, which the files do not give. An image that is not
+            on disk gets the size of the other images in its file.
+        images: folder of the images, if they are not where the files say: under the listed paths, or their last parts.
 
     Raises:
         UserError: a file is malformed or lists no image that is on disk, or there is no file.
@@ -72,15 +72,15 @@ def parse_blender(folder: Path, measure: Measure, *, images: Path | None = None)
             frames += [replace(frame, split=split) for frame in listed]
     if not frames:
         raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")
-    refuse_twins(folder, frames)
+    check_unique_names(folder, frames)
     return Capture(tuple(frames), np.zeros((0, 3)), (), None, "blender")
 
 
 def losses_blender(capture: Capture) -> tuple[str, ...]:
-    """List what Blender files cannot hold of a capture.
+    """List the parts of a capture that Blender files cannot hold.
 
-    They hold pictures' sizes only through the pictures, so that those of frames without an image are lost; frames
-    without a split go to train.
+    The files do not give picture sizes, so the size of a frame without an image is lost. Frames without a split go to
+    train.
     """
     sizes = sum(frame.image is None for frame in capture.frames)
     lost = lost_of_cameras(capture, lost_to_pinhole)
@@ -101,7 +101,7 @@ def write_blender(capture: Capture, folder: Path) -> None:
     Frames without a split are written to train. The angle of a file is the one that most of its frames have.
 
     Raises:
-        UserError: a spherical camera, the file of another split from before, or a place that cannot be written.
+        UserError: a spherical camera, an existing file of a split without frames, or a file that cannot be written.
     """
     spherical = [frame.name for frame in capture.frames if frame.camera.is_spherical]
     if spherical:
@@ -145,14 +145,14 @@ def _by_split(capture: Capture) -> dict[str, list[Frame]]:
 
 
 def _file_path(frame: Frame, folder: Path) -> str:
-    """Return the image's path as NeRF's own loader wants it: without .png, which it appends."""
+    """Return the image's path as NeRF's own loader expects it: without .png, which it appends."""
     path = PurePosixPath(relative_path(frame, folder))
     text = str(path.with_suffix("")) if path.suffix == ".png" else str(path)
     return text if text.startswith(("/", "../")) else f"./{text}"
 
 
 def _angle(frame: Frame) -> float:
-    """Return the horizontal angle between the edges of a picture whose principal point is its middle, radians."""
+    """Return the horizontal field of view of a frame in radians, as if its principal point were in the middle."""
     camera = frame.camera
     values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
     return 2 * math.atan(camera.width / 2 / values.get("fx", values.get("f", math.inf)))

@@ -4,7 +4,7 @@ A camera is a line "f k1 k2", three lines of a rotation R and one of t; its axes
 up). A point X appears, in pixels from the picture's middle with y upwards, at
     P = R X + t,  p = -(P_x, P_y)/P_z,  f (1 + k1 |p|^2 + k2 |p|^4) p
 so the principal point is the picture's middle, and (width/2, height/2) its top right corner. A point is a line with its
-place, one with its colour, and one with its views: how many, and of each the camera, a feature's key, and x y.
+position, one with its colour, and one with its views: the count, and for each the camera, a feature's key, and x y.
 Source: Noah Snavely, "Bundler v0.4 User's Manual", section "Output format and scene representation".
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from nerfcli.cameras import rigid
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats import lenses
-from nerfcli.cameras.formats.fields import filled_lines, malformed, name_of, numbers, read_text, refuse_twins
+from nerfcli.cameras.formats.fields import check_unique_names, content_lines, malformed, name_of, numbers, read_text
 from nerfcli.cameras.formats.photo_names import measured_sizes
 from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame, Observations
@@ -37,16 +37,16 @@ def parse_bundler(
 ) -> Capture:
     """Read the registered cameras, the points with their colours, and where the points were seen.
 
-    Cameras of focal length 0 are the ones that Bundler could not register; they are no frames. The file gives neither
-    the names nor the sizes of the photos: the names come from the list, the sizes from the photos, and those that are
-    not on disk are `missing`, together with what was seen in them.
+    Cameras of focal length 0 are those that Bundler could not register; they give no frames. The file gives neither
+    names nor sizes of the photos: names come from the list, and sizes from the photos. Photos that are not on disk are
+    `missing`, and their observations are left out.
 
     Args:
         path: the .out file.
-        measure: tells an image's upright size and EXIF orientation.
-        images: the folder that the names are relative to; by default the list's own.
-        image_list: the list of images; by default list.txt beside the file or in the folder above, or what COLMAP
-            writes beside X.bundle.out: X.list.txt.
+        measure: returns an image's upright size and EXIF orientation.
+        images: the folder that the names are relative to; by default the folder of the list.
+        image_list: the list of images; by default X.list.txt, which COLMAP writes beside X.bundle.out, or list.txt
+            beside the file or in the folder above.
 
     Raises:
         UserError: a file is damaged (file and line are named), or none of the photos is on disk.
@@ -60,7 +60,7 @@ def parse_bundler(
             str(path), f"has {num_cameras} cameras, but {image_list} has {len(names)} images", _LIST_EXPECTED
         )
     registered = [index for index in range(num_cameras) if numbers(*_line(lines, 1 + 5 * index, 3, path))[0] != 0]
-    refuse_twins((names[index] for index in registered), image_list if registered else path)
+    check_unique_names((names[index] for index in registered), image_list if registered else path)
     found, missing = measured_sizes([names[index] for index in registered], images or image_list.parent, measure, path)
     frames, middles = [], []
     index_of_camera = np.full(num_cameras, -1, dtype=np.int64)
@@ -83,11 +83,11 @@ def _lines(path: Path) -> list[Numbered]:
         raise malformed(str(path), "does not begin with # Bundle file", _EXPECTED)
     if not text.startswith(_HEADER):
         raise malformed(f"{path}: line 1", "is of an unsupported version of the format", _EXPECTED)
-    return filled_lines(text)
+    return content_lines(text)
 
 
 def _counts(lines: list[Numbered], path: Path) -> tuple[int, int]:
-    """Return the numbers of cameras and points, which the file must be long enough for."""
+    """Return the numbers of cameras and points, after checking that they match the number of lines."""
     words, count, where = _line(lines, 0, 2, path)
     cameras, points = numbers(words, count, where)
     if not (cameras >= 0 and points >= 0 and cameras == int(cameras) and points == int(points)):
@@ -102,7 +102,7 @@ def _counts(lines: list[Numbered], path: Path) -> tuple[int, int]:
 
 
 def _line(lines: list[Numbered], index: int, count: int, path: Path) -> tuple[list[str], int, str]:
-    """Return the words of a line, how many they should be, and its place: what `numbers` takes."""
+    """Return the words of a line, their expected number and the line's place: the arguments of `numbers`."""
     if index >= len(lines):
         raise malformed(str(path), "ends too early", "the file is cut off; copy it again")
     number, line = lines[index]
@@ -149,7 +149,7 @@ def _frame(name: str, lines: list[Numbered], size: tuple[int, int], image: Path,
 def _points(
     lines: list[Numbered], num_cameras: int, num_points: int, path: Path
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (N, 3), colours (N, 3) uint8, and a row (camera, point, x, y) for each view, (M, 4)."""
+    """Return points (N, 3), colours (N, 3) uint8, and a row (camera, point, x, y) for each view, (M, 4)."""
     points, colours = np.empty((num_points, 3)), np.empty((num_points, 3))
     views: list[float] = []
     owners: list[int] = []
@@ -174,7 +174,7 @@ def _points(
 
 
 def _observations(views: np.ndarray, index_of_camera: np.ndarray, middles: np.ndarray) -> Observations | None:
-    """Return the views in frames; y turns downwards and the origin moves to the top left corner."""
+    """Return the views of photos on disk, in pixels with y downwards and the origin at the top left corner."""
     if not len(views):
         return None
     frame_index = index_of_camera[views[:, 0].astype(np.int64)]

@@ -5,11 +5,11 @@
 
 Poses are world_from_cam with OpenGL axes. Focal lengths are (render_height / 2) / tan(fov / 2) for perspective and
 fisheye alike, with square pixels and the principal point in the middle; aspect is not used. nerfstudio's fisheye is the
-equidistant one, radius = focal length * angle, so that a fisheye's fov is not its field of view: 90 there is a picture
-114.6 degrees high. Keyframes are what the viewer's editor goes on from; only camera_path is rendered.
+equidistant one, radius = focal length * angle, so a fisheye's fov is not its field of view: with fov 90, a picture is
+114.6 degrees high. Keyframes are the state of the viewer's editor; only camera_path is rendered.
 
 The world of the viewer is nerfstudio's normalised one, in which it trains. `read_normalisation` reads the similarity to
-it from dataparser_transforms.json in the run's folder; its inverse brings a path home.
+it from dataparser_transforms.json in the run's folder; its inverse maps a path back to the scene.
 
 Sources: nerfstudio, cameras/camera_paths.py get_path_from_json; viewer/render_panel.py _write_json; cameras/cameras.py
 for the fisheye; data/dataparsers/base_dataparser.py save_dataparser_transform.
@@ -33,7 +33,7 @@ from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 
-# Larger pictures than this on a side are a damaged number.
+# A larger width or height is taken for a damaged number.
 _MOST_PIXELS = 65536
 
 _DEFAULT_FPS = 24.0
@@ -43,7 +43,7 @@ _MODELS = {"perspective": "PINHOLE", "fisheye": "OPENCV_FISHEYE", "equirectangul
 
 @dataclass(frozen=True)
 class CameraPath:
-    """The views of a path, in order, and how many of them are shown per second."""
+    """The views of a path, in order, and the number of frames per second."""
 
     frames: tuple[Frame, ...]
     fps: float
@@ -87,7 +87,7 @@ def parse_camera_path(path: Path) -> Capture:
 
 
 def losses_camera_path(capture: Capture) -> tuple[str, ...]:
-    """List what a camera path cannot hold of a capture, one clause each."""
+    """List the parts of a capture that a camera path cannot hold, one clause each."""
     frames = capture.frames
     kept = _common_cameras(frames)
     counts = {
@@ -117,10 +117,10 @@ def losses_camera_path(capture: Capture) -> tuple[str, ...]:
 def write_camera_path(capture: Capture, path: Path, *, fps: float = _DEFAULT_FPS) -> None:
     """Write the capture's views as a camera path, atomically; each one is a keyframe too, so that the viewer shows it.
 
-    Type of lens and picture size are the file's: those that most views have. See `losses_camera_path`.
+    The file has one type of lens and one picture size: those of most views. See `losses_camera_path`.
 
     Raises:
-        UserError: there is no view, or the place cannot be written.
+        UserError: there is no view, or the file cannot be written.
     """
     if not capture.frames:
         raise UserError(f"there are no views to write to {path}", "a camera path needs at least one view")
@@ -149,8 +149,8 @@ def write_camera_path(capture: Capture, path: Path, *, fps: float = _DEFAULT_FPS
 def read_normalisation(path: Path) -> Similarity:
     """Read the similarity nerfstudio_from_world in a run's dataparser_transforms.json: scale * (transform @ point).
 
-    The world is the one of the transforms.json that nerfstudio trained on, or where that has an applied_transform, the
-    one before it.
+    The world is that of the transforms.json that nerfstudio trained on, or if that file has an applied_transform, the
+    world before the transform.
 
     Raises:
         UserError: the file is malformed; file and field are named.
@@ -179,7 +179,7 @@ def _camera(record: dict[str, Any], kind: str, width: int, height: int, *, where
 
 
 def _pose(record: dict[str, Any], where: str) -> np.ndarray:
-    """`world_from_cam` (4, 4), OpenCV axes, exactly rigid."""
+    """Return `world_from_cam` (4, 4), OpenCV axes, exactly rigid."""
     where = f"{where}.camera_to_world"
     values = record.get("camera_to_world")
     if isinstance(values, list) and len(values) in (3, 4) and all(isinstance(row, list) for row in values):
@@ -196,7 +196,7 @@ def _pose(record: dict[str, Any], where: str) -> np.ndarray:
 
 
 def _matrix(values: list[Any], rows: int, where: str) -> np.ndarray:
-    """Return a matrix (rows, 4) of a flat list."""
+    """Return a matrix (rows, 4) from a flat list."""
     if len(values) != 4 * rows:
         raise UserError(f"{where} has {len(values)} numbers", f"expected {4 * rows} numbers, row by row")
     numbers = [_number({f"[{i}]": value}, f"[{i}]", where) for i, value in enumerate(values)]
@@ -218,7 +218,7 @@ def _pixels(content: dict[str, Any], key: str, path: Path) -> int:
 
 
 def _fps(content: dict[str, Any], count: int, path: Path) -> float:
-    """Frames per second: fps if it is there, or from seconds."""
+    """Return the frames per second: fps if given, else from seconds, else 24."""
     for key in ("fps", "seconds"):
         if content.get(key) is None:
             continue
@@ -235,14 +235,14 @@ def _short(value: Any) -> str:
 
 
 def _common_cameras(frames: Sequence[Frame]) -> tuple[Camera, ...]:
-    """Return what the format can hold of the frames' cameras: one type, one size, square pixels, no distortion."""
+    """Return the frames' cameras as the format can hold them: one type, one size, square pixels, no distortion."""
     if not frames:
         return ()
     kind = Counter(_kind(frame.camera) for frame in frames).most_common(1)[0][0]
     width, height = Counter(_size(frame.camera) for frame in frames).most_common(1)[0][0]
     kept = []
     for camera in (frame.camera for frame in frames):
-        # The field of view down the picture is what the format keeps, whatever the size.
+        # The format keeps the vertical field of view, whatever the picture's size.
         focal = camera.focal_px * height / camera.height
         params = (width, height) if kind == "equirectangular" else (focal, focal, width / 2, height / 2)
         kept.append(Camera(_MODELS[kind], width, height, params + (0.0,) * 4 * (kind == "fisheye")))

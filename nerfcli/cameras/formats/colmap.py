@@ -1,9 +1,9 @@
 """COLMAP models: cameras, images and points3D, as .bin or .txt.
 
-Read here and not through pycolmap.Reconstruction: on a truncated points3D.bin or frames.bin pycolmap 4.2.1 does not
-fail but loops for ever and fills the memory. The three files hold all that is needed. The rigs and frames of models of
-COLMAP 4 say which images were taken together by cameras on a rig; each image's own pose is in images.bin all the same,
-and pycolmap reads a model without those two files.
+They are read here and not through pycolmap.Reconstruction, because pycolmap 4.2.1 does not fail on a truncated
+points3D.bin or frames.bin: it loops forever and fills the memory. The three files hold all that is needed. The rigs and
+frames files of COLMAP 4 say which images were taken together by a camera rig, but each image's own pose is in
+images.bin, and pycolmap reads a model without those two files.
 Source: colmap.github.io/format.html; colmap src/colmap/scene/reconstruction_io_binary.cc.
 """
 
@@ -36,7 +36,7 @@ def read_colmap(model_dir: Path, image_dir: Path, measure: Measure) -> Capture:
     Args:
         model_dir: holds cameras, images and points3D, as .bin (which wins) or .txt.
         image_dir: image names are relative to it; they may contain subfolders.
-        measure: tells an image's upright size and EXIF orientation.
+        measure: returns an image's upright size and EXIF orientation.
 
     Raises:
         UserError: a file of the model is missing or damaged, or no image is on disk.
@@ -45,7 +45,7 @@ def read_colmap(model_dir: Path, image_dir: Path, measure: Measure) -> Capture:
 
 
 def colmap_on_disk(model: ColmapModel, image_dir: Path, measure: Measure, model_dir: Path) -> Capture:
-    """`read_colmap` of a model that was read from `model_dir` before."""
+    """Return `read_colmap` for a model that was already read from `model_dir`."""
     frames, missing, rescaled = [], [], []
     for image in model.images:
         path = image_dir / image.name
@@ -70,8 +70,8 @@ def colmap_on_disk(model: ColmapModel, image_dir: Path, measure: Measure, model_
 def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
     """Read a COLMAP model: cameras, poses, points with colours, and all 2D features.
 
-    Frames are in the order of their image ids, and those of one camera share its object. What no capture holds: the
-    ids themselves, the mean reprojection error of each point, and rigs.
+    Frames are in the order of their image ids, and frames of one camera share the camera object. A capture does not
+    hold the ids, the mean reprojection error of each point, or rigs.
 
     Args:
         model_dir: holds cameras, images and points3D, as .bin (which wins) or .txt.
@@ -91,7 +91,7 @@ def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
 
 
 def read_model(model_dir: Path) -> ColmapModel:
-    """Read a COLMAP model as its files hold it, whatever pictures are on disk; images in the order of their names.
+    """Read a COLMAP model as its files hold it, whether or not pictures are on disk; images are sorted by name.
 
     Raises:
         UserError: a file is missing, truncated or inconsistent; the file is named.
@@ -119,8 +119,9 @@ def read_model(model_dir: Path) -> ColmapModel:
 
 
 def read_cameras(path: Path) -> tuple[dict[int, Camera], dict[str, int]]:
-    """Read the cameras of a cameras.bin or cameras.txt by their ids, and the ids by the names of the images, which are
-    known where the model's file of images is beside it.
+    """Read the cameras of a cameras.bin or cameras.txt by id, and the camera ids by image name.
+
+    Image names are known only if the model's images file is beside it.
 
     Raises:
         UserError: a file is not readable, truncated or inconsistent; the file is named.
@@ -150,7 +151,7 @@ def _file(model_dir: Path, name: str) -> Path:
 
 
 def _parse(path: Path, reader: Callable[[bytes], T]) -> T:
-    """Read what `reader` makes of a file's bytes, with damage reported as one error that names the file."""
+    """Parse a file's bytes with `reader`, reporting any damage as one error that names the file."""
     try:
         data = path.read_bytes()
     except OSError as error:

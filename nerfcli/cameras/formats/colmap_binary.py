@@ -1,6 +1,6 @@
 """The binary files of a COLMAP model: cameras.bin, images.bin and points3D.bin, little endian.
 
-Lengths that a file announces are checked against its size before anything of that length is made, and features and
+Lengths given in a file are checked against its size before anything of that length is allocated, and features and
 points are read and written as whole arrays. Source: colmap.github.io/format.html; colmap
 src/colmap/scene/reconstruction_io_binary.cc.
 """
@@ -12,7 +12,7 @@ import pycolmap
 
 from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.formats.colmap_model import ColmapImage, ColmapModel, images_of_parts, pose_rows, tracks
-from nerfcli.cameras.formats.limits import plausible, stated_camera
+from nerfcli.cameras.formats.limits import checked_camera, plausible
 
 _FEATURE = np.dtype([("pixel", "<f8", 2), ("point_id", "<i8")])
 _POINT = np.dtype(
@@ -20,12 +20,12 @@ _POINT = np.dtype(
 )  # packed: 51 bytes
 _TRACK_BYTES = 8  # image id and index of the feature
 
-# What COLMAP writes where the reprojection error of a point was not measured.
+# COLMAP's value for the reprojection error of a point if it was not measured.
 _NO_ERROR = -1.0
 
 
 def cameras_from_bytes(data: bytes) -> dict[int, Camera]:
-    """Cameras by id. Raises ValueError, struct.error or UserError where the bytes are damaged."""
+    """Return the cameras by id. Raises ValueError, struct.error or UserError where the bytes are damaged."""
     cameras, offset = {}, 8
     for _ in range(_count(data, 24)):
         camera_id, model_id, width, height = struct.unpack_from("<IiQQ", data, offset)
@@ -34,7 +34,7 @@ def cameras_from_bytes(data: bytes) -> dict[int, Camera]:
         params = struct.unpack_from(f"<{num_params}d", data, offset + 24)
         if camera_id in cameras:
             raise ValueError(f"two cameras have the id {camera_id}")
-        cameras[camera_id] = stated_camera(model, width, height, params, where=f"camera {camera_id}")
+        cameras[camera_id] = checked_camera(model, width, height, params, where=f"camera {camera_id}")
         offset += 24 + 8 * num_params
     _at_end(data, offset)
     return cameras
@@ -64,9 +64,9 @@ def images_from_bytes(data: bytes) -> list[ColmapImage]:
 
 
 def points_from_bytes(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ids (N,), positions (N, 3) and colours (N, 3). Raises ValueError or struct.error where the bytes are damaged.
+    """Return ids (N,), positions (N, 3) and colours (N, 3). Raises ValueError or struct.error if bytes are damaged.
 
-    The tracks are stepped over: the images list the same observations.
+    The tracks are skipped, since the images list the same observations.
     """
     count, offset = _count(data, _POINT.itemsize), 8
     offsets = np.empty(count, dtype=np.int64)
@@ -137,7 +137,7 @@ def _scatter(body: np.ndarray, offsets: np.ndarray, records: np.ndarray) -> None
 
 
 def _count(data: bytes, least_bytes: int) -> int:
-    """Return the number of records that a file announces, if it is long enough to hold them."""
+    """Return the number of records given in a file, if the file is long enough to hold them."""
     (count,) = struct.unpack_from("<Q", data, 0)
     if count * least_bytes > len(data) - 8:
         raise ValueError(f"it announces {count} records, but has {len(data)} bytes")
@@ -145,6 +145,6 @@ def _count(data: bytes, least_bytes: int) -> int:
 
 
 def _at_end(data: bytes, offset: int) -> None:
-    """Refuse bytes after the last record: the count at the beginning is not the one of the records."""
+    """Raise if there are bytes after the last record, so that the count at the beginning must be wrong."""
     if offset != len(data):
         raise ValueError(f"its records end at byte {offset}, but it has {len(data)} bytes")

@@ -1,4 +1,4 @@
-"""A COLMAP model in memory, as its files hold it, and the way between it and a capture."""
+"""A COLMAP model in memory, as its files hold it, and conversions between it and a capture."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.limits import plausible
 from nerfcli.cameras.frame import Capture, Frame, Observations
 
-# The id of a feature's point where it has none: the largest number of 64 bits in the file, which is -1 with a sign.
+# Point id of a feature without a point: in the file, the largest unsigned 64-bit number, which is -1 if signed.
 NO_POINT = -1
 
 
@@ -65,12 +65,12 @@ def images_of_parts(
     """Return the images of a file, from lists with one item per image.
 
     Args:
-        image_ids, names, camera_ids: of the images.
+        image_ids, names, camera_ids: one per image.
         cam_from_world: (images, 7) quaternions wxyz and translations.
         features: pixels (F, 2) and ids of their points (F,), per image.
 
     Raises:
-        ValueError: a number makes no sense; its image is named.
+        ValueError: a number is invalid, in which case its image is named, or two images have the same id.
     """
     if len(set(image_ids)) < len(image_ids):
         raise ValueError("two images have the same id")
@@ -99,12 +99,12 @@ def images_of_parts(
 def capture_of(model: ColmapModel, image_dir: Path | None) -> Capture:
     """Convert a model to a capture, with frames ordered by image id.
 
-    Cameras stay shared: frames of one camera id hold the same object. Where the model has no points at all (some people
-    empty that file), features have no point. COLMAP leaves points black until it has looked up their colours, so where
-    all are black there are no colours.
+    Cameras stay shared: frames of one camera id hold the same object. If the model has no points at all (some people
+    empty that file), features have no point. COLMAP leaves points black until it has looked up their colours, so if all
+    are black, the capture has no colours.
 
     Args:
-        model: to be described.
+        model: the model to convert.
         image_dir: the folder of the photos, if it is known.
 
     Raises:
@@ -134,7 +134,7 @@ def capture_of(model: ColmapModel, image_dir: Path | None) -> Capture:
 
 
 def model_of(capture: Capture) -> ColmapModel:
-    """Return the model that holds a capture: ids count from 1, and equal cameras have one id."""
+    """Convert a capture to a model; ids count from 1, and equal cameras share one id."""
     camera_ids: dict[Camera, int] = {}
     for frame in capture.frames:
         camera_ids.setdefault(frame.camera, len(camera_ids) + 1)
@@ -168,7 +168,7 @@ def model_of(capture: Capture) -> ColmapModel:
 
 
 def pose_rows(model: ColmapModel) -> np.ndarray:
-    """`cam_from_world` of the images as COLMAP writes it: (images, 7) quaternions wxyz and translations."""
+    """Return `cam_from_world` of the images as COLMAP writes it: (images, 7) quaternions wxyz and translations."""
     poses = np.array([image.world_from_cam for image in model.images]).reshape(-1, 4, 4)
     cam_from_world = rigid.inverse(poses)
     quaternions = rigid.quaternion_from_rotation(cam_from_world[:, :3, :3])
@@ -180,7 +180,7 @@ def tracks(model: ColmapModel) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         elements (M, 2) uint32: image id and index of the feature in that image, point after point; lengths (N,) int64:
-        how many of them belong to each point.
+        the number of elements of each point.
     """
     counts = [len(image.point_ids) for image in model.images]
     image_ids = np.repeat([image.image_id for image in model.images], counts)
@@ -195,7 +195,7 @@ def tracks(model: ColmapModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _point_index(ids: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return where the ids (M,) stand in `known` (N,); -1 for `NO_POINT`, and everywhere if nothing is known."""
+    """Return the index of each id (M,) in `known` (N,); -1 for `NO_POINT`, and for all ids if `known` is empty."""
     if not len(known):
         return np.full(len(ids), -1, dtype=np.int64)
     order = np.argsort(known, kind="stable")

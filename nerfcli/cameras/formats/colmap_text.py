@@ -9,14 +9,14 @@ import numpy as np
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.colmap_model import ColmapImage, ColmapModel, images_of_parts, pose_rows, tracks
-from nerfcli.cameras.formats.limits import plausible, stated_camera
+from nerfcli.cameras.formats.limits import checked_camera, plausible
 
-# Ids have 32 bits, of points 64, of which float64 holds 53 exactly.
+# Ids have 32 bits, those of points 64, of which float64 holds 53 exactly.
 _MOST_ID = 2**53
 
 
 def cameras_from_text(data: bytes) -> dict[int, Camera]:
-    """Cameras by id. Raises ValueError or UserError where a line is damaged."""
+    """Return the cameras by id. Raises ValueError or UserError where a line is damaged."""
     cameras = {}
     for line in _filled(_lines(data)):
         camera_id, model, width, height, *params = line.split()
@@ -24,7 +24,7 @@ def cameras_from_text(data: bytes) -> dict[int, Camera]:
         if int(camera_id) in cameras:
             raise ValueError(f"two cameras have the id {camera_id}")
         values = tuple(float(value) for value in params)
-        cameras[int(camera_id)] = stated_camera(model, int(width), int(height), values, where=where)
+        cameras[int(camera_id)] = checked_camera(model, int(width), int(height), values, where=where)
     return cameras
 
 
@@ -36,7 +36,7 @@ def images_from_text(data: bytes) -> list[ColmapImage]:
         if not line.strip() or line.startswith("#"):
             continue
         image_id, *pose, camera_id, name = line.strip().split(maxsplit=9)
-        # The line after an image's lists its features; it may be empty, and at the end of the file it may be missing.
+        # The line after an image's line lists its features; it may be empty, or missing at the end of the file.
         if len(pose) != 7:
             raise ValueError(f"the line of image {name} has {len(pose) + 3} words, expected 10")
         values = np.fromiter(map(float, next(lines, "").split()), dtype=np.float64)
@@ -53,7 +53,7 @@ def images_from_text(data: bytes) -> list[ColmapImage]:
 
 
 def points_from_text(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ids (N,), positions (N, 3) and colours (N, 3). Raises ValueError where a line is damaged."""
+    """Return ids (N,), positions (N, 3) and colours (N, 3). Raises ValueError where a line is damaged."""
     lines = _filled(_lines(data))
     rows = [list(map(float, line.split(maxsplit=8)[:8])) for line in lines]
     if any(len(row) < 8 for row in rows):
@@ -95,7 +95,7 @@ def images_to_text(model: ColmapModel) -> bytes:
 
 
 def points_to_text(model: ColmapModel) -> bytes:
-    """Return the bytes of points3D.txt; the tracks are those of the images' features, and errors -1: not measured."""
+    """Return the bytes of points3D.txt; the tracks are those of the images' features, and errors -1 (not measured)."""
     elements, lengths = tracks(model)
     words = list(map(str, elements.ravel().tolist()))
     ends = (2 * np.cumsum(lengths)).tolist()

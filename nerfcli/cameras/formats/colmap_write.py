@@ -1,4 +1,4 @@
-"""Writing COLMAP models, binary or text: the three files that every version of COLMAP and its friends read.
+"""Writing COLMAP models, binary or text: the three files that every version of COLMAP and related programs read.
 
 pycolmap 4.2.1 reads a model without rigs and frames and makes a rig of each camera.
 """
@@ -13,19 +13,19 @@ from nerfcli.cameras.formats.unsupported import lost_parts
 from nerfcli.cameras.frame import Capture
 from nerfcli.errors import UserError
 
-# Models are replaced as a whole: beside another model's files the new ones would lie.
+# Models are replaced as a whole: new files would be wrong together with remaining files of another model.
 _MODEL_FILES = {
     f"{name}{end}" for name in ("cameras", "images", "points3D", "rigs", "frames") for end in (".bin", ".txt")
 }
 
 
 def losses_colmap(capture: Capture) -> tuple[str, ...]:
-    """List what a binary COLMAP model cannot hold of a capture."""
+    """List the parts of a capture that a binary COLMAP model cannot hold."""
     return tuple(lost_parts(capture, holds=("points", "colours", "observations")))
 
 
 def losses_colmap_text(capture: Capture) -> tuple[str, ...]:
-    """List what a COLMAP text model cannot hold of a capture: COLMAP truncates names at their first space."""
+    """List the parts of a capture that a COLMAP text model cannot hold: COLMAP truncates names at their first space."""
     spaced = sum(" " in frame.name for frame in capture.frames)
     names = [f"{spaced} names with spaces (COLMAP truncates them at the first space)"] if spaced else []
     return (*losses_colmap(capture), *names)
@@ -35,7 +35,7 @@ def write_colmap_binary(capture: Capture, path: Path) -> None:
     """Write a capture as cameras.bin, images.bin and points3D.bin into the folder `path`, all or none.
 
     Ids count from 1 in the order of the frames, equal cameras have one id, points without colours are black and their
-    reprojection errors -1 (not measured), as COLMAP has it.
+    reprojection errors -1 (not measured), as in COLMAP.
 
     Raises:
         UserError: a name that the files cannot hold, or a folder that cannot be written or holds other files.
@@ -57,7 +57,7 @@ def write_colmap_binary(capture: Capture, path: Path) -> None:
 def write_colmap_text(capture: Capture, path: Path) -> None:
     """Write a capture as cameras.txt, images.txt and points3D.txt into the folder `path`, all or none.
 
-    As `write_colmap_binary`; numbers have all their digits.
+    As `write_colmap_binary`; numbers are written with full precision.
 
     Raises:
         UserError: a name that the files cannot hold, or a folder that cannot be written or holds other files.

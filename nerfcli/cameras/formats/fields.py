@@ -1,4 +1,4 @@
-"""Numbers and texts out of files that may be damaged: whatever is wrong becomes one error that names file and field.
+"""Read numbers and texts from files that may be damaged; every problem is one error that names file and field.
 
 `where` is always the file and the place in it, such as "poses.txt: line 3"; it begins the message.
 """
@@ -23,7 +23,7 @@ def malformed(where: str, what: str, hint: str) -> UserError:
 
 
 def shown(value: Any) -> str:
-    """Return a value as a message can show it: on one line and not longer than 60 characters."""
+    """Return a value as text for a message: on one line and at most 60 characters long."""
     text = repr(value) if not isinstance(value, dict | list) else f"a {type(value).__name__} of {len(value)}"
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -32,7 +32,7 @@ def read_text(path: Path, expected: str) -> str:
     """Read the text of a file in UTF-8, with or without a byte order mark.
 
     Raises:
-        UserError: the file is not there, not readable, or no text; `expected` says what it should have been.
+        UserError: the file is missing, not readable, or not text; `expected` says what it should have been.
     """
     try:
         return path.read_text(encoding="utf-8-sig")
@@ -46,7 +46,7 @@ def read_json(path: Path, expected: str) -> Any:
     """Read the value that a JSON file holds.
 
     Raises:
-        UserError: as for `read_text`, or the text is no JSON, or is nested deeper than any file of cameras.
+        UserError: as for `read_text`, or the text is not JSON, or is too deeply nested.
     """
     text = read_text(path, expected)
     try:
@@ -54,7 +54,7 @@ def read_json(path: Path, expected: str) -> Any:
     except json.JSONDecodeError as error:
         what = f"not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}"
         raise malformed(str(path), what, "the file is truncated or was edited by hand; write it again") from error
-    except (ValueError, RecursionError) as error:  # a number of thousands of digits; brackets in brackets in brackets
+    except (ValueError, RecursionError) as error:  # a number with thousands of digits; too deep nesting
         raise malformed(str(path), f"not valid JSON: {error}", expected) from error
 
 
@@ -62,13 +62,13 @@ def read_json_object(path: Path) -> dict[str, Any]:
     """Read the JSON object in a file.
 
     Raises:
-        UserError: the file cannot be read, is no JSON, or holds something else than an object.
+        UserError: the file cannot be read, is not JSON, or does not hold an object.
     """
     return record_of(read_json(path, "expected a JSON file"), str(path))
 
 
-def filled_lines(text: str) -> list[tuple[int, str]]:
-    """Line numbers, from 1, and lines without the empty ones and the comments (#)."""
+def content_lines(text: str) -> list[tuple[int, str]]:
+    """Return the lines that are neither empty nor comments (#), with their line numbers from 1."""
     lines = enumerate(text.splitlines(), start=1)
     return [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
 
@@ -77,7 +77,7 @@ def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
     """Return the numbers of a line of text.
 
     Raises:
-        UserError: there are more or fewer than `count`, or one of them is no finite number.
+        UserError: there are more or fewer than `count`, or one of them is not a finite number.
     """
     if len(words) != count:
         raise malformed(where, f"has {len(words)} numbers", f"expected {count}")
@@ -95,7 +95,7 @@ def record_of(value: Any, where: str) -> dict[str, Any]:
     """Return a JSON object.
 
     Raises:
-        UserError: the value is something else.
+        UserError: the value is not a JSON object.
     """
     if not isinstance(value, dict):
         raise malformed(where, f"is {shown(value)}", "expected a JSON object {...}")
@@ -106,7 +106,7 @@ def number(record: dict[str, Any], key: str, where: str, *, default: float | Non
     """Return a number of a JSON object, or `default` where the key is absent.
 
     Raises:
-        UserError: the key is absent and there is no default, or its value is no finite number.
+        UserError: the key is absent and there is no default, or its value is not a finite number.
     """
     value = record.get(key, default)
     if not _is_number(value):
@@ -120,7 +120,7 @@ def vector(record: dict[str, Any], key: str, count: int, where: str) -> np.ndarr
     """Return a list of `count` numbers of a JSON object, as float64.
 
     Raises:
-        UserError: the key is absent or holds something else.
+        UserError: the key is absent, or its value is not such a list.
     """
     value = record.get(key)
     if not isinstance(value, list) or len(value) != count or not all(map(_is_number, value)):
@@ -130,10 +130,10 @@ def vector(record: dict[str, Any], key: str, count: int, where: str) -> np.ndarr
 
 
 def size_of(width: float, height: float, where: str) -> tuple[int, int]:
-    """Width and height of a picture as whole pixels.
+    """Return the width and height of a picture as integers.
 
     Raises:
-        UserError: one of them is no whole number from 1 to the largest picture there is.
+        UserError: one of them is not a whole number from 1 to `MOST_PIXELS`.
     """
     if not all(1 <= side <= MOST_PIXELS and side == int(side) for side in (width, height)):
         what = f"width and height are {shown(width)} and {shown(height)}"
@@ -145,14 +145,14 @@ def name_of(value: Any, where: str) -> str:
     """Return the name of an image, with forward slashes.
 
     Raises:
-        UserError: no text, an empty one, or one that no file can have as its name.
+        UserError: the value is not text, is empty, or cannot be the name of a file.
     """
     if not isinstance(value, str) or not value.strip() or len(value) > _LONGEST_NAME or not _is_plain(value):
         raise malformed(where, f"the image's name is {shown(value)}", "expected the image's path as text")
     return value.strip().replace("\\", "/")
 
 
-def refuse_twins(names: Iterable[str], path: Path) -> None:
+def check_unique_names(names: Iterable[str], path: Path) -> None:
     """Check that no two frames have the same name.
 
     Raises:
@@ -172,7 +172,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_plain(text: str) -> bool:
-    """Return whether a text has no control characters and no halves of characters (a lone surrogate from JSON)."""
+    """Return whether a text has no control characters and no lone surrogates, which JSON may contain."""
     return not any(ord(char) < 32 or ord(char) == 127 or 0xD800 <= ord(char) <= 0xDFFF for char in text)
 
 

@@ -1,11 +1,11 @@
-"""The COLMAP camera model that holds a lens as other programs describe it, with as few parameters as it needs.
+"""Convert lenses as other programs describe them to COLMAP's camera models, with as few parameters as needed.
 
-Letters: focal lengths fx, fy and principal point cx, cy in pixels; k radial, p tangential, in OpenCV's order.
+Notation: focal lengths fx, fy and principal point cx, cy in pixels; k radial, p tangential, in OpenCV's order.
 """
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import malformed
-from nerfcli.cameras.formats.limits import stated_camera
+from nerfcli.cameras.formats.limits import checked_camera
 
 Pair = tuple[float, float]
 
@@ -26,22 +26,22 @@ def brown_camera(
         v = fy (y (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p2 x y + p1 (r^2 + 2 y^2)) + cy
 
     Raises:
-        UserError: numbers that make no camera; `where` is named.
+        UserError: invalid parameters of a camera; `where` is named.
 
     Source: docs.opencv.org, "Camera Calibration and 3D Reconstruction".
     """
     k1, k2, k3 = radial
     if k3:
-        return stated_camera(
+        return checked_camera(
             "FULL_OPENCV", *size, (*focal, *centre, k1, k2, *tangential, k3, 0.0, 0.0, 0.0), where=where
         )
     if any(tangential) or (focal[0] != focal[1] and (k1 or k2)):
-        return stated_camera("OPENCV", *size, (*focal, *centre, k1, k2, *tangential), where=where)
+        return checked_camera("OPENCV", *size, (*focal, *centre, k1, k2, *tangential), where=where)
     if k2:
-        return stated_camera("RADIAL", *size, (focal[0], *centre, k1, k2), where=where)
+        return checked_camera("RADIAL", *size, (focal[0], *centre, k1, k2), where=where)
     if k1:
-        return stated_camera("SIMPLE_RADIAL", *size, (focal[0], *centre, k1), where=where)
-    return stated_camera("PINHOLE", *size, (*focal, *centre), where=where)
+        return checked_camera("SIMPLE_RADIAL", *size, (focal[0], *centre, k1), where=where)
+    return checked_camera("PINHOLE", *size, (*focal, *centre), where=where)
 
 
 def fisheye_camera(
@@ -61,14 +61,14 @@ def fisheye_camera(
         v = fy (y (1 + k1 r^2 + ... + k4 r^8) + 2 p2 x y + p1 (r^2 + 2 y^2) + sy r^2) + cy
 
     Raises:
-        UserError: numbers that make no camera; `where` is named.
+        UserError: invalid parameters of a camera; `where` is named.
 
     Source: docs.opencv.org, "Fisheye camera model"; COLMAP src/colmap/sensor/models.h, ThinPrismFisheyeCameraModel.
     """
     if any(tangential) or any(prism):
         params = (*focal, *centre, *radial[:2], *tangential, *radial[2:], *prism)
-        return stated_camera("THIN_PRISM_FISHEYE", *size, params, where=where)
-    return stated_camera("OPENCV_FISHEYE", *size, (*focal, *centre, *radial), where=where)
+        return checked_camera("THIN_PRISM_FISHEYE", *size, params, where=where)
+    return checked_camera("OPENCV_FISHEYE", *size, (*focal, *centre, *radial), where=where)
 
 
 def long_fisheye_camera(
@@ -77,17 +77,17 @@ def long_fisheye_camera(
     """Create a camera like `fisheye_camera`, with six radial terms up to k6 r^12 and no other.
 
     Raises:
-        UserError: numbers that make no camera; `where` is named.
+        UserError: invalid parameters of a camera; `where` is named.
     """
     params = (*focal, *centre, *radial, *(0.0,) * 6)
-    return stated_camera("RAD_TAN_THIN_PRISM_FISHEYE", *size, params, where=where)
+    return checked_camera("RAD_TAN_THIN_PRISM_FISHEYE", *size, params, where=where)
 
 
 def spherical_camera(size: tuple[int, int], where: str) -> Camera:
-    """Return the camera of a panorama of the whole sphere: longitude and latitude on equally long pixels.
+    """Return the camera of a panorama of the whole sphere: pixels are equal steps of longitude and latitude.
 
     Raises:
-        UserError: the picture is not twice as wide as high, so that it shows something else.
+        UserError: the picture is not twice as wide as high, so it cannot show the whole sphere.
     """
     if abs(size[0] - 2 * size[1]) > 1:
         raise malformed(
@@ -95,4 +95,4 @@ def spherical_camera(size: tuple[int, int], where: str) -> Camera:
             f"invalid size of a spherical picture: {size[0]}x{size[1]} pixels",
             "its width must be twice its height",
         )
-    return stated_camera("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), where=where)
+    return checked_camera("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), where=where)

@@ -1,11 +1,11 @@
-"""The numbers that captures hold: what lies beyond is damage, however well the file parses."""
+"""Limits of the numbers in captures: anything beyond is damage, even if the file parses."""
 
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.errors import UserError
 
-# Positions and depths in scene units. Beyond, float64 cannot tell a millimetre from none, even in UTM coordinates.
+# Positions and depths in scene units. Beyond this, float64 cannot resolve a millimetre, even in UTM coordinates.
 MOST_UNITS = 1e12
 
 # Width and height; the largest stitched pictures have a million.
@@ -20,11 +20,11 @@ def plausible(positions: np.ndarray) -> np.ndarray:
     return np.asarray((np.abs(positions) < MOST_UNITS).all(axis=-1))  # False at NaN
 
 
-def stated_camera(model: str, width: int, height: int, params: tuple[float, ...], *, where: str) -> Camera:
-    """Return the camera that a file states.
+def checked_camera(model: str, width: int, height: int, params: tuple[float, ...], *, where: str) -> Camera:
+    """Return the camera given by a file, if its numbers are valid and within the limits.
 
     Raises:
-        UserError: it makes no camera, or one of a size or with a number that no camera has; `where` opens the message.
+        UserError: a size or parameter is invalid or beyond its limit; the message begins with `where`.
     """
     if max(width, height) > MOST_PIXELS:
         raise UserError(

@@ -15,7 +15,7 @@ from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
-from nerfcli.cameras.formats.limits import plausible, stated_camera
+from nerfcli.cameras.formats.limits import checked_camera, plausible
 from nerfcli.cameras.formats.npy import array_from_npy
 from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole
@@ -26,7 +26,7 @@ from nerfcli.errors import UserError
 FILE = "poses_bounds.npy"
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 
-# Between which percentiles of the depths of its points a view's scene lies. Source: pose_utils.py, save_poses.
+# Percentiles of the depths of a view's points that give its depth bounds. Source: pose_utils.py, save_poses.
 _NEAR_PERCENT, _FAR_PERCENT = 0.1, 99.9
 
 
@@ -35,8 +35,8 @@ def read_llff(folder: Path, measure: Measure, list_images: Callable[[Path], list
 
     Args:
         folder: holds poses_bounds.npy.
-        measure: tells an image's upright size and EXIF orientation.
-        list_images: the image files of a folder, sorted by name.
+        measure: returns an image's upright size and EXIF orientation.
+        list_images: returns the image files of a folder, sorted by name.
 
     Raises:
         UserError: the array is damaged or of another shape, or no image folder has as many images as it has rows.
@@ -56,12 +56,12 @@ def read_llff(folder: Path, measure: Measure, list_images: Callable[[Path], list
 def parse_llff(folder: Path, list_images: Callable[[Path], list[Path]]) -> Capture:
     """Read poses_bounds.npy; cameras are for the full-size photos.
 
-    The file names no photos. They are those of the first image folder that holds one per row; where there is no image
-    folder at all, frames are named image000, image001, ... and have no image.
+    The file does not name the photos. They are those of the first image folder that holds one per row. If there is no
+    image folder at all, frames are named image000, image001, ... and have no image.
 
     Args:
         folder: holds poses_bounds.npy.
-        list_images: the image files of a folder, sorted by name.
+        list_images: returns the image files of a folder, sorted by name.
 
     Raises:
         UserError: the array is damaged or of another shape, or image folders hold other numbers of images.
@@ -79,10 +79,10 @@ def parse_llff(folder: Path, list_images: Callable[[Path], list[Path]]) -> Captu
 
 
 def losses_llff(capture: Capture) -> tuple[str, ...]:
-    """List what poses_bounds.npy cannot hold of a capture.
+    """List the parts of a capture that poses_bounds.npy cannot hold.
 
-    The order of the photos' file names stands for their names, so these are lost only where that order does not tell
-    them apart: where photos are in more than one folder.
+    Photos are identified by the order of their file names, so names are lost only if that order is ambiguous: if the
+    photos are in more than one folder.
     """
     folders = {Path(frame.name).parent for frame in capture.frames}
     names = [f"the photos' {len(folders)} folders"] if len(folders) > 1 else []
@@ -95,10 +95,10 @@ def write_llff(capture: Capture, folder: Path) -> None:
 
     Depth bounds are the capture's own. Where it has none, they are the 0.1th and 99.9th percentile of the depths of the
     points that a view observes, or if there are no observations, of those that lie within its picture. A view without
-    two such depths gets the widest bounds of the other ones. Of two focal lengths the horizontal one is written.
+    two such depths gets the widest bounds of the other views. The horizontal focal length is written.
 
     Raises:
-        UserError: neither depth bounds nor points, a spherical camera, or a place that cannot be written.
+        UserError: neither depth bounds nor points, a spherical camera, or a file that cannot be written.
     """
     spherical = [frame.name for frame in capture.frames if frame.camera.is_spherical]
     if spherical:
@@ -132,7 +132,7 @@ def _read_rows(path: Path) -> np.ndarray:
 
 
 def _views(path: Path, rows: np.ndarray) -> list[tuple[Camera, np.ndarray]]:
-    """Camera and `world_from_cam` of each row; rows of equal intrinsics share one camera."""
+    """Return the camera and `world_from_cam` of each row; rows of equal intrinsics share one camera."""
     matrices = rows[:, :15].reshape(-1, 3, 5)
     poses = opencv_from_llff_pose(rigid_poses(matrices[:, :, :4], lambda index: f"{path}: row {index}"))
     bad = ~((rows[:, 15] > 0) & (rows[:, 15] < rows[:, 16]) & plausible(rows[:, 15:]))
@@ -177,7 +177,7 @@ def _camera(size_and_focal: Iterable[float], where: str) -> Camera:
             "expected three positive numbers in the fifth column of the pose",
         )
     params = (focal, focal, round(width) / 2, round(height) / 2)
-    return stated_camera("PINHOLE", round(width), round(height), params, where=where)
+    return checked_camera("PINHOLE", round(width), round(height), params, where=where)
 
 
 def _focal_x(camera: Camera) -> float:
@@ -186,7 +186,7 @@ def _focal_x(camera: Camera) -> float:
 
 
 def _percentile_bounds(capture: Capture) -> np.ndarray:
-    """Nearest and farthest depth of each view (frames, 2), from the points."""
+    """Return the nearest and farthest depth of each view, (frames, 2), from the points."""
     bounds = np.full((len(capture.frames), 2), np.nan)
     seen = _points_seen(capture)
     for index, frame in enumerate(capture.frames):
@@ -206,7 +206,7 @@ def _percentile_bounds(capture: Capture) -> np.ndarray:
 
 
 def _points_seen(capture: Capture) -> list[np.ndarray]:
-    """Return which points each view sees: indices of those that it observes, or that lie within its picture."""
+    """Return the indices of the points that each view sees: those it observes, or else those within its picture."""
     seen = capture.observations
     if seen is not None and (seen.point_index >= 0).any():
         with_point = seen.point_index >= 0

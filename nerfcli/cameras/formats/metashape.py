@@ -6,7 +6,7 @@ A lens maps the point (X, Y, Z) in camera axes (OpenCV's) to the pixel (u, v), w
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p2 (r^2 + 2 y^2) + 2 p1 x y
     u = w/2 + cx + x' f + x' b1 + y' b2,  v = h/2 + cy + y' f
-so OpenCV's p1 is Metashape's p2 and the other way round. A camera's transform is chunk_from_cam; that of its component
+so OpenCV's p1 is Metashape's p2 and vice versa. A camera's transform is chunk_from_cam; that of its component
 (before version 1.3: of the chunk) is the similarity world_from_chunk.
 Source: Metashape Professional user manual, appendix "Camera models"; agisoft-llc/metashape-scripts
 src/export_for_gaussian_splatting.py (pixel centres, principal point, use of the transforms).
@@ -22,7 +22,7 @@ import numpy as np
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats import lenses
-from nerfcli.cameras.formats.fields import malformed, name_of, numbers, refuse_twins, shown, size_of
+from nerfcli.cameras.formats.fields import check_unique_names, malformed, name_of, numbers, shown, size_of
 from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 
@@ -34,18 +34,18 @@ _FRAME = "frame"
 _FISHEYE = ("fisheye", "equidistant_fisheye")
 _SPHERICAL = "spherical"
 
-# Up to this many pixels at the edge of the picture, a term that no camera model here has is taken for rounding.
+# A term that no camera model here has counts as rounding if it moves the edge of the picture by at most this much.
 _NEGLIGIBLE_PX = 1e-9
 
 
 def parse_metashape(path: Path) -> Capture:
     """Read the aligned cameras of the file's first chunk.
 
-    Cameras without a transform (not aligned, or a follower in a rig of cameras) and disabled ones are no frames, as in
-    Agisoft's own export script. Where components lack a transform to the world, they have nothing to do with each
-    other, and only the one with the most cameras is read. The file does not say where the photos are; a frame's name is
-    the camera's label. The unit stays arbitrary: a component's transform comes from georeferencing (then it is in
-    metres) or from someone's moving the model about, and the file does not tell which.
+    Cameras without a transform (not aligned, or a follower in a camera rig) and disabled ones give no frames, as in
+    Agisoft's own export script. If a component lacks a transform to the world, components are unrelated to each other,
+    and only the one with the most cameras is read. The file does not say where the photos are; a frame's name is the
+    camera's label. The unit stays arbitrary: a component's transform comes from georeferencing (then it is in metres)
+    or from moving the model by hand, and the file does not say which.
 
     Raises:
         UserError: the file is damaged (file and field are named), or has a lens that no COLMAP model holds.
@@ -73,7 +73,7 @@ def parse_metashape(path: Path) -> Capture:
         world_from_chunk = worlds.get(record.get("component_id"))
         world_from_cam = chunk_from_cam if world_from_chunk is None else world_from_chunk.apply_pose(chunk_from_cam)
         frames.append(Frame(name, cameras[sensor], world_from_cam))
-    refuse_twins((frame.name for frame in frames), path)
+    check_unique_names((frame.name for frame in frames), path)
     return Capture(tuple(frames), np.zeros((0, 3)), (), None, "metashape")
 
 
@@ -87,7 +87,7 @@ def _chunk(path: Path) -> Element:
 
 
 def _parse_xml(path: Path) -> Element:
-    """Read the root of an XML file that declares no document type, so that there are no entities to expand."""
+    """Read the root of an XML file; refuse a document type declaration, so that there are no entities to expand."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -115,7 +115,7 @@ def _is_aligned(record: Element) -> bool:
 
 
 def _worlds_from_chunk(chunk: Element, path: Path) -> dict[str | None, rigid.Similarity | None]:
-    """`world_from_chunk` by component id; under None that of cameras that belong to no component."""
+    """Return `world_from_chunk` by component id; the key None is for cameras without a component."""
     worlds: dict[str | None, rigid.Similarity | None] = {None: _similarity(chunk.find("transform"), f"{path}: chunk")}
     for component in chunk.iterfind("components/component"):
         key = component.get("id")

@@ -1,4 +1,4 @@
-"""Arrays from the bytes of .npy files, without trust: nothing is unpickled, and no size is believed before it is seen.
+"""Arrays from the bytes of untrusted .npy files: nothing is unpickled, and sizes are checked against the data.
 
 Source: numpy.lib.format, "Format Version 1.0".
 """
@@ -15,10 +15,10 @@ _HEADERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_ar
 
 
 def array_from_npy(data: bytes) -> np.ndarray:
-    """Return the array that the bytes of an .npy file hold; it shares their memory and cannot be written.
+    """Return the array that the bytes of an .npy file hold; it shares their memory and is read-only.
 
     Raises:
-        ValueError: no .npy file, an array of Python objects, or more or fewer bytes than the header's shape needs.
+        ValueError: not an .npy file, an array of Python objects, or more or fewer bytes than the header's shape needs.
     """
     stream = io.BytesIO(data)
     try:
@@ -26,7 +26,7 @@ def array_from_npy(data: bytes) -> np.ndarray:
         if version not in _HEADERS:
             raise ValueError(f"version {version} of the format")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of headers that Python 2 wrote
+            warnings.simplefilter("ignore", UserWarning)  # about headers that Python 2 wrote
             shape, by_columns, dtype = _HEADERS[version](stream)
     except (TypeError, KeyError, SyntaxError, OverflowError, RecursionError, MemoryError, tokenize.TokenError) as error:
         raise ValueError(f"its header is invalid ({type(error).__name__})") from error

@@ -3,7 +3,7 @@
 Lengths in the picture are divided by the larger of width and height, with the origin in the picture's middle:
 normalised = (pixel + 1/2 - size/2) / max(size) with whole numbers at pixel centres, which is (p - size/2) / max(size)
 for positions p with pixel centres at 1/2. Poses are cam_from_world as angle-axis and translation, in OpenCV axes.
-Cameras refer to the stored pixels: OpenSfM ignores the EXIF orientation, and only notes it with the shot.
+Cameras refer to the stored pixels: OpenSfM ignores the EXIF orientation, and only records it with the shot.
 Source: opensfm.org/docs/dataset.html and geometry.html; mapillary/OpenSfM opensfm/io.py, opensfm/features.py and
 opensfm/src/geometry/camera_{projections,distortions}_functions.h.
 """
@@ -21,12 +21,12 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.formats import lenses
 from nerfcli.cameras.formats.fields import (
+    check_unique_names,
     malformed,
     name_of,
     number,
     read_json,
     record_of,
-    refuse_twins,
     shown,
     size_of,
     vector,
@@ -44,7 +44,7 @@ _BROWN = ("perspective", "simple_radial", "radial", "brown")
 _FISHEYE = ("fisheye", "fisheye_opencv", "fisheye62", "fisheye624")
 _SPHERICAL = ("spherical", "equirectangular")
 
-# What OpenSfM has no term for. The tangential and prism terms of RAD_TAN_THIN_PRISM_FISHEYE act on other coordinates.
+# Terms that OpenSfM lacks. The tangential and prism terms of RAD_TAN_THIN_PRISM_FISHEYE act on other coordinates.
 _LOST_TERMS = {
     "FULL_OPENCV": ("k4", "k5", "k6"),
     "RAD_TAN_THIN_PRISM_FISHEYE": ("p0", "p1", "s0", "s1", "s2", "s3"),
@@ -74,14 +74,14 @@ def parse_opensfm(path: Path) -> Capture:
         if not isinstance(camera, str) or camera not in cameras:
             raise malformed(where, f"camera is {shown(camera)}", "expected a key of cameras")
         frames.append(Frame(name, cameras[camera], world_from_cam, image=path.parent / IMAGE_FOLDER / name))
-    refuse_twins((frame.name for frame in frames), path)
+    check_unique_names((frame.name for frame in frames), path)
     points, colours = _points(content, path)
     unit = "metre" if _is_on_earth(content, path) else "arbitrary"
     return Capture(tuple(frames), points, (), None, "opensfm", colours=colours, unit=unit)
 
 
 def losses_opensfm(capture: Capture) -> tuple[str, ...]:
-    """List what reconstruction.json cannot hold of a capture. Observations are in OpenSfM's tracks.csv."""
+    """List the parts of a capture that reconstruction.json cannot hold. Observations are in OpenSfM's tracks.csv."""
     return (*lost_of_cameras(capture, _lost_of), *lost_parts(capture, holds=("points", "colours")))
 
 
@@ -89,7 +89,7 @@ def write_opensfm(capture: Capture, path: Path) -> None:
     """Write a capture as reconstruction.json, atomically, with full precision.
 
     Raises:
-        UserError: a lens model that OpenSfM has nothing like, or a place that cannot be written.
+        UserError: a lens model without an equivalent in OpenSfM, or a file that cannot be written.
     """
     keys: dict[Camera, str] = {}
     for frame in capture.frames:
@@ -111,9 +111,7 @@ def write_opensfm(capture: Capture, path: Path) -> None:
 
 
 def _lost_of(camera: Camera) -> list[str]:
-    """Return the distortion terms of a camera that OpenSfM has no key for,
-    or its model where there is nothing like it.
-    """
+    """Return the distortion terms of a camera that OpenSfM lacks, or the lens if it has no equivalent there."""
     if camera.model in _NO_WORDS:
         return [f"the {camera.model} lens"]
     return [name for name in distortion(camera) if name in _LOST_TERMS.get(camera.model, ())]
@@ -176,7 +174,7 @@ def _long_fisheye(
     prism: Sequence[float],
     where: str,
 ) -> Camera:
-    """Return the camera of fisheye62 or fisheye624, whose terms no COLMAP model holds all at once."""
+    """Return the camera of fisheye62 or fisheye624, whose terms no COLMAP model has all at once."""
     tangential = (term["p1"], term["p2"])
     if not any(tangential) and not any(prism):
         radial = tuple(term[f"k{index}"] for index in range(1, 7))
@@ -229,7 +227,7 @@ def _camera_record(camera: Camera) -> dict[str, Any]:
 
 
 def _poses(shots: dict[str, Any], path: Path) -> np.ndarray:
-    """`world_from_cam` (shots, 4, 4)."""
+    """Return `world_from_cam` (shots, 4, 4)."""
     rows = [
         (vector(shot, "rotation", 3, where), vector(shot, "translation", 3, where))
         for where, shot in ((f"{path}: shots.{shown(key)}", shot) for key, shot in shots.items())
@@ -239,7 +237,7 @@ def _poses(shots: dict[str, Any], path: Path) -> np.ndarray:
 
 
 def _points(content: dict[str, Any], path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points (N, 3) and their colours (N, 3) uint8, if there is a point."""
+    """Return points (N, 3) and their colours (N, 3) uint8; the colours are None if there are no points."""
     records = record_of(content.get("points", {}), f"{path}: points")
     if not records:
         return np.zeros((0, 3)), None
@@ -256,7 +254,7 @@ def _points(content: dict[str, Any], path: Path) -> tuple[np.ndarray, np.ndarray
 
 
 def _rows(values: list[Any]) -> np.ndarray:
-    """Lists of three numbers as one array; quicker than `vector` on each. Raises where one of them is none."""
+    """Convert lists of three numbers to one array, faster than `vector` on each; raise if a list is invalid."""
     rows = np.array(values, dtype=np.float64)
     if rows.shape != (len(values), 3) or not plausible(rows).all():
         raise ValueError("not three finite numbers each")

@@ -1,4 +1,4 @@
-"""The sizes of the photos that a capture lists, for formats that give none; of the pixels as they are stored."""
+"""Measure the stored sizes of the photos that a capture lists, for formats that do not give them."""
 
 import os
 from collections.abc import Iterable
@@ -11,15 +11,15 @@ from nerfcli.cameras.orientation import Measure, stored_size
 def measured_sizes(
     names: Iterable[str], folder: Path, measure: Measure, path: Path
 ) -> tuple[dict[str, tuple[tuple[int, int], Path]], tuple[str, ...]]:
-    """Width and height of each photo that is on disk, with its path, and the names of the others.
+    """Return the width and height of each photo on disk, with its path, and the names of the missing ones.
 
     Args:
         names: of the photos, relative to `folder`.
-        measure: tells an image's upright size and EXIF orientation.
+        measure: returns an image's upright size and EXIF orientation.
         path: the file that lists them, for the error.
 
     Raises:
-        UserError: there is none of them, or one is no readable photo.
+        UserError: none of them is on disk, or one is not a readable photo.
     """
     sizes, missing = {}, []
     for name in names:

@@ -35,7 +35,7 @@ _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_
 
 @dataclass(frozen=True)
 class _Element:
-    """An element of the header: its name, how many there are, and its properties' names and types (None: a list)."""
+    """An element of the header: its name, its count, and the names and types of its properties (None: a list)."""
 
     name: str
     count: int
@@ -65,7 +65,7 @@ def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def losses_ply(capture: Capture) -> tuple[str, ...]:
-    """List what a PLY file of points cannot hold of a capture."""
+    """List the parts of a capture that a PLY file of points cannot hold."""
     cameras = f"{len(capture.frames)} cameras and their poses"
     return (cameras, *lost_parts(capture, holds=("points", "colours")))
 
@@ -125,7 +125,7 @@ def _points(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
-    """Encoding, elements, and where the body begins."""
+    """Return the encoding, the elements, and the offset of the body."""
     if data[:3] != b"ply":
         raise ValueError("it does not begin with the word ply")
     end = data.find(b"end_header")

@@ -3,10 +3,10 @@
 RealityCapture calls the columns name, x, y, alt, heading, pitch, roll, f, px, py, k1, k2, k3, k4, t1, t2; RealityScan 2
 calls some of them yaw, f_35mm, px_norm, py_norm. With s = max(width, height) of the photo in pixels:
     focal length = f/36 s,  principal point = (width/2 + px s, height/2 + py s)
-since f is in millimetres on a frame 36 mm long, but px and py are in lengths of that frame. k1 to k3 are OpenCV's, t1
+since f is in millimetres on a frame 36 mm long, but px and py are fractions of that length. k1 to k3 are OpenCV's, t1
 is OpenCV's p2 and t2 its p1. The camera's centre is (x, y, alt), and its rotation with OpenGL axes
     world_from_cam = Rz(-heading) Rx(pitch) Ry(roll)
-in degrees: with zeros it looks straight down with north (+y) at the top of the picture, about which roll turns.
+in degrees: with zeros it looks straight down with north (+y) at the top of the picture, and roll turns about north.
 Source: calibration.xml of RealityScan 2.2, the templates of its exports ("Internal/External camera parameters" with
 $(f*36), $(px); "OpenCV-compliant ..." with $(px*scale+width*0.5) and the order k1, k2, t2, t1, k3);
 nerfstudio process_data/realitycapture_utils.py for the rotation (it takes t1 for p1).
@@ -22,7 +22,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats import lenses
-from nerfcli.cameras.formats.fields import malformed, name_of, numbers, read_text, refuse_twins, shown
+from nerfcli.cameras.formats.fields import check_unique_names, malformed, name_of, numbers, read_text, shown
 from nerfcli.cameras.formats.photo_names import measured_sizes
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure
@@ -44,11 +44,11 @@ def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None =
 
     The file does not give the size of the photos, so they are measured; those that are not on disk are `missing`.
     Distortion must be of one of the Brown models: the division model gives k1 another meaning, and the file does not
-    tell which it is.
+    say which model it is.
 
     Args:
         path: the .csv file.
-        measure: tells an image's upright size and EXIF orientation.
+        measure: returns an image's upright size and EXIF orientation.
         images: the folder that the names in the file are relative to; by default the file's own.
 
     Raises:
@@ -71,9 +71,7 @@ def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None =
 
 
 def _table(path: Path) -> tuple[list[str], np.ndarray, list[str]]:
-    """Return the images' names, their numbers (images, 15) in the order of `_NUMBERS`,
-    and the place in the file of each.
-    """
+    """Return the images' names, their numbers (images, 15) in the order of `_NUMBERS`, and their places in the file."""
     lines = read_text(path, _EXPECTED).splitlines()
     start = next((index for index, line in enumerate(lines) if line.lower().startswith(("#name,", "name,"))), None)
     if start is None:
@@ -96,12 +94,12 @@ def _table(path: Path) -> tuple[list[str], np.ndarray, list[str]]:
         names.append(name_of(words[columns["name"]], where))
         rows.append(numbers([words[columns[key]] for key in _NUMBERS], len(_NUMBERS), where))
         places.append(where)
-    refuse_twins(names, path)
+    check_unique_names(names, path)
     return names, np.array(rows), places
 
 
 def _cells(line: str, where: str) -> list[str]:
-    """Return the cells of a line, where a name that has a comma in it is quoted."""
+    """Return the cells of a line, in which a name with a comma is quoted."""
     if '"' not in line:
         return line.split(",")
     try:

@@ -8,22 +8,22 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.formats.limits import MOST_UNITS, plausible
 from nerfcli.errors import UserError
 
-# How far a pose's rotation may be from orthonormal: files print 6 digits or more; beyond is a mistake, not rounding.
-_MAX_BEND = 1e-2
+# Largest deviation of a rotation from orthonormal: files print 6 digits or more, so more is a mistake, not rounding.
+_MAX_DEVIATION = 1e-2
 
-# Rotations that are off by less are left alone, to the last bit.
+# Rotations that deviate by less are kept, bit for bit.
 _ROUNDING = 1e-13
 
 
 def rigid_poses(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
-    """Poses (N, 4, 4) whose rotations are orthonormal to 1e-13, from (N, 3, 4) or (N, 4, 4) as a file holds them.
+    """Return poses (N, 4, 4) with rotations orthonormal to 1e-13, from (N, 3, 4) or (N, 4, 4) as a file holds them.
 
     Args:
-        matrices: with a rotation in the upper left and a position in the fourth column; a fourth row is not looked at.
-        where: says of a number of these matrices which file and field it is, to open the message.
+        matrices: with a rotation in the upper left and a position in the fourth column; a fourth row is ignored.
+        where: returns the file and field of the matrix with a given index, to begin the message.
 
     Raises:
-        UserError: not finite, mirrored, or farther from a rotation than rounding explains.
+        UserError: a matrix is not finite, mirrored, or farther from a rotation than rounding explains.
     """
     rotations, positions = matrices[:, :3, :3], matrices[:, :3, 3]
     _refuse(
@@ -34,7 +34,7 @@ def rigid_poses(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray
     )
     bend = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(1, 2), initial=0)
     _refuse(
-        bend > _MAX_BEND,
+        bend > _MAX_DEVIATION,
         where,
         what="the upper left 3x3 block is not a rotation",
         hint="rows must be orthogonal and of length 1",
@@ -53,7 +53,7 @@ def rigid_poses(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray
 
 
 def rigid_pose(matrix: np.ndarray, where: str) -> np.ndarray:
-    """`rigid_poses` of one matrix (3, 4) or (4, 4): a pose (4, 4)."""
+    """Return `rigid_poses` of one matrix (3, 4) or (4, 4): a pose (4, 4)."""
     return rigid_poses(matrix[None], lambda _: where)[0]
 
 

@@ -14,9 +14,9 @@ from nerfcli.errors import UserError
 from nerfcli.sealed import SEAL, read_sealed, write_sealed
 
 CAMERAS = "cameras.json"
-# What to do about a damaged file of a run.
+# Hint for a damaged file of a run.
 MEND = f"train again with --overwrite, or restore the file; if you edited it yourself, remove its entry {SEAL}"
-# In an entry: camera and pose as the scene had them. Beside the entries: the run's absolute path.
+# Keys: in an entry, camera and pose as the scene had them; beside the entries, the run's absolute path.
 _GIVEN, _WRITTEN_AT = "given", "written_at"
 
 
@@ -33,12 +33,12 @@ def write_cameras(
 ) -> None:
     """Write the frames of both sets: full-size cameras and poses in the scene's frame.
 
-    Rendering needs nothing else of the scene; evaluation finds the photos through it.
+    Rendering needs nothing else from the scene; evaluation finds the photos through this file.
 
     Args:
         run: the folder.
         train, test: frames as the field knows them.
-        given: by name, as the scene has them, where training has refined them.
+        given: by name, the frames that training refined, as the scene has them.
     """
     frames = {"train": train, "test": test}
     content = {name: [_frame_to_json(frame, run, given or {}) for frame in frames[name]] for name in frames}
@@ -64,13 +64,13 @@ def read_given_cameras(run: Path) -> RunCameras:
 
 
 def find_run(path: Path) -> Path | None:
-    """Return RUN/cameras.json of a run, or of a file of that name in one; None if it is neither."""
+    """Return RUN/cameras.json, given the folder of a run or that file itself; None if the path is neither."""
     file = path if path.is_file() and path.name == CAMERAS else path / CAMERAS
     return file if file.is_file() and (file.parent / "config.json").is_file() else None
 
 
 def parse_run(path: Path) -> Capture:
-    """Return the frames of a RUN/cameras.json, training photos first; without points, which a run has none of.
+    """Return the frames of a RUN/cameras.json, training photos first; a run has no points.
 
     Raises:
         UserError: see `read_cameras`.
@@ -108,7 +108,7 @@ def _frame_to_json(frame: Frame, run: Path, given: Mapping[str, Frame]) -> dict[
         "name": frame.name,
         **_view_to_json(frame),
         **({} if before is None else {_GIVEN: _view_to_json(before)}),
-        # Relative, so that scene and run can be moved together; if the run alone was, `written_at` leads to them.
+        # Relative, so that scene and run can be moved together; if only the run was moved, `written_at` locates them.
         "image": None if frame.image is None else os.path.relpath(frame.image, run),
         "mask": None if frame.mask is None else os.path.relpath(frame.mask, run),
     }
@@ -132,6 +132,6 @@ def _frame_from_json(entry: dict[str, Any], run: Path, written_at: Path) -> Fram
 
 
 def _found(file: str, run: Path, written_at: Path) -> Path:
-    """Return where a file is by its path from the run, or else from where the run was written."""
+    """Return a file's path from the run, or if only that exists, its path from where the run was written."""
     here, there = run / file, Path(os.path.normpath(written_at / file))
     return there if there.exists() and not here.exists() else here

@@ -27,13 +27,13 @@ class Description:
 
     Args:
         path: the file.
-        image_folder: the photos, which the names of the model's images are relative to; need not be there.
+        image_folder: folder of the photos, which the names of the model's images are relative to; need not exist.
         model_dir: the COLMAP model, whose cameras refer to upright photos.
-        unit, unit_source: as of `Scene`.
-        listed: names of frames by what they are for: "test", "val", or "unused" of those that the split leaves out.
+        unit, unit_source: as in `Scene`.
+        listed: names of frames by their use: "test", "val", or "unused" for those that the split leaves out.
         masks: the folder of the masks, or the mask of each photo that has one.
         depth_bounds: nearest and farthest z by the name of the frame, in scene units; empty where they are not known.
-        provenance: what made the scene: command, settings, versions; empty where unknown.
+        provenance: how the scene was made: command, settings, versions; empty if unknown.
     """
 
     path: Path
@@ -47,16 +47,16 @@ class Description:
     provenance: Mapping[str, Any]
 
     def described(self, frames: Sequence[Frame], find_mask: FindMask) -> tuple[Frame, ...]:
-        """Return the frames of the model with their masks and their part of the split; None for unused ones.
+        """Return the frames of the model with their masks and splits; the split of unused frames is None.
 
         Args:
             frames: of the model.
-            find_mask: finds the mask of the photo of some name in a folder of masks.
+            find_mask: finds the mask of a photo, given its name and the folder of masks.
         """
         return tuple(replace(f, mask=self._mask_of(f.name, find_mask), split=self._split_of(f.name)) for f in frames)
 
     def bounds_of(self, frames: Sequence[Frame]) -> np.ndarray | None:
-        """Nearest and farthest z of frames, (frames, 2), if the file gives them for all of these."""
+        """Return the nearest and farthest z of frames, (frames, 2), if the file gives them for all of the frames."""
         if not self.depth_bounds or not all(frame.name in self.depth_bounds for frame in frames):
             return None
         return np.array([self.depth_bounds[frame.name] for frame in frames]).reshape(-1, 2)
@@ -130,7 +130,7 @@ def _text(content: dict[str, Any], key: str, path: Path) -> str:
 
 
 def _listed_names(content: dict[str, Any], path: Path) -> dict[str, frozenset[str]]:
-    """Return the names under "test", "val" and "unused" of the split; the first is never left out."""
+    """Return the names under "test", "val" and "unused" of the split; only "test" is required."""
     split = content.get("split")
     names: dict[str, frozenset[str]] = {}
     for part in ("test", "val", UNUSED):

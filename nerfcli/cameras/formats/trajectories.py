@@ -1,7 +1,7 @@
 """Trajectories of the TUM and KITTI benchmarks: poses without cameras, pictures or points.
 
 TUM: a line "timestamp tx ty tz qx qy qz qw" for each pose. KITTI: a line with the first three rows of a 4x4 matrix, row
-by row; its frames are known by their place in the file alone. Both are world_from_cam with OpenCV axes.
+by row; its frames are identified only by their order in the file. Both are world_from_cam with OpenCV axes.
 Sources: cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; cvlibs.net/datasets/kitti, odometry devkit, readme.txt.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.fields import filled_lines, malformed, numbers, read_text, refuse_twins, shown
+from nerfcli.cameras.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, shown
 from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.cameras.frame import Capture, Frame
@@ -23,19 +23,19 @@ from nerfcli.errors import UserError
 _TUM_EXPECTED = "expected lines of timestamp tx ty tz qx qy qz qw"
 _KITTI_EXPECTED = "expected lines of 12 numbers, the first three rows of a 4x4 matrix"
 
-# How far the length of a quaternion may be from 1: files print 4 digits or more; beyond is a mistake, not rounding.
-_MAX_BEND = 1e-2
+# Largest deviation of a quaternion's length from 1: files print 4 digits or more, so more is a mistake, not rounding.
+_MAX_DEVIATION = 1e-2
 
 _NUMBER = re.compile(r"[+-]?\d{1,20}(\.\d{0,20})?([eE][+-]?\d{1,2})?", re.ASCII)
 _PICTURE = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp)$", re.IGNORECASE)
 
 
 def parse_tum(path: Path, camera: Camera | None) -> Capture:
-    """Read a trajectory in the TUM format; a frame's name is its timestamp as the file has it.
+    """Read a trajectory in the TUM format; a frame's name is its timestamp as written in the file.
 
     Args:
         path: the text file.
-        camera: that all frames have, since the file names none.
+        camera: of all frames, since the file has none.
 
     Raises:
         UserError: the file is damaged (file and line are named), or no camera is given.
@@ -48,7 +48,7 @@ def parse_kitti(path: Path, camera: Camera | None) -> Capture:
 
     Args:
         path: the text file.
-        camera: that all frames have, since the file names none.
+        camera: of all frames, since the file has none.
 
     Raises:
         UserError: the file is damaged (file and line are named), or no camera is given.
@@ -57,12 +57,12 @@ def parse_kitti(path: Path, camera: Camera | None) -> Capture:
 
 
 def losses_tum(capture: Capture) -> tuple[str, ...]:
-    """List what a TUM trajectory cannot hold of a capture."""
+    """List the parts of a capture that a TUM trajectory cannot hold."""
     return _losses(capture, named=_timestamps(capture) == [frame.name for frame in capture.frames])
 
 
 def losses_kitti(capture: Capture) -> tuple[str, ...]:
-    """List what a KITTI trajectory cannot hold of a capture."""
+    """List the parts of a capture that a KITTI trajectory cannot hold."""
     return _losses(capture, named=all(frame.name == _indexed(i) for i, frame in enumerate(capture.frames)))
 
 
@@ -73,7 +73,7 @@ def write_tum(capture: Capture, path: Path) -> None:
     ("1305031102.175304.png"); else the frames' indices.
 
     Raises:
-        UserError: a place that cannot be written.
+        UserError: the file cannot be written.
     """
     lines = ["# timestamp tx ty tz qx qy qz qw"]
     poses = np.stack([frame.world_from_cam for frame in capture.frames])
@@ -88,7 +88,7 @@ def write_kitti(capture: Capture, path: Path) -> None:
     """Write a capture's poses in the KITTI format, atomically, with full precision.
 
     Raises:
-        UserError: a place that cannot be written.
+        UserError: the file cannot be written.
     """
     rows = [frame.world_from_cam[:3].ravel().tolist() for frame in capture.frames]
     _write([" ".join(map(repr, row)) for row in rows], path)
@@ -108,12 +108,12 @@ def _parse(
             "give the camera with --intrinsics FILE",
         )
     frames = []
-    for index, (number, line) in enumerate(filled_lines(read_text(path, expected))):
+    for index, (number, line) in enumerate(content_lines(read_text(path, expected))):
         name, world_from_cam = pose_of(index, line.split(), f"{path}: line {number}")
         frames.append(Frame(name, camera, world_from_cam))
     if not frames:
         raise malformed(str(path), "has no pose", expected)
-    refuse_twins((frame.name for frame in frames), path)
+    check_unique_names((frame.name for frame in frames), path)
     return Capture(tuple(frames), np.zeros((0, 3)), (), None, kind)
 
 
@@ -122,7 +122,7 @@ def _tum_pose(_: int, words: list[str], where: str) -> tuple[str, np.ndarray]:
         raise malformed(where, f"has {len(words)} numbers", "expected 8")
     values = np.array(numbers(words[1:], 7, where))
     xyzw = values[3:]
-    if abs(np.linalg.norm(xyzw) - 1.0) > _MAX_BEND:
+    if abs(np.linalg.norm(xyzw) - 1.0) > _MAX_DEVIATION:
         raise malformed(where, f"its quaternion has length {np.linalg.norm(xyzw):.4g}", "expected length 1")
     if not _NUMBER.fullmatch(words[0]):
         raise malformed(where, f"its timestamp is {shown(words[0])}", "expected seconds, such as 1305031102.1753")

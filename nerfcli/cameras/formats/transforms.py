@@ -1,6 +1,6 @@
-"""transforms.json: nerfstudio's and instant-ngp's files of cameras; Blender's (NeRF) are of the same kind.
+"""transforms.json: the camera files of nerfstudio and instant-ngp; Blender's (NeRF) are of the same kind.
 
-Poses in these files are world_from_cam with OpenGL axes. Their pixel positions are COLMAP's: no half pixel to move.
+Poses in these files are world_from_cam with OpenGL axes. Pixel positions are as in COLMAP, without a half-pixel offset.
 Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips.md and scripts/colmap2nerf.py.
 """
 
@@ -37,11 +37,11 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", 
 
 
 def read_transforms(path: Path, measure: Measure) -> Capture:
-    """Read a capture that one transforms.json lists (nerfstudio, instant-ngp), of the images that are on disk.
+    """Read a capture from one transforms.json (nerfstudio, instant-ngp), with the images that are on disk.
 
     Args:
         path: the JSON file; image paths in it are relative to its folder.
-        measure: tells an image's upright size and EXIF orientation.
+        measure: returns an image's upright size and EXIF orientation.
 
     Raises:
         UserError: the file is malformed (file and field are named), or none of its images is on disk.
@@ -59,12 +59,12 @@ def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
     """Read a transforms.json, whether or not its images exist.
 
     Poses and points stay in the file's own world. nerfstudio's applied_transform and applied_scale say how that world
-    came from the one of the poses' first home (COLMAP's); they are not undone, which would part the cameras from every
-    field that was trained on the file.
+    came from the original world of the poses (COLMAP's). They are not undone, since the cameras would then no longer
+    match the fields that were trained on the file.
 
     Args:
         path: the JSON file; paths in it are relative to its folder.
-        measure: tells an image's upright size and EXIF orientation; only where the file does not give `w` and `h`.
+        measure: returns an image's upright size and EXIF orientation; needed only if the file lacks `w` or `h`.
 
     Raises:
         UserError: the file, or the PLY file of points that it names, is malformed or missing; file and field are named.
@@ -73,13 +73,13 @@ def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
     frames = listed_frames(path, content, measure)
     splits = _listed_splits(path, content)
     frames = [replace(frame, split=splits.get(frame.name)) for frame in frames]
-    refuse_twins(path, frames)
+    check_unique_names(path, frames)
     points, colours = _points_beside(path, content)
     return Capture(tuple(frames), points, (), None, "transforms", colours=colours)
 
 
 def losses_transforms(capture: Capture) -> tuple[str, ...]:
-    """List what a transforms.json cannot hold of a capture. Points go into a PLY file next to it."""
+    """List the parts of a capture that a transforms.json cannot hold. Points go into a PLY file next to it."""
     parts = lost_parts(capture, holds=("masks", "points", "colours", "splits"))
     return (*lost_of_cameras(capture, lost_to_transforms), *parts)
 
@@ -87,11 +87,11 @@ def losses_transforms(capture: Capture) -> tuple[str, ...]:
 def write_transforms(capture: Capture, path: Path) -> None:
     """Write a capture as nerfstudio's transforms.json (OpenGL axes), atomically; instant-ngp reads it too.
 
-    Intrinsics stand once if all frames agree. Images and masks are named as seen from the file's folder, an image whose
-    place is not known by its frame's name. Points are written beside the file, as NAME_points.ply.
+    Intrinsics are written once if all frames share them. Paths of images and masks are relative to the file's folder;
+    an image whose path is unknown gets its frame's name. Points are written beside the file, as NAME_points.ply.
 
     Raises:
-        UserError: a place that cannot be written.
+        UserError: the file cannot be written.
     """
     intrinsics = {
         camera: record_of_camera(camera) for camera in dict.fromkeys(frame.camera for frame in capture.frames)
@@ -139,8 +139,10 @@ def records_of(path: Path, content: dict[str, Any]) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class Found:
-    """The frames of a file whose image is on disk, fitted to it, the names of the other ones, and for how many the
-    intrinsics were given for another size (see `Capture.rescaled`)."""
+    """The frames of a file whose image is on disk, fitted to it, and the names of those whose image is missing.
+
+    `rescaled` is as in `Capture`.
+    """
 
     frames: list[Frame]
     missing: list[str]
@@ -170,13 +172,13 @@ def frames_on_disk(path: Path, content: dict[str, Any], measure: Measure) -> Fou
 
 
 def capture_on_disk(path: Path, found: Found, *, kind: str) -> Capture:
-    """Return the capture of `frames_on_disk`, if there are any and no two have the same name."""
+    """Return the capture of `frames_on_disk`; raise a UserError if it has no frames or two with the same name."""
     if not found.frames:
         raise UserError(
             f"{path}: none of the {len(found.missing)} listed images exists, such as {found.missing[0]}",
             "put the images where file_path points, relative to this file",
         )
-    refuse_twins(path, found.frames)
+    check_unique_names(path, found.frames)
     return Capture(
         tuple(found.frames),
         np.zeros((0, 3)),
@@ -201,9 +203,9 @@ def listed_frames(
     Args:
         path: of the file.
         content: of the file.
-        measure: tells an image's size where the file does not. Where an image is not on disk either, it has the size
-            of the other images if that is one.
-        suffix: what the format appends to a file_path without a suffix, where no such image is on disk.
+        measure: returns an image's size, if the file does not give it. An image that is not on disk either gets the
+            size of the other images, if they all have the same.
+        suffix: appended to a file_path without a suffix if no such image is on disk, as the format does.
         images: a folder where images are looked for first: under the paths that the file lists, or their last parts.
     """
     records = records_of(path, content)
@@ -238,9 +240,7 @@ def listed_frames(
 
 
 def relative_path(frame: Frame, folder: Path) -> str:
-    """Return a frame's image as seen from a folder, with forward slashes;
-    its name where the image's place is not known.
-    """
+    """Return a frame's image path relative to a folder, with forward slashes, or its name if it has no image."""
     return frame.name if frame.image is None else _seen_from(folder, frame.image)
 
 
@@ -254,7 +254,7 @@ def _seen_from(folder: Path, path: Path) -> str:
 def _sizes(
     records: list[dict[str, Any]], images: list[Path], wheres: list[str], *, measure: Measure | None
 ) -> list[tuple[int, int]]:
-    """Width and height of each frame's picture: given, or else measured."""
+    """Return the width and height of each frame's picture: given, else measured, else the only given size."""
     sizes = [given_size(record, where) for record, where in zip(records, wheres, strict=True)]
     if measure is not None:
         sizes = [
@@ -270,7 +270,7 @@ def _sizes(
     return result
 
 
-def refuse_twins(path: Path, frames: list[Frame]) -> None:
+def check_unique_names(path: Path, frames: list[Frame]) -> None:
     """Raise a UserError where two frames have the same name."""
     twice, count = Counter(frame.name for frame in frames).most_common(1)[0]
     if count > 1:
@@ -285,9 +285,7 @@ def _listed_path(record: dict[str, Any], where: str) -> str:
 
 
 def _name_of(listed: str, where: str, *, suffix: str = "") -> str:
-    """Return a name with forward slashes and without "./";
-    of an absolute path, which is one machine's, the file name.
-    """
+    """Return a name with forward slashes and without "./"; absolute paths are reduced to the file name."""
     pure = PurePosixPath(listed.replace("\\", "/"))
     if pure.is_absolute() or ":" in str(pure).split("/")[0]:
         pure = PurePosixPath(pure.name)
@@ -316,7 +314,7 @@ def _find_mask(folder: Path, listed: Any, where: str) -> Path | None:
 
 
 def _poses(path: Path, records: list[dict[str, Any]]) -> np.ndarray:
-    """`world_from_cam` (frames, 4, 4), OpenCV axes, rigid."""
+    """Return `world_from_cam` (frames, 4, 4), OpenCV axes, rigid."""
     matrices = np.stack([_matrix(record, f"{path}: frames[{index}]")[:3] for index, record in enumerate(records)])
     rigid = rigid_poses(matrices, lambda index: f"{path}: frames[{index}].transform_matrix")
     return opencv_from_opengl_pose(rigid)
@@ -336,7 +334,7 @@ def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
 
 
 def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points (N, 3) and colours (N, 3) of the PLY file that ply_file_path names; none where it is not given."""
+    """Read points (N, 3) and colours (N, 3) of the PLY file that ply_file_path names; no points if it is not given."""
     cloud = content.get("ply_file_path")
     if cloud is None:
         return np.zeros((0, 3)), None
@@ -349,7 +347,7 @@ def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.
 
 
 def _listed_splits(path: Path, content: dict[str, Any]) -> dict[str, str]:
-    """nerfstudio's train_filenames, val_filenames and test_filenames: name to split."""
+    """Return the split of each name in nerfstudio's train_filenames, val_filenames and test_filenames."""
     splits = {}
     for split in SPLITS:
         listed = content.get(f"{split}_filenames", [])

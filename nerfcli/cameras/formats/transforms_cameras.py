@@ -1,4 +1,4 @@
-"""The keys that describe a camera in a transforms.json: fl_x, cx, k1, camera_model, ... and the way from and to them.
+"""The keys that describe a camera in a transforms.json: fl_x, cx, k1, camera_model, ..., from and to cameras.
 
 Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips.md and src/nerf_loader.cu.
 """
@@ -8,7 +8,7 @@ from typing import Any
 
 from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.formats.fields import malformed
-from nerfcli.cameras.formats.limits import stated_camera
+from nerfcli.cameras.formats.limits import checked_camera
 from nerfcli.cameras.formats.unsupported import distortion, projection
 
 _INTRINSICS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -19,7 +19,7 @@ _FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE")
 # Lens models of instant-ngp that COLMAP does not have.
 _FOREIGN = ("ftheta_p0", "latlong")
 
-# Under which keys the format holds the distortion terms of COLMAP's models; other terms have no key.
+# The format's keys for the distortion terms of COLMAP's models; other terms have no key.
 _KEY_OF_TERM = {
     "SIMPLE_RADIAL": {"k": "k1"},
     "RADIAL": {"k1": "k1", "k2": "k2"},
@@ -37,17 +37,17 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str) 
     """Return the camera of a frame.
 
     Args:
-        record: the frame's keys over those of the whole file.
+        record: the frame's keys, merged over those of the whole file.
         size: of the picture that the numbers are for.
-        where: file and frame, to open the message of an error.
+        where: file and frame, to begin error messages.
 
     Raises:
-        UserError: no focal length, a number that is none, or a lens model that is not known.
+        UserError: no focal length, an invalid number, or an unknown lens model.
     """
     width, height = size
     model = record.get("camera_model")
     if model == "EQUIRECTANGULAR":
-        return stated_camera("EQUIRECTANGULAR", width, height, (width, height), where=where)
+        return checked_camera("EQUIRECTANGULAR", width, height, (width, height), where=where)
     foreign = next((key for key in _FOREIGN if record.get(key) not in (None, False)), None)
     if foreign is not None:
         raise malformed(where, f"the lens model of {foreign} is not supported", "undistort the pictures first")
@@ -56,7 +56,7 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str) 
     if fx is None and fy is None:
         raise malformed(where, "neither fl_x nor camera_angle_x is given", "expected the focal length or field of view")
     fx = fx if fx is not None else fy
-    # The files of Blender give the horizontal angle only: pixels are square.
+    # Blender's files give only the horizontal angle, since pixels are square.
     fy = fy if fy is not None else fx
     assert fx is not None
     assert fy is not None
@@ -66,7 +66,7 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str) 
     if model in _FISHEYE_MODELS or record.get("is_fisheye") is True:
         if p1 or p2:
             raise malformed(where, "a fisheye camera with p1 or p2", "expected k1 to k4 only (OpenCV's fisheye)")
-        return stated_camera("OPENCV_FISHEYE", width, height, (*head, k1, k2, k3, k4), where=where)
+        return checked_camera("OPENCV_FISHEYE", width, height, (*head, k1, k2, k3, k4), where=where)
     if model not in _PERSPECTIVE_MODELS:
         supported = ", ".join(str(name) for name in (*_PERSPECTIVE_MODELS[1:], *_FISHEYE_MODELS, "EQUIRECTANGULAR"))
         raise malformed(where, f"camera_model {model!r:.80} is not supported", f"expected one of {supported}")
@@ -74,10 +74,10 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str) 
         raise malformed(where, f"k4 is {k4} without a fisheye camera", "k1, k2, k3, p1, p2 are the perspective terms")
     if k3:
         params = (*head, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-        return stated_camera("FULL_OPENCV", width, height, params, where=where)
+        return checked_camera("FULL_OPENCV", width, height, params, where=where)
     if k1 or k2 or p1 or p2:
-        return stated_camera("OPENCV", width, height, (*head, k1, k2, p1, p2), where=where)
-    return stated_camera("PINHOLE", width, height, head, where=where)
+        return checked_camera("OPENCV", width, height, (*head, k1, k2, p1, p2), where=where)
+    return checked_camera("PINHOLE", width, height, head, where=where)
 
 
 def record_of_camera(camera: Camera) -> dict[str, Any]:
@@ -100,10 +100,10 @@ def lost_to_transforms(camera: Camera) -> list[str]:
 
 
 def given_size(record: dict[str, Any], where: str) -> tuple[int, int] | None:
-    """Width and height that `w` and `h` give, or None where one of them is missing.
+    """Return the width and height under `w` and `h`, or None if one of them is missing.
 
     Raises:
-        UserError: they are no whole numbers of pixels.
+        UserError: they are not whole numbers of pixels.
     """
     width, height = number(record, "w", where), number(record, "h", where)
     if width is None or height is None:
@@ -116,10 +116,10 @@ def given_size(record: dict[str, Any], where: str) -> tuple[int, int] | None:
 
 
 def number(record: dict[str, Any], key: str, where: str) -> float | None:
-    """Return the number under a key, or None where there is none.
+    """Return the number under a key, or None if there is none.
 
     Raises:
-        UserError: something else than a finite number.
+        UserError: the value is not a finite number.
     """
     value = record.get(key)
     if value is None:

@@ -34,11 +34,11 @@ def lost_parts(capture: Capture, *, holds: Collection[str]) -> list[str]:
 
 
 def lost_of_cameras(capture: Capture, lost: Callable[[Camera], Iterable[str]]) -> list[str]:
-    """Clauses "k3 of 2 cameras", with the number of different cameras that lose a property.
+    """List the losses of cameras as clauses "k3 of 2 cameras", with the number of distinct cameras affected.
 
     Args:
         capture: to be written.
-        lost: the properties of a camera that the format cannot hold.
+        lost: returns the properties of a camera that the format cannot hold.
     """
     cameras = {frame.camera for frame in capture.frames}
     counts = Counter(name for camera in cameras for name in lost(camera))
@@ -46,7 +46,7 @@ def lost_of_cameras(capture: Capture, lost: Callable[[Camera], Iterable[str]]) -
 
 
 def distortion(camera: Camera) -> dict[str, float]:
-    """Return the parameters beside focal lengths and principal point that are not 0, by name."""
+    """Return the non-zero parameters other than focal lengths and principal point, by name."""
     if camera.is_spherical:
         return {}
     values = zip(parameter_names(camera.model), camera.params, strict=True)
@@ -54,9 +54,7 @@ def distortion(camera: Camera) -> dict[str, float]:
 
 
 def projection(camera: Camera) -> str:
-    """Return the projection of a model without its distortion:
-    "perspective", "fisheye" (equidistant) or "spherical".
-    """
+    """Return a camera's projection without distortion: "perspective", "fisheye" (equidistant) or "spherical"."""
     return "spherical" if camera.is_spherical else "fisheye" if "FISHEYE" in camera.model else "perspective"
 
 

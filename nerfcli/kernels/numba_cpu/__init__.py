@@ -61,7 +61,7 @@ def warm_up() -> None:
     """Run every kernel once on a ray of two samples, which compiles it or loads it from the cache.
 
     Raises:
-        UserError: what was compiled cannot be kept.
+        UserError: compiled code cannot be cached on disk.
     """
     try:
         _run_all()

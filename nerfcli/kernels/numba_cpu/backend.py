@@ -1,7 +1,7 @@
-"""The operations on rays by the compiled kernels: float32 on the CPU.
+"""Backend of the compiled CPU kernels, for float32.
 
-What marching has computed, places and codes of samples, goes on into the step with gradients as it is. A hash grid of
-other sizes than the compiled ones, see `can_radiance`, is sampled and asked by the reference.
+The pass with gradients reuses the coordinates and features of samples that marching has computed. A hash grid of sizes
+that are not compiled, see `can_radiance`, is sampled and evaluated by the reference.
 """
 
 from typing import ClassVar
@@ -18,7 +18,7 @@ from nerfcli.kernels.reference.backend import encode_into
 
 
 class NumbaBackend(ComposedBackend):
-    """`numba_cpu`, composed. The same seed gives the same bits for the same number of threads."""
+    """Backend composed of `numba_cpu`. The same seed and number of threads give the same bits."""
 
     name = "numba_cpu"
     parts: ClassVar[Parts] = numba_cpu
@@ -138,6 +138,6 @@ def _encode(
 
 
 def _fits(grid: HashGrid, layers: tuple[Tensor, ...]) -> bool:
-    """Return whether marching is compiled for these sizes of a table and of layers."""
+    """Return whether marching is compiled for the sizes of a grid's table and of these layers."""
     code = grid.table.new_empty(0, grid.table.shape[0] * grid.table.shape[2])
     return numba_cpu.can_hash_encode(code, grid.table, grid.resolutions) and numba_cpu.can_radiance(code, layers)

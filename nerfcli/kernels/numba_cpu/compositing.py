@@ -1,7 +1,7 @@
 """Compositing on CPU threads, a ray at a time, with the gradient in suffix form.
 
 Same operations as in `reference`, for float32; running sums are kept in float64. The gradient with respect to a density
-needs the colour of all that is behind the sample: it is summed from the far end, so that nothing is ever divided by a
+needs the colour of everything behind the sample: it is summed from the far end, so that nothing is ever divided by a
 transmittance or subtracted from a total.
 """
 
@@ -67,8 +67,8 @@ def _backward(
         depth = 0.0
         for i in range(first, last):
             depth += np.float64(density[i]) * np.float64(lengths[i])
-            density_gradient[i] = np.exp(-depth)  # the transmittance behind the sample, until its gradient comes
-        # What the loss gains per unit of light that passes this sample: d loss / d T behind it, times that T.
+            density_gradient[i] = np.exp(-depth)  # the transmittance behind the sample, until its gradient replaces it
+        # Change of the loss by the light that passes this sample: d loss / d T behind it, times that T.
         behind = np.float64(transmittance[ray]) * (
             gr * background[ray, 0] + gg * background[ray, 1] + gb * background[ray, 2] + transmittance_gradient[ray]
         )

@@ -1,4 +1,4 @@
-"""Gradients of the coordinates of samples to their rays, on CPU threads; a thread owns rays.
+"""Gradients of the coordinates of samples with respect to their rays, on CPU threads; a thread owns rays.
 
 Same operation as `reference.sample_coordinates`, in float32.
 """
@@ -31,7 +31,7 @@ def _back_from_cube(x: Any, y: Any, z: Any, contraction: Any, a: Any, b: Any, c:
         return a * quarter, b * quarter, c * quarter
     inverse = one / norm
     scale = (two - inverse) * inverse
-    # In units of the norm, as squares of what is far away would overflow.
+    # In units of the norm, as squares of distant coordinates would overflow.
     u, v, w = x * inverse, y * inverse, z * inverse
     along = two * inverse * (inverse - one) * (u * a + v * b + w * c)
     if contraction == 2:  # the gradient of the largest component is its sign
@@ -126,7 +126,7 @@ def sample_coordinates(
     """See `reference.sample_coordinates`; float32 on the CPU, differentiable in origins and directions.
 
     Args:
-        known: (N, 3), the answer, where it has been computed before without gradients.
+        known: (N, 3), the result, if it has already been computed without gradients.
     """
     number = CONTRACTIONS.index(contraction)
     return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, known)  # type: ignore[return-value]

@@ -1,6 +1,6 @@
 """Table rows and trilinear weights of the corners of cells, for 16 samples at a time.
 
-Written as vectors: LLVM leaves the same loops of Numba scalar, and the hash grid then takes five times as long.
+Written as vectors: LLVM does not vectorise the same loops in Numba, and the hash grid then takes five times as long.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ HASH_FACTORS = (2654435761, 805459861)
 
 
 def _cells(builder: Any, coordinates: Any, resolution: Any) -> tuple[list[Any], list[Any]]:
-    """Cells and places inside them along each axis, coordinates clamped to [0, 1]; NaN gives cell 0 and place NaN."""
+    """Return cells and positions in them by axis; coordinates are clamped to [0, 1], NaN gives cell 0, position NaN."""
     top = in_all_lanes(builder, builder.sitofp(resolution, FLOAT), FLOATS)
     last = in_all_lanes(builder, builder.sub(resolution, ir.Constant(INT, 1)), INTS)
     zero, one = floats(0.0), floats(1.0)
@@ -60,11 +60,11 @@ def _weights(builder: Any, inside: Any) -> list[Any]:
 
 
 def _corners(rows_of: Callable[..., list[Any]]) -> Any:
-    """Return an intrinsic: (points, at, stride, resolution, rows, place, apart, index, weight, inside).
+    """Return an intrinsic (points, at, stride, resolution, rows, place, apart, index, weight, inside).
 
     Reads the coordinates of 16 samples at points[at], points[at + stride], points[at + 2 stride]; writes the table row
     and the weight of corner c to index[place + c apart] and weight[place + c apart] (bit 0 of c is x, bit 1 is y, bit 2
-    is z), and the places inside the cells to inside[place + axis apart]. All arrays are flat, `index` of uint32.
+    is z), and the positions inside the cells to inside[place + axis apart]. All arrays are flat, `index` of uint32.
     """
 
     @intrinsic
@@ -98,6 +98,6 @@ def _corners(rows_of: Callable[..., list[Any]]) -> Any:
     return corners
 
 
-# See `_corners`; for levels whose corners all have rows of their own, and for those that share rows by a hash.
+# See `_corners`; for levels with a separate row for each vertex, and for levels whose vertices share rows by a hash.
 dense_corners: Callable[..., None] = cast(Any, _corners(_dense_rows))
 hashed_corners: Callable[..., None] = cast(Any, _corners(_hashed_rows))

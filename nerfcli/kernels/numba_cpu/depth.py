@@ -1,7 +1,7 @@
 """Depth of rays on CPU threads, one ray at a time: mean, spread, heaviest interval and quantiles in one pass.
 
 Same operation as `depth.light_ends`, for float32; everything is computed in float64. Mean and variance are updated
-sample by sample around the mean so far, which cancels nothing.
+sample by sample around the mean so far, which avoids cancellation.
 Source: West 1979, Updating mean and variance estimates, CACM 22(9).
 """
 
@@ -21,7 +21,7 @@ _SERIES = np.array(VARIANCE_SERIES)
 
 @numba.njit(inline="always")
 def _mean_fraction(x: Any, alpha: Any) -> Any:
-    """`depth.mean_fraction` of an optical depth whose opacity is alpha."""
+    """Return `depth.mean_fraction` of an optical depth x with opacity alpha."""
     if x < SERIES_BELOW:
         x2 = x * x
         tail = 1 / 30240 - x2 * (1 / 1209600 - x2 / 47900160)
@@ -31,7 +31,7 @@ def _mean_fraction(x: Any, alpha: Any) -> Any:
 
 @numba.njit(inline="always")
 def _variance_fraction(x: Any, alpha: Any) -> Any:
-    """`depth.variance_fraction` of an optical depth whose opacity is alpha."""
+    """Return `depth.variance_fraction` of an optical depth x with opacity alpha."""
     if x < VARIANCE_SERIES_BELOW:
         x2, series = x * x, 0.0
         for i in range(len(_SERIES) - 1, -1, -1):
@@ -40,17 +40,17 @@ def _variance_fraction(x: Any, alpha: Any) -> Any:
     return 1.0 / (x * x) - (1.0 - alpha) / (alpha * alpha)
 
 
-# Columns of the running sums of a ray: optical depth, weight, mean and sum of squared differences from it, heaviest
-# interval and its weight, how many quantiles have been passed.
+# Columns of the running sums of a ray: optical depth, weight, mean and sum of squared differences from it, mean of
+# the heaviest interval and its weight, number of quantiles passed.
 DEPTH, MASS, MEAN, SQUARES, HEAVIEST, LARGEST, PASSED = range(7)
 COLUMNS = 7
 
 
 @numba.njit(inline="always")
 def add_interval(sums: Any, ray: Any, start: Any, length: Any, density: Any, targets: Any, quantiles: Any) -> Any:
-    """Add the next interval of a ray to its row of `sums`, zero at first, and return its weight.
+    """Add the next interval of a ray to its row of `sums`, initially zero, and return its weight.
 
-    The optical depths `targets` increase; where the ray passes them goes to its row of `quantiles`.
+    `targets` are increasing optical depths; the distances where the ray passes them go to its row of `quantiles`.
     """
     depth, own = sums[ray, DEPTH], density * length
     alpha = -np.expm1(-own)
@@ -94,13 +94,13 @@ def light_ends(
 
 
 def new_sums(rays: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return sums (R, COLUMNS), quantiles (R, Q) that no ray has passed, and their optical depths in order (Q,)."""
+    """Return sums (R, COLUMNS) of 0, quantiles (R, Q) of NaN, and the sorted optical depths of the quantiles (Q,)."""
     targets = np.sort(-np.log1p(-np.asarray(shares, dtype=np.float64)), kind="stable")
     return np.zeros((rays, COLUMNS)), np.full((rays, len(shares)), np.nan, np.float32), targets
 
 
 def light_ends_of(sums: np.ndarray, quantiles: np.ndarray, shares: tuple[float, ...]) -> LightEnds:
-    """Return what rays came to whose intervals have all been added."""
+    """Return the results of rays from their sums, after all their intervals have been added."""
     depth, mass, mean, squares, heaviest, largest, _ = torch.from_numpy(sums).unbind(1)
     seen = mass > 0.0
     spread = torch.sqrt(squares / torch.where(seen, mass, 1.0))

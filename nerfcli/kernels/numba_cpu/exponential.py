@@ -1,4 +1,4 @@
-"""The exponential and the logistic function in float32, without branches or calls: loops over them become vectors."""
+"""The exponential and logistic functions in float32, without branches or calls, so that loops can be vectorised."""
 
 from collections.abc import Callable
 from typing import Any, cast
@@ -24,10 +24,10 @@ float_of_bits: Callable[[Any], Any] = cast(Any, _float_of_bits)
 
 @numba.njit(inline="always")
 def exponential(x: Any) -> Any:
-    """exp(x) to 2e-7 relative for -87 <= x <= 88, the nearer of exp(-87) and exp(88) beyond; NaN for NaN.
+    """Return exp(x) to a relative error of 2e-7, with x clipped to [-87, 88]; NaN for NaN.
 
-    x = n ln 2 + r with a whole n and |r| <= ln(2) / 2, ln 2 as the sum of two floats of which the first has few digits;
-    exp(r) by a polynomial. Source: Moshier, Cephes Math Library, expf.c.
+    x = n ln 2 + r with an integer n and |r| <= ln(2) / 2, where ln 2 is the sum of two floats, the first with few
+    digits; exp(r) by a polynomial. Source: Moshier, Cephes Math Library, expf.c.
     """
     x = min(max(x, np.float32(-87)), np.float32(88))
     n = np.floor(x * np.float32(1.44269504088896341) + np.float32(0.5))
@@ -44,7 +44,7 @@ def exponential(x: Any) -> Any:
 
 @numba.njit(inline="always")
 def sigmoid(x: Any) -> Any:
-    """1 / (1 + exp(-x)), with all digits in both tails."""
+    """Return 1 / (1 + exp(-x)), at full precision in both tails."""
     tail = exponential(-abs(x))
     return (np.float32(1) if x >= 0 else tail) / (np.float32(1) + tail)
 

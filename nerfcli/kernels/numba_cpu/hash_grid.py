@@ -1,9 +1,9 @@
 """The hash grid on CPU threads, compiled by Numba for the vector units of the machine it runs on.
 
-Same operation as in `reference`, for float32. What makes it fast: unsigned 32-bit index arithmetic; samples in blocks,
-with the rows of a block asked for from memory before any of them is used; one level after the other, so that its table
-stays in the cache. What makes it repeatable: a thread owns samples in the forward pass and whole levels in the
-backward pass, and no two threads ever write one number.
+Same operation as in `reference`, for float32. It is fast through unsigned 32-bit index arithmetic; blocks of samples,
+whose hashed rows are prefetched before any is used; and one level after the other, so that its table stays in the
+cache. It is repeatable because a thread owns samples in the forward pass and whole levels in the backward pass: no two
+threads ever write the same number.
 """
 
 from typing import Any
@@ -17,15 +17,15 @@ from nerfcli.kernels.numba_cpu.corners import dense_corners, hashed_corners
 from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.vector import LANES, ROW, dot_rows, gather_rows, prefetch, scatter_rows
 
-# Row width that the kernels are written for, and samples in a block: in smaller ones, a sample's row numbers are read
-# before the processor has stored them.
+# Row width that the kernels are written for, and samples in a block: in smaller blocks, a sample's row numbers would be
+# read before the processor has stored them.
 FEATURES = ROW
 BLOCK = 128
 
 
 @numba.njit(inline="always")
 def _fade(widths: Any, first: Any, count: Any, resolution: Any, weight: Any) -> None:
-    """Lower the weights of a level whose cells are smaller than a pixel; without widths, of none."""
+    """Lower the weights of samples where the level's cells are smaller than a pixel; without widths, of none."""
     if widths.shape[0] > 0:
         one, side = np.float32(1), np.float32(resolution)
         for corner in range(8):
@@ -38,7 +38,7 @@ def _prepare_block(
     points: Any, stride: Any, widths: Any, first: Any, count: Any, level: Any, resolution: Any, rows: Any, flat: Any,
     scratch: Any,
 ) -> None:  # fmt: skip
-    """Rows and weights of all corners of a block of samples, with the rows on their way into the cache."""
+    """Compute rows and weights of all corners of a block of samples, and prefetch the rows if they are hashed."""
     inside, index, weight = scratch
     side = np.int64(resolution) + 1
     if side * side * side <= rows:
@@ -56,7 +56,7 @@ def _prepare_block(
 
 @numba.njit(inline="always")
 def new_scratch() -> Any:
-    """Room for places inside cells, rows and weights of a block."""
+    """Return room for the positions inside cells, rows and weights of a block."""
     return np.empty(3 * BLOCK, np.float32), np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
 
 
@@ -65,10 +65,10 @@ def encode_range(
     points: Any, stride: Any, widths: Any, first: Any, last: Any, flat: Any, rows: Any, resolutions: Any, scratch: Any,
     out: Any,
 ) -> None:  # fmt: skip
-    """Encode all levels of samples first to last into the flat array `out`, with `new_scratch`.
+    """Encode all levels of samples first up to last into the flat array `out`, with scratch space of `new_scratch`.
 
     Args:
-        points: coordinates as `by_axis` lays them out, the next axis `stride` further on.
+        points: coordinates as from `by_axis`, flattened, with `stride` numbers per axis.
     """
     index, weight = scratch[1], scratch[2]
     width = resolutions.shape[0] * FEATURES
@@ -88,7 +88,7 @@ def encode_range(
 
 
 def by_axis(points: Tensor) -> np.ndarray:
-    """Coordinates (N, 3) as (3, M), M >= N, a multiple of a vector: the corners of whole vectors are computed."""
+    """Return coordinates (N, 3) as (3, M), M >= N a multiple of LANES, as corners are computed for whole vectors."""
     count = len(points)
     laid_out = points.new_zeros(3, -(-count // LANES) * LANES)
     laid_out[:, :count] = points.t()
@@ -135,8 +135,8 @@ def _encode_backward(
 def _slopes(
     inside: Any, count: Any, resolution: Any, dots: Any, points: Any, widths: Any, first: Any, out: Any
 ) -> None:
-    """Add to `out` what the coordinates of a block of samples change: differences across the cell, between corners'
-    scalar products of gradient and row, each weighted by the place along the two other axes."""
+    """Add the gradient of the coordinates of a block of samples to `out`: differences across the cell between corners'
+    scalar products of gradient and row, each weighted by the position along the two other axes."""
     one, side = np.float32(1), np.float32(resolution)
     for i in range(count):
         scale = side / max(side * widths[first + i], one) if widths.shape[0] > 0 else side
@@ -225,9 +225,7 @@ class _HashEncode(torch.autograd.Function):
 
 
 def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> bool:
-    """Return whether this module's `hash_encode` supports these tensors;
-    malformed ones go to the reference's checks.
-    """
+    """Return whether this module's `hash_encode` supports these tensors; the reference checks malformed ones."""
     rows, features = table.shape[1:]
     return (
         points.device.type == table.device.type == "cpu"
@@ -250,6 +248,6 @@ def hash_encode(
 
     Args:
         sink: see `Backend.hash_encode`.
-        known: (N, L * F), the answer, where it has been computed before without gradients.
+        known: (N, L * F), the result, if it has already been computed without gradients.
     """
     return _HashEncode.apply(points, table, resolutions, sink, known, widths)  # type: ignore[return-value]

@@ -1,8 +1,8 @@
 """Cache of compiled kernels on disk, invalidated when the sources change.
 
-Numba compiles a kernel again when the file that it stands in has changed, but not for what it calls in other files.
-Where sources were replaced in place, as `git pull` does, old machine code then worked on buffers of a new shape: a
-segmentation fault, or wrong numbers. So all of it goes as soon as one of the sources is another.
+Numba recompiles a kernel when its own file has changed, but not when functions that it calls in other files have. After
+sources were replaced in place, as by `git pull`, old machine code worked on buffers of a new shape: a segmentation
+fault, or wrong numbers. So all machine code is removed as soon as one of the sources has changed.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ _NOTE = "sources.blake2b"
 
 @numba.njit(cache=True)
 def _nothing() -> None:
-    """Never called: it knows where Numba keeps what is compiled in this folder."""
+    """Never called; it knows the folder where Numba caches the kernels of this folder."""
 
 
 def folder() -> Path:
@@ -37,17 +37,17 @@ def is_there() -> bool:
 
 
 def sources() -> list[Path]:
-    """Return the files that the machine code is made of."""
+    """Return the source files from which the machine code is compiled."""
     return list(Path(__file__).parent.parent.rglob("*.py"))
 
 
 def discard_outdated(made_of: Iterable[Path], compiled: Path) -> None:
-    """Remove the machine code in a folder unless it was made of these very sources."""
+    """Remove the machine code in a folder unless it was compiled from exactly these sources."""
     made_of = list(made_of)
     try:
         if (compiled / _NOTE).read_text() == _digest(made_of):
             return
-    except (OSError, ValueError):  # nobody knows what it was made of
+    except (OSError, ValueError):  # unknown sources
         pass
     for pattern in ("*.nbi", "*.nbc"):
         for path in compiled.glob(pattern):
@@ -56,8 +56,8 @@ def discard_outdated(made_of: Iterable[Path], compiled: Path) -> None:
 
 
 def note_sources(made_of: Iterable[Path], compiled: Path) -> None:
-    """Note that the machine code in a folder is made of these sources."""
-    with suppress(UserError), atomic_path(compiled / _NOTE) as partial:  # else nothing compiled can be kept there, too
+    """Record that the machine code in a folder is compiled from these sources."""
+    with suppress(UserError), atomic_path(compiled / _NOTE) as partial:  # else machine code cannot be kept there either
         partial.write_text(_digest(made_of))
 
 

@@ -55,7 +55,7 @@ def _write(
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _keep_largest(cells: Any, coordinates: Any, values: Any, threads: Any) -> None:
-    """`keep_largest`; each thread owns layers of cells, so that none is written by two."""
+    """See `keep_largest`; each thread owns layers of cells, so that no cell is written by two threads."""
     side = cells.shape[0]
     scale, zero, most = np.float32(side), np.float32(0), np.float32(side - 1)
     for thread in numba.prange(threads):

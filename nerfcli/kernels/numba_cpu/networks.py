@@ -1,8 +1,8 @@
-"""The two small networks of the field on CPU threads: tiles of samples go through all layers inside the first cache.
+"""The two small networks of the field on CPU threads: tiles of samples pass through all layers inside the L1 cache.
 
-Same operation as `reference.radiance`. Nothing but the inputs is kept for the backward pass: computing the hidden
-layers of a tile again is cheaper than bringing them back from memory. Each thread sums its own weight gradients; the
-sums are added in the order of the threads.
+Same operation as `reference.radiance`. Only the inputs are kept for the backward pass: recomputing the hidden layers
+of a tile is cheaper than loading them from memory. Each thread sums its own weight gradients; the sums are added in the
+order of the threads.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ OUT = 16
 TILE = 64
 LIMIT = np.float32(LOG_DENSITY_LIMIT)
 
-# Where each layer's weights stand in the flat arrays: encoded-hidden, hidden-density, inputs-hidden, hidden-hidden,
+# Offsets of each layer's weights in the flat arrays: encoded-hidden, hidden-density, inputs-hidden, hidden-hidden,
 # hidden-colour.
 D1, D2, C1, C2, C3 = 0, 1024, 1536, 2560, 3584
 WEIGHTS = 4096
@@ -82,14 +82,14 @@ def _weights_16(x: Any, g: Any, sums: Any, at: Any) -> None:
 
 @numba.njit(inline="always")
 def _mask(g: Any, h: Any) -> None:
-    """Gradients pass where the rectified value is above 0."""
+    """Zero the gradients g where the rectified values h are 0."""
     for i in range(TILE * WIDTH):
-        g[i] = np.float32(0) if h[i] <= np.float32(0) else g[i]  # a store under a branch would not become vectors
+        g[i] = np.float32(0) if h[i] <= np.float32(0) else g[i]  # a store under a branch would not be vectorised
 
 
 @numba.njit(inline="always")
 def _load_rows(source: Any, first: Any, count: Any, out: Any) -> None:
-    """Rows of `source`, and zeros after the last."""
+    """Copy `count` rows of `source` from `first` on to `out`, and fill the rest with zeros."""
     for i in range(count):
         for j in range(WIDTH):
             out[i * WIDTH + j] = source[first + i, j]
@@ -109,16 +109,16 @@ def _colour_inputs(geometry: Any, harmonics: Any, rays: Any, first: Any, count: 
 
 @numba.njit(inline="always")
 def _densities(geometry: Any, density: Any) -> None:
-    """Densities (TILE,) of what the density network puts out, (TILE, 16)."""
+    """Write the densities (TILE,) of the outputs (TILE, 16) of the density network."""
     for i in range(TILE):
         density[i] = geometry[i * OUT]
-    for i in range(TILE):  # apart from the loop above, so that it becomes vectors
+    for i in range(TILE):  # a loop of its own, so that it is vectorised
         density[i] = exponential(min(max(density[i], -LIMIT), LIMIT))
 
 
 @numba.njit(inline="always")
 def _channels(out: Any, channels: Any) -> None:
-    """Write the three numbers (TILE, 3) of the output (TILE, 16) of the colour network."""
+    """Write the three channels (TILE, 3) of the outputs (TILE, 16) of the colour network."""
     for i in range(TILE):
         for channel in range(3):
             channels[3 * i + channel] = out[i * OUT + channel]
@@ -126,8 +126,7 @@ def _channels(out: Any, channels: Any) -> None:
 
 @numba.njit(nogil=True, error_model="numpy")
 def density_tile(encoded: Any, first: Any, weights: Any, h: Any, geometry: Any, density: Any) -> None:
-    """Outputs (TILE, 16) of the density network and densities (TILE,) of a tile of the flat `encoded`, which is whole;
-    see `density_range`."""
+    """Write the density network's outputs (TILE, 16) and the densities (TILE,) of a full tile of the flat `encoded`."""
     _rectified_32(encoded, weights, D1, h, first)
     _layer_16(h, weights, D2, geometry)
     _densities(geometry, density)
@@ -137,7 +136,7 @@ def density_tile(encoded: Any, first: Any, weights: Any, h: Any, geometry: Any, 
 def density_range(
     encoded: Any, begin: Any, end: Any, weights: Any, x: Any, h: Any, geometry: Any, density: Any
 ) -> None:
-    """Density of samples begin to end, with scratch space x and h of TILE * WIDTH, geometry of TILE * OUT."""
+    """Write the density of samples begin up to end; scratch space: x and h of TILE * WIDTH, geometry of TILE * OUT."""
     own = np.empty(TILE, np.float32)
     for first in range(begin, end, TILE):
         count = min(TILE, end - first)
@@ -149,7 +148,7 @@ def density_range(
 
 @numba.njit(nogil=True, error_model="numpy")
 def colour_range(inputs: Any, weights: Any, x: Any, h: Any, out: Any, channels: Any) -> None:
-    """Colours (3 TILE,) of a tile of `_colour_inputs`; scratch space: x and h of TILE * WIDTH, out of TILE * OUT."""
+    """Write colours (3 TILE,) of a tile of `_colour_inputs`; scratch space: x, h of TILE * WIDTH, out of TILE * OUT."""
     _rectified_32(inputs, weights, C1, h)
     _rectified_32(h, weights, C2, x)
     _layer_16(x, weights, C3, out)
@@ -208,7 +207,7 @@ def _radiance_backward(
     sums: Any,
     threads: Any,
 ) -> None:
-    """`view_gradient` is of the harmonics of each sample; without rows, nobody wants it."""
+    """Write all gradients; `view_gradient`, of the harmonics of each sample, only if it has rows."""
     samples = encoded.shape[0]
     tiles = (samples + TILE - 1) // TILE
     for thread in numba.prange(threads):
@@ -276,7 +275,7 @@ def flat_weights(weights: Sequence[Tensor]) -> np.ndarray:
 
 
 def _flat_back(weights: Sequence[Tensor]) -> np.ndarray:
-    """Return all layers as (outputs, inputs), padded alike, as the backward pass reads them."""
+    """Return all layers as (outputs, inputs), padded in the same way, as the backward pass reads them."""
     padded = [torch.nn.functional.pad(w.detach(), (0, 0, 0, -len(w) % OUT)) for w in weights]
     return torch.cat([w.reshape(-1) for w in padded]).numpy()
 

@@ -1,8 +1,8 @@
 """Line integrals through a grid of voxels and their transpose, on CPU threads.
 
-Same operations as `reference.project` and `reference.back_project`. Lines are worked on in parallel forwards;
-backwards each thread owns some planes of the axis that lines are most aligned with, as a line touches a plane only
-in its own four voxels: no two threads write to one voxel, and the order of sums does not depend on threads.
+Same operations as `reference.project` and `reference.back_project`. Forwards, lines are processed in parallel.
+Backwards, each thread owns some planes across the axis that lines are most aligned with, and a line touches only four
+voxels of a plane: no two threads write to the same voxel, and the order of sums does not depend on the threads.
 """
 
 from typing import Any
@@ -14,15 +14,13 @@ from torch import Tensor
 
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
-# Planes of one piece of work backwards: small enough to share out, large enough to cut each line seldom.
+# Planes per work item backwards: few enough to keep all threads busy, enough to cut each line rarely.
 SLAB = 16
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _enter(start: Any, slope: Any, count: Any, low: Any, high: Any) -> tuple[Any, Any]:
-    """Return the planes between `low` and `high` at
-    which start + plane * slope is above -1 and below count, or all but so.
-    """
+    """Return the planes from `low` up to `high` where start + plane * slope is, or almost is, between -1 and count."""
     if slope == 0.0:
         if start <= -1.0 or start >= count:
             return 0, 0
@@ -30,7 +28,7 @@ def _enter(start: Any, slope: Any, count: Any, low: Any, high: Any) -> tuple[Any
     one, two = (-1.0 - start) / slope, (count - start) / slope
     if one > two:
         one, two = two, one
-    # Bounds are compared before they become integers: a line may pass very far away.
+    # Bounds are compared before conversion to integers: a line may pass very far away.
     if one >= high or two < low:
         return 0, 0
     if one >= low:
@@ -42,7 +40,7 @@ def _enter(start: Any, slope: Any, count: Any, low: Any, high: Any) -> tuple[Any
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _line(origin: Any, direction: Any, first: Any, size: Any, counts: Any, low: Any, high: Any) -> tuple:
-    """Axis, planes and the two other coordinates of a line as functions of the plane, in voxels."""
+    """Return a line's main and other axes, its planes, start and slope of its other coordinates, length per plane."""
     axis = 0
     for j in range(1, 3):
         if abs(direction[j]) > abs(direction[axis]):

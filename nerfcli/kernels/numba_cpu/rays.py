@@ -1,4 +1,4 @@
-"""Steps along rays, and the cells that they come through; the pieces of which `visible` is made, and `ray_indices`."""
+"""Steps along rays and the cells that they cross: building blocks of `visible`; and `ray_indices`."""
 
 from typing import Any
 
@@ -11,13 +11,13 @@ from nerfcli.kernels.numba_cpu.steps import steps_in_ball, steps_in_contracted_c
 from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.vector import LANES
 
-# Steps of a ray that are looked at together.
+# Steps of a ray that are processed together.
 CHUNK = LANES
 
 
 @numba.njit(inline="always")
 def cube(x: Any, y: Any, z: Any, contraction: Any) -> Any:
-    """`contraction.grid_coordinates` of one point; without branches inside, so that loops over it become vectors.
+    """Return `contraction.grid_coordinates` of one point, without branches on it, so that loops can be vectorised.
 
     `contraction` is the number of the name in `CONTRACTIONS`.
     """
@@ -41,9 +41,9 @@ def look_ahead(
     origins: Any, directions: Any, edges: Any, jitter: Any, ray: Any, first: Any, side: Any, contraction: Any,
     places: Any, cells: Any,
 ) -> None:  # fmt: skip
-    """Coordinates (3 CHUNK,) of the middles of CHUNK intervals from `first`, and their cells; -1 outside of the grid.
+    """Write coordinates (3 CHUNK,) of the midpoints of CHUNK intervals from `first` on, and their cells, -1 outside.
 
-    `edges` are `padded`: what lies beyond the last interval is for the caller to leave out.
+    `edges` must be `padded`; the caller has to leave out steps beyond the last interval.
     """
     if contraction == 0:
         steps_in_cube(origins, directions, ray, edges, jitter[ray], first, side, places, cells)
@@ -54,7 +54,7 @@ def look_ahead(
 
 
 def padded(edges: Tensor) -> np.ndarray:
-    """Edges with as many copies of the last as `look_ahead` may look at."""
+    """Return edges followed by the CHUNK copies of the last one that `look_ahead` may read."""
     return torch.nn.functional.pad(edges[None], (0, CHUNK), mode="replicate")[0].numpy()
 
 

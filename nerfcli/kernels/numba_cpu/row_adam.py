@@ -1,8 +1,8 @@
-"""Adam on the rows of a table that have a gradient, on CPU threads; the gradient is set to zero on the way.
+"""Adam on the rows of a table that have a gradient, on CPU threads; the gradient is zeroed in the same pass.
 
-Same operation as `reference.adam_rows`. Four rows make a vector, which is stepped if any of them has a gradient; the
-others among them keep what they have. LLVM leaves such a loop of Numba scalar, which takes 1.3 times as long where a
-fifth of the rows has a gradient, and 3.8 times where all have.
+Same operation as `reference.adam_rows`. Four rows make a vector, which is updated if any of them has a gradient; its
+other rows keep their values. LLVM does not vectorise such a loop written in Numba, which takes 1.3 times as long if a
+fifth of the rows has a gradient, and 3.8 times if all have one.
 """
 
 from typing import Any
@@ -21,7 +21,7 @@ FEATURES = 4
 
 
 def _touched(builder: Any, gradient: Any) -> Any:
-    """Return -1 in all lanes of a row if any of its numbers is not zero (or NaN), else 0."""
+    """Return -1 in all lanes of a row if any of its numbers is nonzero or NaN, else 0."""
     touched = builder.sext(builder.fcmp_unordered("!=", gradient, floats(0.0)), INTS)
     for distance in (1, 2):
         swapped = ir.Constant(INTS, [lane ^ distance for lane in range(LANES)])
@@ -36,7 +36,7 @@ def _square_root(builder: Any, vector: Any) -> Any:
 
 
 def _step(builder: Any, places: Any, numbers: Any) -> None:
-    """Step the rows of a vector that have a gradient; `numbers` as in `_update`."""
+    """Update the rows of a vector that have a gradient; `numbers` as in `_update`."""
     table_at, gradient_at, first_at, second_at = places
     gradient = builder.load(gradient_at, align=4)
     touched = _touched(builder, gradient)
@@ -72,7 +72,7 @@ def _step_vector(
     return types.none(table, gradient, first, second, at, rate, beta1, beta2, correction, eps, decay), generate
 
 
-# step_vector(table, gradient, first, second, at, rate, ...): a step of LANES numbers of flat arrays, from `at` on.
+# step_vector(table, gradient, first, second, at, rate, ...) updates LANES numbers of flat arrays, from `at` on.
 step_vector: Any = _step_vector
 
 

@@ -1,4 +1,4 @@
-"""Coordinates and cells of 16 steps along a ray, as vectors: LLVM leaves the same loop of Numba scalar."""
+"""Coordinates and cells of 16 steps along a ray, as vectors: LLVM does not vectorise the same loop written in Numba."""
 
 from collections.abc import Callable
 from typing import Any, cast
@@ -48,7 +48,7 @@ def _cube(builder: Any, points: list[Any]) -> list[Any]:
 
 
 def _cells(builder: Any, coordinates: list[Any], side: Any) -> Any:
-    """Numbers of cells in a grid, -1 outside; places are clamped first, as far ones would not fit into an integer."""
+    """Return indices of cells in a grid, -1 outside; coordinates are clamped first, as distant ones would overflow."""
     zero, one = floats(0.0), floats(1.0)
     scale = in_all_lanes(builder, builder.sitofp(side, FLOAT), FLOATS)
     line = in_all_lanes(builder, side, INTS)
@@ -65,10 +65,9 @@ def _cells(builder: Any, coordinates: list[Any], side: Any) -> Any:
 
 
 def _steps(cube_of: Callable[[Any, list[Any]], list[Any]]) -> Any:
-    """Return an intrinsic: (origins, directions, ray, edges, shift, first, side, places, cells),
-    with arrays that are flat.
+    """Return an intrinsic (origins, directions, ray, edges, shift, first, side, places, cells), on flat arrays.
 
-    Edge k of the ray is edges[k] + shift * (edges[k + 1] - edges[k]). Writes the coordinates of the middles of 16
+    Edge k of the ray is edges[k] + shift * (edges[k + 1] - edges[k]). It writes the coordinates of the midpoints of 16
     intervals from number `first` on to places[axis * 16 + i], and their cells in a grid of `side` to cells[i].
     """
 

@@ -7,19 +7,19 @@ from numba.np.ufunc.parallel import threading_layer
 
 
 def use_threads() -> int:
-    """Have Numba's loops use as many threads as torch, which --threads sets; returns how many these are."""
+    """Set Numba's thread count to torch's, which --threads sets, or to Numba's maximum if less; return it."""
     count = min(torch.get_num_threads(), int(config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
     numba.set_num_threads(count)
     return count
 
 
 def thread_safe() -> bool:
-    """Return whether several threads may run compiled loops at the same time; workqueue then ends the process."""
+    """Return whether several threads may run compiled loops at once; the workqueue layer would abort the process."""
     return threading_layer() != "workqueue"
 
 
 def _launch() -> None:
-    """Start Numba's threads now: both libraries share one OpenMP, and the start overwrites torch's thread count."""
+    """Start Numba's threads now: both libraries share one OpenMP, and starting it overwrites torch's thread count."""
     wanted = torch.get_num_threads()
     use_threads()
     torch.set_num_threads(wanted)

@@ -1,8 +1,8 @@
-"""Rays of pictures through a hash grid: marching, encoding, both networks and compositing in one pass.
+"""Rendering of pictures of a hash grid: marching, encoding, both networks and compositing in one pass.
 
-Same operation as `ComposedBackend.trace_rays`, two to three times as fast: of a sample nothing is kept but its interval
-and density. Whether a sample is asked for its colour is decided as it comes, when the number of samples of its ray is
-not yet known: the light of those that are not asked is counted, and bounds the error as before.
+Same operation as `ComposedBackend.trace_rays`, two to three times as fast, because only the interval and the density of
+a sample are kept. A sample's colour is evaluated or skipped as soon as the sample is found, when the number of samples
+of its ray is not yet known; the weight of the skipped ones is summed, and bounds the error as before.
 """
 
 import math
@@ -23,7 +23,7 @@ from nerfcli.kernels.numba_cpu.rays import CHUNK, padded
 from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.visible import LANES, ROUND, fill_round, new_round, occupied_blocks
 
-# A sample may go without its colour if it weighs no more than this part of what all of a ray together may weigh.
+# A sample's colour may be skipped if its weight is at most this fraction of `negligible`, the limit for its ray.
 PART = 1 / 32
 
 
@@ -45,12 +45,12 @@ def _trace(
     targets: Any, coming: Any, last_ray: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any, counts: Any,
     owner: Any, record: Any,
 ) -> Any:  # fmt: skip
-    """Add all that rays `coming` to `last_ray` meet to their rows of sums, quantiles, colours and unseen weight.
+    """Trace rays from `coming` up to `last_ray`, adding to their rows of sums, quantiles, colours and unseen weight.
 
-    The samples go to `owner` and `record`, if there is room, in the order in which they are found.
+    Unless `owner` is empty, samples are written to `owner` and `record`, in the order in which they are found.
 
     Returns:
-        how many samples there are.
+        number of samples written.
     """
     intervals = edges.shape[0] - 2 - CHUNK
     (lane_ray, lane_next, lane_depth), (places, cells), (sample_lane, sample_span, points) = new_round()
@@ -112,7 +112,7 @@ def _trace_all(
     targets: Any, borders: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any, counts: Any, owner: Any,
     record: Any, found: Any,
 ) -> None:  # fmt: skip
-    """`_trace`, by a thread for the rays from each border to the next."""
+    """Call `_trace` in parallel, with one thread for the rays from each border to the next."""
     for thread in numba.prange(len(borders) - 1):
         found[thread] = _trace(
             origins, directions, edges, jitter, occupied, blocks, side, contraction, flat, rows, resolutions, weights,
@@ -123,7 +123,7 @@ def _trace_all(
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _sort(borders: Any, offsets: Any, owner: Any, record: Any, found: Any, spans: Any) -> None:
-    """Bring intervals into the order of the rays; along each ray they are in order already."""
+    """Sort intervals by ray; along each ray they are already in order."""
     for thread in numba.prange(len(borders) - 1):
         place = offsets[borders[thread] : borders[thread + 1]].copy()
         for i in range(found[thread]):
@@ -147,7 +147,7 @@ def trace_rays(
     threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
     cones = rays.cones if grid.antialias and rays.cones is not None else rays.origins.new_empty(0)
     borders = np.arange(threads + 1) * count // threads
-    # Room for all samples of all rays: memory that nobody writes to is never really taken.
+    # Room for all samples of all rays: the system allocates memory only when it is first written to.
     room = (threads, -(-count // threads) * intervals if keep_intervals else 0)
     owner, record = np.empty(room, np.int64), np.empty((*room, 3), np.float32)
     counts, found = np.zeros(count if keep_intervals else 0, np.int64), np.zeros(threads, np.int64)
@@ -170,6 +170,6 @@ def trace_rays(
     light, left = light_ends_of(sums, quantiles, shares), torch.from_numpy(np.exp(-sums[:, 0]))
     seen = torch.from_numpy(colours + UNSEEN * unseen[:, None]) + left[:, None] * background
     stopped = left <= math.exp(-along.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
-    behind = torch.maximum(background, 1.0 - background).amax(-1)  # how far any colour is from the background's
+    behind = torch.maximum(background, 1.0 - background).amax(-1)  # largest difference from the background's colour
     error = UNSEEN * torch.from_numpy(unseen) + torch.where(stopped, left * behind, 0.0)
     return RaysSeen(seen.float(), light, error.float(), Intervals(density, starts, ends, torch.from_numpy(offsets)))

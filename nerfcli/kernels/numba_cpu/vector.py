@@ -10,11 +10,11 @@ from llvmlite.binding import get_host_cpu_features
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-# Lanes of a vector; LLVM splits it into what the processor has (AVX-512: one register, AVX2: two, NEON: four).
+# Lanes of a vector; LLVM splits it into the processor's registers (AVX-512: one register, AVX2: two, NEON: four).
 LANES = 16
-# Rows of a block of a matrix product whose rows have 32 and 16 numbers. Its sums fill half of the registers at most and
-# hide the latency of a product: 32 with AVX-512, else 16, which are half as wide with AVX2. There, 8 rows of 32 numbers
-# go to memory and back at every product: 35 instead of 84 GFLOP/s.
+# Rows of a block of a matrix product, for rows of 32 and of 16 numbers. The block's sums fill at most half of the
+# registers (32 with AVX-512, else 16, half as wide with AVX2), and hide the latency of a product. With AVX2, 8 rows of
+# 32 numbers would be spilled to memory at every product: 35 instead of 84 GFLOP/s.
 ROWS_32, ROWS_16 = (8, 8) if get_host_cpu_features().get("avx512f") else (2, 4)
 
 # Types of LLVM, and vectors of them.
@@ -23,23 +23,23 @@ INTS, FLOATS = ir.VectorType(INT, LANES), ir.VectorType(FLOAT, LANES)
 
 
 def ints(value: int) -> Any:
-    """Return a vector of one whole number."""
+    """Return a vector with one integer in all lanes."""
     return ir.Constant(INTS, [value % 2**32] * LANES)
 
 
 def floats(value: float) -> Any:
-    """Return a vector of one number, which float32 must hold exactly."""
+    """Return a vector with one number in all lanes, which float32 must represent exactly."""
     return ir.Constant(FLOATS, [value] * LANES)
 
 
 def in_all_lanes(builder: Any, scalar: Any, kind: Any) -> Any:
-    """Return a vector of type `kind` of one number that the machine code computes."""
+    """Return a vector of type `kind` with a scalar, computed by the machine code, in all lanes."""
     undefined = ir.Constant(kind, ir.Undefined)
     return builder.shuffle_vector(builder.insert_element(undefined, scalar, ir.Constant(INT, 0)), undefined, ints(0))
 
 
 def vector_at(builder: Any, pointer: Any, first: Any, step: Any, count: int, kind: Any) -> Any:
-    """Return the place of a vector of type `kind`: `count` steps behind element `first`."""
+    """Return a pointer to a vector of type `kind`, `count` steps after element `first`."""
     element = builder.add(first, builder.mul(step, ir.Constant(LONG, count)))
     return builder.bitcast(builder.gep(pointer, [element]), kind.as_pointer())
 
@@ -60,7 +60,7 @@ def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
     return types.none(array, index), generate
 
 
-# prefetch(array, index) asks for the cache line of array[index] of a flat float32 array, without waiting for it.
+# prefetch(array, index) requests the cache line of array[index] of a flat float32 array, without waiting for it.
 prefetch: Callable[[Any, Any], None] = cast(Any, _prefetch)
 
 
@@ -106,14 +106,14 @@ def _row_access(generate: Callable[..., None]) -> Any:
 
 
 def _in_all_lanes(builder: Any, pointer: Any) -> Any:
-    """Return the number at a pointer, once for each number of a row."""
+    """Return the number at a pointer, in all lanes of a vector of one row."""
     undefined = ir.Constant(ir.VectorType(ir.FloatType(), ROW), ir.Undefined)
     first = builder.insert_element(undefined, builder.load(pointer), ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(ir.IntType(32), ROW), [0] * ROW))
 
 
 def _gather(builder: Any, corners: Any, row: Any) -> None:
-    # All weights are loaded before anything is stored: the compiler cannot know that they do not stand in the row.
+    # All weights are loaded before anything is stored: the compiler cannot know that they do not overlap the row.
     weights = [_in_all_lanes(builder, weight) for _, weight in corners]
     total = None
     for (pointer, _), weight in zip(corners, weights, strict=True):
@@ -125,7 +125,7 @@ def _gather(builder: Any, corners: Any, row: Any) -> None:
 def _scatter(builder: Any, corners: Any, row: Any) -> None:
     gradient = builder.load(row, align=4)
     weights = [_in_all_lanes(builder, weight) for _, weight in corners]
-    for (pointer, _), weight in zip(corners, weights, strict=True):  # one after the other: two may share a row
+    for (pointer, _), weight in zip(corners, weights, strict=True):  # one after the other: two corners may share a row
         product = builder.fmul(weight, gradient, flags=("contract",))
         builder.store(builder.fadd(builder.load(pointer, align=4), product, flags=("contract",)), pointer, align=4)
 
@@ -157,8 +157,8 @@ def _block_product(
 
     Args:
         rows, vectors: of a block.
-        begin: what a vector of sums starts from, given the builder and where it will be stored.
-        finish: what is stored of a vector of sums.
+        begin: returns the initial vector of sums, given the builder and the pointer to which it will be stored.
+        finish: returns the vector to store, given the builder and the sums.
     """
 
     @intrinsic
@@ -232,13 +232,13 @@ def _as_it_is(builder: Any, total: Any) -> Any:
 
 def _rectified(builder: Any, total: Any) -> Any:
     zero = _zero(builder, None)
-    return builder.select(builder.fcmp_ordered("<=", total, zero), zero, total)  # NaN stays NaN, to be found
+    return builder.select(builder.fcmp_ordered("<=", total, zero), zero, total)  # NaN stays NaN, so that it is detected
 
 
-# X_N(a, a_at, a_row, a_step, b, b_at, b_step, depth, c, c_at, c_row), on flat float32 arrays, with a block of
+# X_N(a, a_at, a_row, a_step, b, b_at, b_step, depth, c, c_at, c_row), on flat float32 arrays, computes a block of
 # ROWS_N x N of a matrix product
 #     p[r, j] = sum_k a[a_at + r a_row + k a_step] * b[b_at + k b_step + j],  r < ROWS_N, j < N, k < depth
-# does to c[c_at + r c_row + j]: add_product adds it, product stores it, rectified_product stores max(0, p).
+# and writes to c[c_at + r c_row + j]: add_product adds p, product stores p, rectified_product stores max(0, p).
 add_product_16 = _block_product(ROWS_16, 1, begin=_stored, finish=_as_it_is)
 add_product_32 = _block_product(ROWS_32, 2, begin=_stored, finish=_as_it_is)
 product_16 = _block_product(ROWS_16, 1, begin=_zero, finish=_as_it_is)

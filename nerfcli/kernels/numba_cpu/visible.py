@@ -1,8 +1,8 @@
-"""The samples of rays that light gets to: marching, encoding and density together, stopping where a ray is opaque.
+"""The samples of rays that light reaches: marching, encoding and density together, stopping where a ray is opaque.
 
-Same operation as `reference.visible_samples`. A thread carries some rays at a time, each a few samples ahead, so that
-encoding and network work on full tiles although every ray stops where it likes; a ray that ends makes room for the
-next one. What stands behind a surface is never computed.
+Same operation as `reference.visible_samples`. A thread works on many rays at a time, each a few samples ahead, so that
+encoding and network get full tiles although rays stop at different depths; when a ray ends, the next one takes its
+lane. Except for those few samples, nothing behind a surface is computed.
 """
 
 from typing import Any
@@ -19,29 +19,29 @@ from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, density_range, 
 from nerfcli.kernels.numba_cpu.rays import CHUNK, cube, cut, look_ahead, padded
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
-# Rays that a thread carries at a time, and samples that each of them looks ahead.
+# Rays that a thread works on at a time, and samples that each of them looks ahead.
 LANES = 256
 AHEAD = 4
 ROUND = LANES * AHEAD
-# Empty blocks of cells are stepped over as a whole: so many along a side of the grid, of this many cells at least.
+# Empty blocks of cells are skipped as a whole: blocks along a side of the grid, and smallest width of one in cells.
 BLOCKS, LEAST_BLOCK = 16, 4
 
 
 @numba.njit(inline="always")
 def _block_side(side: Any) -> Any:
-    """Return how many cells a block is wide."""
+    """Return the width of a block in cells."""
     return max(side // BLOCKS, LEAST_BLOCK)
 
 
 @numba.njit(inline="always")
 def _block(x: Any, side: Any) -> Any:
-    """Return the block of a coordinate along one axis; of the nearest one inside the cube."""
+    """Return the block of a coordinate along one axis; the coordinate is clamped to the cube."""
     return min(np.int64(min(max(x, np.float32(0)), np.float32(1)) * np.float32(side)), side - 1) // _block_side(side)
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def _is_occupied(occupied: Any, z: Any, y: Any, x: Any, width: Any) -> Any:
-    """Return whether a block that begins in a cell has an occupied one."""
+    """Return whether the block of `width` cells that begins at cell (z, y, x) has an occupied cell."""
     side = occupied.shape[0]
     for k in range(z, min(z + width, side)):
         for j in range(y, min(y + width, side)):
@@ -53,7 +53,7 @@ def _is_occupied(occupied: Any, z: Any, y: Any, x: Any, width: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def occupied_blocks(occupied: Any) -> Any:
-    """Return which blocks of cells are occupied, or touch one that is."""
+    """Return a mask of the blocks that have an occupied cell, or touch a block that has one."""
     side = occupied.shape[0]
     width = _block_side(side)
     blocks = (side + width - 1) // width
@@ -75,11 +75,11 @@ def occupied_blocks(occupied: Any) -> Any:
 def _may_hold_something(
     origins: Any, directions: Any, ray: Any, start: Any, end: Any, blocks: Any, side: Any, reach: Any, contraction: Any
 ) -> Any:
-    """Return whether an interval of a ray may come through an occupied cell.
+    """Return whether an interval of a ray may cross an occupied cell.
 
-    Where both its ends are within a block's size of its middle, the middle's block and its neighbours hold all of it:
-    coordinates of the cube change by at most 1/2 per distance, 1/4 where space is contracted to a ball, and 1/4 times
-    1.025 where it is contracted to a cube.
+    If both its ends are within a block's width of its midpoint, the midpoint's block and its neighbours contain all of
+    it: coordinates of the cube change by at most 1/2 per unit of distance, 1/4 where space is contracted to a ball, and
+    1/4 times 1.025 where it is contracted to a cube.
     """
     if end - start > reach:
         return True
@@ -95,7 +95,7 @@ def _may_hold_something(
 
 @numba.njit(inline="always")
 def _stretch(origins: Any, directions: Any, ray: Any, t: Any, contraction: Any) -> Any:
-    """Return how much `contraction.cube_widths` makes of a width of 1 at a distance along a ray."""
+    """Return the factor that `contraction.cube_widths` applies to widths at distance t along a ray."""
     quarter, one, two = np.float32(0.25), np.float32(1), np.float32(2)
     if contraction == 0:
         return np.float32(0.5)
@@ -108,7 +108,7 @@ def _stretch(origins: Any, directions: Any, ray: Any, t: Any, contraction: Any) 
 
 @numba.njit(inline="always")
 def new_round() -> Any:
-    """Lanes without rays, and room for the samples of a round: `lanes` and `round_` of `fill_round`."""
+    """Return lanes without rays, scratch space for `look_ahead`, and room for the samples of a `fill_round`."""
     lanes = np.full(LANES, -1, np.int64), np.zeros(LANES, np.int64), np.zeros(LANES, np.float64)
     look = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
     samples = np.empty(ROUND, np.int64), np.empty((ROUND, 2), np.float32), np.empty((3, ROUND), np.float32)
@@ -117,7 +117,7 @@ def new_round() -> Any:
 
 @numba.njit(inline="always")
 def block_reach(side: Any, contraction: Any) -> Any:
-    """Return the longest interval of which `_may_hold_something` knows where it goes."""
+    """Return the length of the longest interval that `_may_hold_something` can rule out."""
     return np.float32(_block_side(side) / side * (4.0 if contraction == 0 else 7.8))
 
 
@@ -127,12 +127,12 @@ def fill_round(
     cones: Any, coming: Any, last_ray: Any, lane_ray: Any, lane_next: Any, lane_depth: Any, places: Any, cells: Any,
     sample_lane: Any, sample_span: Any, points: Any, widths: Any,
 ) -> Any:  # fmt: skip
-    """Find the next samples of the rays in the lanes, up to AHEAD each; a lane without a ray takes the one `coming`.
+    """Find the next samples of the rays in the lanes, up to AHEAD each; a lane without a ray takes the ray `coming`.
 
-    A sample's lane, start and end, coordinates and width go to the last four arrays.
+    A sample's lane, start and end, coordinates and width are written to the last four arrays.
 
     Returns:
-        how many samples there are, and the ray that comes next.
+        number of samples found, and the ray that the next empty lane takes.
     """
     intervals = edges.shape[0] - 2 - CHUNK
     reach = block_reach(side, contraction)
@@ -181,11 +181,10 @@ def _follow(
     flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any, coming: Any,
     last_ray: Any, counts: Any, owner: Any, record: Any, code: Any, left: Any,
 ) -> Any:  # fmt: skip
-    """Samples of rays `coming` to `last_ray` in the order in which they are found, how many they are, and how many are
-    left out for their weight.
+    """Write the samples of rays from `coming` up to `last_ray`, in the order in which they are found.
 
-    A sample's ray goes to `owner`, its start, end, density and coordinates to `record`, its features to `code`; of one
-    that is left out, coordinates and optical depth go to `left`.
+    A sample's ray goes to `owner`, its start, end, density and coordinates to `record`, its features to `code`. If it
+    is left out for its weight, its coordinates and optical depth go to `left` instead. Returns the number of both.
     """
     intervals = edges.shape[0] - 2 - CHUNK
     (lane_ray, lane_next, lane_depth), (places, cells), (sample_lane, sample_span, points) = new_round()
@@ -214,7 +213,7 @@ def _follow(
                 continue
             own = np.float64(density[i]) * np.float64(sample_span[i, 1] - sample_span[i, 0])
             lane_depth[lane] += own
-            if not (own < least or own * np.exp(-before) < least):  # most faint ones need no exponential
+            if not (own < least or own * np.exp(-before) < least):  # most faint samples need no exponential
                 ray = lane_ray[lane]
                 counts[ray] += 1
                 owner[found] = ray
@@ -240,7 +239,7 @@ def _visible(
     flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any, borders: Any,
     counts: Any, owner: Any, record: Any, code: Any, left: Any, found: Any, missing: Any,
 ) -> None:  # fmt: skip
-    """`_follow`, by a thread for the rays from each border to the next."""
+    """Call `_follow` in parallel, with one thread for the rays from each border to the next."""
     for thread in numba.prange(len(borders) - 1):
         found[thread], missing[thread] = _follow(
             origins, directions, edges, jitter, occupied, blocks, side, contraction, flat, rows,
@@ -254,7 +253,7 @@ def _sort(
     borders: Any, offsets: Any, owner: Any, record: Any, code: Any, found: Any, spans: Any, coordinates: Any,
     encoded: Any,
 ) -> None:  # fmt: skip
-    """Bring what `_visible` found into the order of the rays; along each ray it is in order already."""
+    """Sort the samples of `_visible` by ray; along each ray they are already in order."""
     for thread in numba.prange(len(borders) - 1):
         place = offsets[borders[thread] : borders[thread + 1]].copy()
         for i in range(found[thread]):
@@ -273,7 +272,7 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: torch.Tens
     threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
     cones = rays.cones if grid.antialias and rays.cones is not None else rays.origins.new_empty(0)
     borders = np.arange(threads + 1) * count // threads
-    # Room for all samples of all rays: memory that nobody writes to is never really taken.
+    # Room for all samples of all rays: the system allocates memory only when it is first written to.
     room = (threads, -(-count // threads) * intervals)
     owner, record = np.empty(room, np.int64), np.empty((*room, 6), np.float32)
     code, left = np.empty((*room, WIDTH), np.float32), np.empty((*room, 4), np.float32)

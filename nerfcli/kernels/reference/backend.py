@@ -1,4 +1,4 @@
-"""The operations on rays by their definitions, on any device and in any precision."""
+"""Backend of the reference operations, on any device and in any precision."""
 
 from typing import ClassVar
 
@@ -12,10 +12,10 @@ from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
 
 
 class ReferenceBackend(ComposedBackend):
-    """`reference`, composed.
+    """Backend composed of `reference`.
 
     Args:
-        device: where it works; sums that others add to in any order do not repeat on a GPU.
+        device: of its tensors; on a GPU, sums are added in varying order, and results do not repeat to the bit.
     """
 
     name = "reference"
@@ -93,10 +93,10 @@ class ReferenceBackend(ComposedBackend):
 def encode_into(
     points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, widths: Tensor | None, sink: Tensor | None
 ) -> Tensor:
-    """`reference.hash_encode`; the gradient with respect to the table goes into the sink, if there is one."""
+    """Return `reference.hash_encode`; the gradient with respect to the table goes into the sink, if there is one."""
     if sink is None or not (table.requires_grad and torch.is_grad_enabled()):
         return reference.hash_encode(points, table, resolutions, widths)
-    leaf = table.detach().to(sink.dtype).requires_grad_()  # half precision's gradients go on unrounded
+    leaf = table.detach().to(sink.dtype).requires_grad_()  # gradients of a half-precision table are not rounded
 
     def add_to_sink(given: Tensor) -> None:
         if given.grad is not None:

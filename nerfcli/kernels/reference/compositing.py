@@ -5,7 +5,7 @@ from torch import Tensor
 
 from nerfcli.kernels.activations import opacity
 
-# Relative distance from a target from which on light counts as simply elsewhere.
+# Relative distance from a target beyond which light counts fully as off target.
 MOST_DEVIATION = 0.25
 
 
@@ -16,11 +16,11 @@ def ray_indices(offsets: Tensor) -> Tensor:
 
 
 def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:
-    """Optical depth between the ray's origin and the near end of each interval.
+    """Return the optical depth between the ray's origin and the near end of each interval.
 
     tau_i = sum_{j < i} density_j * length_j over the samples of the same ray.
 
-    Shifted, then accumulated: to accumulate and subtract the own part loses all digits at a much denser interval.
+    Shifted, then accumulated: subtracting the interval's own depth from the sum loses all digits if it is much denser.
 
     Args:
         density: (N,) >= 0, finite, in 1 / unit of length.
@@ -51,7 +51,7 @@ def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple
     Returns:
         weights (N,), transmittance (R,) behind the last interval; per ray they sum to 1.
 
-    Differentiable in density and lengths. 1 - exp would lose every digit below 1e-7 in float32.
+    Differentiable in density and lengths. alpha is computed by expm1: 1 - exp loses all digits below 1e-7 in float32.
     Source: Max 1995, Optical models for direct volume rendering; Mildenhall et al. 2020, arXiv:2003.08934, eq. 3.
     """
     before = optical_depth_before(density, lengths, offsets)
@@ -63,7 +63,7 @@ def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple
 
 
 def sum_along_rays(values: Tensor, offsets: Tensor) -> Tensor:
-    """Sums of the samples of each ray: (N, ...) to (R, ...). Differentiable."""
+    """Return the sum over the samples of each ray: (N, ...) to (R, ...). Differentiable."""
     total = torch.zeros((len(offsets) - 1, *values.shape[1:]), dtype=values.dtype, device=values.device)
     return total.index_add(0, ray_indices(offsets), values)
 
@@ -71,7 +71,7 @@ def sum_along_rays(values: Tensor, offsets: Tensor) -> Tensor:
 def composite(
     density: Tensor, rgb: Tensor, lengths: Tensor, *, offsets: Tensor, background: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour of rays through an emitting, absorbing medium in front of a background.
+    """Compute the colour of rays through an emitting, absorbing medium in front of a background.
 
     colour = sum_i weight_i * rgb_i + T * background; see `interval_weights`.
 
@@ -96,18 +96,18 @@ def composite(
 def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
     """Compute the distortion of each ray: the mean distance between two points at which its light is absorbed.
 
-    sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (ends_i - starts_i), with m the middles; 0 without samples.
+    sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (ends_i - starts_i), with m the midpoints; 0 without samples.
 
     Args:
         weights: (N,) >= 0, see `interval_weights`.
-        starts, ends: (N,) increasing along each ray, in whatever measure of distance counts.
+        starts, ends: (N,) increasing along each ray, in any measure of distance.
         offsets: (R + 1,).
 
     Returns:
         (R,). Differentiable in weights.
 
-    The double sum is 2 sum_i (m_i - m_(i-1)) W_i B_i with the weights W_i in front of interval i and B_i from it on: a
-    gap between two middles counts for all pairs on its two sides. Nothing is subtracted from a sum.
+    The double sum is 2 sum_i (m_i - m_(i-1)) W_i B_i, with the total weights W_i before interval i and B_i from it on:
+    the gap between two midpoints counts for every pair across it. Nothing is subtracted from a sum.
     Source: Barron et al. 2022, Mip-NeRF 360, arXiv:2111.12077, eq. 15.
     """
     middles, ones = (starts + ends) / 2, torch.ones_like(weights)
@@ -119,28 +119,28 @@ def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -
 
 
 def contracted_distance(distance: Tensor) -> Tensor:
-    """s(t) = t / 2 for t <= 1, else 1 - 1 / (2 t): the place on a ray, from 0 at the camera to 1 at infinity."""
+    """Return s(t) = t / 2 for t <= 1, else 1 - 1 / (2 t): from 0 at the camera to 1 at infinity."""
     return torch.where(distance <= 1.0, distance, 2.0 - 1.0 / distance.clamp_min(1.0)) / 2.0
 
 
 def off_target(
     weights: Tensor, transmittance: Tensor, middles: Tensor, *, offsets: Tensor, distances: Tensor
 ) -> Tensor:
-    """Compute the distance of absorption from known distances, for the last K rays.
+    """Compute how far from known distances the light of the last K rays is absorbed.
 
     sum_i weight_i min(1, |middle_i - distance| / (c distance)) + transmittance,  c = 0.25
 
-    Light that ends c of the distance away or more, or not at all, counts 1, so that a wrong distance pulls no harder
-    than a right one that has been reached pulls back.
+    Light that is absorbed a fraction c of the distance away or more, or not at all, counts 1. So a wrong distance pulls
+    no harder than a right one, once reached, holds.
 
     Args:
-        weights, middles: (N,); middles of the intervals.
+        weights, middles: (N,) weights and midpoints of the intervals.
         transmittance: (R,).
         offsets: (R + 1,).
         distances: (K,) > 0, K <= R.
 
     Returns:
-        (K,) in [0, 1]; 0 where all light ends there. Differentiable in weights and transmittance.
+        (K,) in [0, 1]; 0 where all light is absorbed at that distance. Differentiable in weights and transmittance.
     """
     first = len(transmittance) - len(distances)
     of_targets = offsets[first:] - offsets[first]
@@ -151,10 +151,10 @@ def off_target(
 
 
 def scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor) -> None:
-    """Have gradients that come to these tensors multiplied by min(1, distance^2).
+    """Multiply the gradients that reach these tensors by min(1, distance^2).
 
-    Space near a camera is crossed by many of its rays and by those of no other camera: without this it learns
-    faster than what all cameras see, and fog grows in front of the lenses.
+    Space near a camera is crossed by many of its rays and by no other camera's: without this it learns faster than the
+    space that all cameras see, and fog grows in front of the lenses.
     Source: Philip and Deschaintre 2023, Floaters no more, arXiv:2305.02756, eq. 6.
     """
     scale = distance.square().clamp_max(1.0)

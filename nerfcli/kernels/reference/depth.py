@@ -1,8 +1,8 @@
 """Depth of rays: means, quantiles and spread of the distance of absorption, in plain torch, as definitions.
 
-For a ray with density sigma(t), transmittance T(t) and end density p(t) = T(t) sigma(t), whose integral is the opacity.
-Density is constant inside an interval, and everything here is exact for that: no midpoints. Packed samples as in
-`interface`; any dtype, differentiable; `light_ends` is the operation that has a fast version.
+A ray has density sigma(t), transmittance T(t) and the density of absorption p(t) = T(t) sigma(t), whose integral is the
+opacity. Density is constant inside an interval, and everything here is exact for that: no midpoints. Packed samples as
+in `interface`; any dtype, differentiable. Only `light_ends` and `mixture_quantile` have fast versions.
 """
 
 import math
@@ -19,10 +19,9 @@ from nerfcli.kernels.reference.compositing import (
     sum_along_rays,
 )
 
-# Below this optical depth the mean place is taken from its series, whose next term is then 5e-14.
+# Below this optical depth the mean position is taken from its series, whose next term is then at most 5e-14.
 SERIES_BELOW = 0.25
-# The same for the variance, whose closed form loses 12 / x^2 units of precision to cancellation; next term 9e-20, and
-# 3e-16 of the slope.
+# The same for the variance, whose closed form loses 12 / x^2 units of precision; next term 9e-20, 3e-16 in the slope.
 VARIANCE_SERIES_BELOW = 1.0
 # (2n - 1) B_2n / (2n)! with the Bernoulli numbers B, for n = 1, 2, ...
 VARIANCE_SERIES = (
@@ -31,7 +30,7 @@ VARIANCE_SERIES = (
     *(77683 / 671480954256752640000, -236364091 / 73644527683988855193600000),
 )
 
-# Halvings of the bracket of `mixture_quantile`: to 1e-12 of the farthest sample.
+# Bisection steps of `mixture_quantile`: to 1e-12 of the farthest sample's distance.
 BISECTIONS = 40
 
 
@@ -44,7 +43,7 @@ def mean_fraction(optical_depth: Tensor) -> Tensor:
         optical_depth: density * length, >= 0.
 
     Returns:
-        The same shape, in (0, 1/2]. Relative error of some units of the dtype's precision everywhere.
+        The same shape, in (0, 1/2]. Relative error of a few units of the dtype's precision everywhere.
 
     Differentiable, also at 0 (where the slope is -1/12) and for large arguments.
     """
@@ -60,7 +59,7 @@ def mean_fraction(optical_depth: Tensor) -> Tensor:
 
 
 def variance_fraction(optical_depth: Tensor) -> Tensor:
-    """Variance of that place, in squared lengths of the interval.
+    """Return the variance of the position of absorption within an interval, in squared lengths of the interval.
 
     h(x) = -g'(x) = 1/x^2 - exp(-x) / (1 - exp(-x))^2; 1/12 at 0, 1/x^2 at infinity; see `mean_fraction`.
 
@@ -68,7 +67,7 @@ def variance_fraction(optical_depth: Tensor) -> Tensor:
         optical_depth: density * length, >= 0.
 
     Returns:
-        The same shape, in (0, 1/12]. Relative error of some ten units of the dtype's precision everywhere.
+        The same shape, in (0, 1/12]. Relative error of about ten units of the dtype's precision everywhere.
 
     Differentiable, also at 0 (where the slope is 0) and for large arguments.
     """
@@ -84,7 +83,7 @@ def variance_fraction(optical_depth: Tensor) -> Tensor:
 
 
 def interval_means(density: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
-    """Mean distance (N,) where light ends that ends inside each interval: t0 + 1/s - d / (exp(s d) - 1).
+    """Return the mean distance (N,) of the light absorbed in each interval: t0 + 1/s - d / (exp(s d) - 1).
 
     Differentiable in all arguments.
     """
@@ -93,20 +92,20 @@ def interval_means(density: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
 
 
 def interval_variances(density: Tensor, lengths: Tensor) -> Tensor:
-    """Variance (N,) of the distance where light ends that ends inside each interval. Differentiable."""
+    """Return the variance (N,) of the distance of the light absorbed in each interval. Differentiable."""
     return lengths.square() * variance_fraction(density * lengths)
 
 
 def moment(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
-    """sum_i weight_i * mean_i, (R,). Differentiable; 0 for a ray without samples."""
+    """Return sum_i weight_i * mean_i, (R,). Differentiable; 0 for a ray without samples."""
     return sum_along_rays(weights * means, offsets)
 
 
 def conditional(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
-    """moment / sum of the weights, (R,); NaN where no light ends.
+    """Return `moment` / sum of the weights, (R,); NaN where no light is absorbed.
 
-    Differentiable where defined. The division is by the sum of the weights, so that weights that underflow together
-    still give their mean.
+    Differentiable where defined. It divides by the sum of the weights, not by the opacity, so that weights close to
+    underflow still give their mean.
     """
     total = sum_along_rays(weights, offsets)
     defined = total > 0
@@ -116,13 +115,12 @@ def conditional(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
 def mean_and_spread(
     weights: Tensor, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Mean (R,) of the distance where light ends, given that it ends, and its standard deviation (R,); NaN where none
-    does.
+    """Return mean and standard deviation (R,) of the distance of the absorbed light; NaN where none is absorbed.
 
     mean = `conditional`,  variance = sum_i w_i (variance_i + (mean_i - mean)^2) / sum_i w_i: around the mean, so that
-    nothing cancels. Places count from the mean place of the heaviest interval, for the spread and for the gradients of
-    both: a far, thin surface would be narrower than its distance's last digit, and move by less with its density.
-    Differentiable where they are defined and the spread is above 0.
+    nothing cancels. For the spread and for the gradients of both, positions are relative to the mean position of the
+    heaviest interval: a distant, thin surface may be narrower than its distance's last digit, and move by less than
+    that with its density. Differentiable where they are defined and the spread is above 0.
     """
     total, lengths, rays = sum_along_rays(weights, offsets), ends - starts, ray_indices(offsets)
     defined = total > 0
@@ -142,25 +140,25 @@ def mean_and_spread(
 
 
 def max_weight(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
-    """`means` of the interval with the largest weight, the nearest of equals, (R,); NaN where no light ends.
+    """Return the mean of the interval with the largest weight, (R,), the nearest in a tie; NaN where none is absorbed.
 
-    The only functional that depends on how the ray was cut into intervals. Differentiable in means.
+    The only result that depends on how the ray was cut into intervals. Differentiable in means.
     """
     largest = _largest(weights.detach(), offsets)[ray_indices(offsets)]
     return _nearest(torch.where((weights == largest) & (weights > 0), means, torch.inf), offsets)
 
 
 def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, share: float) -> Tensor:
-    """Compute the distance by which `share` of the light of a ray is absorbed, solved inside its interval, (R,).
+    """Compute the distance (R,) by which a fraction `share` of a ray's light is absorbed, solved inside its interval.
 
     T(t) = 1 - share, so t = t0 + (-log(1 - share) - tau_before) / density in the interval where the optical depth
-    passes -log(1 - share). Of all light, not of that which ends: NaN for a ray whose opacity stays below `share`, which
-    lies between 0 and 1. Differentiable where defined; the value jumps where the crossing moves over empty space.
+    passes -log(1 - share). `share`, between 0 and 1, is a fraction of all light, not of the absorbed light: NaN for a
+    ray of less opacity. Differentiable where defined; the value jumps where the crossing moves across empty space.
     """
     target = -math.log1p(-share)
     lengths, rays = ends - starts, ray_indices(offsets)
     before = optical_depth_before(density, lengths, offsets)
-    # Behind an interval is in front of the next, to the last bit: else rounding could find neither to be crossed.
+    # The depth behind an interval is the one before the next, to the last bit: else rounding might find no crossing.
     behind = before + density * lengths
     behind = torch.cat([torch.where(rays[1:] == rays[:-1], before[1:], behind[:-1]), behind[-1:]])
     numbers = torch.arange(len(density), device=density.device)
@@ -169,7 +167,7 @@ def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, 
     found = first < len(density)
     crossed = first[found]
     inside = (target - before[crossed]) / torch.where(density > 0, density, 1.0)[crossed]
-    # Rounding may lead out of a thin interval: the value stays in it, with the gradient of the crossing.
+    # Rounding may put the crossing outside a thin interval: the value is clamped, the gradient is the crossing's.
     bounded = torch.minimum(inside, lengths[crossed])
     places = starts[crossed] + inside + (bounded - inside).detach()
     result = torch.full((len(offsets) - 1,), torch.nan, dtype=density.dtype, device=density.device)
@@ -179,20 +177,20 @@ def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, 
 def light_ends(
     density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, shares: tuple[float, ...]
 ) -> LightEnds:
-    """Everything about where the light of rays ends, at once.
+    """Compute all statistics of where the light of rays is absorbed.
 
     Args:
         density: (N,) >= 0, finite; density * length from 0 to 1e6 and beyond.
         starts, ends: (N,) increasing along each ray.
         offsets: (R + 1,).
-        shares: of the quantiles, each between 0 and 1.
+        shares: fractions of light for the quantiles, each between 0 and 1.
 
     Returns:
-        opacity (R,), transmittance (R,); mean (R,) distance given that light ends, `spread` (R,) around it; heaviest
-        (R,): `max_weight`, and largest (R,) that weight, 0 without samples; quantiles (R, len(shares)). Undefined
-        values are NaN, and only those.
+        opacity (R,), transmittance (R,); mean (R,) distance of the absorbed light, and its standard deviation `spread`
+        (R,); heaviest (R,): `max_weight`, and largest (R,): that weight, 0 without samples; quantiles (R, len(shares)).
+        Undefined values are NaN, and no others.
 
-    Differentiable in density, starts and ends. opacity keeps its digits where it is small, transmittance where that is.
+    Differentiable in density, starts and ends. Opacity and transmittance keep full precision where they are small.
     """
     lengths = ends - starts
     weights, transmittance = interval_weights(density, lengths, offsets)
@@ -208,13 +206,13 @@ def light_ends(
 def mixture_quantile(
     density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, share: float
 ) -> Tensor:
-    """Compute the distance by which `share` of the light of a group of equally weighted rays is absorbed.
+    """Compute the distance by which a fraction `share` of the light of a group of equally weighted rays is absorbed.
 
     mean_k T_k(t) = 1 - share, solved by bisection to 1e-12 of the group's farthest sample.
 
     Args:
-        density, starts, ends, offsets: as in `light_ends`; groups of `rays_per_pixel` rays stand side by side.
-        rays_per_pixel: rays of a group, a divisor of R.
+        density, starts, ends, offsets: as in `light_ends`; groups are `rays_per_pixel` consecutive rays.
+        rays_per_pixel: rays per group, a divisor of R.
         share: between 0 and 1.
 
     Returns:

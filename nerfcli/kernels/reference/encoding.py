@@ -7,7 +7,7 @@ HASH_PRIMES = (1, 2654435761, 805459861)
 
 
 def corner_rows(cells: Tensor, resolution: int, rows: int) -> Tensor:
-    """Return the table row of each grid vertex: its place in the dense grid where that fits, else its spatial hash.
+    """Return the table row of each grid vertex: its index in the dense grid if that fits, else its spatial hash.
 
     hash(i, j, k) = (i * 1 xor j * 2654435761 xor k * 805459861) mod rows, in unsigned 32-bit arithmetic.
 
@@ -28,16 +28,16 @@ def corner_rows(cells: Tensor, resolution: int, rows: int) -> Tensor:
 
 
 def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...], widths: Tensor | None = None) -> Tensor:
-    """Trilinear interpolation in a multiresolution hash table.
+    """Interpolate a multiresolution hash table trilinearly.
 
-    With widths, a level of n cells per axis counts min(1, 1 / (n width)): details smaller than what a pixel covers
-    fade out of what it sees.
+    With widths, a level of n cells per axis is weighted by min(1, 1 / (n width)): details smaller than a pixel's
+    footprint fade out.
 
     Args:
         points: (N, 3) in [0, 1]; values outside are clamped.
         table: (L, T, F), T a power of two.
         resolutions: cells per axis of each of the L levels; 0 leaves a level out.
-        widths: (N,) of a pixel at the points, as a share of the cube's side, >= 0; without gradient.
+        widths: (N,) width of a pixel at the points, as a fraction of the cube's side, >= 0; without gradient.
 
     Returns:
         (N, L * F), level after level; 0 for a level that is left out.
@@ -49,7 +49,7 @@ def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...], wid
     function. It jumps where a point crosses a face of a cell of any level, where it takes the value of the upper cell;
     outside [0, 1] it is 0.
     Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, section 3; for the widths Barron et al. 2023, Zip-NeRF,
-    arXiv:2304.06706, eq. 3, with a cheaper function that falls off alike.
+    arXiv:2304.06706, eq. 3, with a cheaper function of similar fall-off.
     """
     levels, rows, _ = table.shape
     if levels != len(resolutions):

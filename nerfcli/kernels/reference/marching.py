@@ -1,4 +1,4 @@
-"""Samples along rays: those in occupied cells, and those of them that light gets to. Letters as in `interface`."""
+"""Samples along rays: those in occupied cells, and those among them that light reaches. Letters as in `interface`."""
 
 import torch
 from torch import Tensor
@@ -35,7 +35,7 @@ def march(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor]:
 def sample_coordinates(
     origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, contraction: str
 ) -> Tensor:
-    """Return the middles of intervals as coordinates of the field's unit cube: (N, 3). See `grid_coordinates`.
+    """Return the midpoints of intervals as coordinates of the field's unit cube: (N, 3). See `grid_coordinates`.
 
     Differentiable in origins and directions.
     """
@@ -45,7 +45,7 @@ def sample_coordinates(
 
 
 def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the samples of `march` with their places.
+    """Return the samples of `march` with their coordinates.
 
     Returns:
         starts (N,), ends (N,), coordinates (N, 3) in the field's unit cube, offsets (R + 1,).
@@ -58,7 +58,7 @@ def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, 
 
 
 def keep_largest(cells: Tensor, coordinates: Tensor, values: Tensor) -> None:
-    """Raise each cell of a grid over the unit cube to the largest of the values that lie in it; NaN counts for none.
+    """Raise each cell of a grid over the unit cube to the largest value at the points inside it; NaN is ignored.
 
     Args:
         cells: (C, C, C), indexed [z, y, x]; changed in place.
@@ -74,11 +74,11 @@ def keep_largest(cells: Tensor, coordinates: Tensor, values: Tensor) -> None:
 def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: Tensor | None = None) -> Samples:
     """Return the samples of `march` in front of which the optical depth is below a limit, with their encoding.
 
-    Of an optical depth d of a sample behind an optical depth D, those with d exp(-D) < least_weight are left out: they
-    absorb less than this of the ray's light, and what is behind the limit at most exp(-max_optical_depth). A density
-    that is NaN is kept, and where all samples of all rays are so faint, none is left out: a field that has become
-    transparent can learn again. `visits` (C, C, C) are raised to the optical depths of all samples before the limit,
-    those left out for their weight among them, see `keep_largest`. Without gradients.
+    A sample of optical depth d behind an optical depth D is left out if d exp(-D) < least_weight: it absorbs less than
+    this fraction of its ray's light. Everything behind the limit absorbs at most exp(-max_optical_depth). Samples whose
+    density is NaN are kept. If all samples of all rays are that faint, none is left out, so that a field that has
+    become transparent can learn again. `visits` (C, C, C) is raised to the optical depths of all samples before the
+    limit, including those left out for their weight, see `keep_largest`. Without gradients.
     """
     starts, ends, coordinates, offsets = occupied_samples(rays, along)
     widths = None

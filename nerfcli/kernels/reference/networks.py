@@ -7,18 +7,18 @@ from nerfcli.kernels.activations import density_from_log
 
 
 def geometry(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
-    """Return the density network: (N, E) to (N, G), W2 relu(W1 x); the first output is the log of the density."""
+    """Return the outputs of the density network, (N, E) to (N, G): W2 relu(W1 x); the first is the log density."""
     return torch.relu(encoded @ weights[0].t()) @ weights[1].t()
 
 
 def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
-    """Density of encoded positions.
+    """Return the density of encoded positions.
 
     density = exp((W2 relu(W1 x))_0), the exponent clipped to [-15, 15]; see `density_from_log`.
 
     Args:
         encoded: (N, E).
-        weights: W1 (H, E), W2 (G, H), and whatever follows.
+        weights: W1 (H, E), W2 (G, H); any further layers are ignored.
 
     Returns:
         (N,).
@@ -27,7 +27,7 @@ def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
 
 
 def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """Density and colour of encoded positions seen along rays.
+    """Return density and colour of encoded positions seen along rays.
 
     g = W2 relu(W1 x),  density = exp(g_0),  rgb = sigmoid(C3 relu(C2 relu(C1 [g, harmonics of the ray])))
 

@@ -1,4 +1,4 @@
-"""The rays and colours of pixels that a training draws. Letters as in `interface`."""
+"""The rays and colours of the pixels drawn in training. Letters as in `interface`."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Line integrals through a grid of voxels, and the transpose of that sum. Letters as in `interface`."""
+"""Line integrals through a grid of voxels, and their transpose. Letters as in `interface`."""
 
 import torch
 from torch import Tensor
@@ -7,7 +7,7 @@ from torch import Tensor
 def project(
     volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
 ) -> Tensor:
-    """Line integral of a volume along straight lines, by Joseph's method.
+    """Return the line integrals of a volume along straight lines, by Joseph's method.
 
     A line is cut at the planes of voxel centres of the axis it is most aligned with. In each plane the four voxels
     around the point are interpolated; voxels outside the grid are 0:
@@ -15,7 +15,7 @@ def project(
         integral = size / |d_a| * sum over planes k of volume interpolated at (k, b(k), c(k))
 
     Exact for values that are constant or linear along the line between planes; error of second order in `size` for
-    smooth ones. Lines have no end: the grid has to lie between source and detector.
+    smooth ones. Lines are infinite: the grid has to be between source and detector.
 
     Args:
         volume: (Z, Y, X).
@@ -66,7 +66,7 @@ def back_project(
 
 
 def _dominant(directions: Tensor) -> Tensor:
-    """(R,) the axis that each line is most aligned with, the first of equal ones."""
+    """Return the axis (R,) that each line is most aligned with; the first one in a tie."""
     return directions.abs().argmax(1)
 
 
@@ -79,7 +79,7 @@ def _taps(
     first: tuple[float, float, float],
     size: float,
 ) -> tuple[Tensor, Tensor]:
-    """Flat indices and weights (R, planes, 4) of the voxels that lines along one axis meet; weight 0 outside."""
+    """Return indices and weights (R, planes, 4) of the voxels that lines along one axis cross; weight 0 outside."""
     counts = {0: shape[2], 1: shape[1], 2: shape[0]}
     strides = {0: 1, 1: shape[2], 2: shape[1] * shape[2]}
     b, c = (other for other in range(3) if other != axis)

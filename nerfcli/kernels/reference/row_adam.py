@@ -17,7 +17,7 @@ def adam_rows(
     eps: float,
     decay: float = 0.0,
 ) -> None:
-    """Take one step of Adam with weight decay, in place, on the rows whose gradient is not zero, and zero it.
+    """Take one step of Adam with weight decay, in place, on rows with a nonzero gradient, and zero the gradient.
 
     g := g + decay table
     m = b1 m + (1 - b1) g,  v = b2 v + (1 - b2) g^2
@@ -30,7 +30,7 @@ def adam_rows(
         table, gradient, first, second: (..., F), all of one shape.
         step: number of this step, from 1.
         rate, betas, eps: of Adam.
-        decay: >= 0, the weight of the sum of table^2 / 2 over the touched rows in the loss.
+        decay: >= 0, weight in the loss of the sum of table^2 / 2 over the touched rows.
 
     Source: Kingma and Ba 2015, Adam, arXiv:1412.6980, algorithm 1; skipping untouched rows as in Müller et al. 2022.
     """

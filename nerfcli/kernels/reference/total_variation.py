@@ -15,8 +15,8 @@ def denoise_total_variation(target: Tensor, threshold: Tensor, dual: Tensor, *, 
     Args:
         target: (Z, Y, X).
         threshold: (Z, Y, X) > 0: how far a step between neighbours may move a voxel.
-        dual: (3, Z, Y, X), where to begin, for x, y and z; overwritten by where it ended: the next call for a similar
-            target goes on from there.
+        dual: (3, Z, Y, X), initial dual variables for x, y and z; overwritten with the final ones, from which the next
+            call for a similar target can start.
         iterations: >= 0.
 
     Returns:
@@ -25,7 +25,7 @@ def denoise_total_variation(target: Tensor, threshold: Tensor, dual: Tensor, *, 
     Source: Chambolle 2004, An algorithm for total variation minimization and applications; Beck and Teboulle 2009,
     Fast gradient-based algorithms for constrained total variation image denoising, IEEE TIP 18(11), section IV.
     """
-    # |D^T| is at most 12 for each voxel's dual, of the largest threshold it touches.
+    # The step is 1 / (12 t) for each voxel's dual, with t the largest threshold it touches: |D D^T| is at most 12.
     largest = threshold.clone()
     for axis in range(3):
         n = threshold.shape[axis] - 1
@@ -40,7 +40,7 @@ def denoise_total_variation(target: Tensor, threshold: Tensor, dual: Tensor, *, 
 
 
 def total_variation(volume: Tensor) -> Tensor:
-    """Sum over voxels of the length of the differences to the next voxels along x, y and z; 0 beyond the last ones."""
+    """Return the sum over voxels of the norm of the differences to the next voxels along x, y and z, 0 at the last."""
     return _differences(volume).norm(dim=0).sum()
 
 

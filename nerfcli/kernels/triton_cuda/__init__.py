@@ -1,1 +1,1 @@
-"""The hot operations on GPUs from compute capability 8.0 on, by Triton: machine code is made on first use and kept."""
+"""The hot operations on GPUs of compute capability 8.0 or newer, by Triton: compiled on first use, cached on disk."""

@@ -1,7 +1,7 @@
-"""The operations on rays by the GPU kernels: float32 fields, computed in float16 with float32 sums where it is safe.
+"""Backend of the GPU kernels: float32 fields, computed in float16 with float32 sums where it is safe.
 
-A hash grid of other sizes than those that the kernels are written for is sampled and asked by the reference, on the
-device; so are mixtures of rays, total variation and projections of scans.
+The reference, on the device, samples and evaluates a hash grid of sizes that the kernels do not support, and computes
+mixtures of rays, total variation and projections of scans.
 """
 
 import weakref
@@ -20,7 +20,7 @@ from nerfcli.kernels.triton_cuda.row_adam import adam_rows
 
 
 class HalfCopy:
-    """The float16 copy of a table, made again when the table was changed by others than `adam_rows`."""
+    """The float16 copy of a table, remade when anything but `adam_rows` has changed the table."""
 
     def __init__(self) -> None:
         self._of: tuple[weakref.ref[Tensor], int, int] | None = None
@@ -36,7 +36,7 @@ class HalfCopy:
 
 
 class TritonBackend(ReferenceBackend):
-    """`triton_cuda`, composed. Sums are atomic: the same seed gives results that differ in their last digits."""
+    """Backend composed of `triton_cuda`. Sums are atomic: results of the same seed differ in their last digits."""
 
     name = "triton_cuda"
     parts: ClassVar[Parts] = operations
@@ -147,7 +147,7 @@ class TritonBackend(ReferenceBackend):
 
 
 class _Radiance(torch.autograd.Function):
-    """Codes, densities and colours of samples as one step: the gradient between them is float16, and scaled."""
+    """Codes, densities and colours of samples as one autograd step: the gradient of codes is float16, and scaled."""
 
     @staticmethod
     def forward(
@@ -185,7 +185,7 @@ class _Radiance(torch.autograd.Function):
 
 
 def _fits(grid: HashGrid) -> bool:
-    """Return whether the kernels are written for these sizes."""
+    """Return whether the kernels support the sizes of a grid."""
     levels, _, features = grid.table.shape
     return hash_grid.can_hash_encode(grid.table, grid.resolutions) and networks.can_radiance(
         levels * features, grid.layers

@@ -1,7 +1,7 @@
-"""Compositing on a GPU: a program owns some rays, and takes some samples of each at a time, in float32.
+"""Compositing on a GPU: a program owns some rays, and processes some samples of each at a time, in float32.
 
-Same operations as in `reference`. Sums in front of a sample are over the samples one place before, and sums behind it
-over those one place after: nothing is ever subtracted from a sum, nor divided by a transmittance.
+Same operations as in `reference`. Sums in front of a sample run over the samples shifted by one place, and sums behind
+it likewise from the far end: nothing is ever subtracted from a sum, nor divided by a transmittance.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, span_of
 
 @jit
 def absorbed(x):
-    """1 - exp(-x) with all digits where x is small: below 1/2 its series, whose next term is 1e-8 of it."""
+    """Return 1 - exp(-x), at full precision for small x: below 1/2 by its series, whose next term is 1e-8 of it."""
     y = tl.minimum(x, 0.5)
     series = 1.0 - y * (0.125 - y * 0.01388888888888889)
     series = 1.0 - y * 0.16666666666666666 * (1.0 - y * 0.14285714285714285 * series)
@@ -28,7 +28,7 @@ def absorbed(x):
 
 @jit
 def thickness(density, lengths, i, valid):
-    """Optical depths of samples; 0 where they are not valid."""
+    """Return optical depths of samples; 0 where they are not valid."""
     return tl.load(density + i, mask=valid, other=0.0) * tl.load(lengths + i, mask=valid, other=0.0)
 
 
@@ -85,7 +85,7 @@ def _forward(
 
 @jit
 def _worth(rgb, by_weight, i, valid, red, green, blue):
-    """Return what the loss gains per unit of weight of samples."""
+    """Return the derivative of the loss by the weights of samples."""
     value = tl.load(by_weight + i, mask=valid, other=0.0)
     value += red * tl.load(rgb + i * 3, mask=valid, other=0.0)
     value += green * tl.load(rgb + i * 3 + 1, mask=valid, other=0.0)
@@ -105,7 +105,7 @@ def _backward(
     red = tl.load(by_colour + ray * 3, mask=there, other=0.0)
     green = tl.load(by_colour + ray * 3 + 1, mask=there, other=0.0)
     blue = tl.load(by_colour + ray * 3 + 2, mask=there, other=0.0)
-    # What the loss gains per unit of light that passes: d loss / d T behind the last sample, times that T.
+    # Change of the loss by the light that passes: d loss / d T behind the last sample, times that T.
     behind = tl.load(by_transmittance + ray, mask=there, other=0.0)
     behind += red * tl.load(background + ray * 3, mask=there, other=0.0)
     behind += green * tl.load(background + ray * 3 + 1, mask=there, other=0.0)
@@ -116,7 +116,7 @@ def _backward(
         i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
         valid = i < last[:, None]
         own = thickness(density, lengths, i, valid)
-        # The transmittance behind the sample, until its gradient comes.
+        # The transmittance behind the sample, until its gradient replaces it.
         tl.store(by_density + i, tl.exp(-(depth[:, None] + tl.cumsum(own, 1))), mask=valid)
         depth += tl.sum(own, 1)
     tl.debug_barrier()
@@ -141,7 +141,7 @@ def _backward(
 
 @jit
 def _gaps(starts, ends, i, valid):
-    """Between the middles of samples and those one place before; differences first, which are exact far away."""
+    """Return gaps between midpoints of samples and those one place before; differences first: exact far away."""
     near = tl.load(starts + i, mask=valid, other=0.0) - tl.load(starts + i - 1, mask=valid, other=0.0)
     return (near + (tl.load(ends + i, mask=valid, other=0.0) - tl.load(ends + i - 1, mask=valid, other=0.0))) * 0.5
 
@@ -151,7 +151,7 @@ def _distortion(
     weights, starts, ends, offsets, ahead_out, out, rays, RAYS: tl.constexpr,
     STEPS: tl.constexpr,
 ):  # fmt: skip
-    """2 sum_i w_i D_i + ..., with D_i = sum_(j<i) w_j (m_i - m_j) = D_(i-1) + (m_i - m_(i-1)) sum_(j<i) w_j."""
+    """Sum 2 sum_i w_i D_i + ..., with D_i = sum_(j<i) w_j (m_i - m_j) = D_(i-1) + (m_i - m_(i-1)) sum_(j<i) w_j."""
     ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
     first, last = span_of(offsets, ray, rays)
     longest = tl.max(last - first, 0).to(tl.int32)
@@ -179,7 +179,7 @@ def _distortion_backward(
     weights, starts, ends, offsets, ahead, gradient, out, rays,
     RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
-    """2 (D_i + D'_i) + ..., with D' as D from the other end."""
+    """Write g (2 (D_i + D'_i) + ...), with D' like D but from the far end of the ray."""
     ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
     first, last = span_of(offsets, ray, rays)
     blocks = tl.cdiv(tl.max(last - first, 0).to(tl.int32), STEPS)
@@ -266,9 +266,7 @@ def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -
 
 
 def off_target(weights: Tensor, transmittance: Tensor, middles: Tensor, *, rays: Tensor, distances: Tensor) -> Tensor:
-    """`reference.off_target` over all samples, whose `rays` (N,) are given: the host need not know where the last ones
-    begin.
-    """
+    """See `reference.off_target`; with the `rays` (N,) of samples, the host need not know where the last K begin."""
     first = len(transmittance) - len(distances)
     distance = torch.nn.functional.pad(distances, (first, 0), value=1.0)[rays]
     deviation = ((middles - distance).abs() / (MOST_DEVIATION * distance)).clamp_max(1.0)

@@ -1,6 +1,6 @@
-"""Gradients of the coordinates of samples to their rays: what cameras learn from.
+"""Gradients of the coordinates of samples with respect to their rays, from which cameras learn.
 
-Same operation as `reference.sample_coordinates`, of coordinates that marching has computed.
+Same operation as `reference.sample_coordinates`, for coordinates that marching has already computed.
 """
 
 from typing import Any
@@ -27,7 +27,7 @@ def _back_from_cube(x, y, z, a, b, c, CONTRACTION: tl.constexpr):
         norm = contracted_norm(x, y, z, CONTRACTION)
         inverse = 1.0 / norm
         scale = (2.0 - inverse) * inverse
-        # In units of the norm, as squares of what is far away would overflow.
+        # In units of the norm, as squares of distant coordinates would overflow.
         u, v, w = x * inverse, y * inverse, z * inverse
         along = 2.0 * inverse * (inverse - 1.0) * (u * a + v * b + w * c)
         if CONTRACTION == 2:  # the gradient of the largest component is its sign
@@ -116,7 +116,7 @@ def sample_coordinates(
     """See `reference.sample_coordinates`; float32, differentiable in origins and directions.
 
     Args:
-        known: (N, 3), the answer, which has been computed before without gradients.
+        known: (N, 3), the result, already computed without gradients.
     """
     number = CONTRACTIONS.index(contraction)
     return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, known)  # type: ignore[return-value]

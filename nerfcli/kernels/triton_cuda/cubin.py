@@ -1,9 +1,9 @@
-"""Machine code of kernels: compiled by Triton with the ptxas in its package, and kept on disk.
+"""Machine code of kernels: compiled by Triton with the ptxas in its package, and cached on disk.
 
 The cache is in the user's cache folder, or in NERFCLI_KERNEL_CACHE. A file is named by two digests: of the sources of
 all kernels and the versions of Triton and Python; and of the variant and the architecture. So nothing outdated is ever
-loaded. Of more than `MOST_BYTES`, what was used least recently is removed. Several processes may do this at once: files
-appear whole, and what another process has removed is compiled again.
+loaded. Beyond `MOST_BYTES`, the least recently used files are removed. Several processes may use the cache at once:
+files appear whole, and a file that another process has removed is compiled again.
 """
 
 import functools
@@ -34,9 +34,9 @@ class Cubin:
 
     Args:
         name: of the entry in the machine code.
-        code: for the driver.
-        ptx: what it was assembled from.
-        formats: of the parameters, as letters of `struct`, those that Triton adds among them; these are 0.
+        code: machine code for the driver.
+        ptx: the PTX from which the code was assembled.
+        formats: letters of `struct` for the parameters, including those that Triton appends, whose values are 0.
         warps: per program.
         shared_bytes: dynamic shared memory per program.
     """
@@ -50,29 +50,29 @@ class Cubin:
 
 
 class UnexpectedCodeError(Exception):
-    """What Triton compiled cannot be launched from here."""
+    """A kernel compiled by Triton cannot be launched by `driver`."""
 
 
-# Parameters in PTX and as letters of `struct`.
+# Letters of `struct` for the parameter types of PTX, and for those of Triton's signatures.
 _FORMATS = {"u64": "Q", "b64": "Q", "u32": "I", "b32": "I", "f32": "f"}
 _OF_TYPES = {"i32": "i", "i64": "q", "fp32": "f"}
-# Machine code of several versions of the kernels; that of one is about 5 MB.
+# Room for several versions of the kernels; one version takes about 5 MB.
 MOST_BYTES = 2**26
-# What Triton appends: pointers to scratch memory, unused.
+# Maximum number of parameters that Triton appends: unused pointers to scratch memory.
 _MOST_EXTRA = 3
 
 
 def compiled(variant: "Variant", capability: int) -> Cubin:
-    """Return the machine code of a variant for a compute capability such as 90, from the disk where it is there.
+    """Return the machine code of a variant for a compute capability such as 90, from the disk if it is there.
 
     Raises:
-        UnexpectedCodeError: it needs something that is not passed, as this version of Triton compiles it.
+        UnexpectedCodeError: as compiled by this version of Triton, it needs something that is not passed.
     """
     path = folder() / f"{_environment()}-{_digest(variant, capability)}.cubin"
     try:
         head, ptx, code = path.read_bytes().split(b"\0\0\0\0", 2)
         built = Cubin(code=code, ptx=ptx.decode(), **json.loads(head))
-        with suppress(OSError):  # the folder may be somebody else's
+        with suppress(OSError):  # the folder may belong to another user
             path.touch()
         return built
     except (OSError, ValueError):  # not there, or damaged
@@ -88,12 +88,12 @@ def compiled(variant: "Variant", capability: int) -> Cubin:
 
 
 def is_compiled() -> bool:
-    """Return whether machine code of the kernels as they stand is on the disk."""
+    """Return whether machine code of the current kernels is on the disk."""
     return any(folder().glob(f"{_environment()}-*.cubin"))
 
 
 def compile_now(variant: "Variant", capability: int) -> Cubin:
-    """`compiled` without the disk."""
+    """Compile a variant as `compiled` does, without the cache on disk."""
     from triton import knobs
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
@@ -134,9 +134,7 @@ def folder() -> Path:
 
 
 def _formats(ptx: str, types: tuple[str, ...]) -> str:
-    """Return the parameters of the only entry,
-    which are the arguments and at most `_MOST_EXTRA` pointers behind them.
-    """
+    """Return the parameters of the only entry: the arguments, then at most `_MOST_EXTRA` pointers."""
     entry = re.search(r"\.entry\s+\w+\s*\((.*?)\)", ptx, re.DOTALL)
     found = re.findall(r"\.param\s+\.(\w+)", entry[1]) if entry else []
     wanted = ["Q" if name.startswith("*") else _OF_TYPES[name] for name in types]
@@ -152,9 +150,9 @@ def _formats(ptx: str, types: tuple[str, ...]) -> str:
 
 
 def _prune(place: Path) -> None:
-    """Remove what was used least recently, beyond `MOST_BYTES`."""
+    """Remove the least recently used files beyond `MOST_BYTES`."""
     found = []
-    for path in place.glob("[!.]*.cubin"):  # with a dot, another process is writing it
+    for path in place.glob("[!.]*.cubin"):  # another process is writing those with a dot
         with suppress(OSError):  # another process has removed it
             found.append((path.stat().st_mtime, path.stat().st_size, path))
     total = sum(size for _, size, _ in found)
@@ -173,7 +171,7 @@ def _digest(variant: "Variant", capability: int) -> str:
 
 @functools.cache
 def _environment() -> str:
-    """Digest of the sources of the kernels and the versions."""
+    """Return a digest of the sources of the kernels and the versions of Triton and Python."""
     versions = f"{triton.__version__} {sys.version_info[:2]} {platform.machine()}"
     content = hashlib.blake2b(versions.encode(), digest_size=8)
     for path in sorted(Path(__file__).parent.glob("*.py")):

@@ -1,7 +1,8 @@
-"""Where the light of rays ends, on a GPU: mean, spread, heaviest interval and quantiles, in float32.
+"""Where the light of rays is absorbed, on a GPU: mean, spread, heaviest interval and quantiles, in float32.
 
-Same operation as `reference.light_ends`. Mean and spread count places from that of the heaviest interval: a far, thin
-surface is narrower than its distance's last digit. Rays are gone along three times, as sums of squares would cancel.
+Same operation as `reference.light_ends`. For mean and spread, positions are relative to the heaviest interval: a
+distant, thin surface is narrower than its distance's last digit. Three passes go along each ray, as sums of squares
+would cancel; one more for each quantile.
 """
 
 import math
@@ -18,14 +19,14 @@ from nerfcli.kernels.triton_cuda.launch import jit, launch
 from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, span_of
 
 THIN, VARIANCE_THIN = tl.constexpr(SERIES_BELOW), tl.constexpr(VARIANCE_SERIES_BELOW)
-# So many terms reach float32's precision at the limit.
+# Six terms reach float32's precision at the limit.
 V0, V1, V2, V3, V4, V5 = (tl.constexpr(value) for value in VARIANCE_SERIES[:6])
 NOWHERE = tl.constexpr(2**30)
 
 
 @jit
 def _mean_fraction(x, alpha):
-    """`depth.mean_fraction` of optical depths whose opacity is alpha."""
+    """Return `depth.mean_fraction` of optical depths x with opacity alpha."""
     y = tl.minimum(x, THIN)
     x2 = y * y
     series = 0.5 - y * (1 / 12 - x2 * (1 / 720 - x2 * (1 / 30240 - x2 * (1 / 1209600))))
@@ -35,7 +36,7 @@ def _mean_fraction(x, alpha):
 
 @jit
 def _variance_fraction(x, alpha):
-    """`depth.variance_fraction` of optical depths whose opacity is alpha."""
+    """Return `depth.variance_fraction` of optical depths x with opacity alpha."""
     y = tl.minimum(x, VARIANCE_THIN)
     x2 = y * y
     series = V0 + x2 * (V1 + x2 * (V2 + x2 * (V3 + x2 * (V4 + x2 * V5))))

@@ -1,6 +1,6 @@
 """The CUDA driver library: loads machine code and starts it.
 
-The few functions that are needed have had this interface for many years.
+The few functions used here have had this interface for many years.
 Source: CUDA Driver API, sections Primary Context, Context, Module and Execution Control.
 """
 
@@ -15,9 +15,9 @@ from nerfcli.kernels.triton_cuda.cubin import Cubin
 
 LIBRARY = "libcuda.so.1"
 MAX_DYNAMIC_SHARED_SIZE_BYTES = 8
-# Above this a kernel has to ask for its shared memory.
+# A kernel that needs more shared memory than this has to request it.
 SHARED_BYTES_AT_ONCE = 48 * 1024
-# Keys of the list of extras of a launch.
+# Keys of a launch's list of extras.
 END, BUFFER, BUFFER_SIZE = 0, 1, 2
 
 _of_thread = threading.local()
@@ -37,16 +37,16 @@ class Function:
         self._threads, self._shared_bytes = 32 * cubin.warps, cubin.shared_bytes
 
     def launch(self, grid: tuple[int, ...], values: Sequence[float], stream: int) -> None:
-        """Start it behind what the stream holds already.
+        """Enqueue the kernel on a stream.
 
         Args:
             grid: programs along up to three axes.
-            values: addresses and numbers, in the order of the parameters; those that Triton adds are 0.
+            values: addresses and numbers, in the order of the parameters; parameters that Triton appends are set to 0.
             stream: handle of a stream of the device.
         """
         _bind(self._device)
         x, y, z = (*grid, 1, 1)[:3]
-        # One buffer with the layout of a C struct: where it has not the size of the parameters, the driver refuses it.
+        # One buffer with the layout of a C struct: the driver refuses it if it is not as large as the parameters.
         packed = self._parameters.pack(*values, *(0,) * (self._count - len(values)))
         size = ctypes.c_size_t(len(packed))
         address = ctypes.cast(ctypes.c_char_p(packed), ctypes.c_void_p).value
@@ -56,10 +56,10 @@ class Function:
 
 
 def load(cubin: Cubin, device: int) -> Function:
-    """Load a kernel onto a device, for as long as the process lives.
+    """Load a kernel onto a device, for the lifetime of the process.
 
     Raises:
-        DriverError: the driver cannot.
+        DriverError: the driver cannot load it.
     """
     _bind(device)
     module, handle = ctypes.c_void_p(), ctypes.c_void_p()
@@ -96,7 +96,7 @@ def library() -> ctypes.CDLL:
 
 
 def _bind(device: int) -> None:
-    """Give this thread the context of a device that torch uses: threads of autograd may not have it yet."""
+    """Make torch's context of a device current in this thread: threads of autograd may not have it yet."""
     bound: set[int] = _of_thread.__dict__.setdefault("bound", set())
     if device not in bound:
         number, context = ctypes.c_int(), ctypes.c_void_p()

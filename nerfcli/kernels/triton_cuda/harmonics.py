@@ -7,7 +7,7 @@ from nerfcli.kernels.triton_cuda.launch import jit
 
 @jit
 def harmonics(x, y, z, column, DEGREE: tl.constexpr):
-    """(BLOCK, 16) of directions (BLOCK, 1); `column` (1, 16) counts from 0. Those above the degree are 0."""
+    """Return harmonics (BLOCK, 16), 0 above DEGREE, of directions (BLOCK, 1); `column` (1, 16) counts from 0."""
     out = tl.where(column == 0, 0.28209479177387814, 0.0)
     if DEGREE > 0:
         out = tl.where(column == 1, 0.4886025119029199 * y, out)
@@ -32,7 +32,7 @@ def harmonics(x, y, z, column, DEGREE: tl.constexpr):
 
 @jit
 def harmonics_slopes(x, y, z, column, DEGREE: tl.constexpr):
-    """Derivatives (BLOCK, 16) of `harmonics` by x, by y and by z."""
+    """Return the derivatives (BLOCK, 16) of `harmonics` by x, by y and by z."""
     none = tl.where(column == 0, 0.0, 0.0) + x * 0.0
     dx, dy, dz = none, none, none
     if DEGREE > 0:

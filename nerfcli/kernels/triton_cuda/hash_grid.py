@@ -1,11 +1,11 @@
-"""The hash grid on a GPU: a program owns a block of samples at one level, whose table stays in the second cache.
+"""The hash grid on a GPU: a program owns a block of samples at one level, whose table stays in the L2 cache.
 
 Same operation as `reference.hash_encode`, for rows of 4 features, which are loaded and added as one vector. Tables are
 read in float16 or float32; sums are float32. Gradients of rows are added atomically, in no fixed order.
 """
 
 # pyright: reportGeneralTypeIssues=false
-# `tl.static_range` can be iterated over in kernels alone.
+# `tl.static_range` can be iterated over only in kernels.
 
 import functools
 from typing import Any
@@ -23,7 +23,7 @@ BLOCK = Size.of(128, interpreted=1024)
 
 @jit
 def _cell(points, i, valid, axis: tl.constexpr, resolution):
-    """Cell along an axis and the place inside it, coordinates clamped to [0, 1]; NaN stays NaN."""
+    """Return the cell along an axis and the position inside it; coordinates are clamped to [0, 1], NaN stays NaN."""
     at = tl.load(points + i * 3 + axis, mask=valid, other=0.0)
     scaled = tl.clamp(at, 0.0, 1.0, propagate_nan=tl.PropagateNan.ALL) * resolution.to(tl.float32)
     cell = tl.maximum(tl.minimum(scaled.to(tl.int32), resolution - 1), 0)
@@ -32,7 +32,7 @@ def _cell(points, i, valid, axis: tl.constexpr, resolution):
 
 @jit
 def _row(cx, cy, cz, corner: tl.constexpr, resolution, rows):
-    """Table row of a corner; bit 0 of the corner is x, bit 1 is y, bit 2 is z."""
+    """Return the table row of a corner; bit 0 of the corner is x, bit 1 is y, bit 2 is z."""
     x, y, z = cx + (corner & 1), cy + ((corner >> 1) & 1), cz + (corner >> 2)
     side = resolution.to(tl.uint32) + 1
     hashed = (x ^ (y * 2654435761) ^ (z * 805459861)) & (rows - 1).to(tl.uint32)
@@ -43,7 +43,7 @@ def _row(cx, cy, cz, corner: tl.constexpr, resolution, rows):
 
 @jit
 def _weight(fx, fy, fz, corner: tl.constexpr):
-    """Trilinear weight of a corner."""
+    """Return the trilinear weight of a corner."""
     x = fx if corner & 1 else 1.0 - fx
     y = fy if corner & 2 else 1.0 - fy
     z = fz if corner & 4 else 1.0 - fz
@@ -52,7 +52,7 @@ def _weight(fx, fy, fz, corner: tl.constexpr):
 
 @jit
 def _fade(widths, i, valid, resolution, fades: tl.constexpr):
-    """Return the weight of a level where its cells are smaller than a pixel."""
+    """Return the weight of a level at samples: below 1 where its cells are smaller than a pixel."""
     if fades:
         width = tl.load(widths + i, mask=valid, other=0.0)
         return 1.0 / tl.maximum(resolution.to(tl.float32) * width, 1.0)
@@ -99,7 +99,7 @@ def _encode_backward(
     resolution = tl.load(resolutions + level)
     if resolution > 0:
         g = tl.load(gradient + i[:, None] * COLUMNS + (level * 4 + f)[None, :], mask=valid[:, None], other=0.0)
-        # Rows of samples on which nothing depends stay untouched.
+        # Rows of samples without a gradient stay untouched.
         moved = valid & (tl.max(tl.where(g == 0, 0, 1), 1) > 0)
         g = g.to(tl.float32) / tl.load(scale)
         cx, fx = _cell(points, i, valid, 0, resolution)
@@ -118,7 +118,7 @@ def _points_backward(
     points, widths, table, gradient, scale, resolutions, out, count, rows,
     levels, COLUMNS: tl.constexpr, FADES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Slopes of the trilinear function: corners' scalar products of gradient and row, with the signs of their sides."""
+    """Write slopes of the interpolation: corners' scalar products of gradient and row, signed by side of the cell."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = i < count
     f = tl.arange(0, 4)
@@ -155,7 +155,7 @@ def _points_backward(
 def can_hash_encode(table: Tensor, resolutions: tuple[int, ...]) -> bool:
     """Return whether this module supports a table; malformed ones go to the reference's checks."""
     levels, rows, features = table.shape
-    fits = table.numel() < 2**31  # places in the table are counted in 32 bits
+    fits = table.numel() < 2**31  # indices into the table have 32 bits
     return features == FEATURES and len(resolutions) == levels and rows & (rows - 1) == 0 and fits
 
 
@@ -168,10 +168,10 @@ def encode(
     count: Tensor | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """`reference.hash_encode` without gradients, as numbers of a type.
+    """Compute `reference.hash_encode` without gradients, in the given dtype.
 
     Args:
-        count: () int64 on the device: how many of the points there are; all if None. What follows is undefined.
+        count: () int64 on the device: number of valid points, all if None; the codes of the rest are undefined.
     """
     levels, rows, _ = table.shape
     out = torch.empty(len(points), levels * FEATURES, dtype=dtype, device=points.device)
@@ -192,7 +192,7 @@ def add_table_gradient(
     scale: Tensor,
     widths: Tensor | None,
 ) -> None:
-    """Add to the sink (L, T, 4) what a gradient (N, L * 4), multiplied by `scale` (), makes of the table's."""
+    """Add the table's gradient to the sink (L, T, 4); the codes' gradient (N, L * 4) is multiplied by `scale` (1,)."""
     levels, rows, _ = sink.shape
     launch(
         _encode_backward, (blocks(len(points), BLOCK), levels), points, points if widths is None else widths,
@@ -210,7 +210,7 @@ def points_gradient(
     scale: Tensor,
     widths: Tensor | None,
 ) -> Tensor:
-    """Return what a gradient (N, L * 4), multiplied by `scale` (), makes of the points': (N, 3)."""
+    """Return the points' gradient (N, 3); the codes' gradient (N, L * 4) is multiplied by `scale` (1,)."""
     levels, rows, _ = table.shape
     out = torch.empty_like(points)
     launch(
@@ -223,13 +223,13 @@ def points_gradient(
 
 @functools.lru_cache(maxsize=64)
 def device_integers(values: tuple[int, ...], device: torch.device) -> Tensor:
-    """Return integers on the device; each tuple is copied once, as a copy from the host waits."""
+    """Return integers on the device; each tuple is copied only once, as copies from the host wait."""
     return torch.tensor(values, dtype=torch.int32, device=device)
 
 
 @functools.lru_cache(maxsize=64)
 def device_floats(values: tuple[float, ...], device: torch.device) -> Tensor:
-    """`device_integers` of numbers."""
+    """Return floats on the device; see `device_integers`."""
     return torch.tensor(values, dtype=torch.float32, device=device)
 
 

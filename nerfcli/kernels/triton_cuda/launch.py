@@ -1,6 +1,6 @@
 """Launch of Triton kernels: compiled by Triton, loaded and started by the CUDA driver; no C compiler is needed.
 
-Triton's own launcher builds a C module once per machine, and is taken where that works and the driver does not. In
+Triton's own launcher builds a C module once per machine, and is used where that works and the driver does not. In
 Triton's interpreter (TRITON_INTERPRET=1, read when Triton is imported) the same kernels run on the CPU.
 """
 
@@ -31,7 +31,7 @@ ALIGNMENT = 16
 
 
 class Size(int):
-    """How much a program takes at a time: on a GPU, or in the interpreter, where a program costs as much for more."""
+    """Items per program: on a GPU, or in the interpreter, where a program costs about the same however many it has."""
 
     compiled: int
 
@@ -43,12 +43,12 @@ class Size(int):
 
 
 class Variant(NamedTuple):
-    """What a kernel is compiled for.
+    """A kernel with the argument types and constants for which it is compiled.
 
     Args:
         kernel: the function under `triton.jit`.
-        types: of the arguments that are no constants, in order.
-        aligned: numbers of the pointers that are multiples of `ALIGNMENT`.
+        types: of the non-constant arguments, in order.
+        aligned: indices of the pointers that are multiples of `ALIGNMENT`, among these arguments.
         constants: names and values.
         warps, stages: of Triton's options.
     """
@@ -61,13 +61,13 @@ class Variant(NamedTuple):
     stages: int
 
 
-# `triton.jit`, without its types: it says that functions which only kernels may call never return.
+# `triton.jit` without its types, by which functions that only kernels may call never return.
 jit: Callable[[Callable[..., Any]], Any] = triton.jit
 
-# The variants of all launches so far, for those who want to know what to compile.
+# The variants of all launches in the interpreter so far, from which tests learn what to compile.
 seen: dict[Variant, None] = {}
 _loaded: dict[tuple[Variant, int], driver.Function] = {}
-# The devices on which Triton's own launcher is taken.
+# The devices on which Triton's own launcher is used.
 _with_triton: set[int] = set()
 
 
@@ -78,8 +78,8 @@ def launch(
 
     Args:
         kernel: the function under `triton.jit`.
-        grid: number of programs along up to three axes; nothing is done where there are none.
-        arguments: those that are no constants: contiguous tensors, integers of 32 bits and floats.
+        grid: number of programs along up to three axes; nothing is done if one of them is 0.
+        arguments: the non-constant ones: contiguous tensors, 32-bit integers and floats.
         warps, stages: of Triton's options.
         constants: the `tl.constexpr` arguments.
     """
@@ -101,7 +101,7 @@ def launch(
 
 
 def choose_launcher(device: torch.device) -> str | None:
-    """Find out by a small kernel how kernels can be launched on a device, and keep to it.
+    """Find out with a small test kernel how kernels can be launched on a device, and remember it for `launch`.
 
     Returns:
         None, or why they cannot be launched at all.
@@ -118,18 +118,18 @@ def choose_launcher(device: torch.device) -> str | None:
             if _counts(device):
                 return None
             failures.append("wrong numbers")
-        except Exception as error:  # whatever it is, this way cannot be taken
+        except Exception as error:  # any error: this launcher cannot be used
             failures.append(f"{type(error).__name__}: {error}".splitlines()[0])
     return f"kernels cannot be launched by the driver ({failures[0]}), nor by Triton ({failures[1]})"
 
 
 def blocks(count: int, size: int) -> int:
-    """Return how many blocks of a size hold so many."""
+    """Return the number of blocks of `size` items that hold `count` items."""
     return -(-count // size)
 
 
 def launcher(device: torch.device) -> str:
-    """Return who launches kernels on a device: "CUDA driver" or "Triton"."""
+    """Return what launches kernels on a device: "CUDA driver" or "Triton"."""
     return "Triton" if _number(device) in _with_triton else "CUDA driver"
 
 
@@ -141,7 +141,7 @@ def _number(device: torch.device) -> int:
 def variant_of(
     kernel: Any, arguments: tuple[Tensor | float, ...], constants: dict[str, Any], *, warps: int, stages: int
 ) -> Variant:
-    """Return what a kernel has to be compiled for to take these arguments."""
+    """Return the variant of a kernel that takes these arguments."""
     types, aligned = [], []
     for number, value in enumerate(arguments):
         if isinstance(value, Tensor):
@@ -171,7 +171,7 @@ def _count(out, first, step, count, BLOCK: tl.constexpr):
 
 
 def _counts(device: torch.device) -> bool:
-    """Return whether a small kernel does on a device what it should."""
+    """Return whether a small test kernel gives the right numbers on a device."""
     out = torch.zeros(100, device=device)
     launch(_count, (3,), out, 7, 0.5, 90, BLOCK=32)
     expected = torch.where(torch.arange(100) < 90, 7 + 0.5 * torch.arange(100), 0.0)

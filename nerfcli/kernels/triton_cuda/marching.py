@@ -1,12 +1,12 @@
-"""The samples of rays: those in occupied cells, and those of them that light gets to, without gaps between them.
+"""The samples of rays: those in occupied cells, and those among them that light reaches, packed without gaps.
 
-Same operations as `reference.occupied_samples` and `reference.visible_samples`. Rays are marched twice: the first time
-counts, the second writes. What the host does not have yet, the number of samples, stays on the device: buffers are as
-large as those of earlier steps needed, and the one time that it waits, it learns whether they were large enough.
+Same operations as `reference.occupied_samples` and `reference.visible_samples`. Rays are marched twice: first to count,
+then to write. The number of samples stays on the device, as the host would have to wait for it: buffers are as large as
+earlier steps needed, and the host waits only once, to learn whether they were large enough.
 """
 
 # pyright: reportGeneralTypeIssues=false
-# `tl.static_range` can be iterated over in kernels alone.
+# `tl.static_range` can be iterated over only in kernels.
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ from nerfcli.kernels.triton_cuda import hash_grid, networks
 from nerfcli.kernels.triton_cuda.launch import INTERPRETED, blocks, jit, launch
 from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, cube, fill_ray_indices, ray_indices, span_of
 
-# Room for samples is a multiple of this, and this much larger than what was needed last.
+# Room for samples is a multiple of ROOM, about SPARE times the number needed last.
 ROOM, SPARE = 2**6 if INTERPRETED else 2**14, 1.25
 WIDTH = networks.WIDTH
 COMPACTED = 128
@@ -33,7 +33,7 @@ class Capacity:
     samples: int = 0
 
     def fit(self, needed: int) -> None:
-        """Have room for so many, without shrinking for small changes."""
+        """Make room for `needed` samples, without shrinking for small changes."""
         if not needed <= self.samples <= 4 * max(needed, ROOM):
             self.samples = ROOM * blocks(int(SPARE * needed) + 1, ROOM)
 
@@ -91,7 +91,7 @@ def _lit(
     density, starts, ends, offsets, counts, deepest, room, rays,
     RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
-    """Number of samples of each ray in front of which the optical depth is below a limit: the first ones."""
+    """Count the samples of each ray in front of which the optical depth is below a limit: its first samples."""
     ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
     first, last = span_of(offsets, ray, rays)
     last = tl.minimum(last, room)
@@ -101,7 +101,7 @@ def _lit(
     for step in range(0, longest, STEPS):
         i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
         valid = i < last[:, None]
-        # What stands in front of each: the samples one place before, so that nothing is subtracted from a sum.
+        # In front of each: a sum over the samples shifted by one place, so that nothing is subtracted from a sum.
         ahead = valid & (i > first[:, None])
         length = tl.load(ends + i - 1, mask=ahead, other=0.0) - tl.load(starts + i - 1, mask=ahead, other=0.0)
         own = tl.load(density + i - 1, mask=ahead, other=0.0) * length
@@ -142,8 +142,8 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, *, table: Tensor, 
     """See `reference.visible_samples`; codes are float16.
 
     Args:
-        table: that of the grid, in float16.
-        capacity: is kept from call to call; the host waits once where it is large enough.
+        table: the grid's table in float16.
+        capacity: kept from call to call; if it is large enough, the host waits only once.
     """
     offsets = _counted(rays, along)
     count = len(rays.origins)
@@ -182,14 +182,14 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, *, table: Tensor, 
 
 
 def _counted(rays: Rays, along: March) -> Tensor:
-    """Offsets (R + 1,) of the occupied samples."""
+    """Return the offsets (R + 1,) of the occupied samples."""
     counts = torch.empty(len(rays.origins), dtype=torch.int64, device=rays.origins.device)
     _launch_march(rays, along, counts, counts, (rays.jitter, rays.jitter, rays.jitter), room=0)
     return _offsets(counts)
 
 
 def _written(rays: Rays, along: March, offsets: Tensor, *, room: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Starts, ends and coordinates of the first `room` of the occupied samples."""
+    """Return starts, ends and coordinates of the first `room` occupied samples."""
     device = offsets.device
     out = torch.empty(room, device=device), torch.empty(room, device=device), torch.empty(room, 3, device=device)
     _launch_march(rays, along, offsets, None, out, room=room)
@@ -209,14 +209,14 @@ def _launch_march(
 
 
 def _offsets(counts: Tensor) -> Tensor:
-    """(R + 1,) from (R,)."""
+    """Return the offsets (R + 1,) of rays with these counts (R,)."""
     offsets = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
     torch.cumsum(counts, 0, out=offsets[1:])
     return offsets
 
 
 def _widths(rays: Rays, along: March, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
-    """Widths of pixels at samples; anything at those that are not there."""
+    """Return the widths of pixels at samples; those in unused places of the buffers mean nothing."""
     assert rays.cones is not None
     index = torch.zeros(len(starts), dtype=torch.int64, device=starts.device)
     fill_ray_indices(offsets.clamp_max(len(starts)), index)

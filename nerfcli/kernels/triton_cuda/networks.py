@@ -1,12 +1,12 @@
 """Both small networks on tensor cores: float16 operands, float32 sums, all layers of a block of samples in one kernel.
 
 Same operations as `reference.density` and `reference.radiance`, with the spherical harmonics of the directions inside.
-Programs stay for many blocks, so that weights are loaded once. Nothing but the inputs is kept for the backward pass,
-which computes hidden layers again; gradients are scaled in it so that the largest one of a step is well inside float16.
+A program processes many blocks, so that weights are loaded once. Only the inputs are kept for the backward pass, which
+recomputes hidden layers, and scales gradients so that the largest one of a step is well inside the range of float16.
 """
 
 # pyright: reportGeneralTypeIssues=false
-# `tl.static_range` can be iterated over in kernels alone.
+# `tl.static_range` can be iterated over only in kernels.
 
 import functools
 
@@ -23,36 +23,36 @@ WIDTH, HIDDEN, GEOMETRY = 32, (32, 64), 16
 BLOCK = Size.of(64, interpreted=256)
 PROGRAMS_PER_PROCESSOR = 4
 LIMIT = tl.constexpr(LOG_DENSITY_LIMIT)
-# What the largest gradient of an output becomes in float16: 2^12 below its end, 2^28 above its smallest number.
+# Scaled value of the largest gradient of an output: 2^12 below float16's largest number, 2^28 above its smallest.
 LARGEST = tl.constexpr(16.0)
-# Gradients are never scaled beyond float32, and end in float16 at its largest number.
+# The least gradient that sets the scale, so that it stays within float32; float16's largest number, the clamp.
 LEAST, END = tl.constexpr(1e-30), tl.constexpr(65504.0)
 
 
 @jit
 def _transposed(weights, OUT: tl.constexpr, IN: tl.constexpr, at: tl.constexpr, stride: tl.constexpr):
-    """(IN, OUT) in float16 of columns `at` and on of a row-major (OUT, ...) matrix."""
+    """Return IN columns from `at` on of a row-major (OUT, stride) matrix, transposed to (IN, OUT), in float16."""
     o, i = tl.arange(0, OUT), tl.arange(0, IN)
     return tl.load(weights + at + o[None, :] * stride + i[:, None]).to(tl.float16)
 
 
 @jit
 def _colours_transposed(weights, H: tl.constexpr):
-    """(H, 16) in float16 of the matrix (3, H), with columns of zeros."""
+    """Return the matrix (3, H) transposed and padded with columns of zeros to (H, 16), in float16."""
     o, i = tl.arange(0, 16), tl.arange(0, H)
     return tl.load(weights + o[None, :] * H + i[:, None], mask=(o < 3)[None, :], other=0.0).to(tl.float16)
 
 
 @jit
 def _bounded_exp(g, column):
-    """Density of the first of 16 outputs."""
+    """Return the density from the first of 16 outputs, its logarithm, clamped to LIMIT."""
     first = tl.sum(tl.where(column == 0, g, 0.0), 1)
     return tl.exp(tl.clamp(first, -LIMIT, LIMIT, propagate_nan=tl.PropagateNan.ALL))
 
 
 @jit
 def _seen_along(directions, rays, i, valid, column, DEGREE: tl.constexpr):
-    """Harmonics (BLOCK, 16) in float16 of the directions of samples."""
+    """Return the harmonics (BLOCK, 16), in float16, and the components (BLOCK, 1) of the directions of samples."""
     ray = tl.load(rays + i, mask=valid, other=0)
     x = tl.load(directions + ray * 3, mask=valid, other=0.0)[:, None]
     y = tl.load(directions + ray * 3 + 1, mask=valid, other=0.0)[:, None]
@@ -102,13 +102,13 @@ def _forward(
 
 @jit
 def _half(gradient):
-    """Return float16 numbers. Infinity would spoil the sums of all samples; NaN stays, so that it is found."""
+    """Convert to float16, clamped: infinity would spoil the sums of all samples. NaN stays, so that it is detected."""
     return tl.clamp(gradient, -END, END, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
 
 
 @jit
 def _largest(by_density, density, by_rgb, out, samples, BLOCK: tl.constexpr):
-    """Return the largest gradient of a log density or a colour."""
+    """Raise `out` to the largest absolute gradient of a log density or a colour."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = i < samples
     thick = tl.load(by_density + i, mask=valid, other=0.0) * tl.load(density + i, mask=valid, other=0.0)
@@ -149,7 +149,7 @@ def _backward(
         h2 = tl.dot(sh, seen, tl.dot(g16, third))
         h2 = tl.maximum(h2, 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
         h3 = tl.maximum(tl.dot(h2, fourth), 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
-        # The slope of a sigmoid without 1 - value, which ends where the value rounds to 1.
+        # The slope of a sigmoid without 1 - value, which is 0 where the value rounds to 1.
         a = tl.exp(-tl.abs(tl.dot(h3, fifth)))
         slope = a / ((1.0 + a) * (1.0 + a))
         d = tl.load(by_rgb + i[:, None] * 3 + column, mask=valid[:, None] & (column < 3), other=0.0) * slope
@@ -183,7 +183,7 @@ def _backward(
 
 
 def can_radiance(code_width: int, layers: tuple[Tensor, ...]) -> bool:
-    """Return whether this module supports layers behind codes of a width; other ones go to the reference."""
+    """Return whether this module supports these layers behind codes of this width; if not, the reference is used."""
     hidden = len(layers[0])
     shapes = ((hidden, WIDTH), (GEOMETRY, hidden), (hidden, 2 * GEOMETRY), (hidden, hidden), (3, hidden))
     return (
@@ -194,10 +194,10 @@ def can_radiance(code_width: int, layers: tuple[Tensor, ...]) -> bool:
 
 
 def density(encoded: Tensor, layers: tuple[Tensor, ...], *, count: Tensor | None = None) -> Tensor:
-    """`reference.density` of codes (N, 32) in float16, without gradients.
+    """Compute `reference.density` of codes (N, 32) in float16, without gradients.
 
     Args:
-        count: () int64 on the device: how many of the codes there are; all if None. What follows is undefined.
+        count: () int64 on the device: number of valid codes, all if None; the densities of the rest are undefined.
     """
     out = torch.empty(len(encoded), device=encoded.device)
     launch(
@@ -210,7 +210,7 @@ def density(encoded: Tensor, layers: tuple[Tensor, ...], *, count: Tensor | None
 def radiance(
     encoded: Tensor, directions: Tensor, rays: Tensor, layers: tuple[Tensor, ...], *, degree: int
 ) -> tuple[Tensor, Tensor]:
-    """`reference.radiance` of codes (N, 32) in float16 seen along directions (R, 3) of rays (N,), without gradients."""
+    """Compute `reference.radiance` of codes (N, 32) in float16 along directions (R, 3) of rays (N,); no gradients."""
     density, rgb = torch.empty(len(encoded), device=encoded.device), torch.empty(len(encoded), 3, device=encoded.device)
     launch(
         _forward, programs(len(encoded), encoded.device), encoded, directions, rays, *plain(layers), density, rgb,
@@ -231,15 +231,15 @@ def radiance_gradients(
     by_rgb: Tensor,
     rays_learn: bool,
 ) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
-    """Gradients of `radiance`.
+    """Compute the gradients of `radiance`.
 
     Returns:
-        by codes (N, 32) float16, multiplied by the second, a scalar; by directions of samples (N, 3), or (0, 3) where
-        rays do not learn; by layers.
+        gradient by codes (N, 32) in float16, multiplied by a scale; this scale (1,); gradient by directions of samples
+        (N, 3), or (0, 3) unless `rays_learn`; gradients by layers.
     """
     samples, device = len(encoded), encoded.device
     sizes = [layer.numel() for layer in layers]
-    # One buffer, as each that is set to zero is a launch: the gradients of the layers, and the largest one.
+    # One buffer for the gradients of the layers and the largest one, as zeroing a buffer is a launch.
     flat = torch.zeros(sum(sizes) + 1, device=device)
     *parts, largest = flat.split([*sizes, 1])
     of_layers = tuple(part.view(layer.shape) for part, layer in zip(parts, layers, strict=True))
@@ -252,7 +252,7 @@ def radiance_gradients(
     launch(
         _backward, programs(samples, device), encoded, directions, rays, *plain(layers), by_density, by_rgb, largest,
         by_encoded, by_direction, *of_layers, scale, samples, H=len(layers[0]), DEGREE=degree, RAYS_LEARN=rays_learn,
-        BLOCK=BLOCK, warps=4 if len(layers[0]) == 32 else 8,  # half as many registers for the sums of each thread
+        BLOCK=BLOCK, warps=4 if len(layers[0]) == 32 else 8,  # halves the registers for the sums of each thread
     )  # fmt: skip
     return by_encoded, scale, by_direction, of_layers
 
@@ -263,11 +263,11 @@ def plain(layers: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
 
 
 def programs(samples: int, device: torch.device) -> tuple[int]:
-    """Grid of as many programs as the device runs at a time, or as there are blocks."""
+    """Return the grid: as many programs as the device runs at a time, but no more than there are blocks."""
     return (min(blocks(samples, BLOCK), PROGRAMS_PER_PROCESSOR * processors(device)),)
 
 
 @functools.cache
 def processors(device: torch.device) -> int:
-    """Number of streaming multiprocessors; 1 in the interpreter."""
+    """Return the number of streaming multiprocessors; 1 in the interpreter."""
     return torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 1

@@ -1,4 +1,4 @@
-"""Single operations on packed samples, by the GPU kernels or, where none is worth it, by the reference."""
+"""Single operations on packed samples, by the GPU kernels or, where a kernel is not worth it, by the reference."""
 
 from torch import Tensor
 

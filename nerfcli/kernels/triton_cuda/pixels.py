@@ -1,7 +1,7 @@
-"""Rays and colours of the pixels that a training draws, in one launch. Same operation as `reference.pixel_rays`."""
+"""Rays and colours of the pixels drawn in training, in one launch. Same operation as `reference.pixel_rays`."""
 
 # pyright: reportGeneralTypeIssues=false
-# `tl.static_range` can be iterated over in kernels alone.
+# `tl.static_range` can be iterated over only in kernels.
 
 import torch
 import triton.language as tl
@@ -21,7 +21,7 @@ def _pixels(
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     valid = i < count
     pixel = tl.load(chosen + i, mask=valid, other=0)
-    # The last photo that begins at the pixel or before.
+    # The last photo whose first pixel is at or before the pixel.
     low = tl.zeros([BLOCK], tl.int32)
     high = low + photos
     for _ in range(halvings):

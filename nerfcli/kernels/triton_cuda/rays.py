@@ -1,7 +1,7 @@
-"""What kernels along rays have in common: a program owns some rays, and looks at some samples of each at a time."""
+"""Common parts of kernels along rays: a program owns some rays, and processes some samples of each at a time."""
 
 # pyright: reportGeneralTypeIssues=false
-# `tl.static_range` can be iterated over in kernels alone.
+# `tl.static_range` can be iterated over only in kernels.
 
 import torch
 import triton.language as tl
@@ -9,10 +9,10 @@ from torch import Tensor
 
 from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
 
-# Rays of a program, and samples of each that it looks at together.
+# Rays of a program, and samples of each that it processes together.
 RAYS = Size.of(16, interpreted=64)
 STEPS = 32
-# Components above this are scaled before they are squared, and so are all norms.
+# A point with a component above FAR is scaled by SHRINK before its components are squared.
 FAR = tl.constexpr(4294967296.0)
 SHRINK = tl.constexpr(2.0**-66)
 
@@ -24,7 +24,7 @@ def blocks_of(rays: int) -> tuple[int]:
 
 @jit
 def contracted_norm(x, y, z, CONTRACTION: tl.constexpr):
-    """Return the norm of the contraction, at least 1."""
+    """Return the norm of a point that the contraction uses, raised to at least 1."""
     largest = tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z))
     if CONTRACTION == 1:
         shrink = tl.where(largest > FAR, SHRINK, 1.0)
@@ -36,7 +36,7 @@ def contracted_norm(x, y, z, CONTRACTION: tl.constexpr):
 
 @jit
 def cube(x, y, z, CONTRACTION: tl.constexpr):
-    """`grid_coordinates`, with the contractions numbered as in `CONTRACTIONS`."""
+    """Return `grid_coordinates` of points; CONTRACTION is an index into `CONTRACTIONS`."""
     if CONTRACTION == 0:
         return x * 0.5 + 0.5, y * 0.5 + 0.5, z * 0.5 + 0.5
     else:
@@ -47,7 +47,7 @@ def cube(x, y, z, CONTRACTION: tl.constexpr):
 
 @jit
 def span_of(offsets, ray, rays):
-    """First and last + 1 of the samples of rays (RAYS,); none for rays beyond the last."""
+    """Return the first samples of rays (RAYS,) and the ends of their samples, excluded; both 0 beyond the last ray."""
     there = ray < rays
     first = tl.load(offsets + ray, mask=there, other=0)
     return first, tl.load(offsets + ray + 1, mask=there, other=0)
@@ -65,13 +65,13 @@ def _ray_indices(offsets, out, rays, RAYS: tl.constexpr, STEPS: tl.constexpr):
 
 
 def fill_ray_indices(offsets: Tensor, out: Tensor) -> None:
-    """Write the ray of each sample of offsets (R + 1,)."""
+    """Write the ray of each sample to `out`, from offsets (R + 1,)."""
     rays = len(offsets) - 1
     launch(_ray_indices, blocks_of(rays), offsets, out, rays, RAYS=RAYS, STEPS=STEPS)
 
 
 def ray_indices(offsets: Tensor, samples: int | None = None) -> Tensor:
-    """See `reference.ray_indices`; `samples` is their number, where the host has it."""
+    """See `reference.ray_indices`; `samples` is the number of samples, if the host knows it."""
     out = torch.empty(int(offsets[-1]) if samples is None else samples, dtype=torch.int64, device=offsets.device)
     fill_ray_indices(offsets, out)
     return out
@@ -91,7 +91,7 @@ def _sum_rows(values, offsets, out, rays, COLUMNS: tl.constexpr, RAYS: tl.conste
 
 
 def sum_along_rays(values: Tensor, offsets: Tensor) -> Tensor:
-    """`reference.sum_along_rays` of rows (N, C), without gradients."""
+    """See `reference.sum_along_rays`; for rows (N, C), without gradients."""
     rays = len(offsets) - 1
     out = torch.empty(rays, values.shape[1], device=values.device)
     launch(_sum_rows, blocks_of(rays), values, offsets, out, rays, COLUMNS=values.shape[1], RAYS=RAYS, STEPS=STEPS)

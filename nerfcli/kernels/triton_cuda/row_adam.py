@@ -1,7 +1,6 @@
-"""Adam on the rows of a table that have a gradient: moments, table and its copy in float16 in one pass; the gradient is
-set to zero on the way.
+"""Adam on the rows of a table that have a gradient: moments, table and its float16 copy in one pass.
 
-Same operation as `reference.adam_rows`, for rows of 4 features.
+The pass also zeroes the gradient. Same operation as `reference.adam_rows`, for rows of 4 features.
 """
 
 import triton.language as tl
@@ -51,7 +50,7 @@ def adam_rows(
     """See `reference.adam_rows`; float32, rows of 4 features.
 
     Args:
-        half: of the table's shape, float16: where the rows that change are copied to.
+        half: of the table's shape, float16; changed rows are copied to it.
     """
     rows = table.numel() // FEATURES
     scale, correction = rate / (1 - betas[0] ** step), (1 - betas[1] ** step) ** -0.5

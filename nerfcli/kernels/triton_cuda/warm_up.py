@@ -1,4 +1,4 @@
-"""All kernels of a training and of its pictures, compiled before a clock runs."""
+"""Compilation of all kernels of training and rendering, before any time budget starts to run."""
 
 import torch
 

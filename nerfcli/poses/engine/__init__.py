@@ -1,1 +1,1 @@
-"""pycolmap at work, in a process of its own: features, matches, attempts to map, and what supervises it."""
+"""The worker process that runs pycolmap (features, matches, mapping attempts), and its supervision."""

@@ -1,7 +1,7 @@
-"""Judge the component that becomes the scene, and keep the numbers by which the report lists all of them.
+"""Judge the component that becomes the scene, and keep the numbering under which the report lists all components.
 
-Components are numbered by size, after the second chance of the largest: it may take in photos of the others, or lose
-some. A request for a smaller one therefore gets the one that the report lists under this number.
+Components are numbered by size after the second chance of the largest one, which may gain photos of the others or lose
+some. So a request for a smaller component gets the one that the report lists under that number.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,13 +17,13 @@ from nerfcli.poses.input.stages import read_stage, write_stage
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.examine import Examined, examine
 
-# As many photos of its own make a component.
+# A component has at least this many photos of its own.
 _LEAST_PHOTOS = 3
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """What was examined, and the models in the order of their numbers, the examined one among them."""
+    """The examined component, and all models in the order of their numbers, including the examined one."""
 
     mapped: Mapped
     examined: Examined
@@ -37,9 +37,9 @@ def choose_component(
     Args:
         mapped: the models of the first mapping.
         report: called with (stage, done, total).
-        tell: called with what the user should know.
-        component: its number, from 1 on; there may be none of that number.
-        checks: makes the runner of the checks of one model.
+        tell: called with messages for the user.
+        component: its number, from 1; there may be no component with this number.
+        checks: makes a check runner for one model.
     """
     if component == 1:
         return _largest(mapped, report, tell, checks=checks)
@@ -82,7 +82,7 @@ def _largest(mapped: Mapped, report: Report, tell: Tell, *, checks: Callable[[],
 def _with_photos_of_their_own(
     first: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction]
 ) -> list[pycolmap.Reconstruction]:
-    """Return the models of which most photos are in no larger one, the largest first."""
+    """Return the models, largest first, that have most of their photos, and at least 3, in no larger model."""
     taken, kept = set(first.reg_image_ids()), []
     for model in sorted(others, key=lambda model: -model.num_reg_images()):
         photos = set(model.reg_image_ids())
@@ -94,7 +94,7 @@ def _with_photos_of_their_own(
 
 
 def _numbered(mapped: Mapped) -> Mapped | None:
-    """Return the models in the order in which an earlier call has listed them; None if none has, or they are gone."""
+    """Return the models in the order listed by an earlier call; None if there was none, or the models are gone."""
     name = read_stage(_stage(mapped.job), mapping_key(mapped.job))
     if name is None or name == FIRST:
         return None if name is None else mapped

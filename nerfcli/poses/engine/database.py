@@ -1,11 +1,11 @@
-"""pycolmap's database: photos under fixed ids, and what is taken out of it because it no longer holds.
+"""pycolmap's database: photos under fixed ids, and removal of entries that are out of date.
 
-pycolmap writes features photo by photo and matches block by block, each in a transaction, and passes over what is
-there. So a database that was left at any moment is whole, and going on is calling pycolmap again. What is left to do
-here is to take out what depends on something that has changed.
+pycolmap writes features photo by photo and matches block by block, each in a transaction, and skips existing entries.
+So the database is consistent at any moment, and calling pycolmap again continues the work. This module only has to
+remove entries that depend on something that has changed.
 
-pycolmap has its own SQLite library. Two of them must not have a file open in one process: the one that closes it drops
-the locks of the other. So Python's is used only while pycolmap has the database closed.
+pycolmap has its own SQLite library. Two SQLite libraries must not have a file open in one process: when one closes it,
+the locks of the other are dropped. So Python's is used only while pycolmap has the database closed.
 """
 
 import sqlite3
@@ -23,10 +23,10 @@ _PAIR_FACTOR = 2147483647
 
 
 def register_photos(job: Job) -> None:
-    """Have the job's photos and no others in the database, with the ids and cameras that the job gives them.
+    """Make the database hold exactly the job's photos, with the ids and cameras of the job.
 
-    Features stay. Verified matches go if they were verified with intrinsics that have changed, as do all traces of
-    photos that the job does not have.
+    Features are kept. Verified matches are removed if they were verified with intrinsics that have changed, and so is
+    everything about photos that the job does not have.
     """
     job.database.parent.mkdir(parents=True, exist_ok=True)
     cameras = {number: camera_of_group(group) for number, group in enumerate(job.groups, start=1)}
@@ -71,7 +71,7 @@ def register_photos(job: Job) -> None:
 
 
 def camera_of_group(group: CameraGroup) -> pycolmap.Camera:
-    """Return the camera model of a group, with its intrinsics if given, or with an estimated focal length or EXIF's."""
+    """Return the camera of a group, with the given intrinsics, or with the estimated, EXIF or usual focal length."""
     if group.params is not None:
         camera = pycolmap.Camera.create_from_model_name(1, group.model, 1.0, group.width, group.height)
         camera.params = list(group.params)
@@ -85,7 +85,7 @@ def camera_of_group(group: CameraGroup) -> pycolmap.Camera:
 
 
 def forget_features(job: Job, image_ids: Iterable[int]) -> None:
-    """Take out the features of some photos and all matches with them. pycolmap's own functions take out all or none."""
+    """Remove the features of some photos and all their matches; pycolmap itself can only remove those of all photos."""
     with _edited(job) as database:
         for image_id in image_ids:
             for table in ("keypoints", "descriptors"):
@@ -94,14 +94,14 @@ def forget_features(job: Job, image_ids: Iterable[int]) -> None:
 
 
 def forget_geometries(job: Job, image_ids: Iterable[int]) -> None:
-    """Take out the verified matches of some photos; the matches themselves stay, and are soon verified again."""
+    """Remove the verified matches of some photos; the matches themselves are kept, and are verified again later."""
     with _edited(job) as database:
         for image_id in image_ids:
             _forget_pairs(database, image_id, ("two_view_geometries",))
 
 
 def keep_geometries(job: Job, pairs: Iterable[tuple[int, int]]) -> None:
-    """Take out the verified matches of all pairs of photo numbers but these: the mapper uses whatever it finds."""
+    """Remove the verified matches of all pairs but `pairs` (photo numbers), since the mapper uses all that it finds."""
     ids = job.image_ids
     wanted = {pycolmap.image_pair_to_pair_id(ids[i], ids[j]) for i, j in pairs}
     with _edited(job) as database:
@@ -118,10 +118,10 @@ def clear_matches(job: Job, *tables: str) -> None:
 
 
 def discard_if_damaged(path: Path) -> None:
-    """Delete a database that cannot be read from beginning to end; its content will be found again.
+    """Delete a database that cannot be read from beginning to end; its content is then computed again.
 
-    A killed process leaves a whole one, thanks to SQLite's journal. A machine that lost its power may not, for pycolmap
-    does not wait for the disk.
+    A killed process leaves an intact one, thanks to SQLite's journal. After a power failure it may be damaged, since
+    pycolmap does not wait for the disk.
     """
     if not path.exists():
         return
@@ -139,13 +139,13 @@ def name_images(job: Job) -> None:
     """Give the images the photos' own names, so that COLMAP finds them in the user's folder."""
     names = zip(job.names, job.image_ids, strict=True)
     with _edited(job) as database:
-        # In two steps, for a photo's name may be the number of another one.
+        # In two steps, since a photo's own name may be the numbered name of another one.
         database.execute("UPDATE images SET name = '/' || image_id")
         database.executemany("UPDATE images SET name = ? WHERE image_id = ?", list(names))
 
 
 def evidence(job: Job) -> list[dict[str, Any]]:
-    """Per photo: features found, and the photo that it shares most verified matches with."""
+    """Return, per photo, its number of features, and the photo with which it has the most verified matches."""
     numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
     with closing(pycolmap.Database.open(str(job.database))) as database:
         features = {number: database.num_keypoints_for_image(image_id) for image_id, number in numbers.items()}
@@ -167,7 +167,7 @@ def _described(camera: pycolmap.Camera) -> tuple[Any, ...]:
 
 
 def _verified_with(camera: pycolmap.Camera) -> tuple[Any, ...]:
-    """Return what two-view geometry depends on: without a prior, fundamental matrices need no focal length."""
+    """Return the camera data used by two-view geometry; without a prior, fundamental matrices need no focal length."""
     if camera.has_prior_focal_length:
         return _described(camera)
     return (camera.model.name, camera.width, camera.height)

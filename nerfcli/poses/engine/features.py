@@ -1,4 +1,4 @@
-"""Features and matches: what pycolmap writes into its database, going on from what is there."""
+"""Extract features and match pairs with pycolmap, continuing from the existing content of its database."""
 
 import math
 import threading
@@ -15,38 +15,38 @@ from nerfcli.poses.input.job import Job, LaidOutMask, Report
 from nerfcli.poses.input.plan import duration, limit_seconds, matching_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
-# A photo with this share of the requested features is rich enough; measured poses are no better with more.
+# A photo with this fraction of the requested features has enough; measured poses are no better with more.
 _RICH_SHARE = 0.5
-# A mask that leaves less than an eighth of a picture gets no more: fine features at noise level do not help.
+# Largest factor by which a mask raises the feature limit: more would only add fine features at noise level.
 _MOST_FEATURES_FOR_MASK = 8
-# Matches are written, and so progress is seen and kept, after each block.
+# Matches are written after each block, so that progress is visible and kept.
 _PAIRS_PER_BLOCK = 128
-# The time is looked at after so many pairs; matching may take so many seconds, however few they are.
+# The time limit is checked after this many pairs; it is at least this many seconds, however few pairs there are.
 _PAIRS_PER_CALL = 8 * _PAIRS_PER_BLOCK
 _LEAST_LIMIT_SECONDS = 300
-# To be changed with anything here that changes the features of the same photo, or the matches of the same features.
+# Change these whenever this module would find other features in the same photo, or other matches of the same features.
 _FEATURES_VERSION = "octaves 0, then -1 below half"
 _MATCHES_VERSION = "ratio 0.8, cross-checked"
 
 
 def feature_keys(job: Job) -> dict[str, str]:
-    """Per photo (by image id, as JSON wants its keys), a hash of all that its features depend on."""
+    """Return, per photo (by image id, as text for JSON), a hash of everything that its features depend on."""
     settings = (_FEATURES_VERSION, job.max_image_size, job.max_features, pycolmap.__version__)
     contents = [(key, mask.key) for key, mask in zip(job.keys, job.masks or repeat(LaidOutMask()), strict=False)]
     return {str(i): stage_key(*content, *settings) for i, content in zip(job.image_ids, contents, strict=True)}
 
 
 def extract(job: Job, report: Report) -> None:
-    """SIFT features of every photo that has none yet, one camera per group.
+    """Extract SIFT features of every photo that has none yet, with one camera per group.
 
-    Seeking them in the enlarged picture too (SIFT's octave -1, pycolmap's default) takes three times as long. Rich
-    pictures gain nothing, for pycolmap keeps the coarsest features; so only the poor ones get it, in a second pass.
+    Searching the enlarged picture too (SIFT's octave -1, pycolmap's default) takes three times as long. Photos with
+    many features gain nothing, since pycolmap keeps the coarsest; so only those with few are searched in a second pass.
     """
     register_photos(job)
     keys, known = feature_keys(job), _stage_file(job, "features")
     there = read_stage(known, _FEATURES_VERSION) or {}
     forget_features(job, [int(image_id) for image_id, key in keys.items() if there.get(image_id) != key])
-    # From here on, what features the database holds are those of `keys`.
+    # From here on, all features in the database are those of `keys`.
     write_stage(known, _FEATURES_VERSION, keys)
     passes = _stage_file(job, "enlarged")
     enlarged = {i: key for i, key in (read_stage(passes, _FEATURES_VERSION) or {}).items() if keys.get(i) == key}
@@ -54,7 +54,7 @@ def extract(job: Job, report: Report) -> None:
     _extract_octaves(job, first, watched=range(len(job.image_ids)), first_octave=0, report=report)
     counts = feature_counts(job)
     poor = [number for number in first if counts[number] < _RICH_SHARE * job.max_features]
-    # First they go and then it is written that they are due: one that has features and is due has had its second pass.
+    # Features are removed before photos are listed for the second pass: a listed photo with features has had it.
     forget_features(job, [job.image_ids[number] for number in poor])
     enlarged |= {str(job.image_ids[number]): keys[str(job.image_ids[number])] for number in poor}
     write_stage(passes, _FEATURES_VERSION, enlarged)
@@ -64,7 +64,7 @@ def extract(job: Job, report: Report) -> None:
 
 
 def start_matching(job: Job, pairs: Sequence[tuple[int, int]]) -> None:
-    """Take out the matches of other settings, and hide those of other pairs from the mapper."""
+    """Remove the matches of other settings, and the verified matches of other pairs, which the mapper would use."""
     matched, verified = _stage_file(job, "matches"), _stage_file(job, "geometries")
     matches_key = stage_key(_MATCHES_VERSION, pycolmap.__version__)
     verified_key = stage_key(matches_key, job.seed)
@@ -78,12 +78,12 @@ def start_matching(job: Job, pairs: Sequence[tuple[int, int]]) -> None:
 
 
 def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | None:
-    """Descriptor matches of the pairs that have none yet, verified by two-view geometry.
+    """Match the descriptors of the pairs that have no matches yet, and verify them by two-view geometry.
 
-    Each pair's random numbers start from the seed, so its result does not depend on what was done before.
+    Each pair's random numbers start from the seed, so its result does not depend on earlier work.
 
     Returns:
-        What was cut short, where the pairs took ten times as long as planned; the last of them have no matches then.
+        A note if matching was cut short after ten times the planned time, so that the last pairs have no matches.
     """
     planned = matching_seconds(len(pairs), max_features=job.max_features) / max(job.threads, 1)
     most, start = limit_seconds(planned, least=_LEAST_LIMIT_SECONDS), time.perf_counter()
@@ -124,7 +124,7 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
 
 
 def feature_counts(job: Job) -> list[int]:
-    """Features in the database, per photo."""
+    """Return the number of features of each photo in the database."""
     with closing(pycolmap.Database.open(str(job.database))) as database:
         return [database.num_keypoints_for_image(image_id) for image_id in job.image_ids]
 
@@ -132,7 +132,7 @@ def feature_counts(job: Job) -> list[int]:
 def _extract_octaves(
     job: Job, numbers: Iterable[int], *, watched: Sequence[int], first_octave: int, report: Report
 ) -> None:
-    """Seek features in photos that have none; of the photos `watched` it is reported how many have some."""
+    """Extract features of photos that have none, and report how many of the photos `watched` have some."""
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = job.max_image_size
     options.num_threads = job.threads
@@ -161,10 +161,10 @@ def _extract_octaves(
 
 
 def _by_limit(job: Job, numbers: Iterable[int]) -> dict[int, list[str]]:
-    """Files of photos by how many features to seek in the whole picture, so that what a mask leaves has enough.
+    """Group files by the feature limit of the whole picture that leaves enough features inside the mask.
 
-    pycolmap chooses features before it looks at the mask. The limit doubles each time the share of the
-    picture that is used halves.
+    pycolmap chooses features before it applies the mask. The limit doubles each time the used fraction of the picture
+    halves.
     """
     limits: dict[int, list[str]] = {}
     for number in numbers:

@@ -1,4 +1,4 @@
-"""Focal lengths to start mapping from, where EXIF has none to rely on."""
+"""Initial focal lengths for mapping, where EXIF has no reliable one."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -19,10 +19,10 @@ _LEAST_RISE = 0.1
 
 
 def with_focal_lengths(job: Job, tell: Tell) -> Job:
-    """Return the job with focal lengths estimated from pairs of photos, where these determine them; its database too.
+    """Return the job, and update its database, with focal lengths estimated from pairs of photos that determine them.
 
-    Only cameras without a reliable focal length from EXIF or the user are estimated. By itself the mapper starts
-    from 1.2 times the longer side; where that is a third off it takes up to three times as long.
+    Only cameras without a reliable focal length from EXIF or the user are estimated. By default the mapper starts
+    from 1.2 times the longer side; if that is a third off, it takes up to three times as long.
     """
     unknown = [
         group

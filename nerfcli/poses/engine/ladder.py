@@ -1,7 +1,7 @@
-"""One attempt after the other, each costlier than the one before, until enough photos are placed.
+"""Mapping attempts, each costlier than the one before, until enough photos are placed.
 
-Every attempt is written down with its result. The first ones ask the same matches in another way; the last ones look
-for more matches and more features.
+Every attempt is recorded with its result. The first ones use the same matches in other ways; the last ones add matches
+and features.
 """
 
 import math
@@ -24,7 +24,7 @@ from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
 from nerfcli.poses.input.plan import duration, extraction_seconds, mapping_seconds, matching_seconds
 from nerfcli.poses.input.settings import FULL_SIZE
-from nerfcli.poses.judge.parallax import best_turn
+from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model.intrinsics import field_of_view_deg
 from nerfcli.poses.model.lens_family import as_fisheye
 from nerfcli.poses.model.localise import left_out, localise
@@ -32,27 +32,27 @@ from nerfcli.poses.model.merging import merge_models
 from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
 from nerfcli.poses.model.two_views import read_verified_pairs
 
-# Registered shares below which the mapper gets another chance; a photo or two missing is often the photo's own fault.
+# Registered fraction below which mapping is tried again; if only a photo or two are missing, they are often at fault.
 _GOOD_SHARE = 0.9
-# Below this, it is worth several times the work that was done so far.
+# Below this registered fraction, several times the work done so far is worthwhile.
 _FEW_SHARE = 0.75
-# From here on mapping from scratch takes two minutes and more: a few photos are not worth it.
+# From this many photos, mapping from scratch takes two minutes and more, which is not worth it for a few photos.
 _MANY_PHOTOS = 250
-# Below this, what is believed of the lens beforehand is doubted.
+# Below this registered fraction, the initial focal length from EXIF is doubted.
 _LITTLE_SHARE = 0.5
 # Beyond this, comparing every pair, or searching full-size photos, takes longer than taking better photos.
 _MOST_PAIRS = 12_000
 _MOST_FULL_SIZE = 150
 _MORE_FEATURES = 8192
-# Searching larger pictures may take so many times as long as the first search, times the share of photos missing.
+# Searching larger pictures may take this many times as long as the first search, times the fraction of missing photos.
 _MOST_FOR_MORE = 5.0
-# All attempts together may take so many times as long as one run of the mapper may.
+# Time limit of all attempts together, as a multiple of the limit of one run of the mapper.
 _MOST_RUNS = 2
 # A focal length that differs from EXIF's by more than this factor (its logarithm) is reported.
 _FAR_FROM_EXIF = 0.1
-# A perspective lens from here on may be a fisheye.
+# From this field of view, a lens mapped as perspective may be a fisheye.
 _WIDE_DEG = 100.0
-# Each takes some seconds; where more are missing, it is not single photos that are.
+# Each single photo takes some seconds; if more than this are missing, the problem is not one of single photos.
 _MOST_SINGLE_PHOTOS = 60
 
 SMALLER_BASELINE = MapperOptions(init_min_tri_angle=8.0, init_min_num_inliers=50)
@@ -75,7 +75,7 @@ class _Ladder:
         self._is_over = False
 
     def has_time(self) -> bool:
-        """Return whether another attempt may begin. Where none may, that is said once."""
+        """Return whether there is time for another attempt; the first time there is none, tell the user."""
         most = _MOST_RUNS * mapper_limit_seconds(self._photos)
         if not self._is_over and time.perf_counter() - self._start > most:
             self._is_over = True
@@ -83,7 +83,7 @@ class _Ladder:
         return not self._is_over
 
     def announce(self, what: str, *, takes: float = 0.0) -> None:
-        """Report the results so far, and once what comes next."""
+        """Report the results so far and, once, what comes next."""
         self.tell_results()
         if what != self._announced:
             longer = f" (takes about {takes:.1f} times as long as the first features and matches)" if takes else ""
@@ -124,7 +124,7 @@ class _Ladder:
                 self._take("sub-models merged", merged, job)
 
     def attempt_instead(self, what: str, job: Job, start: MapperOptions) -> None:
-        """Map once; the result counts if it places as many photos as the best so far, which rests on something else."""
+        """Map once; the result replaces the best so far, from another initial lens, if it places as many photos."""
         best = self.best
         self.best = Mapped([], job, [])
         self.attempt(what, job, start)
@@ -140,7 +140,7 @@ class _Ladder:
         return any(field_of_view_deg(model.camera(camera_id)) > _WIDE_DEG for camera_id in cameras)
 
     def go_on(self, what: str, start: MapperOptions) -> None:
-        """Try to place the rest from the best model as it is."""
+        """Try to extend the best model to the remaining photos."""
         models, job = self.best.models, self.best.job
         if not models or not self.has_time():
             return
@@ -175,7 +175,7 @@ class _Ladder:
             self._cut(unmatched)
 
     def result(self) -> Mapped:
-        """Return the best models with all that was tried."""
+        """Return the best models with the record of all attempts."""
         return replace(self.best, attempts=self.rungs, cut_short=tuple(self._cut_short))
 
     def _map(
@@ -197,22 +197,22 @@ class _Ladder:
             self.best = Mapped(models, job, self.rungs)
 
     def share(self, candidates: int) -> float:
-        """Return the fraction of the photos that could register which the best model registers."""
+        """Return the best model's number of photos as a fraction of `candidates`, the number that could register."""
         return _placed(self.best.models) / max(candidates, 1)
 
 
 def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     """Map a job's photos, with as many attempts as it takes.
 
-    The first attempt has pycolmap's own thresholds, and starts from focal lengths of pairs of photos where EXIF has
-    none to rely on. If it places less than half of the photos with a focal length from EXIF, the next one starts
-    without it. If its lens came out wide or it leaves out many photos, the next one starts from a fisheye, where pairs
-    of photos say that it was one. If photos that match some other one well are still left out, the next ones start from
-    a pair with a smaller baseline, from the strongest pair that was left out,
-    and with low angles; of many photos, only if a quarter is left out. Then all pairs are compared that were not, and
-    more features are sought in the photos' full size. Last, single photos are placed by the points that they show (see
-    `localise`). Where the camera only turned, nothing more is tried; nor is it after twice the time that one run of the
-    mapper may take. If the first attempt is not the last, `tell` receives each attempt and its result.
+    The first attempt has pycolmap's own thresholds, and starts from focal lengths estimated from pairs of photos where
+    EXIF has no reliable one. If it places less than half of the photos with a focal length from EXIF, the next one
+    starts without it. If its lens came out wide or it leaves out many photos, the next one starts from a fisheye,
+    provided that pairs of photos confirm one. If photos that match some other one well are still left out, the next
+    ones start from a pair with a smaller baseline, from the strongest pair that was left out, and with low angles; with
+    many photos, only if a quarter is left out. Then the remaining pairs are matched, and more features are extracted
+    from the full-size photos. Last, single photos are located from the points that they show (see `localise`). If the
+    camera only turned, nothing more is tried; nor is it after twice the time limit of one run of the mapper. If the
+    first attempt is not the last, `tell` receives each attempt and its result.
     """
     job = given = with_focal_lengths(job, tell)
     ladder = _Ladder(job, report, tell)
@@ -242,8 +242,9 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
 
 
 def _tell_of_exif(given: Job, best: Mapped, tell: Tell) -> None:
-    """Say where the focal length of the result is not EXIF's, which was set aside: where the camera moves straight
-    ahead, the photos determine it poorly.
+    """Tell the user where the resulting focal length differs from EXIF's, which was not used.
+
+    Photos of a camera that moves straight ahead determine the focal length poorly.
     """
     for number, (group, used) in enumerate(zip(given.groups, best.job.groups, strict=True), start=1):
         if group.focal_px is None or used.focal_px is not None or not best.models:
@@ -257,23 +258,23 @@ def _tell_of_exif(given: Job, best: Mapped, tell: Tell) -> None:
 
 
 def _only_turns(job: Job) -> bool:
-    """Return whether rotations of the camera explain all matches: then no model is accepted, whatever is tried."""
+    """Return whether rotations of the camera explain all matches, so that no attempt can give an accepted model."""
     with closing(pycolmap.Database.open(str(job.database))) as database:
         pairs = read_verified_pairs(database, min_matches=FEW_MATCHES)
     sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}
-    turn = best_turn(pairs, sizes)
+    turn = best_rotation_fit(pairs, sizes)
     return turn is not None and turn.explains_all
 
 
 def _with_more_features(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, missing: float) -> None:
-    """Search larger pictures for more features, for at most as long as the missing share of the photos is worth."""
+    """Search larger pictures for more features, within a time that grows with the fraction of missing photos."""
     longest = max(max(group.width, group.height) for group in job.groups)
     more = replace(job, rung="full-size", max_features=_MORE_FEATURES, pairs=all_pairs(len(job.files)))
     so_far = _search_seconds(job)
     matching = _search_seconds(replace(more, max_image_size=0))
     full = _search_seconds(replace(more, max_image_size=FULL_SIZE)) - matching
     allowed = _MOST_FOR_MORE * missing * so_far - matching
-    share = min(1.0, max(allowed, 0.0) / full) ** 0.5  # of the longer side: the time goes with the area
+    share = min(1.0, max(allowed, 0.0) / full) ** 0.5  # of the longer side: time is proportional to area
     size = max(round(share * longest), job.max_image_size)
     what = "more features from full-size photos" if share == 1 else f"more features from photos of {size} pixels"
     more = replace(more, max_image_size=FULL_SIZE if share == 1 else size)
@@ -286,14 +287,14 @@ def _with_more_features(ladder: _Ladder, job: Job, report: Report, tell: Tell, *
 
 
 def _search_seconds(job: Job) -> float:
-    """CPU seconds, about, of a job's features and matches."""
+    """Estimate the CPU seconds for a job's features and matches."""
     sizes = ((group.width, group.height) for group in job.groups for _ in group.photos)
     features = extraction_seconds(sizes, max_image_size=job.max_image_size)
     return features + matching_seconds(len(job.pairs), max_features=job.max_features)
 
 
 def _other_starts(ladder: _Ladder, job: Job, tell: Tell) -> None:
-    """Other ways to begin, until nearly all photos are placed that matches hold together."""
+    """Try other ways to start, until nearly all photos that are connected by matches are placed."""
     candidates = len(connected_groups(job.image_ids, [(one, other) for _, one, other in _strong_pairs(job)])[0])
     if len(job.files) >= _MANY_PHOTOS and _FEW_SHARE <= ladder.share(candidates) < _GOOD_SHARE:
         ladder.tell_results()
@@ -314,13 +315,13 @@ def _other_starts(ladder: _Ladder, job: Job, tell: Tell) -> None:
 
 
 def _without_exif(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, share: float) -> Job:
-    """Start without EXIF's focal lengths, if little is placed with them; the job of the better result."""
+    """Map without EXIF's focal lengths if few photos are placed with them; return the job of the better result."""
     bare = replace(job, groups=tuple(group.without_exif() for group in job.groups))
     if share >= _LITTLE_SHARE or bare.groups == job.groups or not ladder.has_time():
         return job
     what = "without EXIF's focal length"
     ladder.announce(what)
-    register_photos(bare)  # which takes out what was verified with the other focal length
+    register_photos(bare)  # removes what was verified with the other focal length
     ladder.match(bare, bare.pairs)
     bare = with_focal_lengths(bare, tell)
     ladder.attempt(what, bare, MapperOptions())
@@ -332,16 +333,14 @@ def _without_exif(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, shar
 
 
 def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, share: float) -> Job:
-    """Start from a fisheye if the result suggests it and pairs of photos confirm it; return the job of the better
-    result.
-    """
+    """Map from a fisheye if the result suggests it and pairs of photos confirm it; return the better result's job."""
     if share >= _GOOD_SHARE and not ladder.is_wide():
         return job
     fisheye = as_fisheye(job)
     if fisheye is None or not ladder.has_time():
         return job
     ladder.announce("start from a fisheye lens")
-    register_photos(fisheye)  # which takes out what was verified with another lens
+    register_photos(fisheye)  # removes what was verified with another lens
     ladder.match(fisheye, fisheye.pairs)
     ladder.attempt_instead("start from a fisheye lens", fisheye, MapperOptions())
     if ladder.best.job is fisheye:
@@ -352,7 +351,7 @@ def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, share: float) ->
 
 
 def _from_left_out(ladder: _Ladder, job: Job) -> None:
-    """Start from the strongest pair of which the best model lacks a photo."""
+    """Start from the strongest pair with a photo that the best model lacks."""
     placed = set(ladder.best.models[0].reg_image_ids()) if ladder.best.models else set()
     left = [pair for pair in _strong_pairs(job) if not {pair[1], pair[2]} <= placed]
     if left:
@@ -362,7 +361,7 @@ def _from_left_out(ladder: _Ladder, job: Job) -> None:
 
 
 def _strong_pairs(job: Job) -> list[tuple[int, int, int]]:
-    """(verified matches, image id, image id) of the pairs that can hold a photo."""
+    """Return (verified matches, image id, image id) of the pairs with enough matches to place a photo."""
     with closing(pycolmap.Database.open(str(job.database))) as database:
         pair_ids, counts = database.read_two_view_geometry_num_inliers()
     pairs = [(count, *pycolmap.pair_id_to_image_pair(pair_id)) for pair_id, count in zip(pair_ids, counts, strict=True)]

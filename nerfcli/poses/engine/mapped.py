@@ -1,10 +1,10 @@
-"""Keep what the mapper found: models on disk before any check, read back by the checks and by every later call.
+"""Store the mapper's models on disk before any check; the checks and every later call read them back.
 
     WORK/NAME/0, 1, ...   the models, largest first, with the photos' numbers as names
     WORK/NAME.json        the stage: what was tried, and a hash of each file of the models
 
-The checks always read the models from disk, also in the call that wrote them: so a call that was killed during the
-checks ends with the same bits as one that was not. Photos without a pose are not on disk, and reach no check.
+The checks always read the models from disk, even in the call that wrote them, so that the result has the same bits
+after a call that was killed during the checks. Photos without a pose are not on disk, and no check sees them.
 """
 
 import shutil
@@ -19,20 +19,19 @@ import nerfcli
 from nerfcli.poses.input.job import Job, job_from_json
 from nerfcli.poses.input.stages import file_key, read_stage, stage_key, write_stage
 
-# Of the attempts that the ladder makes.
+# Stage with the models of the ladder's attempts.
 FIRST = "mapped"
-# After the second chance of the largest model.
+# Stage with the models after the second chance of the largest one.
 COMPONENTS = "components"
 
 
 @dataclass(frozen=True)
 class Mapped:
-    """The models that were mapped, largest first, and the job whose features and matches they are of.
+    """The mapped models, largest first, and the job whose features and matches they use.
 
-    attempts: what was tried, in order: {"what", "models": sizes, largest first}; the one that looks for single photos
-    has "photos" too: what was found for each. localised: ids of images that are placed by the model's points, without
-    a pair that holds them. seconds: that mapping took. cut_short: what was stopped because it took far longer than
-    planned.
+    attempts: in order, {"what", "models": sizes, largest first}; the one that locates single photos also has "photos":
+    the result for each. localised: ids of images located from the model's points, without a pair that supports them.
+    seconds: spent on mapping. cut_short: what was stopped because it took far longer than planned.
     """
 
     models: list[pycolmap.Reconstruction]
@@ -44,18 +43,18 @@ class Mapped:
 
 
 def write_mapped(mapped: Mapped, key: str, *, name: str = FIRST) -> None:
-    """Write models and stage into the work folder, in place of earlier ones of this name."""
+    """Write models and stage into the work folder, replacing earlier ones of this name."""
     content = {"job": asdict(mapped.job), "attempts": mapped.attempts, "localised": list(mapped.localised)}
     content |= {"seconds": mapped.seconds, "cut_short": list(mapped.cut_short)}
     write_models(Path(mapped.job.folder) / name, mapped.models, key, also=content)
 
 
 def read_mapped(job: Job, key: str, *, name: str = FIRST) -> Mapped | None:
-    """Read what `write_mapped` wrote for this key; None if it is damaged or gone, or the matches that it rests on are.
+    """Read what `write_mapped` wrote for this key; None if it is damaged or missing, or its database is missing.
 
     Args:
-        job: says where the work folder, the photos and the threads are now.
-        key: of all that the models depend on.
+        job: gives the current work folder, photos and threads.
+        key: hash of everything that the models depend on.
         name: of the stage.
     """
     found = read_models(Path(job.folder) / name, key)
@@ -86,7 +85,7 @@ def read_mapped(job: Job, key: str, *, name: str = FIRST) -> Mapped | None:
 def write_models(
     folder: Path, models: Sequence[pycolmap.Reconstruction], key: str, *, also: Mapping[str, Any] | None = None
 ) -> None:
-    """Write models below a folder, in place of earlier ones, and then FOLDER.json, the stage with their hashes."""
+    """Write models below a folder, replacing earlier ones, and then FOLDER.json, the stage with their hashes."""
     stage = folder.with_suffix(".json")
     stage.unlink(missing_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
@@ -98,7 +97,7 @@ def write_models(
 
 
 def read_models(folder: Path, key: str) -> tuple[list[pycolmap.Reconstruction], dict[str, Any]] | None:
-    """Read what `write_models` wrote for this key: the models, and the stage's content; None if they are not whole."""
+    """Read the models that `write_models` wrote for this key, and the stage's content; None if they are not intact."""
     content = read_stage(folder.with_suffix(".json"), key)
     if content is None or content["files"] != file_keys(folder):
         return None
@@ -106,7 +105,7 @@ def read_models(folder: Path, key: str) -> tuple[list[pycolmap.Reconstruction], 
 
 
 def mapping_key(job: Job) -> str:
-    """Return a hash of all that the models of a job depend on."""
+    """Return a hash of everything that the models of a job depend on."""
     content = asdict(job)
     for name in ("folder", "originals", "threads", "component", "skipped_checks"):
         del content[name]
@@ -114,6 +113,6 @@ def mapping_key(job: Job) -> str:
 
 
 def file_keys(folder: Path) -> dict[str, str]:
-    """Return a hash of each file below a folder, by its relative path; empty without the folder."""
+    """Return a hash of each file below a folder, by its relative path; empty if the folder does not exist."""
     files = sorted(path for path in folder.rglob("*") if path.is_file()) if folder.is_dir() else []
     return {str(path.relative_to(folder)): file_key(path) for path in files}

@@ -1,4 +1,4 @@
-"""Map matches to a model: one run of the incremental mapper, and COLMAP files."""
+"""Compute models from matches: single runs of the incremental or global mapper, and COLMAP files."""
 
 import shutil
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from nerfcli.poses.input.plan import limit_seconds, mapping_seconds
 from nerfcli.poses.input.stages import file_key, stage_key
 from nerfcli.poses.model.reasons import FEW_MATCHES
 
-# One run of the mapper may take so many seconds, however few the photos.
+# Least time limit of one run of the mapper, however few the photos.
 _LEAST_LIMIT_SECONDS = 120
 
 
@@ -32,7 +32,7 @@ class MapperOptions:
 
 
 def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
-    """Numbers of the photos that a model places, rising."""
+    """Return the numbers of the photos that a model places, in ascending order."""
     numbers = {file: number for number, file in enumerate(job.files)}
     return sorted(numbers[model.image(image_id).name] for image_id in model.reg_image_ids())
 
@@ -40,7 +40,7 @@ def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
 def describe_cameras(
     model: pycolmap.Reconstruction, job: Job, uncertainty: Mapping[str, dict[str, Any]] | None = None
 ) -> list[dict[str, Any]]:
-    """Intrinsics, for the report, of the cameras that took the placed photos, and how uncertain they are."""
+    """Describe, for the report, the intrinsics of the cameras of the placed photos, and their uncertainty."""
     counts: dict[int, int] = {}
     for image_id in model.reg_image_ids():
         camera_id = model.image(image_id).camera_id
@@ -61,7 +61,7 @@ def describe_cameras(
 
 
 def with_colours(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
-    """Return the model with colours for its points: a copy if most have none, as after a merger.
+    """Return the model with coloured points: a recoloured copy if most have no colour, as after merging sub-models.
 
     Raises:
         RuntimeError, ValueError: pycolmap cannot read a photo.
@@ -80,7 +80,7 @@ def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
     for image in model.images.values():
         image.name = names[image.name]
     folder = _model_folder(job)
-    shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed before it said that it was complete
+    shutil.rmtree(folder, ignore_errors=True)  # left by a run that was killed before it was complete
     folder.mkdir(parents=True)
     model.write_binary(str(folder))
 
@@ -98,10 +98,10 @@ def _model_folder(job: Job) -> Path:
 def map_photos(
     job: Job, report: Report, *, attempt: int, start: MapperOptions, base: pycolmap.Reconstruction | None = None
 ) -> list[pycolmap.Reconstruction]:
-    """Run the incremental mapper once, from nothing or from a model, unless an earlier call has done so.
+    """Run the incremental mapper once, from scratch or from a model, unless an earlier call has done so.
 
     Returns:
-        Its models as they are on disk, largest first, errors filled in.
+        Its models as read back from disk, largest first, with point errors.
     """
     output = Path(job.folder) / f"{job.rung}models_{attempt}"
     base_folder = output.with_name(f"{output.name}_base")
@@ -121,14 +121,14 @@ def map_photos(
 
 
 def mapper_limit_seconds(photos: int) -> int:
-    """Return after how many seconds one run of the mapper ends, with the photos that are placed by then."""
+    """Return the time limit of one run of the mapper, which then ends with the photos placed so far."""
     return round(limit_seconds(mapping_seconds(photos), least=_LEAST_LIMIT_SECONDS))
 
 
 def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
-    """Run the global mapper once: all rotations, then all positions; its models, largest first, errors filled in.
+    """Run the global mapper once (all rotations, then all positions); return its models, largest first, with errors.
 
-    It needs intrinsics that are about right in the database.
+    The intrinsics in the database must be about right.
     """
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = job.threads
@@ -149,7 +149,7 @@ def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.Increm
     options.random_seed = seed
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
-    # Small captures are no less whole; what is the largest is decided below.
+    # Models of small captures count too; the largest is chosen below.
     options.min_model_size = 3
     options.constant_cameras = set(job.fixed_cameras)
     options.mapper.constant_cameras = options.constant_cameras
@@ -168,7 +168,7 @@ def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.Increm
 def _run_mapper(
     job: Job, report: Report, options: pycolmap.IncrementalPipelineOptions, base_folder: Path | None, *, placed: int
 ) -> list[pycolmap.Reconstruction]:
-    beginnings = iter([placed] if placed else [])  # of a given model; each other one begins with two photos
+    beginnings = iter([placed] if placed else [])  # a given model; every other one begins with two photos
     most = 0
 
     def started() -> None:
@@ -183,7 +183,7 @@ def _run_mapper(
 
     def tell() -> None:
         nonlocal most
-        # Of the largest model so far: another one begins with two photos again, of the few that are left.
+        # Report the largest model so far: each further one begins again with two of the few photos left.
         most = max(most, min(placed, len(job.files)))
         report("map", most, len(job.files))
 

@@ -1,11 +1,11 @@
 """Image retrieval: find similar photos from a few of their features, for large captures.
 
-Of each photo the features of the largest scale are compared with those of every other one, by the same rule that the
-matcher has (mutual nearest neighbours that are clearly nearer than the second). They are few, seen from farthest, and
-found again best. Measured on fox (50 photos, 1225 pairs): the 20 most alike of each photo hold 98 % of the pairs with
-100 verified matches or more, at 0.4 ms a pair; VLAD vectors, which cost no less, hold 89 to 93 %.
+The largest-scale features of each photo are compared with those of every other one by the matcher's rule (mutual
+nearest neighbours that are clearly nearer than the second). They are few, visible from farthest away, and the most
+repeatable. Measured on fox (50 photos, 1225 pairs): the 20 photos most similar to each one include 98 % of the pairs
+with 100 verified matches or more, at 0.4 ms a pair; VLAD vectors, which cost no less, include 89 to 93 %.
 
-Descriptors are whole numbers and so are their distances, exactly: the result depends on no thread, no library, no seed.
+Descriptors are integers, so their squared distances are exact: the result does not depend on threads, library or seed.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -18,25 +18,25 @@ import pycolmap
 
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.input.job import Job, Report
-from nerfcli.poses.input.pairs import in_blocks, looked_at_features
+from nerfcli.poses.input.pairs import in_blocks, retrieval_feature_count
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
-# Nearest and second nearest, squared: 0.8 of the distance, as in pycolmap.
+# Ratio of the squared distances to the nearest and the second nearest: 0.8 of the distance, as in pycolmap.
 _RATIO = 0.64
-# So many other photos at a time: some tens of megabytes.
+# Other photos compared at a time: some tens of megabytes.
 _BLOCK = 64
-# Pairs of the order or of GPS with fewer features in common are left out, beyond so many of each photo. Measured on
-# 302, 160 and 50 photos: of the pairs with fewer, at most 3 in 7 have 30 verified matches, none has more than 115.
+# Pairs chosen by order or GPS with fewer common features than this are left out, except the few best of each photo.
+# Measured on 302, 160 and 50 photos: of these pairs, at most 3 in 7 have 30 verified matches, none has more than 115.
 _LEAST_COMMON = 4
 _SURE_PAIRS = 4
-# To be changed with anything here that changes which pairs are found.
+# Change this whenever this module would find other pairs.
 _VERSION = "256 coarsest, ties kept, pairs without common features left out"
 
 
 def with_neighbours(job: Job, report: Report) -> Job:
-    """Return the job with its final pairs: each photo's look-alikes are among them, those without common features not.
+    """Return the job with its final pairs: look-alikes of each photo added, pairs without common features removed.
 
-    A complete stage is not done again.
+    A completed stage is not repeated.
     """
     if job.neighbours == 0:
         return job
@@ -54,7 +54,7 @@ def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
     """Count the common features of all pairs of photos.
 
     Args:
-        descriptors: per photo (features, 128) whole numbers up to 255.
+        descriptors: per photo (features, 128) integers up to 255.
         report: receives ("pair", photos done, photos in all).
 
     Returns:
@@ -62,7 +62,7 @@ def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
     """
     count = len(descriptors)
     most = max((len(rows) for rows in descriptors), default=0)
-    # Photos with fewer features are filled with zeros, which are no photo's clear neighbour.
+    # Photos with fewer features are padded with zeros, which are never a clear nearest neighbour.
     padded = np.zeros((count, max(most, 2), 128), np.float32)
     for photo, rows in enumerate(descriptors):
         padded[photo, : len(rows)] = rows
@@ -81,9 +81,7 @@ def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
 
 
 def alike(likeness: np.ndarray, count: int, *, known: Collection[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, sorted:
-    for each photo the `count` most similar ones that are not in `known` with it.
-    """
+    """Return the sorted pairs (i, j), i < j, of each photo and its `count` most similar ones, without `known` pairs."""
     likeness = likeness.astype(np.float64)
     np.fill_diagonal(likeness, -np.inf)
     for i, j in known:
@@ -96,7 +94,7 @@ def alike(likeness: np.ndarray, count: int, *, known: Collection[tuple[int, int]
 
 
 def promising(likeness: np.ndarray, pairs: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return those of some pairs that have features in common; of each photo the few most alike, whatever they have."""
+    """Return the pairs with enough common features, and for each photo its few most similar pairs in any case."""
     kept: list[tuple[int, int]] = []
     taken = np.zeros(len(likeness), dtype=int)
     for i, j in sorted(pairs, key=lambda pair: (-likeness[pair], pair)):
@@ -107,7 +105,7 @@ def promising(likeness: np.ndarray, pairs: Iterable[tuple[int, int]]) -> list[tu
 
 
 def _clear_matches(distances: np.ndarray) -> np.ndarray:
-    """Per other photo, the matches in squared distances (features, photos, their features), which are overwritten."""
+    """Count matches per other photo from squared distances (features, photos, their features), overwriting these."""
     nearest = distances.argmin(axis=2)[:, :, None]
     first = np.take_along_axis(distances, nearest, axis=2)
     mutual = first == np.take_along_axis(distances.min(axis=0)[None], nearest, axis=2)
@@ -116,8 +114,8 @@ def _clear_matches(distances: np.ndarray) -> np.ndarray:
 
 
 def _coarsest(job: Job) -> list[np.ndarray]:
-    """Per photo the descriptors of its features of the largest scale."""
-    most = looked_at_features(len(job.files))
+    """Return, per photo, the descriptors of its largest-scale features."""
+    most = retrieval_feature_count(len(job.files))
     found: list[np.ndarray] = []
     with closing(pycolmap.Database.open(str(job.database))) as database:
         for image_id in job.image_ids:

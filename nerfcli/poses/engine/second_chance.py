@@ -1,7 +1,7 @@
-"""Try again where the checks refuse a model because verified pairs of photos contradict it.
+"""Map again if the checks refuse a model because verified pairs of photos contradict it.
 
-Wrong matches between parts that look alike put whole groups of photos into wrong places. Each hypothesis below leaves
-out other evidence and maps again; what it finds passes the same checks, against all pairs, before it is believed.
+Wrong matches between parts that look alike put whole groups of photos in wrong places. Each hypothesis below leaves
+out different evidence and maps again; its model must pass the same checks, against all pairs, to be accepted.
 """
 
 import shutil
@@ -35,18 +35,18 @@ from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.two_views import agreements, read_verified_pairs
 from nerfcli.poses.model.view_graph import consistent_groups
 
-# Numbers of the mapper's runs that follow those of the ladder; they are part of the seed.
+# First number of the mapper's runs here, after those of the ladder; the numbers are added to the seed.
 _FIRST_ATTEMPT = 100
-# Of the photos that were placed, the share that must agree with itself to be built upon.
+# Least fraction of the placed photos in a consistent core that is worth extending.
 _LEAST_CORE = 0.3
-# A hypothesis that nothing else bounds may take so many seconds, however little time is left.
+# Least time limit of a hypothesis that has no limit of its own, however little time is left.
 _LEAST_LIMIT_SECONDS = 120
-# In an ordered capture, photos so near in the order are taken to be neighbours in space.
+# In an ordered capture, photos at most this many places apart are taken to be neighbours in space.
 _NEAR_IN_ORDER = 10
 _ALL_AT_ONCE = "all photos at once (global mapper)"
-# All hypotheses together may take so many times as long as the first mapping.
+# Time limit of all hypotheses together, as a multiple of the time of the first mapping.
 _MOST_TIME = 2.0
-# Photos in smaller models, as a share of those in the accepted one, for which these are placed from it.
+# Photos in smaller models, as a fraction of those in the accepted one, from which `grow` tries to add them.
 _LEAST_APART = 0.05
 
 
@@ -71,14 +71,14 @@ def second_chance(
 
     Args:
         mapped: the model that the checks refused, and the smaller ones.
-        first: what they said.
+        first: the result of these checks.
         report: called with (stage, done, total).
-        tell: called with what the user should know.
-        checks: makes the runner of the checks of one more model.
-        component: what the user calls this model. From 2 on, its photos are mapped again by themselves.
+        tell: called with messages for the user.
+        checks: makes a check runner for one more model.
+        component: the number of this model for the user. From 2 on, its photos are mapped again by themselves.
 
     Returns:
-        The first accepted model; else the largest part of a model that is accepted by itself; else what was given.
+        The first accepted model; else the largest consistent part of the first model, if accepted; else the given one.
     """
     start = time.perf_counter()
     pairs = first.verdict.measures["pairs"]
@@ -94,7 +94,7 @@ def second_chance(
     names = "second-chance" if component == 1 else f"component-{component}-second-chance"
     attempts = list(mapped.attempts)
     core = _core(mapped.models[0], mapped.job)
-    at_once: list[Mapped] = []  # what the global mapper gave, to build upon
+    at_once: list[Mapped] = []  # result of the global mapper, to extend later
 
     def grown_from_all() -> Mapped | None:
         return _regrown(mapped, _core(at_once[0].models[0], mapped.job), report) if at_once else None
@@ -102,7 +102,7 @@ def second_chance(
     rest = 1 - core.model.num_reg_images() / mapped.models[0].num_reg_images()
     photos = len(mapped.job.files)
     all_at_once = scratch * at_once_seconds(photos) / mapping_seconds(photos)
-    # What each takes is guessed from what it has to place anew.
+    # The time of each is estimated from the number of photos that it has to place again.
     hypotheses: list[tuple[str, float, Callable[[], Mapped | None]]] = [
         ("from the largest consistent part", rest * scratch, lambda: _regrown(mapped, core, report)),
         (_ALL_AT_ONCE, all_at_once, lambda: _all_at_once(mapped, core)),
@@ -147,17 +147,17 @@ def grow(
     *,
     checks: Callable[[], Checks],
 ) -> Chance:
-    """Place the photos of smaller models from an accepted model, where these are many and match its photos.
+    """Extend an accepted model to the photos of smaller models, if these are many and match its photos.
 
-    The mapper gives up a part of a capture where a few photos fail in a row, and begins another model there; from the
-    adjusted model, with its lens, they often fit.
+    Where a few photos fail in a row, the mapper gives up and begins another model; starting from the adjusted model,
+    with its lens, these photos often fit.
 
     Args:
         mapped, report, tell, checks: see `second_chance`.
-        first: the accepted model; there may be none.
+        first: the examined model, which was accepted; there may be none.
 
     Returns:
-        A larger accepted model, or what was given.
+        A larger accepted model, or the given one.
     """
     given = Chance(mapped, first)
     model = first.model
@@ -195,12 +195,12 @@ def grow(
 
 
 def _mapping_limit_seconds(job: Job) -> float:
-    """Return how long a run of the mapper and what belongs to it may take; the mapper ends by itself before."""
+    """Return the time limit of a mapper run with the work around it; the mapper's own limit is half of that."""
     return 2.0 * mapper_limit_seconds(len(job.files))
 
 
 def _match(some: set[int], others: set[int], job: Job) -> bool:
-    """Return whether photos, by image id, match some of others."""
+    """Return whether any of `some` matches any of `others` (image ids)."""
     with closing(pycolmap.Database.open(str(job.database))) as database:
         pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
     return any(
@@ -209,15 +209,15 @@ def _match(some: set[int], others: set[int], job: Job) -> bool:
 
 
 def _job_of(model: pycolmap.Reconstruction, job: Job) -> Job:
-    """Return the job without the pairs of photos that the model does not place."""
+    """Return the job with only the pairs of photos that the model places."""
     photos = set(photo_numbers(model, job))
     return replace(job, pairs=tuple(pair for pair in job.pairs if photos.issuperset(pair)))
 
 
 def is_contradicted(verdict: Verdict) -> bool:
-    """Return whether pairs of photos contradict the model, rather than the capture as a whole.
+    """Return whether pairs of photos contradict the model, as opposed to a capture that no model can fit.
 
-    Of a camera that only turned, no model can be right.
+    If the camera only turned, no model can be right.
     """
     parallax = verdict.measures["parallax_px"]
     if parallax is not None and parallax < NO_PARALLAX_PX:
@@ -228,10 +228,10 @@ def is_contradicted(verdict: Verdict) -> bool:
 
 @dataclass(frozen=True)
 class _Core:
-    """The largest group of photos that its strongest pairs hold together.
+    """The largest group of photos that the strongest pairs consistently connect.
 
-    model: with the photos of the group only. suspects: pairs of photo numbers that may be mistaken: they contradict the
-    group from within, or would join it with photos that stronger pairs keep apart from it.
+    model: with the photos of the group only. suspects: pairs of photo numbers that may be wrong: they contradict the
+    poses inside a group, or connect groups that stronger pairs keep apart.
     """
 
     model: pycolmap.Reconstruction
@@ -257,7 +257,7 @@ def _core(model: pycolmap.Reconstruction, job: Job) -> _Core:
 
 
 def _neighbours_in_order(job: Job, pairs: Iterable[tuple[int, int]]) -> set[tuple[int, int]]:
-    """Return, of an ordered capture, the pairs that are near in the order: the camera was in nearly the same place."""
+    """Return the pairs that are near in the capture order, where the camera barely moved; none without an order."""
     order = capture_order(job.names)
     if order is None:
         return set()
@@ -266,7 +266,7 @@ def _neighbours_in_order(job: Job, pairs: Iterable[tuple[int, int]]) -> set[tupl
 
 
 def _regrown(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
-    """Adjust the core, and place the other photos from there without the suspects."""
+    """Adjust the core and extend it to the other photos without the suspects; return None if the core is too small."""
     if core.model.num_reg_images() < _LEAST_CORE * mapped.models[0].num_reg_images():
         return None
     base = pycolmap.Reconstruction(core.model)
@@ -275,7 +275,7 @@ def _regrown(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
 
 
 def _from_nothing(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
-    """Map from the beginning, with another seed, from a pair of photos nearer to each other, without the suspects."""
+    """Map from scratch without the suspects, with another seed and a smaller initial baseline."""
     return _mapped_without(mapped, core, report, attempt=_FIRST_ATTEMPT + 1, base=None)
 
 
@@ -292,7 +292,7 @@ def _mapped_without(
 
 
 def _all_at_once(mapped: Mapped, core: _Core) -> Mapped | None:
-    """Rotations, then positions, of all photos together; with the intrinsics of the core."""
+    """Estimate the rotations, then the positions, of all photos together, with the intrinsics of the core."""
     job = _with_own_database(mapped.job, without=frozenset())
     for camera in core.model.cameras.values():
         camera.has_prior_focal_length = True
@@ -303,7 +303,7 @@ def _all_at_once(mapped: Mapped, core: _Core) -> Mapped | None:
 
 
 def _set_cameras(job: Job, model: pycolmap.Reconstruction) -> None:
-    """Write a model's cameras into the job's database: the mapper goes on only from a model with the same lenses."""
+    """Write a model's cameras into the job's database: the mapper can only extend a model with the same lenses."""
     with closing(pycolmap.Database.open(str(job.database))) as database:
         for camera in model.cameras.values():
             database.update_camera(camera)
@@ -319,7 +319,7 @@ def _with_own_database(job: Job, *, without: frozenset[tuple[int, int]]) -> Job:
 
 
 def _kept(job: Job, name: str, make: Callable[[], Mapped | None]) -> Mapped | None:
-    """Return what an earlier call has written under this name, or make it and write it."""
+    """Return the models that an earlier call wrote under this name, or make and write them."""
     key = stage_key(mapping_key(job), name)
     if (there := read_mapped(job, key, name=name)) is not None:
         return there

@@ -1,4 +1,4 @@
-"""Describe the models that a capture fell into, and why they are apart."""
+"""Describe the separate models of a capture, and why they are not joined."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -12,11 +12,11 @@ from nerfcli.poses.model.reasons import FEW_MATCHES
 
 
 def describe_components(models: Sequence[pycolmap.Reconstruction], job: Job) -> list[dict[str, Any]]:
-    """Describe each model: its photos, and what joins it with the largest.
+    """Describe each model: its photos, and why it is not part of the largest.
 
     Args:
         models: of the job, the largest first.
-        job: whose database holds the verified matches.
+        job: its database has the verified matches.
 
     Returns:
         Per model {"size", "photos": numbers, "apart": why it is not part of the largest, None for that one}.

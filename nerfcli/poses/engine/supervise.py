@@ -1,6 +1,4 @@
-"""Run the worker process: receive its progress, enforce limits, stop it when the parent ends, and explain how it
-failed.
-"""
+"""Run the worker process: receive its progress, enforce limits, stop it with the parent, and explain its failures."""
 
 import json
 import os
@@ -36,14 +34,14 @@ _GO_ON = "completed work is kept; run the same command again to continue"
 _LESS_MEMORY = "use smaller photos (--max-size), fewer features (--max-features) or fewer threads (--threads)"
 # Memory can double in a second or two, when a photo is decoded or a bundle adjustment begins.
 _LOOK_EVERY_SECONDS = 0.1
-# With less, SQLite and pycolmap cannot write the next part.
+# With less free space, SQLite and pycolmap cannot write the next part.
 _FULL_DISK_BYTES = 2_000_000
 
 
 class WorkerDiedError(UserError):
-    """The worker ended by itself, neither at a limit nor for want of room on the disk; or a check took too long.
+    """The worker ended by itself, not at a limit or because the disk was full; or a check took too long.
 
-    check: the name of the check that it was computing, if it was.
+    check: the name of the check that it was computing, if any.
     """
 
     check: str | None = None
@@ -59,21 +57,21 @@ def run_worker(
     lock: int | None = None,
     notify: Callable[[str], None] = lambda note: None,
 ) -> None:
-    """Run `nerfcli.poses.engine.worker` on a job until it is done; it is dead when this returns or raises.
+    """Run `nerfcli.poses.engine.worker` on a job until it is done; it has ended when this returns or raises.
 
     Args:
         job_path: the job's JSON file; the worker's log is written beside it.
         threads: for OpenMP inside pycolmap, -1 for all.
         progress: receives (stage, done, total).
-        limits: the worker is ended when it goes beyond one of them.
-        since: the time of `time.monotonic` from which the limit of time counts; None for now.
+        limits: the worker is stopped when it exceeds one of them.
+        since: the start of the time limit, by `time.monotonic`; None for now.
         lock: a descriptor that the worker inherits.
         notify: receives messages for the user, one sentence at a time.
 
     Raises:
-        WorkerDiedError: the worker died; the text says while doing what, and its last words. Or it was ended because a
-            check took longer than it may.
-        UserError: it was ended at a limit, or the disk is full.
+        WorkerDiedError: the worker died; the message has the stage, and the last lines of its log. Or it was stopped
+            because a check exceeded its time limit.
+        UserError: it was stopped at a limit, or the disk is full.
     """
     log = job_path.with_name("worker.log")
     stage = "starting"
@@ -114,10 +112,10 @@ def run_worker(
 
 
 def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> UserError:
-    """Return the error for a worker that ended with `returncode` while at `stage`, with the last words of its log.
+    """Return the error for a worker that ended with `returncode` during `stage`, with the last lines of its log.
 
     Args:
-        free_bytes: on the disk that it wrote to. Where that is full, the log may be empty.
+        free_bytes: free space on the disk that it wrote to. If that is full, the log may be empty.
     """
     if free_bytes < _FULL_DISK_BYTES or "disk is full" in log or os.strerror(ENOSPC) in log:
         return UserError(
@@ -142,9 +140,9 @@ def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> Use
 
 
 class _Guard:
-    """Watches a worker from a thread, and ends it when it goes beyond a limit; `reached` then says which.
+    """Watches a worker from a thread, and kills it when it exceeds a limit; `reached` is then the name of the limit.
 
-    check: the content of `UNDERWAY`, as it was last seen.
+    check: the content of `UNDERWAY` when it was last read.
     """
 
     def __init__(self, worker: subprocess.Popen[bytes], limits: Limits, since: float, *, underway: Path):
@@ -160,7 +158,7 @@ class _Guard:
         self._thread.start()
 
     def stop(self) -> None:
-        """Watch no longer. The worker is dead by now."""
+        """Stop watching. The worker has ended by now."""
         self._stopped.set()
         self._thread.join()
 
@@ -177,7 +175,7 @@ class _Guard:
                 return
 
     def _is_overdue(self) -> bool:
-        """Return whether the check at hand takes longer than it may."""
+        """Return whether the current check has exceeded its time limit."""
         try:
             written = self._underway.stat().st_mtime_ns
             if written != self._check_written:
@@ -210,6 +208,6 @@ def _limit_reached(which: str, limits: Limits, stage: str) -> UserError:
 
 
 def _last_words(log: str) -> str:
-    """Return the last lines that say something: not the stack frames that glog prints below them."""
+    """Return the last informative lines of the log, without the stack frames that glog prints below them."""
     lines = [line.strip() for line in log.splitlines() if line.strip() and not line.strip().startswith(("@", "***"))]
     return " / ".join(lines[-3:]) or "no message"

@@ -1,10 +1,10 @@
-"""An object that turns before a still background: recognised in a job's features, and masks that leave the object.
+"""Detect an object that turns in front of a static background, from a job's features, and make masks of the object.
 
 A few pairs of photos are compared before the long work (see `stationary`). If they show two motions, masks of the
-object are found (see `still_background`), so that what is solved is the object's motion, as if the camera went around
+object are made (see `still_background`), so that the poses describe the object's motion, as if the camera went around
 it.
-The masks stand in the scene's folder, named after the photos as those of `--masks` are, and training uses them too.
-Masks that are there from an earlier call are used as they are: they may have been edited by hand.
+The masks are in the scene's folder, named after the photos like those of `--masks`, and training uses them too.
+Existing masks of an earlier call are used unchanged, since they may have been edited by hand.
 """
 
 import time
@@ -30,20 +30,20 @@ from nerfcli.poses.input.job import Job, LaidOutMask, Tell
 from nerfcli.poses.input.masks import write_mask, write_no_mask
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
-# Photos, evenly chosen, that are compared with those that follow them by so many places, and with one far away.
+# Evenly chosen photos, each compared with those that follow it by these numbers of places, and with one far away.
 _ANCHORS, _FIRST_ANCHORS = 24, 8
 _STEPS = (1, 2, 4)
 # Features per photo, the largest ones.
 _FEATURES = 1200
-# If fewer of the first pairs have matches that stay, the rest is not looked at.
+# If fewer than this fraction of the first pairs have static matches, no further pairs are compared.
 _FEW_STILL = 0.25
-# Of what is free of the object in some photos, one of the same camera place shows this share as the others do.
+# A photo from the same camera position agrees with at least this fraction of the background that some photos show.
 _SAME_PLACE = 0.25
-# Masks are believed if most of the object's matches are in them and most of the background's are not, and if they leave
-# something of most photos, but not all.
+# Masks are accepted if most of the object's matches are inside and most of the background's outside, and if the
+# fraction of a photo that they keep, in the median, is in this range.
 _LEAST_RIGHT = 0.7
 _WHITE = (0.003, 0.9)
-# To be changed with anything here that changes what is found.
+# Change this whenever this module would find other masks or facts.
 _VERSION = "two motions, 1"
 _STAGE = "turntable.json"
 MASKS = "masks"
@@ -51,8 +51,7 @@ MASKS = "masks"
 
 @dataclass(frozen=True)
 class ComparedPair:
-    """Two photos by number, the places (N, 2) of their matches in the first one, as shares of its size, and what they
-    say."""
+    """Two photos by number, positions (N, 2) of matches in the first as fractions of its size, and their motions."""
 
     first: int
     second: int
@@ -66,10 +65,9 @@ def scene_masks(job: Job) -> Path:
 
 
 def recalled(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
-    """Return the job with the masks that an earlier call found, and what is to be reported;
-    None if that is to be done anew.
+    """Return the job with the masks of an earlier call, and the facts to report; None if they must be found again.
 
-    Masks that the user gave are not doubted.
+    Masks that the user gave are used unchanged.
     """
     if job.masks:
         return job, None
@@ -94,16 +92,15 @@ def recalled(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
 
 
 def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[str, Any] | None]:
-    """Return the job with masks of the object, if one turns before a still background;
-    and what is to be reported of it.
+    """Return the job with masks of the object, if one turns in front of a static background, and the facts to report.
 
     Args:
         job: its photos get masks.
-        featured: the job whose features are in the database, of the same photos or some of them.
-        tell: receives one sentence on what was found.
+        featured: the job whose features are in the database, with the same photos or some of them.
+        tell: receives one sentence on the object and its masks.
 
     Returns:
-        The job, and None where there is nothing to report. Without masks that can be believed the job is as it was.
+        The job, unchanged if no masks can be accepted; and the facts, None if there is nothing to report.
     """
     start = time.perf_counter()
     features = _Features(featured)
@@ -143,7 +140,7 @@ def sentence(facts: dict[str, Any]) -> str:
 
 
 def advised(error: UserError, facts: dict[str, Any] | None) -> UserError:
-    """Return a refusal with what to do about an object that turns before a still background, if there is one."""
+    """Return a refusal with advice on an object that turns in front of a static background, if there is one."""
     if facts is None or not facts["wide"]:
         return error
     masks = f"the edited masks in {MASKS}/ of the scene" if facts["masked"] else "white where the object is"
@@ -152,7 +149,7 @@ def advised(error: UserError, facts: dict[str, Any] | None) -> UserError:
 
 
 class _Features:
-    """Places and descriptors of photos in the database, the largest features first, read when they are needed."""
+    """Positions and descriptors of features in the database, the largest first, read when they are needed."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
@@ -178,7 +175,7 @@ class _Features:
         return self._read[number]
 
     def compare(self, first: int, second: int) -> ComparedPair | None:
-        """Two photos, None if they have not the same size."""
+        """Compare two photos; return None if their sizes differ."""
         (x, one, size), (y, other, other_size) = self.of(first), self.of(second)
         if size != other_size:
             return None
@@ -187,7 +184,7 @@ class _Features:
 
 
 def _compared(features: _Features) -> list[ComparedPair]:
-    """Photos that follow each other, and photos that do not; all of a choice if names follow no order."""
+    """Compare photos near and far in the order of names; all pairs of a selection if names seem to have no order."""
     count = len(features.job.files)
     first = _pairs(count, _FIRST_ANCHORS)
     pairs = _all_compared(features, first)
@@ -224,7 +221,7 @@ def _pairs(count: int, most: int) -> list[tuple[int, int]]:
 
 
 def _same_place(pairs: Sequence[ComparedPair], places: dict[int, int]) -> list[list[int]]:
-    """Photos (numbers in the whole job) that pairs with still matches join: each set is of one place of the camera."""
+    """Group photos (numbers in the whole job) connected by static matches: each group has one camera position."""
     groups: list[set[int]] = []
     for pair in pairs:
         if pair.motions.two or pair.motions.only_still:
@@ -238,7 +235,7 @@ def _same_place(pairs: Sequence[ComparedPair], places: dict[int, int]) -> list[l
 def _masks(
     job: Job, pairs: Sequence[ComparedPair], *, groups: Sequence[Sequence[int]], places: dict[int, int]
 ) -> list[np.ndarray | None]:
-    """Return a small mask for each photo that a background is found for."""
+    """Return a small mask of the object for each photo, None for photos without a matching background."""
     pictures = [still.small(read_image(job.photos / file)[..., :3]) for file in job.files]
     behinds = []
     for group in groups:
@@ -261,7 +258,10 @@ def _masks(
 def _judged(
     masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPair], places: dict[int, int]
 ) -> dict[str, Any]:
-    """Return how much of the photos the masks leave, and how many matches of the two motions are on the right side."""
+    """Return the fraction of the photos that the masks keep, and of either motion's matches on the right side of them.
+
+    "why_not" is there if the masks cannot be accepted.
+    """
     found = [mask for mask in masks if mask is not None]
     moving, staying = [], []
     for pair in pairs:
@@ -293,7 +293,7 @@ def _judged(
 
 
 def _written(job: Job, masks: Sequence[np.ndarray | None]) -> tuple[LaidOutMask, ...]:
-    """Write the masks for pycolmap, and for the user those that there are."""
+    """Write a mask of each photo for pycolmap, and the object masks that were found for the user."""
     job.mask_folder.mkdir(exist_ok=True)
     scene_masks(job).mkdir(exist_ok=True)
     laid_out = []

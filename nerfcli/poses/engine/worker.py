@@ -1,12 +1,12 @@
 """The child process: pycolmap from photos to a model on disk. Run as `python -m nerfcli.poses.engine.worker JOB.json`.
 
-pycolmap is C++ that may end the process without a Python exception, so it gets one of its own. It reads a job, goes on
-from the stages that are complete in the job's folder, leaves `sparse/0` and `result.json` there, and tells its progress
-as JSON lines {"stage", "done", "total"} on stdout, and what the user should know as {"note"}. Everything else, glog's
-lines included, goes to stderr. It ends by itself when its stdin closes, which is what happens when the parent dies,
-however it dies.
+pycolmap is C++ code that may end the process without a Python exception, so it runs in a separate process. This reads
+a job, continues from the completed stages in the job's folder, and leaves `sparse/0` and `result.json` there. It
+reports its progress on stdout as JSON lines {"stage", "done", "total"}, and messages for the user as {"note"}.
+Everything else, including glog's lines, goes to stderr. It ends by itself when its stdin closes, as happens whenever
+the parent dies.
 
-Photos go by number here: pycolmap sees `00000.jpg`, `00001.png`..., so that a space or an umlaut in a name
+Photos have numbers as names here: pycolmap sees `00000.jpg`, `00001.png`..., so that a space or an umlaut in a name
 cannot break the list of pairs.
 """
 
@@ -38,9 +38,9 @@ from nerfcli.poses.input.plan import checking_seconds, limit_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 from nerfcli.poses.judge.checks import Checks
 
-# The last stage's file: what the report needs. The model stands beside it, in sparse/0.
+# The last stage's file, with the data for the report. The model is beside it, in sparse/0.
 RESULT = "result.json"
-# Each check may take so many seconds, however few the photos.
+# Least time limit of each check in seconds, however few the photos.
 _LEAST_LIMIT_SECONDS = 300
 
 
@@ -84,9 +84,9 @@ def result_key(job: Job) -> str:
 
 
 def _looked_at(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> tuple[Job, dict[str, Any] | None]:
-    """Return the job with masks of an object that turns before a still background, and what to report of it, if any.
+    """Return the job with masks of an object that turns in front of a static background, and facts to report, if any.
 
-    Held-out photos get masks too, but what is looked for are the features of the others.
+    Held-out photos get masks too, but only features of the training photos are compared.
     """
     discard_if_damaged(job.database)
     with _timed(seconds, "extract"):
@@ -106,12 +106,12 @@ def _solve_strictly(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     found = _estimate(training, report, tell)
     with _timed(found["seconds"], "place"):
         found = place_held_out(job, training, found, report)
-    found["model_files"] = model_keys(job)  # which the held-out photos are in now
+    found["model_files"] = model_keys(job)  # these now contain the held-out photos
     return found
 
 
 def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
-    """Write `sparse/0` if there is a model, and return what the report needs."""
+    """Write `sparse/0` if there is a model, and return the data for the report."""
     seconds = {"extract": 0.0, "match": 0.0, "map": 0.0, "check": 0.0}
     mapped = _mapped(job, report, tell, seconds=seconds)
     checks = partial(_checks, job)
@@ -121,7 +121,7 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     others = [*mapped.models[: job.component - 1], *mapped.models[job.component :]]
     model = examined.model
     placed = [] if model is None else photo_numbers(model, job)
-    lacking = examined.details["not_computed"]  # of this model; ways to map it were ended too
+    lacking = examined.details["not_computed"]  # of this model; ended mapping hypotheses are skipped too
     result: dict[str, Any] = {
         "seconds": seconds,
         "attempts": mapped.attempts,
@@ -152,13 +152,13 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
 
 
 def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> Mapped:
-    """Return the models of an earlier call if they are whole, or map the photos; they are on disk when this returns."""
+    """Return the models of an earlier call if they are intact, else map the photos; either way they are on disk."""
     discard_if_damaged(job.database)
     key = mapping_key(job)
     mapped = read_mapped(job, key)
     if mapped is not None:
         tell("the photos are already mapped: running the checks")
-        register_photos(mapped.job)  # a complete call has given the images the photos' own names
+        register_photos(mapped.job)  # a completed call has renamed the images to the photos' own names
         return mapped
     with _timed(seconds, "extract"):
         extract(job, report)
@@ -182,7 +182,7 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
 
 
 def _checks(job: Job) -> Checks:
-    """Make the runner of the checks of one model."""
+    """Make a check runner for one model."""
     most = limit_seconds(checking_seconds(len(job.files)), least=_LEAST_LIMIT_SECONDS)
     return Checks(Path(job.folder), skip=dict(job.skipped_checks), seconds=most)
 
@@ -192,13 +192,13 @@ def _coloured(model: pycolmap.Reconstruction, job: Job, checks: Checks) -> pycol
 
 
 def _is_complete(job: Job, key: str) -> bool:
-    """Return whether the result is there and its model is the one that was written with it."""
+    """Return whether there is a result with this key, and the model on disk is the one written with it."""
     there = read_stage(Path(job.folder) / RESULT, key)
     return there is not None and there["model_files"].items() <= model_keys(job).items()
 
 
 def _name_images(job: Job) -> None:
-    """Give the images of the database the photos' own names, if it is there."""
+    """Give the images in the database the photos' own names, if there is a database."""
     if job.database.exists():
         name_images(job)
 

@@ -1,7 +1,8 @@
 """Choose frames of a video: the sharpest one of each stretch of equal camera motion.
 
-Equal stretches of time would spend frames on a camera that stands still. So time counts by how fast the picture moves,
-up to its usual speed: standing still counts nothing, and a fast turn, where frames are blurred, no more than the rest.
+Equal stretches of time would waste frames on a camera that stands still. So time is weighted by the speed of the
+picture, up to its usual speed: standing still does not count, and a fast turn, where frames are blurred, counts no
+more than the rest.
 """
 
 from collections.abc import Sequence
@@ -10,17 +11,17 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-# Longer sides, in pixels: what sharpness is judged at (about what features are sought in), and what motion is.
+# Longer sides, in pixels, of the pictures for measuring sharpness (about the size for extracting features) and motion.
 SHARPNESS_SIZE_PX = 960
 _MOTION_SIZE_PX = 320
 
-# The picture has moved when half of its corners moved by this share of its longer side: about what a depth of field's
-# parallax needs, and more than a hand that holds still.
+# The picture has moved when half of its corners moved by this fraction of its longer side: about what is needed for
+# parallax, and more than the shake of a hand that holds still.
 MOVED_SHARE = 0.01
-# Fewer corners than this say nothing about motion; then pictures are the same that differ by less than this, of 255.
+# Fewer corners than this do not measure motion; then pictures that differ by less than this, of 255, are the same.
 _MIN_CORNERS = 12
 _SAME_LEVELS = 3.0
-# Corners that are not found again, from this share on, mean that another part of the scene is in view.
+# If less than this fraction of the corners is found again, another part of the scene is in view.
 _LOST_SHARE = 0.5
 
 
@@ -28,8 +29,8 @@ _LOST_SHARE = 0.5
 class FrameMeasure:
     """Sharpness of a frame (comparable within a video), and its motion since the anchor.
 
-    The anchor is the last frame before that had moved by `MOVED_SHARE`. moved is a share of the longer side, infinite
-    where the two show different things.
+    The anchor is the last earlier frame that had moved by `MOVED_SHARE`. moved is a fraction of the longer side,
+    infinite if the two show different things.
     """
 
     sharpness: float
@@ -37,7 +38,7 @@ class FrameMeasure:
 
 
 class FrameMeter:
-    """Measures the frames of a video in their order; of the pictures it keeps no more than the anchor."""
+    """Measures the frames of a video in their order; it keeps only the picture of the anchor."""
 
     def __init__(self) -> None:
         self._anchor: MotionPicture | None = None
@@ -52,7 +53,7 @@ class FrameMeter:
 
 
 class MotionPicture:
-    """A frame, small, with the corners that are followed from it."""
+    """A reduced frame, with the corners that are tracked from it."""
 
     def __init__(self, picture: np.ndarray):
         """picture: uint8, grey or RGB."""
@@ -63,9 +64,7 @@ class MotionPicture:
         self._corners: np.ndarray | None = None
 
     def moved_to(self, other: "MotionPicture") -> float:
-        """Return the displacement of at least half of the corners to another frame,
-        as a fraction of the longer side.
-        """
+        """Return the median displacement of the corners to another frame, as a fraction of the longer side."""
         if self._corners is None:
             found = cv2.goodFeaturesToTrack(self._grey, maxCorners=200, qualityLevel=0.01, minDistance=8)
             self._corners = np.zeros((0, 1, 2), np.float32) if found is None else found
@@ -90,7 +89,7 @@ def sharpness(grey: np.ndarray) -> float:
 
 
 def choose_frames(seconds: np.ndarray, measures: Sequence[FrameMeasure], *, count: int) -> list[int]:
-    """Numbers of `count` frames, rising: the sharpest (of equals the first) of each of as many stretches.
+    """Return the ascending numbers of `count` frames: the sharpest (the first of equals) of each of `count` stretches.
 
     Args:
         seconds: (frames,) increasing.
@@ -100,7 +99,7 @@ def choose_frames(seconds: np.ndarray, measures: Sequence[FrameMeasure], *, coun
     if not 1 <= count <= len(measures):
         raise ValueError(f"count must be within 1...{len(measures)}, got {count}")
     path = _path(seconds, np.array([measure.moved for measure in measures]))
-    # Stretch k begins with first[k]; each holds a frame at least, even where more are requested than there are.
+    # Stretch k begins with frame first[k]; each has at least one frame, even where the path leaves it none.
     first = np.searchsorted(path, path[-1] * np.arange(count) / count)
     first = np.maximum.accumulate(first - np.arange(count)) + np.arange(count)
     first = np.minimum(first, len(measures) - count + np.arange(count))
@@ -110,12 +109,12 @@ def choose_frames(seconds: np.ndarray, measures: Sequence[FrameMeasure], *, coun
 
 
 def _path(seconds: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """(frames,) how far the camera has come at each frame, in seconds at its usual speed; not decreasing.
+    """Return the distance covered at each frame, (frames,), in seconds at the camera's usual speed; not decreasing.
 
-    Between one anchor and the next the speed is constant, and the usual one is the median over these steps.
+    The speed is taken to be constant between successive anchors, and the usual speed is the median over these steps.
     """
     anchors = np.flatnonzero(moved >= MOVED_SHARE)
-    # Before the first step and behind the last one the picture moves by less than can be measured.
+    # Before the first step and after the last one, the picture moves by less than can be measured.
     times = seconds[anchors]
     steps = np.diff(times)
     if len(steps) == 0:

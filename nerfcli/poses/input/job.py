@@ -7,9 +7,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-# Told (stage, done, total) as the work goes on.
+# Called with (stage, done, total) as the work proceeds.
 Report = Callable[[str, int, int], None]
-# Told what the user should know, one sentence at a time.
+# Called with messages for the user, one sentence at a time.
 Tell = Callable[[str], None]
 
 
@@ -17,10 +17,10 @@ Tell = Callable[[str], None]
 class CameraGroup:
     """Photos (by index) with a common camera: its COLMAP model and the upright size.
 
-    choose: whether the model is only where to start, and a better one may be chosen. params: what is known of the
-    intrinsics, in COLMAP's order. fixed: whether they stay as they are. focal_px is where the focal length starts by
-    EXIF, None if EXIF does not say; focal_is_prior: whether it may be relied on. estimated_focal_px: where it starts by
-    pairs of its photos, see `engine.initial_focal`.
+    choose: whether the model is only a starting point, and a better one may be chosen. params: known intrinsics, in
+    COLMAP's order. fixed: whether these are kept fixed. focal_px: the initial focal length by EXIF, None if EXIF has
+    none; focal_is_prior: whether it is reliable. estimated_focal_px: the initial focal length estimated from pairs of
+    the photos, see `engine.initial_focal`.
     """
 
     photos: tuple[int, ...]
@@ -40,7 +40,7 @@ class CameraGroup:
 
 
 def usual_focal_px(width: int, height: int) -> float:
-    """Return the focal length to start from where nothing is known of it, as COLMAP does."""
+    """Return the initial focal length if nothing is known about it, as in COLMAP."""
     return 1.2 * max(width, height)
 
 
@@ -56,14 +56,14 @@ class LaidOutMask:
 class Job:
     """Structure from motion of photos 0, 1, 2...
 
-    folder: where to work. files: the photos' names below folder/photos, which are numbers that stay with a photo for
-    as long as the folder is there. originals: the user's folder, and names: the photos' names there. keys: of their
-    content. pairs: which to compare. neighbours: how many more each is compared with, those that look most alike; once
-    they are found, pairs has them too. rung: "" or the name of an attempt with other features, which has its own
-    database and stages: `replace(job, rung="full-size", max_image_size=...)`. masks: one per photo, or none at all for
-    a capture without masks; their pictures are in mask_folder. held_out: photos that are placed when all else is fixed.
+    folder: the work folder. files: the photos' names below folder/photos, which are numbers that a photo keeps as long
+    as the folder exists. originals: the user's folder, and names: the photos' names there. keys: hashes of their
+    content. pairs: to match. neighbours: how many look-alikes to add to the pairs of each photo; 0 once they are in
+    pairs. rung: "" or the name of an attempt with other features, which has its own database and stages:
+    `replace(job, rung="full-size", max_image_size=...)`. masks: one per photo, or none at all for a capture without
+    masks; their pictures are in mask_folder. held_out: photos that are placed last, with everything else fixed.
     component: which of the models becomes the scene, 1 for the largest. skipped_checks: (name, reason) of checks that
-    ended an earlier process. The rest is as in `PoseSettings`.
+    ended an earlier process. The other fields are as in `PoseSettings`.
     """
 
     folder: str
@@ -86,17 +86,17 @@ class Job:
 
     @property
     def photos(self) -> Path:
-        """The upright photos under their numbered names."""
+        """Folder of the upright photos under their numbered names."""
         return Path(self.folder) / "photos"
 
     @property
     def mask_folder(self) -> Path:
-        """The masks, under the names of the photos' files with .png after them."""
+        """Folder of the masks, named after the photos' files with .png appended."""
         return Path(self.folder) / "masks"
 
     @property
     def fixed_cameras(self) -> list[int]:
-        """The ids of the cameras whose intrinsics stay as they are; a camera's id is its group's place, from 1 on."""
+        """Ids of the cameras whose intrinsics are kept fixed; a camera's id is the position of its group, from 1."""
         return [number for number, group in enumerate(self.groups, start=1) if group.fixed]
 
     @property
@@ -116,7 +116,7 @@ class Job:
 
 
 def database_path(work: Path, rung: str = "") -> Path:
-    """Return the path of the database of a work folder: in the scene folder above it; inside it for later attempts."""
+    """Return the path of a work folder's database: in the scene folder above it, or inside it for a named rung."""
     return work / f"{rung}.db" if rung else work.parent / "database.db"
 
 
@@ -131,7 +131,7 @@ def read_job(path: Path) -> Job:
 
 
 def job_from_json(content: dict[str, Any]) -> Job:
-    """Make a job of what `dataclasses.asdict` made of one, after a way through JSON."""
+    """Rebuild a job from the result of `dataclasses.asdict`, after a round trip through JSON."""
     content = dict(content)
     content["groups"] = tuple(_group(group) for group in content["groups"])
     content["pairs"] = tuple((i, j) for i, j in content["pairs"])

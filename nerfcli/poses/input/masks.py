@@ -25,8 +25,8 @@ def lay_out_masks(
     Args:
         photos: the photos, and files: their names below the worker's folder of photos.
         masks: the user's folder of masks.
-        folder: where to write; made if need be.
-        notify: receives which photos have no mask, and which are hidden by theirs.
+        folder: where to write; created if missing.
+        notify: receives notes on photos without a mask, and on photos with a completely black one.
 
     Raises:
         UserError: no such folder, no mask in it for any photo, or masks that cannot be read or do not fit.
@@ -67,13 +67,13 @@ def lay_out_masks(
 
 
 def write_mask(path: Path, used: np.ndarray) -> LaidOutMask:
-    """Write a mask for pycolmap: which pixels of the upright photo are used, bool (height, width)."""
+    """Write a mask for pycolmap from the used pixels of the upright photo, bool (height, width)."""
     Image.fromarray(used).save(path)
     return LaidOutMask(stage_key(used.shape, np.packbits(used).tobytes().hex()), float(used.mean()))
 
 
 def write_no_mask(path: Path, size: tuple[int, int]) -> LaidOutMask:
-    """Write a white mask for a photo of (width, height): pycolmap leaves out a photo whose mask is not there."""
+    """Write a white mask for a photo of (width, height), since pycolmap leaves out a photo whose mask is missing."""
     Image.new("1", size, 1).save(path)
     return LaidOutMask()
 

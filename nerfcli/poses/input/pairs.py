@@ -1,6 +1,6 @@
 """Choose which pairs of photos to match.
 
-Matching is quadratic in the photos, and with a hundred of them the longest step.
+Matching all pairs is quadratic in the number of photos, and the longest step with a hundred of them.
 """
 
 import re
@@ -14,30 +14,32 @@ from nerfcli.errors import UserError
 from nerfcli.media.geodesy import east_north_up
 from nerfcli.poses.input.photos import Photo
 
-# Choices. "auto" is one of the others, by the number of photos and what is known of them.
+# Choices. "auto" selects one of the others, by the number of photos and their metadata.
 PAIRINGS = ("auto", "exhaustive", "sequential", "retrieval", "spatial")
 
-# Up to here every photo is compared with every other one, whatever the names say.
+# Up to this many photos, every photo is compared with every other one, whatever their names.
 EXHAUSTIVE_UP_TO = 60
-# In an ordered capture, so many followers...
+# In an ordered capture, each photo is compared with this many that follow it...
 _FOLLOWERS = 10
-# ...and so many that look alike though they are not near in the order, which closes loops.
+# ...and with this many look-alikes that are not near it in the order, which closes loops.
 _LOOP_NEIGHBOURS = 8
-# In an unordered one.
+# In an unordered capture, with this many look-alikes.
 _NEIGHBOURS = 25
-# With GPS: so many that are nearest, and so many that look alike.
+# With GPS, with this many nearest photos, and this many look-alikes.
 _NEAREST = 20
 _SPATIAL_NEIGHBOURS = 5
-# Neighbours that are all nearer than this look no different to a phone's GPS.
+# A phone's GPS cannot tell apart neighbours that are all nearer than this.
 _GPS_ERROR_METRES = 10.0
-# From one photo to the next, where the order of times is an order of places.
+# Largest median time from one photo to the next for which the order in time is an order in space.
 _WALKING_PACE_SECONDS = 30.0
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """The rule, one of `PAIRINGS` but "auto", or "file"; pairs (i, j), i < j, of photo numbers; and with how many more
-    that look alike each photo is compared, which is known once their features are.
+    """Pairs of photos to match.
+
+    rule: one of `PAIRINGS` except "auto", or "file". pairs: (i, j), i < j, of photo numbers. neighbours: how many
+    look-alikes of each photo to add, once features are known.
     """
 
     rule: str
@@ -48,9 +50,8 @@ class Pairing:
 def choose_pairs(photos: Sequence[Photo], *, rule: str = "auto") -> Pairing:
     """Choose the pairs of photos to match by one of the rules below.
 
-    "auto" compares a small capture exhaustively, and a larger one as its photos allow: by where they were taken, if
-    their GPS can tell neighbours apart; in the order in which they were taken, if there is one; else by how alike they
-    look.
+    "auto" compares a small capture exhaustively, and a larger one as its photos allow: by position, if their GPS can
+    tell neighbours apart; in the order in which they were taken, if there is one; else by similarity.
 
     Raises:
         ValueError: no such rule.
@@ -81,7 +82,7 @@ def _best_rule(photos: Sequence[Photo]) -> str:
 
 
 def sequential_pairs(order: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    """Return each photo with the next 10 in the order, and with those 16, 32, 64... further on."""
+    """Pair each photo with the next 10 in the order, and with those 16, 32, 64... places after it."""
     count = len(order)
     steps = [*range(1, _FOLLOWERS + 1), *(2**k for k in range(4, count.bit_length()))]
     near = {(i, i + step) for step in steps for i in range(count - step)}
@@ -89,7 +90,7 @@ def sequential_pairs(order: Sequence[int]) -> tuple[tuple[int, int], ...]:
 
 
 def nearest_pairs(places: np.ndarray, count: int) -> tuple[tuple[int, int], ...]:
-    """Return each of the places (N, 2) with the `count` that are nearest to it."""
+    """Pair each of the positions (N, 2) with the `count` nearest ones."""
     distances = np.linalg.norm(places[:, None] - places[None], axis=-1)
     np.fill_diagonal(distances, np.inf)
     nearest = np.argsort(distances, axis=1, kind="stable")[:, : min(count, len(places) - 1)]
@@ -101,27 +102,27 @@ def all_pairs(count: int) -> tuple[tuple[int, int], ...]:
     return in_blocks(combinations(range(count), 2))
 
 
-def looked_at_features(photos: int) -> int:
+def retrieval_feature_count(photos: int) -> int:
     """Return how many features of each photo are compared to find look-alikes; the time grows with their square.
 
-    Measured: the 20 most alike of each photo of fox hold 98 % of the pairs with 100 verified matches with 256 of them,
-    and 96 % with 128. Of 300 frames of a walk through a town, 97, 100, 96 and 93 % of the pairs that close loops are
-    found with 256, 128, 64 and 32, at 0.56, 0.13, 0.04 and 0.01 ms a pair.
+    Measured: with 256 features, the 20 photos most similar to each photo of fox include 98 % of the pairs with 100
+    verified matches, and 96 % with 128 features. Of 300 frames of a walk through a town, 97, 100, 96 and 93 % of the
+    pairs that close loops are found with 256, 128, 64 and 32 features, at 0.56, 0.13, 0.04 and 0.01 ms a pair.
     """
     return 256 if photos <= 500 else 128 if photos <= 2000 else 64
 
 
 def in_blocks(pairs: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-    """Return the pairs in an order in which few photos are in use at a time, since the matcher keeps what it used last.
+    """Sort the pairs so that few photos are in use at a time, since the matcher caches the features it used last.
 
-    Photos near each other in the order come first: these are matched where the time does not suffice for all.
+    Pairs of photos with near numbers come first, so that these are matched if there is not enough time for all.
     """
     block = 16
     return tuple(sorted(pairs, key=lambda pair: (abs(pair[1] // block - pair[0] // block), pair[0] // block, pair)))
 
 
 def order_of_capture(photos: Sequence[Photo]) -> list[int] | None:
-    """Indices in the order of capture: by the numbers in the names, or by the clock of the one camera; else None."""
+    """Return indices in capture order, by the numbers in the names or the clock of a single camera; else None."""
     by_name = capture_order([photo.name for photo in photos])
     if by_name is not None:
         return by_name
@@ -130,14 +131,14 @@ def order_of_capture(photos: Sequence[Photo]) -> list[int] | None:
         return None
     order = sorted(range(len(times)), key=times.__getitem__)
     gaps = sorted(times[j] - times[i] for i, j in pairwise(order))
-    # Photos of a week are in order too, but not because the camera moved from one to the next.
+    # Photos taken over a week are in order too, but not because the camera moved from one to the next.
     return order if gaps[len(gaps) // 2] <= _WALKING_PACE_SECONDS else None
 
 
 def capture_order(names: Sequence[str]) -> list[int] | None:
-    """Indices of the names by their number, if they differ in one number and nothing else; None otherwise.
+    """Return the indices of the names sorted by number, if they differ only in one number; None otherwise.
 
-    So they do when a camera or a video tool wrote them: IMG_0412.JPG, frame_9.png, frame_10.png.
+    Cameras and video tools write such names: IMG_0412.JPG, frame_9.png, frame_10.png.
     """
     parts = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in names]
     matches = [match for match in parts if match]
@@ -150,7 +151,7 @@ def capture_order(names: Sequence[str]) -> list[int] | None:
 
 
 def _positions(photos: Sequence[Photo]) -> np.ndarray:
-    """(N, 2) metres to the east and to the north. Heights are left out: GPS knows them least."""
+    """Return positions (N, 2), metres east and north. Heights are left out, since GPS measures them worst."""
     places = [photo.exif.gps for photo in photos]
     without = [photo.name for photo in photos if photo.exif.gps is None]
     if without:

@@ -9,13 +9,13 @@ from nerfcli.poses.input.photos import Photos
 
 
 def read_pairs(path: Path, photos: Photos) -> Pairing:
-    """Read the pairs that a text file lists. Empty lines and those that begin with # are passed over.
+    """Read the pairs that a text file lists. Empty lines and lines that begin with # are skipped.
 
-    Names may hold spaces: a line is cut where both parts are names of photos. Quotes around a name, or a tab between
-    the two, help where more than one cut would do. Pairs with a photo that cannot be read are left out.
+    Names may contain spaces: a line is split where both parts are names of photos. Quotes around a name, or a tab
+    between the two, help if more than one split is possible. Pairs with a photo that cannot be read are left out.
 
     Raises:
-        UserError: no such file, no pair in it, or a line that is no pair of two photos, with its number.
+        UserError: there is no such file, no pair in it, or a line, given by its number, that is not a pair of photos.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -53,7 +53,7 @@ def _names(line: str, known: Container[str], place: str, folder: Path) -> tuple[
 
 
 def _cuts(line: str) -> Iterator[tuple[str, str]]:
-    """Yield all ways to cut a line in two, at a tab if it has one, else at every space."""
+    """Yield all ways to split a line in two, at each tab if it has any, else at each space."""
     separator = "\t" if "\t" in line else " "
     for at, character in enumerate(line):
         if character == separator:
@@ -61,14 +61,14 @@ def _cuts(line: str) -> Iterator[tuple[str, str]]:
 
 
 def _bare(text: str) -> str:
-    """Without the space around it and one pair of quotes."""
+    """Strip the surrounding space and one pair of quotes."""
     text = text.strip()
     quoted = len(text) >= 2 and text[0] == text[-1] and text[0] in "\"'"
     return text[1:-1] if quoted else text
 
 
 def _unknown(line: str, known: Container[str]) -> str:
-    """Return what is wrong with a line that holds no two names."""
+    """Describe the error in a line that does not contain two names of photos."""
     cuts = list(_cuts(line))
     for one, other in cuts:
         if one in known:

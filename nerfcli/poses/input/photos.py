@@ -11,7 +11,7 @@ from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import IMAGE_SUFFIXES, Exif, list_images, read_exif, read_image
 from nerfcli.media.unsupported_photos import unsupported_photos
 
-# Three views fix a scene up to scale, but nothing then checks any of them; four are the least that do.
+# Three views determine a scene up to scale, but leave nothing to check them with; four are the fewest that do.
 MIN_PHOTOS = 4
 
 # Decoded photos are large; more readers than this only hold more of them in memory at once.
@@ -78,8 +78,8 @@ def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None
 def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
     """Group photos that may share intrinsics: same make, model, lens, focal length, upright size and crop.
 
-    Focal lengths within 2 % are the same one: autofocus moves them a little. Photos without EXIF are distinguished by
-    their size alone. Groups and the names in them are in the order of `photos`.
+    Focal lengths within 2 % count as the same: autofocus changes them a little. Photos without EXIF are distinguished
+    by their size alone. Groups and the names in them are in the order of `photos`.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     focals: list[float] = []
@@ -94,9 +94,7 @@ def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
 
 
 def _same_as(focal: float | None, focals: list[float]) -> float | None:
-    """Return the first of the focal lengths so far that is the same as this one;
-    if there is none, this one joins them.
-    """
+    """Return the first of the earlier focal lengths that counts as the same; without one, add and return this one."""
     if focal is None:
         return None
     for earlier in focals:

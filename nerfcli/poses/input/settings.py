@@ -19,10 +19,10 @@ CAMERA_MODELS = (
     "OPENCV_FISHEYE",
 )
 
-# No photo has a longer side: its features are sought in the full size.
+# More than the longer side of any photo, so that features are extracted at full size.
 FULL_SIZE = 100_000
-# (max_image_size, max_features). Measured poses hardly change from the first to the last; photos that are hard to match
-# are placed more often by the later ones.
+# (max_image_size, max_features). Measured poses hardly change from the first to the last; the later ones place photos
+# that are hard to match more often.
 QUALITIES = {"fast": (1000, 2048), "default": (1600, 4096), "best": (FULL_SIZE, 8192)}
 
 
@@ -30,13 +30,13 @@ QUALITIES = {"fast": (1000, 2048), "default": (1600, 4096), "best": (FULL_SIZE, 
 class PoseSettings:
     """Settings that the result depends on.
 
-    max_image_size: longer side of the pictures that features are sought in, pixels. max_features: per photo.
+    max_image_size: longer side of the pictures that are searched for features, pixels. max_features: per photo.
     threads: -1 for all; with 1 thread the same seed gives the same poses. camera_model: one of `CAMERA_MODELS`.
-    min_registered: the share of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a text
-    file with two names per line, these pairs are compared and no others. masks: a folder of masks, see `media.masks`.
-    holdout: the rule by which photos are held out, see `nerfcli.holdout`. strict: whether these are placed afterwards,
-    with all that the others gave fixed, see `strict`. component: which of the models that share no frame becomes the
-    scene, 1 for the largest. accept_refused: whether a model that the checks refuse becomes the scene all the same.
+    min_registered: the fraction of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a
+    text file with two names per line, only these pairs are matched. masks: a folder of masks, see `media.masks`.
+    holdout: the rule by which photos are held out, see `nerfcli.holdout`. strict: whether held-out photos are placed
+    afterwards, with the result of the other photos fixed, see `strict`. component: which of the separate models becomes
+    the scene, 1 for the largest. accept_refused: whether a model that the checks refuse becomes the scene anyway.
     """
 
     max_image_size: int = QUALITIES["default"][0]
@@ -63,7 +63,7 @@ class Limits:
 
 
 def check_settings(settings: PoseSettings) -> None:
-    """Refuse values that pycolmap would die of.
+    """Refuse values that would crash pycolmap.
 
     Raises:
         ValueError: a setting is out of its range.

@@ -1,7 +1,7 @@
-"""Stages as files: what is complete, and on what it depends.
+"""Files of completed stages: their content, and a hash of what it depends on.
 
-A complete stage is a JSON file {"key", "content", "seal"} in the work folder. The key is a hash of all that the content
-depends on: a stage with another key than the requested one counts as missing. The seal is a hash of the
+A complete stage is a JSON file {"key", "content", "seal"} in the work folder. The key is a hash of everything that the
+content depends on: a stage with another key than the requested one counts as missing. The seal is a hash of the
 content: a stage that is cut off or was changed counts as missing, too.
 """
 
@@ -26,17 +26,17 @@ def file_key(path: Path) -> str:
 
 
 def write_stage(path: Path, key: str, content: Any) -> None:
-    """Say that a stage is complete. Whatever else belongs to it must be on disk by now."""
+    """Mark a stage as complete. Everything else that belongs to it must be on disk already."""
     write_json(path, {"key": key, "content": content, "seal": _seal(content)})
 
 
 def read_stage(path: Path, key: str) -> Any | None:
-    """Read the content of a complete stage with this key, None where there is none, or a damaged one."""
+    """Return the content of the complete stage with this key, None if it is missing or damaged."""
     if not path.is_file():
         return None
     try:
         stage = json.loads(path.read_bytes())
-    except (ValueError, RecursionError):  # cut off, or no text
+    except (ValueError, RecursionError):  # cut off, or not text
         return None
     if not isinstance(stage, dict) or stage.get("key") != key or "content" not in stage:
         return None
@@ -44,4 +44,4 @@ def read_stage(path: Path, key: str) -> Any | None:
 
 
 def _seal(content: Any) -> str:
-    return stage_key(json.loads(json.dumps(content)))  # as a file gives it back: keys are texts, tuples are lists
+    return stage_key(json.loads(json.dumps(content)))  # as read back from a file: keys are strings, tuples are lists

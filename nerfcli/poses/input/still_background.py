@@ -1,11 +1,12 @@
-"""Masks of what turns before a background that stays: from photos that a camera on a tripod took.
+"""Masks of an object that turns in front of a static background, from photos of a camera on a tripod.
 
-What a pixel shows most often is the background, wherever the object leaves it free in some photos: an object that
-turns shows other colours each time. Where no colour comes back as precisely as at the background's features, the
-object is always there. A photo's object is that, and what differs from the background, with its holes filled: an
-object of one colour is taken for the background where it is in all photos, but there it is surrounded by what differs.
+The most frequent colour of a pixel is the background, wherever the object leaves it visible in some photos: an object
+that turns shows other colours each time. Where no colour recurs as precisely as at the background's features, the
+object always covers the pixel. The object in a photo is these pixels and those that differ from the background, with
+holes filled: an object of one colour is taken for the background where it covers a pixel in all photos, but there it is
+surrounded by pixels that differ.
 
-All is done in small pictures; the masks are enlarged and a little wider than the object, for a mask that cuts the
+All steps use small pictures; the masks are enlarged and slightly wider than the object, since a mask that cuts the
 object costs more than one that leaves a rim of the background.
 """
 
@@ -18,31 +19,32 @@ from scipy.ndimage import binary_fill_holes
 
 # The longer side of the pictures that are compared.
 SIDE_PX = 480
-# So many photos at most, evenly chosen, tell what the background looks like; fewer than so many tell nothing.
+# At most this many photos, evenly chosen, are used to find the background; fewer than the second number are too few.
 _MOST_PHOTOS = 40
 LEAST_PHOTOS = 6
-# The background is the colour that a pixel has, most nearly, in this share of the photos.
+# The background is the colour that a pixel has most consistently in this fraction of the photos.
 _SHARE = 0.3
-# How many levels of 255 a pixel may differ from the background, apart from noise and edges that are a little displaced.
+# Tolerance of a pixel: levels of 255, plus a multiple of its noise, plus the effect of edges displaced by this much.
 _LEVELS = 9.0
 _NOISES = 3.0
 _DISPLACED_PX = 0.5
-# Where colours come back so much less precisely than at the background's features, there is no background.
+# No background is visible where colours vary more than at the background's features, by this factor and these levels;
+# the last number is the quantile of the features' noise that is compared with.
 _LESS_PRECISE = 2.0
 _LESS_PRECISE_LEVELS = 2.0
 _AT_MOST_WORST = 0.9
-# Parts smaller than this share of the largest one, or of the picture, are no objects.
+# Parts smaller than these fractions of the largest part, or of the picture, are not objects.
 _LEAST_OF_LARGEST = 0.02
 _LEAST_OF_PICTURE = 0.0005
-# Gaps of this many pixels are closed, and the mask is this much wider than what differs.
+# Gaps of this many pixels are closed, and the mask is dilated by this many.
 _CLOSED_PX = 4
 _WIDER_PX = 2
 
 
 @dataclass(frozen=True)
 class Background:
-    """What stays: colours (h, w, 3) float32; how much a pixel of each place may differ, (h, w); and where the object
-    always is, (h, w) bool."""
+    """Static background: colours (h, w, 3) float32; tolerance of each pixel, (h, w); and where the object always covers
+    it, (h, w) bool."""
 
     colours: np.ndarray
     tolerance: np.ndarray
@@ -50,7 +52,7 @@ class Background:
 
 
 def small(picture: np.ndarray) -> np.ndarray:
-    """Return a picture (height, width, 3) uint8 at `SIDE_PX`."""
+    """Reduce a picture (height, width, 3) uint8 to `SIDE_PX`."""
     height, width = picture.shape[:2]
     scale = min(1.0, SIDE_PX / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -58,11 +60,11 @@ def small(picture: np.ndarray) -> np.ndarray:
 
 
 def background(pictures: Sequence[np.ndarray], places: np.ndarray) -> Background:
-    """Return what stays in pictures (h, w, 3) of one place, `LEAST_PHOTOS` or more.
+    """Estimate the static background of pictures (h, w, 3) from one camera position, `LEAST_PHOTOS` or more.
 
     Args:
-        pictures: of it, see `small`.
-        places: (N, 2) where the background has features that stay, as shares of width and height, 0...1.
+        pictures: of equal size, see `small`.
+        places: (N, 2) positions of static features of the background, as fractions of width and height, 0...1.
     """
     chosen = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), _MOST_PHOTOS)).astype(int))
     stack = np.stack([pictures[index] for index in chosen]).astype(np.float32)  # (n, h, w, 3)
@@ -88,9 +90,7 @@ def background(pictures: Sequence[np.ndarray], places: np.ndarray) -> Background
 
 
 def differs(picture: np.ndarray, behind: Background) -> np.ndarray:
-    """Return where a picture (h, w, 3) shows something else than the background, (h, w) bool:
-    the object, a little wider.
-    """
+    """Return where a picture (h, w, 3) differs from the background, (h, w) bool: the object, slightly dilated."""
     raw = ((cv2.medianBlur(_distances(picture, behind), 5) > 1) | behind.covered).astype(np.uint8)
     raw = cv2.morphologyEx(raw, cv2.MORPH_OPEN, _disc(1))
     closed = cv2.morphologyEx(np.pad(raw, _CLOSED_PX), cv2.MORPH_CLOSE, _disc(_CLOSED_PX))
@@ -105,13 +105,13 @@ def differs(picture: np.ndarray, behind: Background) -> np.ndarray:
 
 
 def agreement(picture: np.ndarray, behind: Background) -> float:
-    """Return the fraction of places with a background that a picture (h, w, 3) shows as it is there."""
+    """Return the fraction of pixels with a known background at which a picture (h, w, 3) agrees with it."""
     free = ~behind.covered
     return float(np.mean(_distances(picture, behind)[free] <= 1)) if free.any() else 0.0
 
 
 def enlarged(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return a mask in the size (width, height) of its photo, with smooth edges."""
+    """Enlarge a mask to the size (width, height) of its photo, with smooth edges."""
     return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
 
 
@@ -122,7 +122,7 @@ def _distances(picture: np.ndarray, behind: Background) -> np.ndarray:
 
 
 def _gain(picture: np.ndarray, behind: Background) -> np.ndarray:
-    """Return what the picture's channels are to be multiplied by, so that most of it is as light as the background."""
+    """Return the factor for each of the picture's channels that makes most of it as bright as the background."""
     bright = (behind.colours > 16) & (behind.colours < 240) & (picture > 8) & (picture < 245)
     gains = []
     for channel in range(3):
@@ -131,7 +131,7 @@ def _gain(picture: np.ndarray, behind: Background) -> np.ndarray:
             gains.append(1.0)
             continue
         ratios = np.log(behind.colours[..., channel][usable] / picture[..., channel][usable])
-        # The densest part of the ratios, not their middle: the object may take more than half of the picture.
+        # The mode of the ratios, not their median: the object may take more than half of the picture.
         heights, edges = np.histogram(ratios, bins=np.arange(-1.0, 1.02, 0.02))
         peak = int(np.convolve(heights, np.ones(3), mode="same").argmax())
         near = np.abs(ratios - (edges[peak] + 0.01)) < 0.03

@@ -1,6 +1,6 @@
 """Extract chosen frames of a video to a folder of JPEG photos, with frames.json about their origin.
 
-The frames keep their number in the video as a name, so that pairs are chosen as for any capture that is in order.
+The frames are named by their number in the video, so that pairs are chosen as for any ordered capture.
 """
 
 import hashlib
@@ -31,9 +31,9 @@ FRAMES_FILE = "frames.json"
 DEFAULT_FRAMES = 120
 
 _JPEG_QUALITY = 97
-# Enough of a file to tell it from others without reading all of it: its size, and this much of its two ends.
+# A file is identified without reading all of it, by its size and this many bytes at each end.
 _END_BYTES = 1 << 20
-# Measuring decodes every frame and looks at it, extracting only decodes: about this share of the time is measuring.
+# Approximate fraction of the time for measuring, which decodes and examines every frame; extracting only decodes.
 _MEASURING_SHARE = 0.7
 
 
@@ -64,20 +64,21 @@ def extract_frames(
 ) -> None:
     """Write the sharpest frames of a video to `folder`, or keep them if they are there already.
 
-    The video is cut into `count` stretches in which the camera moves equally far, standing still not counted. Of each
-    the sharpest frame is taken, unless it shows the same as the one before. The same video gives the same frames.
+    The video is divided into `count` stretches in which the camera moves equally far, not counting when it stands
+    still. The sharpest frame of each is written, unless it shows the same as the one before. The same video gives the
+    same frames.
 
     Args:
         path: the video.
         folder: gets frame_000123.jpg... and frames.json, all or nothing.
-        count: how many; None for 120. A video that has fewer gives all that it has.
+        count: how many; None for 120. A video with fewer frames gives all of them.
         overwrite: replace frames that were made from another video or with another count.
         notify: receives messages for the user, one sentence at a time.
-        progress: receives (share done in 0...1, what is being done).
+        progress: receives (fraction done in 0...1, current step).
 
     Raises:
-        UserError: the video cannot be read or is cut short, or shows fewer than four different pictures; or other
-            things stand at `folder`.
+        UserError: the video cannot be read or is cut short, or shows fewer than four different pictures; or `folder`
+            contains something else.
     """
     video = open_video(path)
     request = {"video": _identity(path), "frames": count, "selection": 1}
@@ -127,7 +128,7 @@ def _write(
     measured: MeasuredFrames[FrameMeasure],
     progress: Callable[[float], None],
 ) -> list[VideoFrame]:
-    """Write the chosen frames that differ from the one written before; of two alike the sharper one."""
+    """Write the chosen frames that differ from the one written before; of similar frames, the sharpest one."""
     written: list[VideoFrame] = []
     for number, picture in _different(zip(numbers, read_frames(video, numbers), strict=True), measured.values):
         name = f"frame_{number:06d}.jpg"
@@ -141,7 +142,7 @@ def _write(
 def _different(
     frames: Iterator[tuple[int, np.ndarray]], measures: Sequence[FrameMeasure]
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the frames without those that show the same as the one before; of a run of them, the sharpest stays."""
+    """Yield the frames without repetitions: of a run of frames that show the same, only the sharpest."""
     best: tuple[int, np.ndarray] | None = None
     first: MotionPicture | None = None
     for number, picture in frames:
@@ -161,7 +162,7 @@ def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool,
     """Return whether `folder` already holds the requested frames.
 
     Raises:
-        UserError: it holds something else, and must not be replaced.
+        UserError: it contains something else, and must not be replaced.
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return False
@@ -186,7 +187,7 @@ def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool,
 
 
 def _identity(path: Path) -> dict[str, Any]:
-    """Return what tells a video from others, wherever it lies."""
+    """Return data that identifies a video, whatever its folder."""
     size = path.stat().st_size
     digest = hashlib.sha256()
     with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""The photos as the worker gets them: upright, under numbers that stay with a photo, and only what has changed anew."""
+"""Lay out the photos for the worker: upright, under permanent numbers, repeating only what has changed."""
 
 import os
 import shutil
@@ -12,11 +12,11 @@ from nerfcli.media.images import read_image
 from nerfcli.poses.input.photos import Photo, Photos
 from nerfcli.poses.input.stages import file_key, read_stage, write_stage
 
-# What pycolmap reads as we do, if stored upright. Of all else (CMYK, 16 bit, alpha, TIFF) it gets a JPEG copy.
+# Formats that pycolmap reads as we do, if stored upright. For all others (CMYK, 16 bit, alpha, TIFF) it gets JPEGs.
 _PLAIN = {("JPEG", ".jpg"), ("JPEG", ".jpeg"), ("MPO", ".jpg"), ("MPO", ".jpeg"), ("PNG", ".png")}
-# Each holds a decoded photo.
+# Each copier holds a decoded photo in memory.
 _COPIERS = 4
-# To be changed with how copies are made.
+# Change this whenever copies are made differently.
 _VERSION = "JPEG 97"
 
 
@@ -29,10 +29,10 @@ class LaidOut:
 
 
 def lay_out(photos: Photos, work: Path) -> tuple[LaidOut, ...]:
-    """Give the worker each photo, upright, under its number: a link where the file will do, else a copy.
+    """Give the worker each photo, upright, under its number: a link if the file can be used directly, else a copy.
 
-    A photo keeps the number that it got when it was first laid out, and no number is given twice, so that what is known
-    of it stays its own when others come and go.
+    A photo keeps the number that it got when it was first laid out, and numbers are not reused, so that stored results
+    stay with their photo when others are added or removed.
     """
     folder, stage = work / "photos", work / "photos.json"
     folder.mkdir(parents=True, exist_ok=True)

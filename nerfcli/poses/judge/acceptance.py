@@ -1,7 +1,7 @@
 """Acceptance of a model, based on evidence that the mapper did not choose itself.
 
-The number of placed photos and the reprojection error say little: a wrong model has thrown away what contradicts it. So
-the verified matches of all pairs are tested again, and observations that the adjustment did not see.
+The number of placed photos and the reprojection error say little: a wrong model has discarded what contradicts it. So
+the verified matches of all pairs are tested again, and so are observations held out from the adjustment.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -18,24 +18,24 @@ from nerfcli.poses.model import held_out
 from nerfcli.poses.model.determined import is_centred
 from nerfcli.poses.model.two_views import Agreement, RotationError, VerifiedPair, agreements, rotation_errors
 
-# Pairs with fewer verified matches hold nothing up and contradict nothing.
+# Pairs with fewer verified matches neither support nor contradict a model.
 MIN_MATCHES = 15
-# Share of all matches in pairs that contradict the model strongly. Measured: up to 0.013 in right models, 0.14 where
-# the scene repeats itself.
+# Largest fraction of all matches in pairs that strongly contradict the model. Measured: up to 0.013 in correct models,
+# 0.14 for a scene that repeats itself.
 _MOST_RIVALS = 0.05
 _GROSS_DEG = 10.0
-# Measured: 0.08 at the most in right models, among them one with many mistaken pairs; 0.1 to 0.56 in wrong ones.
+# Measured: at most 0.08 in correct models, including one with many wrong pairs; 0.1 to 0.56 in wrong models.
 _MOST_GROSS = 0.2
 _LEAST_ANGLE_DEG = 1.5
 _LEAST_IN_FRONT = 0.95
-# Root mean square distance of the cameras from their middle, over the median distance to what they see.
+# Root mean square distance of the cameras from their centre, over the median distance to the points.
 _LEAST_SPREAD = 0.003
 _FOCAL_RANGE = (0.3, 3.0)
 _MOST_HELD_OUT_PX = 4.0
 _LEAST_OBSERVATIONS = 15
-# In the report; the share counts all.
+# Contradictions listed in the report; the fraction counts all.
 _MOST_LISTED = 20
-# What is reported where it could not be measured.
+# Reported if the measurement failed.
 _UNKNOWN_GEOMETRY: dict[str, Any] = {
     "triangulation_angle_deg": None,
     "share_in_front": None,
@@ -67,11 +67,11 @@ class Verdict:
 
     @property
     def accepted(self) -> bool:
-        """Whether there are no failures."""
+        """True if there are no failures."""
         return not self.failures
 
     def to_json(self) -> dict[str, Any]:
-        """Plain lists and dictionaries."""
+        """Return plain lists and dictionaries."""
         return {"accepted": self.accepted, **asdict(self)}
 
 
@@ -90,18 +90,18 @@ def judge(
 ) -> Verdict:
     """Measure a model against the evidence and decide whether to accept it.
 
-    What cannot be measured is None, and speaks neither for the model nor against it.
+    A value that cannot be measured is None, and counts neither for nor against the model.
 
     Args:
         model: a converged model.
         pairs: the verified pairs of the capture.
-        turn: how well mere turns of the camera explain the matches.
-        names: what the user calls each photo of the model.
+        turn: how well rotations of the camera alone explain the matches.
+        names: the user's name for each photo of the model.
         seed: of random draws.
         threads: of the adjustment, -1 for all.
-        held: what holds photos that were placed by points of the model, see `localise.shared_pairs`.
-        given: ids of cameras whose intrinsics were known beforehand, whatever focal length they have.
-        fixed: ids of cameras whose intrinsics stay as they are.
+        held: pairs that support photos located from points of the model, see `localise.shared_pairs`.
+        given: ids of cameras with given intrinsics, whose focal lengths are not checked.
+        fixed: ids of cameras whose intrinsics are kept fixed.
         checks: runs the checks.
     """
     run = (Checks() if checks is None else checks).run
@@ -149,7 +149,7 @@ def nothing_placed(turn: Turn | None) -> Verdict:
 
 
 def _geometry(model: pycolmap.Reconstruction) -> dict[str, Any]:
-    """Angles at which points are seen, cheirality, and how far apart the cameras are."""
+    """Measure the triangulation angles, the fraction of observations in front, and the spread of the cameras."""
     photos = sorted(model.reg_image_ids())
     centres = {photo: np.asarray(model.image(photo).projection_center()) for photo in photos}
     angles, distances, in_front, observations = [], [], 0, 0
@@ -288,7 +288,7 @@ def _turned(rotations: Mapping[str, Any]) -> list[Failure]:
 def _implausible(
     model: pycolmap.Reconstruction, measures: Mapping[str, Any], *, given: Collection[int]
 ) -> list[Failure]:
-    """Numbers that no real capture has."""
+    """Return a failure for each value that no real capture has."""
     checks = [
         (
             measures["triangulation_angle_deg"],

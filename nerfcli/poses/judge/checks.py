@@ -1,8 +1,8 @@
-"""Run the checks of a finished model so that none of them can lose it.
+"""Run the checks of a finished model so that none of them can cause its loss.
 
-A check is auxiliary: what it raises is noted as its reason, and the other checks go on. A check that ends the whole
-process leaves its name behind in a file, by which the next process knows which one to leave out. The file also says how
-long the check may take: who supervises the process ends it then, since no thread of its own can while C++ computes.
+A check is auxiliary: if it raises an exception, the reason is noted and the other checks continue. A check that ends
+the whole process leaves its name in a file, so that the next process leaves it out. The file also has the time limit of
+the check, which the supervising process enforces, since no thread of the worker can while C++ code computes.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,7 +14,7 @@ from nerfcli.errors import reason_of
 
 T = TypeVar("T")
 
-# Holds the name of the check that is being computed; it is there only while one is.
+# Holds the name of the check being computed; it exists only during a check.
 UNDERWAY = "check-underway.json"
 
 
@@ -23,8 +23,8 @@ class Checks:
 
     Args:
         folder: where the name of the check being computed is written; None to write nothing.
-        skip: reasons by the names of checks that must not be started, because they ended an earlier process.
-        seconds: that each may take.
+        skip: reasons, by name, of checks that must not be started because they ended an earlier process.
+        seconds: time limit of each check.
     """
 
     def __init__(
@@ -40,9 +40,9 @@ class Checks:
 
         Args:
             name: of the check.
-            compute: computes it.
-            otherwise: what to return where it cannot be computed.
-            seconds: that it may take, if not as long as each of the others.
+            compute: computes the result.
+            otherwise: the result if it cannot be computed.
+            seconds: time limit of this check, if it differs from that of the others.
 
         Example:
             >>> Checks().run("pose uncertainty", lambda: 1 / 0, otherwise=None)
@@ -55,7 +55,7 @@ class Checks:
             write_json(marker, {"check": name, "seconds": self._seconds if seconds is None else seconds})
         try:
             return compute()
-        except Exception as error:  # pycolmap, SciPy and NumPy raise what they like
+        except Exception as error:  # pycolmap, SciPy and NumPy raise various types
             self.not_computed[name] = reason_of(error)
             return otherwise
         finally:

@@ -1,4 +1,4 @@
-"""Find the verified pairs of photos that a model contradicts, and leave out the photos on its weak side."""
+"""Find the verified pairs of photos that contradict a model, and leave out the photos on the weaker side."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,13 +10,13 @@ from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.model.two_views import Agreement, VerifiedPair, agreements
 from nerfcli.poses.model.view_graph import Bottlenecks
 
-# A pair with fewer may be mistaken even if no other joins its photos: measured, up to 81 between unlike walls.
+# A pair with fewer may be wrong even if no other pair joins its photos: measured, up to 81 between different walls.
 _CERTAIN_MATCHES = 100
-# A pair this strong, relative to the best chain that contradicts it, tells another story and not a mistake; up to the
-# second factor the chain is as good a story.
+# A pair this strong, relative to the best chain that contradicts it, is a serious rival and not a mistake; up to the
+# second factor, the chain is equally credible.
 _RIVAL_STRENGTH = 0.5
 _RIVAL_OF_EQUALS = 2.0
-# Share of the photos that may be left out because they contradict the others, which then still are a whole.
+# Largest fraction of the photos that may be left out because they contradict the others.
 _MOST_LEFT_OUT = 0.2
 _FARTHEST = 10.0
 # A pair whose rays meet at a smaller angle, in the median, says little about how far away its cameras are.
@@ -34,24 +34,23 @@ class Contradiction:
 
     @property
     def outweighs(self) -> bool:
-        """Whether the pair is stronger than the support of the model; a weak one must be so by half."""
+        """True if the pair is stronger than the chain that supports the model; a pair with few matches, by half."""
         return self.matches > (1.0 if self.matches >= _CERTAIN_MATCHES else 1.5) * self.agreeing_chain
 
     @property
     def is_rival(self) -> bool:
-        """Whether pair and chain are about equally strong, so that either may be wrong."""
+        """True if pair and chain are about equally strong, so that either may be wrong."""
         return self.matches <= _RIVAL_OF_EQUALS * self.agreeing_chain
 
 
 def leave_out_contradicting(
     model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair]
 ) -> tuple[pycolmap.Reconstruction, dict[int, str]]:
-    """Return the model without the photos that its strongest evidence contradicts,
-    and why each was left out, by image id.
+    """Return the model without the photos that the strongest evidence contradicts, and the reasons by image id.
 
-    Photos are held together by their pairs. Where the strongest chain of pairs runs over one that contradicts the
-    model, the smaller side may be anywhere. If all such sides together are few, they are left out; if they are many,
-    the model is not mended but left as it is, to be refused.
+    Photos are connected by their pairs. If the strongest chain of pairs contains one that contradicts the model, the
+    smaller side may be anywhere. If all such sides together have few photos, these are left out; if they have many, the
+    model is not repaired but returned unchanged, to be refused.
     """
     found = agreements(model, pairs)
     placed = sorted(model.reg_image_ids())
@@ -78,12 +77,12 @@ def leave_out_contradicting(
     rest = pycolmap.Reconstruction(model)
     for photo in reasons:
         rest.deregister_frame(rest.image(photo).frame_id)
-    rest.tear_down()  # an image without a pose would end the covariance
+    rest.tear_down()  # an image without a pose would make the covariance fail
     return rest, reasons
 
 
 def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[Agreement]) -> list[Contradiction]:
-    """Pairs that contradict a model and are at least half as strong as what supports it there, the strongest first."""
+    """Return pairs that contradict a model, more than half as strong as the chain that supports it, strongest first."""
     chains = Bottlenecks(
         sorted(model.reg_image_ids()), [(a.one, a.other, a.matches * a.share) for a in found if not a.contradicts]
     )
@@ -96,7 +95,7 @@ def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[Agreem
 
 
 def _spanning_tree(placed: Sequence[int], found: Sequence[Agreement]) -> list[Agreement]:
-    """Return the strongest pairs that hold all photos together, as few as can be."""
+    """Return the strongest pairs that connect all photos, as few as possible."""
     taken: list[Agreement] = []
     chains = {photo: {photo} for photo in placed}
     for a in sorted(found, key=lambda a: -a.matches):
@@ -109,14 +108,14 @@ def _spanning_tree(placed: Sequence[int], found: Sequence[Agreement]) -> list[Ag
 
 
 def _is_held(photo: int, found: Sequence[Agreement]) -> bool:
-    """Return whether more matches of a photo determine its place than contradict it."""
+    """Return whether more matches of a photo determine its position than contradict it."""
     own = [a for a in found if photo in (a.one, a.other)]
     supporting = sum(a.matches for a in own if not a.contradicts and a.angle_deg > _LEAST_ANGLE_DEG)
     return supporting > sum(a.matches for a in own if a.contradicts)
 
 
 def _far_away(model: pycolmap.Reconstruction) -> dict[int, str]:
-    """Photos much farther from the middle of all than the others are."""
+    """Return photos much farther from the centre of all cameras than the others, with reasons."""
     photos = sorted(model.reg_image_ids())
     centres = np.array([model.image(photo).projection_center() for photo in photos])
     distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)

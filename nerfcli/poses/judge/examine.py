@@ -13,14 +13,14 @@ from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict, judge, nothing_placed
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
-from nerfcli.poses.judge.parallax import best_turn
+from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.judge.uncertainty import pose_blur_px
 from nerfcli.poses.model.intrinsics import Lenses, choose_lenses
 from nerfcli.poses.model.localise import shared_pairs
 from nerfcli.poses.model.reasons import FEW_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, read_verified_pairs
 
-# From here on the covariance of all poses together takes minutes.
+# With more photos, the joint covariance of all poses takes minutes.
 _MOST_PHOTOS_FOR_BLUR = 500
 
 
@@ -28,7 +28,7 @@ _MOST_PHOTOS_FOR_BLUR = 500
 class Examined:
     """A model after examination, with the results for the report.
 
-    left_out: why photos were taken out, by number. blur_px: of each photo's pose, by number. details: for the report.
+    left_out: why photos were left out, by number. blur_px: of each photo's pose, by number. details: for the report.
     uncertainty: of the lenses, by camera id, see `determined.uncertainty`.
     """
 
@@ -48,15 +48,15 @@ def examine(
     localised: Sequence[int] = (),
     checks: Checks | None = None,
 ) -> Examined:
-    """Choose lenses, leave out what contradicts, adjust, judge, and measure the uncertainty of the first model.
+    """Leave out contradicting photos of the first model, choose lenses, adjust, judge, and measure the uncertainty.
 
     A check that cannot be computed is left out and listed in `details["not_computed"]`; the others go on.
 
     Args:
-        models: as the mapper left them; the first one is examined.
-        job: that they were made for.
+        models: from the mapper; the first one is examined.
+        job: the job of the models.
         report: called with ("check", done, total).
-        localised: ids of images that are held by no pair but by points of the model.
+        localised: ids of images that are supported by points of the model instead of a pair.
         checks: runs the checks.
     """
     checks = Checks() if checks is None else checks
@@ -64,7 +64,7 @@ def examine(
         pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
     sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}
     strong = [pair for pair in pairs if pair.matches >= FEW_MATCHES]
-    turn = checks.run("parallax", lambda: best_turn(strong, sizes), otherwise=None)
+    turn = checks.run("parallax", lambda: best_rotation_fit(strong, sizes), otherwise=None)
     joined = connected_groups(job.image_ids, [(pair.one, pair.other) for pair in strong])
     details: dict[str, Any] = {"parts": [len(part) for part in joined if len(part) > 1]}
     if not models:
@@ -123,7 +123,7 @@ def with_pose_only(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 
 
 def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> Lenses:
-    """Lens models by evidence, where neither the user nor a file has said what they are."""
+    """Choose lens models by evidence, unless the user or a file has named them."""
     named = [number for number, group in enumerate(job.groups, start=1) if not group.choose]
     exif_focal_px = {
         number: group.focal_px
@@ -141,6 +141,6 @@ def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> Lenses:
 
 
 def _with_names(reason: str, job: Job) -> str:
-    """Replace the numbered files of a reason by the photos' names, in one pass: a name may hold another's number."""
+    """Replace numbered files in a reason by the photos' names, in one pass: a name may contain another's number."""
     names = dict(zip(job.files, job.names, strict=True))
     return re.sub(r"\d+\.\w+", lambda found: names.get(found[0], found[0]), reason)

@@ -1,8 +1,8 @@
 """Parallax: how far matches deviate from a pure rotation of the camera.
 
-Without a baseline there is no depth, and a mapper that is made to find some finds noise. A turn about the lens moves
-every pixel by a homography whatever its depth; the focal length and one distortion term that fit this best are sought,
-and what is left over is parallax.
+Without a baseline there is no depth, and a mapper that is forced to find some finds noise. A rotation about the lens
+moves every pixel by a homography, whatever its depth; the focal length and one distortion term that fit this best are
+estimated, and the remaining error is parallax.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,13 +16,13 @@ from nerfcli.poses.model.two_views import VerifiedPair
 
 Array = NDArray[np.float64]
 
-# Matches are verified to 4 px; real baselines leave 20 px and more in most pairs, turns leave the noise of features.
+# Matches are verified to 4 px; real baselines leave 20 px and more in most pairs, rotations leave feature noise only.
 NO_PARALLAX_PX = 3.0
-# One pair in four may be mistaken.
+# One pair in four may be wrong.
 _QUANTILE = 0.75
 _MOST_PAIRS = 40
 _MOST_MATCHES = 150
-# Sought within these multiples of the longer side; beyond, any pair looks like a turn.
+# The focal length is searched within these multiples of the longer side; beyond them, any pair looks like a rotation.
 _FOCAL_RANGE = (0.3, 4.0)
 _FOCAL_STARTS = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
 _MOST_DISTORTION = 0.4
@@ -31,9 +31,10 @@ _STEPS = 40
 
 @dataclass(frozen=True)
 class Turn:
-    """The best explanation of all matches by turns of the camera alone.
+    """The best explanation of all matches by rotations of the camera alone.
 
-    parallax_px: what is left of three pairs in four, or less. focal_px: as a pinhole in the largest picture.
+    parallax_px: the remaining error that three pairs in four do not exceed (median over the matches of each). focal_px:
+    as a pinhole in the largest picture.
     """
 
     parallax_px: float
@@ -41,15 +42,15 @@ class Turn:
 
     @property
     def explains_all(self) -> bool:
-        """Whether there is no significant parallax."""
+        """True if there is no significant parallax."""
         return self.parallax_px < NO_PARALLAX_PX
 
 
-def best_turn(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]]) -> Turn | None:
+def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]]) -> Turn | None:
     """Find how well rotations of one camera explain the matches; None without a pair.
 
     Args:
-        pairs: verified pairs; of many, an even choice is used.
+        pairs: verified pairs; if there are many, an even selection is used.
         sizes: width and height of every photo, pixels, by image id.
     """
     if not pairs:
@@ -76,7 +77,7 @@ def best_turn(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]
 
 
 def _from_middle(photos: Sequence[tuple[Array, tuple[int, int]]], counts: NDArray[np.int64]) -> Array:
-    """(P, M, 2) the first pixels of each photo, relative to its middle; zero past its count (P,)."""
+    """Return the first pixels of each photo relative to its centre, (P, M, 2); zero beyond its count (P,)."""
     places = np.zeros((len(photos), counts.max(), 2))
     for place, count, (pixels, size) in zip(places, counts, photos, strict=True):
         place[:count] = pixels[:count] - np.array(size) / 2
@@ -84,7 +85,7 @@ def _from_middle(photos: Sequence[tuple[Array, tuple[int, int]]], counts: NDArra
 
 
 def _rays(distorted: Array, distortion: float) -> Array:
-    """Unit rays of a pinhole with one radial term, its inverse by fixed-point iteration."""
+    """Return unit rays of a pinhole with one radial term, inverted by fixed-point iteration."""
     straight = distorted
     for _ in range(5):
         squared = np.minimum((straight**2).sum(axis=-1, keepdims=True), 25.0)
@@ -94,8 +95,9 @@ def _rays(distorted: Array, distortion: float) -> Array:
 
 
 def _rest(p: Array, q: Array, counts: NDArray[np.int64]) -> Array:
-    """(P,) median angles between the first rays of q and p (P, M, 3), after the rotation of each pair that fits them
-    best (Kabsch 1976, three times reweighted).
+    """Return each pair's median angle, (P,), between the first rays of p and q (P, M, 3), after the best rotation.
+
+    The rotation is found as in Kabsch 1976, reweighted three times.
     """
     there = np.arange(p.shape[1]) < counts[:, None]
     weights = there.astype(np.float64)

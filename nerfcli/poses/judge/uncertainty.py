@@ -1,8 +1,8 @@
 """Uncertainty of poses: one standard deviation of each pose, as blur in pixels.
 
 The covariance of the adjustment depends on which points or cameras fix the frame, an arbitrary choice. It is
-brought into the frame in which the pictures of a scene that stands still move least in all photos together (an
-S-transformation, Baarda 1973); there, every photo's own share is read off.
+transformed to the frame in which the pictures of a static scene move least over all photos together (an
+S-transformation, Baarda 1973); each photo's own uncertainty is read off there.
 
 Letters: R, t is a camera's pose from the world, C its centre. A pose's six unknowns are w, a rotation after R in the
 camera's axes, and the change of t; J maps them to pixels; a similarity has theta, tau, s as its seven.
@@ -19,18 +19,18 @@ from nerfcli.poses.model.lens_evidence import projection_jacobians
 
 Array = NDArray[np.float64]
 
-# So many points show how a picture moves.
+# Points per photo used to measure how a picture moves.
 _POINTS_PER_PHOTO = 60
 # pycolmap's tangent space of a quaternion is half the angle.
 _ANGLE_FROM_TANGENT = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 
 
 def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int, fixed: Sequence[int] = ()) -> dict[int, float]:
-    """Compute by image id how far a typical point moves in the photo, root mean square, by one standard deviation of
-    its pose.
+    """Compute the root mean square motion of a typical point in each photo by one standard deviation of its pose.
 
-    The noise of an observation is taken from what the adjustment leaves. Points and intrinsics are as uncertain as
-    poses; the lens is as it came out. What all photos get wrong together, and what no lens model says, is not in it.
+    The noise of an observation is estimated from the residuals of the adjustment. Points and intrinsics are treated as
+    uncertain too; the lens model is taken as chosen. Errors common to all photos, and errors that no lens model
+    describes, are not included.
 
     Args:
         model: a converged model; it is not changed.
@@ -38,7 +38,7 @@ def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int, fixed: Sequenc
         fixed: ids of cameras whose intrinsics are taken to be exact.
 
     Returns:
-        Empty if the covariance could not be had, for a model that is not held in all directions.
+        By image id; empty if there is no covariance, since the model is not constrained in all directions.
     """
     copy = pycolmap.Reconstruction(model)
     adjuster = held_out.adjust(copy, threads=threads, fixed=fixed)
@@ -67,7 +67,7 @@ def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int, fixed: Sequenc
 
 
 def _joint_covariance(found: pycolmap.BACovariance, photos: list[int]) -> Array | None:
-    """(6 photos, 6 photos) for unit noise, rotations as angles."""
+    """Return the covariance of all poses, (6 photos, 6 photos), for unit noise, with rotations as angles."""
     joint = np.zeros((6 * len(photos), 6 * len(photos)))
     for i, one in enumerate(photos):
         for j, other in enumerate(photos[: i + 1]):
@@ -81,7 +81,7 @@ def _joint_covariance(found: pycolmap.BACovariance, photos: list[int]) -> Array 
 
 
 def _pixel_metric(model: pycolmap.Reconstruction, photo: int) -> Array:
-    """(6, 6) mean of J^T J over points that a photo sees: its pixels' mean squared motion by a motion of its pose."""
+    """Return the mean of J^T J over points that a photo sees, (6, 6): the mean squared pixel motion per pose motion."""
     image = model.image(photo)
     camera = model.camera(image.camera_id)
     seen = image.get_observation_points2D()
@@ -103,7 +103,7 @@ def _pixel_metric(model: pycolmap.Reconstruction, photo: int) -> Array:
 
 
 def _gauge_directions(image: pycolmap.Image) -> Array:
-    """(6, 7) how a camera's unknowns move if the world is turned by theta, moved by tau and scaled by 1 + s.
+    """Return the change of a camera's unknowns, (6, 7), for a world rotated by theta, moved by tau, scaled by 1 + s.
 
     X' = (1 + s) X + theta x X + tau and R' = R exp(-theta), so w = -R theta and dt = w x t - R (s C + theta x C + tau).
     """

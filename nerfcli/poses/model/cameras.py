@@ -14,9 +14,9 @@ from nerfcli.poses.input.job import CameraGroup
 from nerfcli.poses.input.photos import Photos, camera_groups
 from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL
 
-# How intrinsics that are given are used: as they are, or as where the adjustment starts.
+# Uses of given intrinsics: kept fixed, or as the start of the adjustment.
 USES = ("fixed", "prior")
-# So many cameras are named one by one.
+# Up to this many cameras are listed one by one.
 _MOST_LISTED = 4
 
 
@@ -28,13 +28,13 @@ class GivenIntrinsics:
     use: str = "fixed"
 
     def to_json(self) -> dict[str, Any]:
-        """{"file", "use", "key"}: the key is a hash of the cameras and of the names that the file lists them for."""
+        """Return {"file", "use", "key"}; the key is a hash of the cameras and of the photo names in the file."""
         return {"file": str(self.calibration.path.absolute()), "use": self.use, "key": self.calibration.key}
 
 
 @dataclass(frozen=True)
 class Grouped:
-    """Photos by camera, what the user should know of that, and for the report what was given (None if nothing was)."""
+    """Photos by camera, notes on them for the user, and the given intrinsics for the report (None without any)."""
 
     groups: tuple[CameraGroup, ...]
     notes: tuple[str, ...]
@@ -42,9 +42,9 @@ class Grouped:
 
 
 def group_photos(photos: Photos, *, model: str) -> Grouped:
-    """Groups by EXIF and upright size; model: COLMAP's name, or "auto" for the one that EXIF suggests to start from.
+    """Group photos by EXIF and upright size; model: COLMAP's name, or "auto" to start from the one that EXIF suggests.
 
-    Where EXIF is of another picture than the file, its focal length is where the adjustment starts, but no prior.
+    If EXIF describes another picture than the file, its focal length is only the start of the adjustment, not a prior.
     """
     numbers = {name: number for number, name in enumerate(photos.names)}
     groups: list[CameraGroup] = []
@@ -72,7 +72,7 @@ def group_photos(photos: Photos, *, model: str) -> Grouped:
 
 
 def group_by_given(photos: Photos, given: GivenIntrinsics) -> Grouped:
-    """Groups by the cameras of a file. Photos that it does not list share a camera only if EXIF says that they do.
+    """Group photos by the cameras of a file. Photos that it does not list share a camera only if their EXIF agrees.
 
     Raises:
         UserError: a photo has no camera in the file, or one that structure from motion cannot use.
@@ -117,7 +117,7 @@ def start_model(exif: Exif) -> str:
 
 
 def _doubts(doubted: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return a note for each reason why EXIF is not believed; of many, for the first ones, and how many more."""
+    """Return a note for each reason to doubt EXIF; if there are many, for the first ones and the number of the rest."""
     notes = []
     for doubt, names in list(doubted.items())[:_MOST_LISTED]:
         which = names[0] if len(names) == 1 else f"{names[0]} and {_photos(len(names) - 1, 'more ')}"
@@ -127,7 +127,7 @@ def _doubts(doubted: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
 
 
 def _summary(groups: Sequence[CameraGroup]) -> str:
-    """Return the cameras one by one if they are few, else how many photos they took, in which sizes."""
+    """Describe the cameras one by one if they are few, else by their numbers of photos, sizes and models."""
     counts = [len(group.photos) for group in groups]
     if len(groups) <= _MOST_LISTED:
         return ", ".join(f"{_photos(len(g.photos))} of {g.width}x{g.height} ({g.model})" for g in groups)

@@ -1,9 +1,9 @@
-"""Which lens parameters a capture determines: the others stay where lenses usually are.
+"""Find which lens parameters a capture determines; the others keep their usual values.
 
-A parameter that observations leave open is not harmless: it takes on what is wrong elsewhere, and turns or moves the
-poses with it. So the principal point stays at the centre, and higher distortion at none, until the observations speak
-for it clearly, in photos and parts of the scene taken by themselves (see `lens_evidence`). A focal length that they
-leave open stays at the one of EXIF.
+A parameter that the observations do not determine is not harmless: it absorbs errors from elsewhere, and rotates or
+moves the poses with it. So the principal point stays at the centre, and higher distortion at zero, until the
+observations clearly support another value, judged by photos and by parts of the scene (see `lens_evidence`). A focal
+length that they do not determine stays at EXIF's.
 """
 
 from collections.abc import Sequence
@@ -24,19 +24,20 @@ from nerfcli.poses.model.lens_evidence import (
     parameters_of,
 )
 
-# The chance to take a parameter that is not there; as eight parts of a scene are few, it must be small.
+# Probability of freeing a parameter that is in fact zero; it must be small, since eight parts of a scene are few.
 _CHANCE = 5e-4
-# Where one distortion term moves the corner by less than this share of its distance from the centre, one way or the
-# other, it may be free without being sure of it: it does no harm.
+# If the standard deviation of the distortion term moves the corner by less than this fraction of its distance from the
+# centre, the term is harmless, and may be free without being significant.
 _HARMLESS = 0.003
-# Standard deviation of a focal length by EXIF, and of one of which nothing is known, between a fisheye and a small
-# telephoto lens; from where on one without EXIF is held; and from where on it is said to be uncertain.
+# Relative standard deviation of a focal length by EXIF, and of an unknown one, between a fisheye and a small telephoto
+# lens; the deviation above which a focal length without EXIF is held; and those above which focal length and distortion
+# (at the corner) are reported as weak.
 _EXIF_DEVIATION = 0.03
 _UNKNOWN_DEVIATION = 0.35
 _OPEN_DEVIATION = 0.05
 _WEAK_FOCAL = 0.01
 _WEAK_BORDER = 0.005
-# A principal point farther than this from the centre, as a share of the size, is a fit to something else.
+# A principal point farther than this from the centre, as a fraction of the size, is a fit to something else.
 PRINCIPAL_POINT_RANGE = 0.1
 
 _PRINCIPAL_POINT = ("cx", "cy")
@@ -53,8 +54,8 @@ _MODELS = {
 class Step:
     """A decision about some parameters.
 
-    distance: how far from nothing they are, squared and in units of their uncertainty, relative to what is required:
-    taken from 1 on; None for the model that the others are added to.
+    distance: their squared distance from zero in units of their uncertainty, relative to the required one: parameters
+    are added above 1; None for the model to which the others are added.
     """
 
     model: str
@@ -93,11 +94,11 @@ def determine(
     """Find which lens parameters of a perspective camera a converged model determines.
 
     Args:
-        mapped: the model before it was adjusted to the end, when a focal length that is left open had not yet strayed.
+        mapped: the model before its full adjustment, in which an undetermined focal length has not drifted yet.
         seed: see `lens_evidence`.
         fixed: cameras whose intrinsics are exact.
         named: whether the camera keeps its model; its principal point may still become free.
-        exif_focal_px: where the focal length stays if it is not determined.
+        exif_focal_px: the focal length to keep if the observations do not determine it.
 
     Raises:
         UndeterminedError: the model has too few observations.
@@ -106,8 +107,8 @@ def determine(
     evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed)
     free = list(parameters_of(camera)) if named else ["f", "k1"]
     steps = [_step(free, None, taken=True, camera=camera if named else None)]
-    # The principal point comes first: a sensor off its axis is what cameras have, and tangential terms imitate it.
-    # It is tested again with k2, which may hide it.
+    # The principal point comes first: real cameras have sensors off the axis, and tangential terms imitate that.
+    # It is tested again once k2 is free, whose absence may have hidden it.
     for group in [_PRINCIPAL_POINT] if named else [_PRINCIPAL_POINT, ("k2",), _PRINCIPAL_POINT, _TANGENTIAL]:
         if set(group) <= set(free) or (len(steps) > 2 and "k2" not in free):
             continue
@@ -116,7 +117,7 @@ def determine(
         steps.append(_step(tried, distance, taken=distance > 1, camera=camera if named else None))
         free = tried if distance > 1 else free
     found = evidence.estimate(free)
-    # Where the focal length is open, so is distortion with it: without the one, the other would go astray.
+    # If the focal length is undetermined, so is distortion: neither can be estimated without the other.
     share = found.deviation("f") / camera.mean_focal_length()
     if not named and not share <= (_OPEN_DEVIATION if exif_focal_px is None else _EXIF_DEVIATION):
         focal_px = exif_focal_px or _between_px(mapped, camera_id, seed=seed, fixed=fixed)
@@ -132,10 +133,10 @@ def uncertainty(
     """Compute the uncertainty of the intrinsics of a camera, one standard deviation each, for the report.
 
     Returns:
-        {"focal_percent", "principal_point_px": how uncertain it would be if it were free, "principal_point_free",
-        "distortion_border_px": how far distortion moves the corner, "reason": None}; all None but the reason where the
-        lens is not one that can be examined so, or the observations are too few; and "weak": whether the focal length
-        or the distortion is uncertain enough to say so.
+        {"focal_percent", "principal_point_px": its uncertainty if it were free, "principal_point_free",
+        "distortion_border_px": uncertainty of distortion at the corner, "weak": whether focal length or distortion are
+        uncertain enough for a warning, "reason": None}. If the lens cannot be examined in this way or the observations
+        are too few, "reason" says so and the numbers and "weak" are None.
     """
     camera = model.cameras[camera_id]
     nothing = {"focal_percent": None, "principal_point_px": None, "distortion_border_px": None}
@@ -164,7 +165,7 @@ def uncertainty(
 
 
 def is_centred(camera: pycolmap.Camera) -> bool:
-    """Return whether the principal point is within a tenth of the size of the centre."""
+    """Return whether the principal point is less than a tenth of the picture's size away from the centre."""
     x, y = camera.principal_point_x / camera.width, camera.principal_point_y / camera.height
     return abs(x - 0.5) < PRINCIPAL_POINT_RANGE and abs(y - 0.5) < PRINCIPAL_POINT_RANGE
 
@@ -184,18 +185,18 @@ def _relative_distance(
 def _with_or_without_distortion(
     evidence: LensEvidence, free: list[str], found: Estimate, camera: pycolmap.Camera, steps: list[Step]
 ) -> tuple[list[str], Estimate]:
-    """Return the free parameters without k1, if it is neither sure nor harmless."""
+    """Return the free parameters and their estimate, without k1 if it is neither significant nor harmless."""
     distance = found.distance(["k1"]) / float(chdtri(1, _CHANCE))
     if _is_harmless(evidence, found, camera) or distance > 1:
         return free, found
     free = [name for name in free if name != "k1"]
-    # What the model has of it now goes to zero, and the others follow.
+    # Its current value goes to zero, and the other parameters follow.
     steps.append(_step(free, distance, taken=True, camera=None))
     return free, evidence.without("k1").estimate(free)
 
 
 def _between_px(mapped: pycolmap.Reconstruction, camera_id: int, *, seed: int, fixed: Sequence[int]) -> float:
-    """Return a focal length between that of a mapped model and a usual one, each by its uncertainty (in logarithms)."""
+    """Return the mean of a mapped model's focal length and a usual one, weighted by uncertainty (in logarithms)."""
     camera = mapped.cameras[camera_id]
     focal_px, usual_px = camera.mean_focal_length(), usual_focal_px(camera.width, camera.height)
     try:
@@ -221,9 +222,7 @@ def _held(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:
 def has_open_distortion(
     model: pycolmap.Reconstruction, camera_id: int, *, seed: int, fixed: Sequence[int] = ()
 ) -> bool:
-    """Return whether the one distortion term of a camera is neither sure nor harmless,
-    its focal length being as it is.
-    """
+    """Return whether a camera's one distortion term is neither significant nor harmless at its current focal length."""
     camera = model.cameras[camera_id]
     try:
         evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed)
@@ -251,7 +250,7 @@ def _model_name(free: Sequence[str]) -> str:
 
 
 def _camera(camera: pycolmap.Camera, found: Estimate, *, named: bool) -> pycolmap.Camera:
-    """Return a camera with the parameters that were found; those that were not free are as they were, or not there."""
+    """Return a camera with the estimated parameters; those that were not free keep their values, or are absent."""
     name = camera.model.name if named else _model_name(found.names)
     values = dict(zip(found.names, found.values.tolist(), strict=True))
     new = pycolmap.Camera.create_from_model_name(

@@ -1,6 +1,6 @@
-"""Focal length of a camera from the verified pairs of its photos, before any of them is placed.
+"""Estimate the focal length of a camera from verified pairs of its photos, before any photo is placed.
 
-Letters: p, q are the pixels of a match from the middle of the picture, in units of the focal length, with 1 appended;
+Letters: p, q are the pixels of a match from the centre of the picture, in units of the focal length, with 1 appended;
 E = U diag(1, 1, 0) V the essential matrix of a pair, q^T E p = 0.
 """
 
@@ -18,13 +18,13 @@ Array = NDArray[np.float64]
 
 # Focal lengths that are compared, over the longer side: fields of view from 103 to 14 degrees.
 _GRID = np.geomspace(0.4, 4.0, 48)
-# Pairs that are used, drawn at random, and matches of each.
+# Number of pairs used, drawn at random, and of matches of each.
 _MOST_PAIRS, _MATCHES = 300, 50
 _LEAST_PAIRS = 20
 _VERIFIED_PX = 2.0
 # Distances from the epipolar line beyond this count by their logarithm.
 _NOISE_PX = 1.5
-# What a pair may say against a focal length, px^2: one with wrong matches, or of something that moves, must not decide.
+# Largest cost of a pair for a focal length, px^2: one with wrong matches, or of a moving object, must not decide.
 _MOST_PER_PAIR = 3.0
 _FITTING_STEPS = 6
 _RESAMPLED = 100
@@ -38,10 +38,10 @@ _TWO = np.diag([1.0, 1.0, 0.0])
 
 @dataclass(frozen=True)
 class FocalLength:
-    """Focal length in pixels, by so many pairs.
+    """Focal length in pixels, and the number of pairs that it is estimated from.
 
-    spread: relative, half of the interval that holds 80 % of estimates from pairs drawn again. rise: of a pair's cost
-    where the focal length is a fifth shorter or longer, px^2, whichever is less; 3 at most.
+    spread: relative, half of the interval with 80 % of the estimates from resampled pairs. rise: of the mean cost per
+    pair if the focal length is a fifth shorter or longer, px^2, whichever is less; 3 at most.
     """
 
     px: float
@@ -51,15 +51,15 @@ class FocalLength:
 
 
 def focal_length(pairs: Sequence[VerifiedPair], size: tuple[int, int], *, seed: int) -> FocalLength | None:
-    """Estimate the focal length with which the matches of all pairs fit essential matrices best.
+    """Estimate the focal length with which essential matrices fit the matches of all pairs best.
 
-    With a wrong focal length a fundamental matrix belongs to no rotation and direction (Kruppa's equations). For each
-    focal length of a grid, each pair gets the essential matrix that fits its matches best; what these cost more than
-    with the pair's own best focal length, up to a limit, is summed over the pairs. Flat scenes, pure rotations, and
-    cameras that look at one point from one distance fit any focal length: there is no rise then, or a large spread.
+    With a wrong focal length, a fundamental matrix corresponds to no rotation and direction (Kruppa's equations). For
+    each focal length of a grid, each pair gets the essential matrix that fits its matches best; its cost above that of
+    the pair's own best focal length, up to a limit, is summed over the pairs. Flat scenes, pure rotations, and cameras
+    that look at one point from one distance fit any focal length; then there is no rise, or a large spread.
 
     Args:
-        pairs: of photos of one camera, without distortion to speak of, with the principal point in the middle.
+        pairs: of photos of one camera, with negligible distortion and the principal point at the centre.
         size: (width, height) of its pictures.
         seed: of the choice of pairs and matches, and of the spread.
 
@@ -87,7 +87,7 @@ def focal_length(pairs: Sequence[VerifiedPair], size: tuple[int, int], *, seed: 
 def _two_views(
     pair: VerifiedPair, size: tuple[int, int], rng: np.random.Generator
 ) -> tuple[Array, Array, Array] | None:
-    """Return the fundamental matrix of a pair, and some of its inliers in each photo, pixels from the middle."""
+    """Return the fundamental matrix of a pair, and some of its inliers in each photo, pixels from the centre."""
     options = pycolmap.RANSACOptions()
     options.max_error = _VERIFIED_PX
     options.min_num_trials, options.max_num_trials = 50, 1000  # the matches are verified

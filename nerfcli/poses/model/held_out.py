@@ -1,7 +1,7 @@
-"""Bundle adjustment without a tenth of the observations, and how far they are off afterwards.
+"""Bundle adjustment without a tenth of the observations, and the errors of these held-out observations afterwards.
 
-The mean reprojection error is measured on what was adjusted to it. Observations that were not fitted measure how well
-poses and intrinsics generalise; camera models are compared, and results accepted, by them.
+The mean reprojection error is measured on observations that were fitted. Observations that were not fitted measure how
+well poses and intrinsics generalise; they are used to compare camera models and to accept results.
 """
 
 from collections.abc import Sequence
@@ -16,10 +16,10 @@ Array = NDArray[np.float64]
 _SHARE = 0.1
 # Beyond this, more observations cost time and change nothing; a part of the points is adjusted instead.
 _MOST_OBSERVATIONS = 40_000
-# A robust adjustment counts observations less from this many times the usual error on: 95 % as sharp for normal noise.
+# A robust adjustment downweights observations from this many times the usual error: 95 % efficient for normal noise.
 _LOSS_FROM = 2.4
 _LEAST_LOSS_PX = 0.3
-# With the others of its point left, it must still be two that hold the point, and better three.
+# A point with fewer observations gives none away: at least two must remain to determine it.
 _MIN_TRACK = 3
 
 
@@ -33,9 +33,9 @@ class HeldOutObservations:
 
 
 def split(model: pycolmap.Reconstruction, *, seed: int) -> tuple[pycolmap.Reconstruction, HeldOutObservations]:
-    """Return a copy of a model without every tenth observation, and these; at most one of each point.
+    """Return a copy of a model without a random tenth of the observations, and these; at most one of each point.
 
-    Points seen fewer than three times give none away. Of a large model the copy holds a part of the points.
+    Points with fewer than three observations give none away. The copy of a large model has only some of the points.
     """
     rng = np.random.default_rng(seed)
     copy = pycolmap.Reconstruction(model)
@@ -45,7 +45,7 @@ def split(model: pycolmap.Reconstruction, *, seed: int) -> tuple[pycolmap.Recons
     for point_id in point_ids[dropped]:
         copy.delete_point3D(int(point_id))
     lengths = np.array([copy.point3D(int(point_id)).track.length() for point_id in point_ids[~dropped]])
-    # One observation of a point in so many that a tenth of all are taken.
+    # One observation of each of as many points as needed to take a tenth of all observations.
     taken = (lengths >= _MIN_TRACK) & (rng.uniform(size=len(lengths)) < _SHARE * lengths)
     images, points, pixels = [], [], []
     for point_id, length in zip(point_ids[~dropped][taken], lengths[taken], strict=True):
@@ -61,7 +61,7 @@ def split(model: pycolmap.Reconstruction, *, seed: int) -> tuple[pycolmap.Recons
 
 
 def errors_px(model: pycolmap.Reconstruction, held: HeldOutObservations) -> Array:
-    """(n,) distance of each held-out observation from where the model projects its point; inf if it does not."""
+    """Return the reprojection error of each held-out observation, (n,); inf if its point does not project."""
     errors = np.full(len(held.points), np.inf)
     for index, (image_id, point_id) in enumerate(zip(held.images, held.points, strict=True)):
         projected = model.image(int(image_id)).project_point(model.point3D(int(point_id)).xyz)
@@ -80,17 +80,17 @@ def adjust(
     robust_px: float | None = None,
     tolerance: float = 1e-9,
 ) -> pycolmap.CeresBundleAdjuster:
-    """Bundle adjustment of a whole model, in place, until it no longer moves; the adjuster, for the covariance.
+    """Run bundle adjustment of a whole model in place until it converges; return the adjuster, for the covariance.
 
     Args:
-        model: what is adjusted.
+        model: the model to adjust.
         threads: -1 for all.
         principal_points: whether they are adjusted too.
         focal_lengths: whether they are adjusted too.
-        fixed: camera ids whose intrinsics stay as they are.
-        robust_px: where observations begin to count less (Cauchy's loss); None: all count by their square.
-        tolerance: the relative change of the cost, in one iteration, at which it ends. By default that is the very end:
-            of two models that are compared, the one that was adjusted longer must not look better for that.
+        fixed: camera ids whose intrinsics are kept fixed.
+        robust_px: error from which observations are downweighted (Cauchy loss); None for squared errors.
+        tolerance: the relative change of the cost per iteration at which it ends. The default is full convergence: of
+            two models that are compared, neither must look better because it was adjusted longer.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
@@ -102,14 +102,14 @@ def adjust(
     if robust_px is not None:
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = robust_px
-        # It creeps towards its end for hundreds of steps that change nothing any more.
+        # It converges slowly, over hundreds of iterations that change nothing significant.
         options.ceres.solver_options.max_num_iterations = 40
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
     for camera_id in fixed:
         config.set_constant_cam_intrinsics(camera_id)
-    # Points, not cameras, hold the frame: so every camera has a covariance.
+    # Points, not cameras, fix the gauge, so that every camera has a covariance.
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     adjuster.solve()
@@ -117,9 +117,7 @@ def adjust(
 
 
 def loss_scale_px(errors: Array) -> float:
-    """Return where a robust adjustment begins to count observations less,
-    from their errors (distances in the picture).
-    """
+    """Return the error from which a robust adjustment downweights observations, given all errors in pixels."""
     finite = errors[np.isfinite(errors)]
     if len(finite) == 0:
         return _LEAST_LOSS_PX
@@ -128,7 +126,7 @@ def loss_scale_px(errors: Array) -> float:
 
 
 def observation_errors_px(model: pycolmap.Reconstruction) -> Array:
-    """(n,) distance of each observation of a model from where it projects its point; those that it cannot left out."""
+    """Return the reprojection errors of a model's observations, (n,), without points that do not project."""
     errors = []
     for image_id in model.reg_image_ids():
         image = model.image(image_id)
@@ -147,9 +145,9 @@ def observation_errors_px(model: pycolmap.Reconstruction) -> Array:
 def intrinsic_deviations(
     model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster, *, principal_points: bool
 ) -> dict[int, Array]:
-    """Standard deviation of each intrinsic parameter by camera id, NaN where it was held; from an adjustment's end.
+    """Return the standard deviation of each intrinsic parameter after an adjustment, by camera id; NaN if it was fixed.
 
-    The residuals themselves say how noisy an observation is.
+    The noise of the observations is estimated from the residuals.
     """
     options = pycolmap.BACovarianceOptions()
     options.params = pycolmap.BACovarianceOptionsParams.ALL
@@ -171,7 +169,7 @@ def intrinsic_deviations(
 
 
 def residual_deviation_px(model: pycolmap.Reconstruction) -> float:
-    """Standard deviation of one coordinate of an observation, by what an adjustment has left; unbiased."""
+    """Estimate the standard deviation of one coordinate of an observation from the residuals, without bias."""
     squares, count = 0.0, 0
     for image_id in model.reg_image_ids():
         image = model.image(image_id)

@@ -1,9 +1,9 @@
 """Choose the lens model that a capture supports, and adjust with it.
 
-Mapping starts from one distortion term. Of a perspective camera the observations then tell which parameters are
+Mapping starts from one distortion term. For a perspective camera, the observations then show which parameters are
 determined (see `determined`). Fisheyes and very wide lenses are adjusted with richer models, each time without a tenth
-of the observations: a richer model is kept if it foresees these better by more than chance, and if what it adds is
-larger than its own uncertainty; the principal point is freed by the same measure.
+of the observations: a richer model is kept if it predicts these better by more than chance, and if its added parameters
+are larger than their uncertainty; the principal point is freed by the same criteria.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,40 +22,40 @@ from nerfcli.poses.model.lens_evidence import UndeterminedError, parameters_of
 
 Array = NDArray[np.float64]
 
-# From simple to rich. A fisheye model is a candidate where the picture is wide enough to tell.
+# From simple to rich. A fisheye model is a candidate if the field of view is wide enough to distinguish it.
 PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE")
 _FISHEYE_FROM_DEG = 90.0
-# What a mapper starts from, by the family that the lens belongs to.
+# Initial models for the mapper, for perspective and fisheye lenses.
 START_MODEL = "SIMPLE_RADIAL"
 START_FISHEYE = "OPENCV_FISHEYE"
 
-# The gain must be this many standard errors, and this share of the error; a smaller one changes no picture.
+# The gain must be this many standard errors, and this fraction of the error; a smaller one changes no picture.
 _GAIN_DEVIATIONS = 2.0
 _GAIN_SHARE = 0.001
-# Errors count up to here: one wrong match must not decide on a lens.
+# Errors are clipped at this value: one wrong match must not decide on a lens.
 _CLIP_PX = 4.0
-# What a model adds must be this many standard deviations from nothing.
+# An added parameter must be this many standard deviations from zero.
 _PARAMETER_DEVIATIONS = 3.0
-# Each lens costs some adjustments; beyond this many, and for lenses with fewer photos, the simplest model stays.
+# Each lens costs some adjustments; beyond this many lenses, and for those with fewer photos, the simplest model stays.
 _MOST_CAMERAS = 4
 _LEAST_PHOTOS = 3
 _MOST_DESCRIBED = 8
 # As in pycolmap's mapper.
 _LEAST_ANGLE_DEG = 1.5
-# Where the two adjustments of `settle` end. Measured on 261 frames of a walk: the robust one ends after 19 iterations
-# instead of 328, with cameras within 4e-5 of the radius of where these would take them; at 1e-4 it is 1.3e-4.
+# Tolerances of the two adjustments of `settle`. Measured on 261 frames of a walk: the robust one ends after 19
+# iterations instead of 328, with cameras within 4e-5 of the radius from where these take them; with 1e-4 it is 1.3e-4.
 _TOLERANCE, _ROBUST_TOLERANCE = 1e-6, 1e-5
 _FIT_GRID = 15
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A lens model that was tried for a camera, or decided on by what the observations determine.
+    """A lens model that was tried for a camera, or a decision by which parameters the observations determine.
 
-    held_out_px: of a wide lens, mean error of the held-out observations of this camera, each counted up to 4 px. gain:
-    how many standard errors that is below the model kept before it. significance: of a wide lens, value over standard
-    deviation of what it adds, the largest; else see `determined.Step`. kept: whether it was chosen.
+    held_out_px: for a wide lens, mean error of this camera's held-out observations, each clipped to 4 px. gain: how
+    many standard errors that is below the model kept before it. significance: for a wide lens, the largest ratio of an
+    added parameter to its standard deviation; else the distance of `determined.Step`. kept: whether it was chosen.
     """
 
     camera: int
@@ -77,7 +77,7 @@ class _Trial:
 
 @dataclass(frozen=True)
 class Lenses:
-    """A model with the lenses that were chosen, the decisions, and by camera id how certain each is, for the report."""
+    """A model with the chosen lenses, the decisions, and each lens's uncertainty by camera id, for the report."""
 
     model: pycolmap.Reconstruction
     candidates: list[Candidate]
@@ -93,15 +93,15 @@ def choose_lenses(
     named: Sequence[int] = (),
     exif_focal_px: Mapping[int, float] | None = None,
 ) -> Lenses:
-    """Return the model with the lens models that it can hold, adjusted anew.
+    """Return the model with the lens models that its observations support, adjusted again.
 
     Args:
         model: a converged model; it is not changed.
-        seed: which observations are looked at or held out.
+        seed: of the choice of observations to use or to hold out.
         threads: of the adjustments, -1 for all.
-        fixed: camera ids that keep their intrinsics as they are.
-        named: camera ids that keep their model; whether its principal point is free is still tried.
-        exif_focal_px: by camera id, where a focal length stays that the observations leave open.
+        fixed: ids of cameras whose intrinsics are kept fixed.
+        named: ids of cameras that keep their model; their principal points may still become free.
+        exif_focal_px: by camera id, the focal length to keep if the observations do not determine it.
     """
     photos = _photos_by_camera(model)
     cameras = sorted((c for c in photos if c not in fixed and photos[c] >= _LEAST_PHOTOS), key=lambda c: -photos[c])
@@ -128,7 +128,7 @@ def choose_lenses(
                 )
             except (UndeterminedError, np.linalg.LinAlgError):
                 if not wide:
-                    continue  # the uncertainty says why
+                    continue  # `uncertainty` reports the reason
         if found is not None and found.held:
             held[camera_id] = found
             continue
@@ -145,7 +145,7 @@ def choose_lenses(
         return _with_held(
             model, held, seed=seed, threads=threads, fixed=fixed, named=named, exif_focal_px=exif_focal_px
         )
-    # pycolmap frees the principal points of all cameras or of none; those of some are found first and then stay.
+    # pycolmap frees the principal points of all cameras or of none; if only some are free, they are adjusted first.
     everywhere = bool(freed) and len(freed) == len(photos)
     if freed and not everywhere:
         held_out.adjust(result, threads=threads, principal_points=True, fixed=[c for c in photos if c not in freed])
@@ -175,9 +175,9 @@ def _with_held(
     named: Sequence[int],
     exif_focal_px: Mapping[int, float] | None,
 ) -> Lenses:
-    """Choose the lenses anew, with the focal lengths that are left open where they are believed to be.
+    """Choose the lenses again, with the undetermined focal lengths held at their assumed values.
 
-    Only distortion follows them, and then stays; or it goes, where it is as open.
+    Only the distortion of these cameras is adjusted, and then fixed; or removed, if it is undetermined too.
     """
     start = pycolmap.Reconstruction(model)
     for camera_id, found in held.items():
@@ -226,9 +226,7 @@ def _by_trials(
     fixed: Sequence[int],
     named: Sequence[int],
 ) -> tuple[bool, list[Candidate]]:
-    """Return whether the principal point is free after trials with held-out observations,
-    and these; sets the camera.
-    """
+    """Set a camera by trials with held-out observations; return whether its principal point is free, and the trials."""
     training, held = held_out.split(result, seed=seed)
     choice = _Choice(held, camera_id, threads=threads, fixed=fixed)
     best = choice.make(training, named=camera_id in named)
@@ -241,10 +239,10 @@ def _by_trials(
 def settle(
     model: pycolmap.Reconstruction, *, threads: int, principal_points: bool = False, fixed: Sequence[int] = ()
 ) -> None:
-    """Adjust a whole model in place, drop the observations that do not fit any more, and adjust once more.
+    """Adjust a whole model in place, drop the observations that no longer fit, and adjust once more.
 
-    The last adjustment is robust: highlights and things that move are seldom far enough off to be dropped, and are
-    wrong in the same way in many photos; counted by their square, they would pull the lens.
+    The last adjustment is robust: highlights and moving things are seldom far enough off to be dropped, and are wrong
+    in the same way in many photos; with squared errors, they would bias the lens.
     """
     adjust = partial(held_out.adjust, model, threads=threads, principal_points=principal_points, fixed=fixed)
     adjust(tolerance=_TOLERANCE)
@@ -256,9 +254,7 @@ def settle(
 
 
 def converted(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
-    """Return a camera of another COLMAP model that sees each ray at nearly the same pixel,
-    the principal point unchanged.
-    """
+    """Return a camera of another COLMAP model that projects rays to nearly the same pixels, same principal point."""
     start = pycolmap.Camera.create_from_model_name(
         camera.camera_id, name, camera.mean_focal_length(), camera.width, camera.height
     )
@@ -275,7 +271,7 @@ def converted(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
         params[free] = values
         start.params = params.tolist()
         found = np.asarray(start.img_from_cam(rays[good]), dtype=np.float64).reshape(-1, 2) - pixels[good]
-        return np.nan_to_num(found, nan=1e3).ravel()  # a ray that the trial cannot project: far away
+        return np.nan_to_num(found, nan=1e3).ravel()  # a ray that the trial cannot project counts as far off
 
     scale = np.array([camera.mean_focal_length() if i in start.focal_length_idxs() else 0.1 for i in free])
     fitted = least_squares(misses, params[free], x_scale=scale, loss="soft_l1")
@@ -285,7 +281,7 @@ def converted(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
 
 
 def field_of_view_deg(camera: pycolmap.Camera) -> float:
-    """From corner to corner of a picture, as far as the lens model can tell."""
+    """Return the field of view from corner to corner of a picture; 180 if the lens model has no rays there."""
     corners = np.array([[0.0, 0.0], [camera.width, camera.height]])
     rays = np.asarray(camera.cam_ray_from_img(corners), dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(rays).all():
@@ -295,14 +291,14 @@ def field_of_view_deg(camera: pycolmap.Camera) -> float:
 
 
 def _field_by_exif_deg(camera: pycolmap.Camera, exif_focal_px: float | None) -> float:
-    """Return the field of view by the focal length of EXIF; without one, by what came out, which may have strayed."""
+    """Return the field of view by EXIF's focal length; without one, by the estimated camera, which may have drifted."""
     if exif_focal_px is None:
         return field_of_view_deg(camera)
     return float(2 * np.degrees(np.arctan(np.hypot(camera.width, camera.height) / 2 / exif_focal_px)))
 
 
 class _Choice:
-    """The trials of one camera, from the simplest on, each against the best before it."""
+    """The trials of one camera, from the simplest model on, each compared with the best one before it."""
 
     def __init__(
         self, held: held_out.HeldOutObservations, camera_id: int, *, threads: int, fixed: Sequence[int]
@@ -313,8 +309,8 @@ class _Choice:
     def make(self, training: pycolmap.Reconstruction, *, named: bool) -> _Trial:
         """Return the best trial.
 
-        The principal point comes before the tangential terms: both shift the picture, but a sensor off its axis is
-        what cameras have, and it turns the poses.
+        The principal point comes before the tangential terms: both shift the picture, but real cameras have sensors off
+        the axis, and that rotates the poses.
         """
         camera = training.cameras[self.camera_id]
         wide = field_of_view_deg(camera) > _FISHEYE_FROM_DEG
@@ -376,13 +372,13 @@ def _gain(before: Array, after: Array) -> float:
 
 
 def _significance(before: _Trial, after: _Trial, camera_id: int) -> float:
-    """Value over standard deviation of the parameters that are free only in `after`, the largest."""
+    """Return the largest ratio of value to standard deviation of the parameters that are free only in `after`."""
     old, new = before.model.cameras[camera_id], after.model.cameras[camera_id]
     if old.is_perspective_fisheye() != new.is_perspective_fisheye():
-        return float("inf")  # another family: it adds nothing, it is something else
+        return float("inf")  # another family, not added parameters
     added = [(index, new.params[index]) for index in new.extra_params_idxs()[len(old.extra_params_idxs()) :]]
     if after.principal_point and not before.principal_point:
-        before_it = (old.principal_point_x, old.principal_point_y)  # the centre, or what was given
+        before_it = (old.principal_point_x, old.principal_point_y)  # the centre, or the given point
         indices = new.principal_point_idxs()
         added += [(index, new.params[index] - start) for index, start in zip(indices, before_it, strict=True)]
     ratios = [abs(value) / after.deviations[index] for index, value in added if after.deviations[index] > 0]

@@ -1,13 +1,13 @@
-"""Evidence of the observations of a model about a lens, with free poses and points.
+"""Evidence of a model's observations about a lens, with free poses and points.
 
-A lens parameter is determined as far as no motion of poses and points can imitate it. So the parameters' effect on the
-observations is freed from all that poses and points can explain (a Schur complement); what is left tells their values
-and uncertainties in one step of Gauss-Newton, without adjusting anything.
+A lens parameter is determined as far as no motion of poses and points can imitate it. So everything that poses and
+points can explain is removed from the parameters' effect on the observations (a Schur complement); the rest gives their
+values and uncertainties in one Gauss-Newton step, without an adjustment.
 
 Residuals are not independent: highlights that move with the view, or photos with rolling shutters, are wrong in the
-same way many times. Noise is therefore counted by groups: photos, and neighbouring points of the scene. If one part of
-the scene says another lens than the rest, the parameter is as uncertain as that (a sandwich estimate by clusters; White
-1980, Cameron and Miller 2015).
+same way many times. Noise is therefore estimated by clusters: photos, and neighbouring points of the scene. If one part
+of the scene implies another lens than the rest, the uncertainty of the parameter includes that difference (a sandwich
+estimate by clusters; White 1980, Cameron and Miller 2015).
 
 Letters: x and y are a ray's coordinates at z = 1, r its distance from the axis; k1, k2, p1, p2 are terms of the Brown
 model as COLMAP's OPENCV has them; f the focal length, fa the difference of the two along the axes of the picture.
@@ -28,17 +28,17 @@ from nerfcli.poses.model import held_out
 Array = NDArray[np.float64]
 
 NAMES = ("f", "fa", "cx", "cy", "k1", "k2", "p1", "p2")
-# Beyond this, more observations cost time and change little: the clusters, not their members, make the uncertainty.
+# Beyond this, more observations cost time and change little: clusters, not their members, determine the uncertainty.
 _MOST_OBSERVATIONS = 30_000
 _SCENE_CLUSTERS = 8
-# Other cameras whose focal length and distortion are free too; of captures with more, the rest is taken as it is.
+# Other cameras whose focal length and distortion are free too; if there are more, the rest is taken as exact.
 _MOST_OTHERS = 12
-# Of the diagonal: the seven directions in which all poses move together are free, and take no part in the lens.
+# Relative to the diagonal: the seven directions in which all poses move together are free, and do not affect the lens.
 _DAMPING = 1e-9
 
 
 class UndeterminedError(Exception):
-    """A model has too few observations to say anything of its lens."""
+    """A model has too few observations to determine its lens."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class LensEvidence:
     """Evidence about the `NAMES` of one camera.
 
     Args:
-        current: (8,) the parameters' values, relative to the centre of the picture and to no distortion.
+        current: (8,) the parameters' values, relative to the centre of the picture and to zero distortion.
         information: (8, 8) inverse covariance for unit noise.
         scores: for each way to cluster, (clusters, 8) the clusters' gradients.
-        informations: for each way, (clusters, 8, 8), their shares of the information.
+        informations: for each way, (clusters, 8, 8) the clusters' contributions to the information.
         noise_px: standard deviation of an observation.
-        border_px: (8,) how far the corner of the picture moves by a unit of each parameter.
+        border_px: (8,) motion of the corner of the picture per unit of each parameter.
     """
 
     current: Array
@@ -62,10 +62,10 @@ class LensEvidence:
     border_px: Array
 
     def estimate(self, names: Sequence[str]) -> "Estimate":
-        """Estimate the parameters `names` if they alone are free, the others being as they are.
+        """Estimate the parameters `names`, with the other ones fixed at their values.
 
         Raises:
-            UndeterminedError: the observations leave one of them open.
+            UndeterminedError: the observations do not determine one of them.
         """
         index = [NAMES.index(name) for name in names]
         information = self.information[np.ix_(index, index)]
@@ -83,7 +83,7 @@ class LensEvidence:
         return Estimate(tuple(names), self.current[index] + change, change, tuple(covariances))
 
     def without(self, name: str) -> "LensEvidence":
-        """Return the evidence as it would be with a parameter at zero: what it explained is among the residuals."""
+        """Return the evidence with a parameter set to zero, so that what it explained is added to the residuals."""
         index = NAMES.index(name)
         value = self.current[index]
         scores = tuple(
@@ -97,7 +97,7 @@ class LensEvidence:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Values of lens parameters, their change from the model's, and their covariance, by each way to count noise."""
+    """Values of lens parameters, their change from the model's, and their covariance by each way to estimate noise."""
 
     names: tuple[str, ...]
     values: Array
@@ -105,7 +105,7 @@ class Estimate:
     covariances: tuple[Array, ...]
 
     def deviation(self, name: str) -> float:
-        """Standard deviation of a parameter, the largest of all ways to count noise."""
+        """Return the standard deviation of a parameter, the largest of all ways to estimate noise."""
         index = self.names.index(name)
         return float(np.sqrt(max(covariance[index, index] for covariance in self.covariances)))
 
@@ -114,9 +114,7 @@ class Estimate:
         return float(self.values[self.names.index(name)])
 
     def distance(self, names: Sequence[str]) -> float:
-        """Return how far some parameters are from zero,
-        squared and in units of their covariance; the least of all ways.
-        """
+        """Return the squared Mahalanobis distance of some parameters from zero, the least of all ways."""
         index = [self.names.index(name) for name in names]
         values = self.values[index]
         return float(
@@ -132,7 +130,7 @@ def lens_evidence(
     Observations are weighted as the robust adjustment does, see `held_out.adjust`.
 
     Args:
-        seed: of the part of the points that is taken of a large model, and of the clusters.
+        seed: of the selection of points of a large model, and of the clusters.
         fixed: cameras whose intrinsics are exact.
 
     Raises:
@@ -151,7 +149,7 @@ def lens_evidence(
         array *= root_weights[:, None, None]
     residuals = residuals * root_weights[:, None]
     own = _freed(poses, points, lens, seen)
-    # The other cameras' lenses follow too; they are few, and go the way of the poses.
+    # What the other cameras' lenses can explain is removed too, like that of the poses; these cameras are few.
     if others:
         flat = own.reshape(2 * rows, columns)
         first, rest = flat[:, : len(NAMES)], flat[:, len(NAMES) :]
@@ -165,14 +163,14 @@ def lens_evidence(
         information=products.sum(axis=0),
         scores=tuple(_summed(scores, labels) for labels in clusters),
         informations=tuple(_summed(products, labels) for labels in clusters),
-        # Observations that count less take part of the unknowns with them.
+        # Divided by the mean weight, since downweighted observations contribute less to the sum.
         noise_px=float(np.sqrt((residuals**2).sum() / np.mean(root_weights**2) / max(2 * rows - unknowns, 1))),
         border_px=_border_px(camera),
     )
 
 
 def parameters_of(camera: pycolmap.Camera) -> tuple[str, ...]:
-    """List which of `NAMES` a camera model has, except the principal point; empty if it has others."""
+    """List which of `NAMES` a camera model has, except the principal point; empty if it has other parameters."""
     return {
         "SIMPLE_PINHOLE": ("f",),
         "PINHOLE": ("f", "fa"),
@@ -184,7 +182,7 @@ def parameters_of(camera: pycolmap.Camera) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Observations: (n,) positions in `images` and `xyz`, (n, 2) pixels."""
+    """Observations: photos and points (n,) are positions in `images` and `xyz`; pixels (n, 2)."""
 
     images: list[int]
     cameras: list[int]
@@ -252,7 +250,7 @@ def _jacobians(
         elif image.camera_id in others:
             start = len(NAMES) + 2 * others.index(image.camera_id)
             lens[rows, :, start : start + 2] = terms[:, :, [NAMES.index("f"), NAMES.index("k1")]]
-    # What cannot be projected says nothing.
+    # Points that cannot be projected contribute nothing.
     bad = ~(
         np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1) & np.isfinite(lens).all(axis=(1, 2))
     )
@@ -262,7 +260,7 @@ def _jacobians(
 
 
 def projection_jacobians(camera: pycolmap.Camera, local: Array) -> Array:
-    """(n, 2, 3) pixels per unit of points (n, 3) in the camera's axes, by central differences."""
+    """Return pixels per unit of points (n, 3) in the camera's axes, (n, 2, 3), by central differences."""
     step = 1e-5 * np.linalg.norm(local, axis=1, keepdims=True)
     columns = []
     for axis in range(3):
@@ -275,7 +273,7 @@ def projection_jacobians(camera: pycolmap.Camera, local: Array) -> Array:
 
 
 def _lens_terms(camera: pycolmap.Camera, local: Array) -> Array:
-    """(n, 2, 8) pixels per unit of the `NAMES`."""
+    """Return pixels per unit of the `NAMES`, (n, 2, 8)."""
     x, y = local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]
     r2 = x * x + y * y
     focal, none, one = camera.mean_focal_length(), np.zeros_like(x), np.ones_like(x)
@@ -293,7 +291,7 @@ def _lens_terms(camera: pycolmap.Camera, local: Array) -> Array:
 
 
 def _freed(poses: Array, points: Array, lens: Array, seen: _Seen) -> Array:
-    """(n, 2, columns) the effect of lens parameters that no motion of poses and points can imitate."""
+    """Return the effect of lens parameters that no motion of poses and points can imitate, (n, 2, columns)."""
     count, columns = len(poses), lens.shape[2]
     by_pose = _sparse(poses, seen.photos, width=6 * len(seen.images))
     by_point = _sparse(points, seen.points, width=3 * len(seen.xyz))
@@ -314,7 +312,7 @@ def _freed(poses: Array, points: Array, lens: Array, seen: _Seen) -> Array:
 
 
 def _sparse(blocks: Array, columns: NDArray[np.int64], *, width: int) -> csr_array:
-    """Rows of blocks (n, 2, size), block i at the place `columns[i]` of its row."""
+    """Return a sparse matrix of blocks (n, 2, size), with block i in row block i and column block `columns[i]`."""
     count, _, size = blocks.shape
     places = np.repeat((columns[:, None] * size + np.arange(size))[:, None, :], 2, axis=1)
     pointers = np.arange(0, 2 * count * size + 1, size)
@@ -329,7 +327,7 @@ def _block_diagonal(blocks: Array) -> csr_array:
 
 
 def _scene_clusters(seen: _Seen, *, seed: int) -> NDArray[np.int64]:
-    """(n,) which part of the scene each observation is of; far points are drawn near, so that they are one part."""
+    """Return the scene part of each observation, (n,); far points are moved nearer, so that they form one part."""
     offsets = seen.xyz - np.median(seen.xyz, axis=0)
     distances = np.linalg.norm(offsets, axis=1)
     typical = np.median(distances) + 1e-300
@@ -359,6 +357,6 @@ def _current(camera: pycolmap.Camera) -> Array:
 
 
 def _border_px(camera: pycolmap.Camera) -> Array:
-    """(8,) how far the corner of the picture moves by a unit of each parameter."""
+    """Return the motion of the corner of the picture per unit of each parameter, (8,)."""
     corner = np.array([[camera.width / 2, camera.height / 2, camera.mean_focal_length()]])
     return np.linalg.norm(_lens_terms(camera, corner)[0], axis=0)

@@ -1,9 +1,9 @@
 """Detect fisheye lenses from pairs of photos, before there is a model.
 
-A mapper that starts from a perspective lens finds few photos that fit together if the lens was a fisheye, or many that
+If the lens was a fisheye, a mapper that starts from a perspective lens finds few photos that fit together, or many that
 fit badly. A pair of photos alone can tell: with the right projection, more of its matches agree on one motion of the
-camera. Two matches in pixels may agree on any fundamental matrix, which is freer than a motion with a known lens; so a
-perspective photo never gains by a fisheye.
+camera. Without a known lens, matches may agree on any fundamental matrix, which is more general than a motion with a
+known lens; so a perspective photo never gains by a fisheye.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL
 
 Array = NDArray[np.float64]
 
-# Focal lengths to try, as a share of the longer side: an equidistant lens that shows 1 / share radians along it.
+# Focal lengths to try, as a fraction of the longer side: an equidistant lens shows 1 / fraction radians along it.
 _FOCAL_SHARES = np.geomspace(0.25, 0.85, 8)
 # More matches must agree by this factor.
 _CLEARLY = 1.1
@@ -30,8 +30,7 @@ _MAX_ERROR_PX = 4.0
 
 
 def as_fisheye(job: Job) -> Job | None:
-    """Return the job with cameras that start from a fisheye, where pairs of photos say so;
-    None where none of them does.
+    """Return the job with cameras that start from a fisheye where pairs of photos indicate one; None if none do.
 
     Only cameras without a model from a file or the user are tested.
     """
@@ -50,9 +49,7 @@ def _fisheye(group: CameraGroup, focal_px: float) -> CameraGroup:
 
 
 def _fisheye_focal_px(group: CameraGroup, job: Job, database: pycolmap.Database) -> float | None:
-    """Return the focal length of the fisheye with
-    which clearly more matches agree than without; None if there is none.
-    """
+    """Return the focal length of a fisheye with which clearly more matches agree than without one; None without any."""
     pairs = _strongest_pairs({job.image_ids[number] for number in group.photos}, database)
     if not pairs:
         return None
@@ -86,9 +83,9 @@ def _agreeing(
 
 
 def _strongest_pairs(images: set[int], database: pycolmap.Database) -> list[tuple[Array, Array]]:
-    """Return pixels (matches, 2) in both photos of the pairs with the most matches, each photo in one pair at the most.
+    """Return pixels (matches, 2) in both photos of the pairs with the most matches, each photo in at most one pair.
 
-    Of photos that were taken side by side all matches agree whatever the lens, so that one pair per photo is enough.
+    All matches of photos that were taken side by side agree whatever the lens, so that one pair per photo is enough.
     """
     pair_ids, counts = database.read_num_matches()
     pairs = [(count, *pycolmap.pair_id_to_image_pair(pair_id)) for pair_id, count in zip(pair_ids, counts, strict=True)]

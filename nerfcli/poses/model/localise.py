@@ -1,11 +1,11 @@
 """Locate photos that match no other photo well, from the 3D points of the whole model.
 
-Two photos far apart may share too few certain matches to hold one of them. The points of a model were seen by many
+Two photos far apart may share too few certain matches to place one of them. The points of a model were seen by many
 photos: a feature that looks more like one point than like any other votes for it, and a pose that many votes agree on
-is no accident. Where that pose expects the points, more features are found than anyone could tell by looks alone;
-beside these places, where nothing should be, hardly any. A photo of which this cannot be said is not placed.
+is no accident. At the positions where that pose predicts points, more features match than by looks alone; beside these
+positions, where none should match, hardly any do. A photo that fails this test is not placed.
 
-Source: 2D-3D matching as in Sattler et al. 2011 (ICCV), the ratio test between points as there in section 3.
+Source: 2D-3D matching as in Sattler et al. 2011 (ICCV), with the ratio test between points of section 3.
 """
 
 from collections.abc import Sequence
@@ -36,25 +36,25 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _TRIALS = 40_000
-# Fewer agreeing votes, or features found, than these place nothing.
+# A photo needs at least this many agreeing votes, and this many features found, to be placed.
 _LEAST_VOTES = 10
 _LEAST_FOUND = 25
-# The first pose is rough: features are sought so far around, in tolerances, first and then.
+# Search radii for features, in tolerances: larger at first, since the first pose is rough.
 _WITHIN = (2.0, 1.0)
-# Beside the places where points are expected, in tolerances, so many times fewer features may look like them.
+# At these offsets from the predicted positions, in tolerances, at least `_CLEARLY` times fewer features must match.
 _BESIDE = (6.0, 9.0)
 _HERE = np.zeros(2)
 _CLEARLY = 2.5
-# A second pose with this share of the votes makes the first one a guess.
+# A second pose with this fraction of the votes makes the first one ambiguous.
 _RIVAL_SHARE = 0.5
-# Share of the picture that what is found must be spread over. Measured: 0.02 where a detail looks like one that is
-# elsewhere, 0.13 and more where the place was right.
+# Least fraction of the picture over which the found features must spread. Measured: 0.02 where a detail looks like one
+# that is elsewhere, 0.13 and more where the pose was right.
 _LEAST_AREA = 0.05
-# Standard deviations of a pose: of its angles, and of its place relative to the distance of what it sees.
+# Largest standard deviations of a pose: of its angles, and of its position relative to the distance of its points.
 _MOST_TURN_DEG, _MOST_SHIFT = 0.5, 0.02
-# Of the features that place a photo, the share that must be left after the adjustment.
+# Fraction of `_LEAST_FOUND` features that must be left after the adjustment.
 _LEAST_KEPT = 0.6
-# A photo that was placed may make others possible.
+# Rounds of attempts, since a placed photo may make it possible to place others.
 _ROUNDS = 3
 
 
@@ -62,9 +62,9 @@ _ROUNDS = 3
 class Attempt:
     """Result of an attempt to locate a photo.
 
-    image_id, votes: features that choose a point. agreeing: of them, those that a pose explains. found: points found
-    where the pose expects them. beside: how many are found, at most, where none should be. refused: why the photo was
-    not placed, "" if it was.
+    votes: number of features that vote for a point. agreeing: votes that the pose explains. found: points found where
+    the pose predicts them. beside: the largest number found where none should be. refused: why the photo was not
+    placed, "" if it was.
     """
 
     image_id: int
@@ -89,15 +89,14 @@ def localise(
     image_ids: Sequence[int],
     report: Report = lambda stage, done, total: None,
 ) -> tuple[pycolmap.Reconstruction, list[Attempt]]:
-    """Return a copy of the model with those of the photos placed that its points tell the place of,
-    adjusted; what was tried.
+    """Return an adjusted copy of the model with the photos that can be located from its points, and the attempts.
 
-    Photos that resemble what a placed one shows are tried again, so that a chain of them is followed. One whose own
-    matches with other photos, however few, contradict its place is not kept.
+    Photos that resemble the points of a newly placed one are tried again, so that chains of photos are followed. A
+    photo is not kept if its verified matches with another photo, if there are enough of them, contradict its pose.
 
     Args:
         model: with points; it is not changed.
-        job: whose features and matches are used.
+        job: provides features and matches.
         image_ids: of the photos to place.
         report: called with ("locate", done, total), in trials, of which each photo may have several.
     """
@@ -142,7 +141,7 @@ def localise(
 
 
 def left_out(model: pycolmap.Reconstruction, job: Job) -> list[int]:
-    """Ids of the images that a model does not place though they have features enough."""
+    """Return the ids of images that a model does not place although they have enough features."""
     placed = set(model.reg_image_ids())
     with closing(pycolmap.Database.open(str(job.database))) as database:
         return [
@@ -155,7 +154,7 @@ def left_out(model: pycolmap.Reconstruction, job: Job) -> list[int]:
 
 
 def shared_pairs(model: pycolmap.Reconstruction, image_ids: Sequence[int], *, min_matches: int) -> list[VerifiedPair]:
-    """Return the pairs of these photos with all others of a model, by the points that they both see."""
+    """Return the pairs of these photos with all others of a model, matched by the points that both see."""
     pixels: dict[tuple[int, int], list[tuple[Array, Array]]] = {}
     for image_id in image_ids:
         for seen in model.image(image_id).get_observation_points2D():
@@ -174,7 +173,7 @@ def shared_pairs(model: pycolmap.Reconstruction, image_ids: Sequence[int], *, mi
 
 
 def _doubt(model: pycolmap.Reconstruction, image_id: int, pairs: Sequence[VerifiedPair]) -> str:
-    """Return what speaks against a photo's place after the adjustment, "" if nothing does."""
+    """Return the evidence against a photo's pose after the adjustment, "" if there is none."""
     observations = model.image(image_id).num_points3D
     if observations < _LEAST_KEPT * _LEAST_FOUND:
         return f"only {observations} of its points remain after the adjustment"
@@ -184,7 +183,7 @@ def _doubt(model: pycolmap.Reconstruction, image_id: int, pairs: Sequence[Verifi
 
 
 def _place(photo: PhotoFeatures, known: KnownPoints, *, seed: int) -> tuple[_Placed | None, Attempt]:
-    """Return where a photo was taken and what it sees, or None; and how that was found or why not."""
+    """Return a photo's pose with the points it sees, or None; and the record of the attempt."""
     features, points = votes(photo, known)
     first = _pose(photo, known, features, points, seed=seed)
     agreeing = 0 if first is None else len(first.features)
@@ -218,7 +217,7 @@ def _place(photo: PhotoFeatures, known: KnownPoints, *, seed: int) -> tuple[_Pla
 
 
 def _pose(photo: PhotoFeatures, known: KnownPoints, features: Indices, points: Indices, *, seed: int) -> _Placed | None:
-    """Return the pose that most of the features agree on, and which do."""
+    """Return the pose that most of the features agree on, with these features."""
     if len(features) < _LEAST_VOTES:
         return None
     options = pycolmap.AbsolutePoseEstimationOptions()
@@ -238,9 +237,9 @@ def _pose(photo: PhotoFeatures, known: KnownPoints, features: Indices, points: I
 def _expected(
     photo: PhotoFeatures, known: KnownPoints, pose: pycolmap.Rigid3d, *, within: float = 1.0, beside: Array = _HERE
 ) -> tuple[Indices, Indices]:
-    """Features that look like the points that a pose expects there, and these points.
+    """Return the features that look like the points that a pose predicts there, and these points.
 
-    within: how near. beside: how far away from there. Both are in tolerances.
+    within: search radius. beside: offset of the search from the predicted positions. Both are in tolerances.
     """
     local = known.places @ pose.rotation.matrix().T + pose.translation
     pixels = np.full((len(local), 2), np.nan)
@@ -262,26 +261,26 @@ def _expected(
     points = known.of[looks]
     order = np.argsort(distances, kind="stable")
     order = order[distances[order] < ALIKE]
-    for ids in (points, features):  # of each point the likest feature, and of each feature the likest point
+    for ids in (points, features):  # the most similar feature of each point, and the reverse
         _, first = np.unique(ids[order], return_index=True)
         order = order[np.sort(first)]
     return features[order], points[order]
 
 
 def _steps() -> list[Array]:
-    """Return distances in eight directions to where no feature is expected, in tolerances."""
+    """Return offsets in eight directions to positions where no feature is expected, in tolerances."""
     angles = np.arange(8) * np.pi / 4
     return [_BESIDE[i % 2] * np.array([np.cos(angle), np.sin(angle)]) for i, angle in enumerate(angles)]
 
 
 def _area(photo: PhotoFeatures, features: Indices) -> float:
-    """Share of the picture that the features lie in: an ellipse of their spread."""
+    """Return the fraction of the picture that the features cover, as an ellipse of their spread."""
     spread = np.sqrt(max(np.linalg.det(np.cov(photo.pixels[features].T)), 0.0))
     return float(4 * np.pi * spread / (photo.camera.width * photo.camera.height))
 
 
 def _alike(one: _Placed, other: _Placed, known: KnownPoints) -> bool:
-    """Return whether two poses are the same but for noise."""
+    """Return whether two poses are the same except for noise."""
     turned = np.degrees((one.pose.rotation * other.pose.rotation.inverse()).angle())
     places = [np.asarray(placed.pose.inverse().translation) for placed in (one, other)]
     distance = np.median(np.linalg.norm(known.places[one.points] - places[0], axis=1))
@@ -289,7 +288,7 @@ def _alike(one: _Placed, other: _Placed, known: KnownPoints) -> bool:
 
 
 def _deviations(photo: PhotoFeatures, known: KnownPoints, placed: _Placed) -> tuple[float, float]:
-    """Standard deviations of a pose: of its angles, degrees, and of its place by the distance of what it sees."""
+    """Return the standard deviations of a pose: angles in degrees, position relative to the distance of its points."""
     refined = pycolmap.refine_absolute_pose(
         placed.pose,
         photo.pixels[placed.features],
@@ -312,7 +311,7 @@ def _deviations(photo: PhotoFeatures, known: KnownPoints, placed: _Placed) -> tu
 def _add(
     model: pycolmap.Reconstruction, photo: PhotoFeatures, placed: _Placed, *, known: KnownPoints, name: str
 ) -> None:
-    """Put a photo with what it sees into a model."""
+    """Add a photo and its observations to a model."""
     if not model.exists_camera(photo.camera.camera_id):
         model.add_camera_with_trivial_rig(photo.camera)
     if model.exists_image(photo.image_id):

@@ -1,8 +1,8 @@
-"""Sub-models brought together where they see the same points.
+"""Merge sub-models that see the same points.
 
-A mapper that runs out of photos it can add starts again elsewhere, and leaves models that each have their own frame.
-Matches between a photo of the one and a photo of the other whose pixels are points in both give pairs of points; a
-similarity that brings many of them together joins the models.
+A mapper that can add no more photos starts again elsewhere, and leaves models that each have their own frame. Matches
+between photos of two models give pairs of points, if both features belong to a point of their model; a similarity that
+aligns many of these pairs joins the models.
 """
 
 import math
@@ -23,17 +23,17 @@ from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verifie
 
 Array = NDArray[np.float64]
 
-# A similarity has seven unknowns; that many points agreeing within the tolerance is no accident.
+# A similarity has seven unknowns; this many points agreeing within the tolerance is no accident.
 _LEAST_COMMON = 15
 _TOLERANCE_PX = 12.0
 _TRIALS = 500
-# Of the matches between the two parts, this share must agree with the joined model.
+# Fraction of the matches between the two parts that must agree with the joined model.
 _LEAST_AGREEMENT = 0.5
 
 
 @dataclass(frozen=True)
 class CommonPoints:
-    """Points that two models have both placed: (n, 3) in each, and where a photo of the first saw them."""
+    """Points that both of two models contain: (n, 3) in each, with pixels (n, 2) in photos (n,) of the first."""
 
     first: Array
     second: Array
@@ -53,19 +53,19 @@ def merge_models(
     report: Callable[[str, int, int], None] = lambda stage, done, total: None,
     tell: Callable[[str], None] = lambda text: None,
 ) -> list[pycolmap.Reconstruction]:
-    """Return the models, largest first, each joined with the ones before where they have enough in common.
+    """Return the models, largest first, each merged with an earlier one if they have enough in common.
 
-    Of two models with the same photos, or one with some of the other's, the larger stays.
+    If all photos of a model are in a larger one, it is dropped.
 
     Args:
         models: of one database, largest first; they are not changed.
         database: with the matches.
-        output: a folder for what pycolmap writes on the way.
+        output: a folder for temporary files of pycolmap.
         seed: of the search for the similarity.
         threads: -1 for all.
-        fixed: ids of cameras whose intrinsics stay as they are.
-        seconds: after which the rest of the models stay as they are.
-        report: called with ("merge", models done, in all).
+        fixed: ids of cameras whose intrinsics are kept fixed.
+        seconds: time after which the remaining models are not merged.
+        report: called with ("merge", models done, models in all).
         tell: called with what was cut short, if anything was.
     """
     with pycolmap.Database.open(str(database)) as opened:
@@ -80,7 +80,7 @@ def merge_models(
             tell(f"merging: {len(models) - number} of {len(models)} sub-models are left after {duration(seconds)}")
             break
         if any(set(model.reg_image_ids()) <= set(base.reg_image_ids()) for base in merged):
-            continue  # nothing that is not there already
+            continue  # it has no further photos
         for index, base in enumerate(merged):
             common = common_points(base, model, tracks)
             similarity = align(base, common, seed=seed)
@@ -101,7 +101,7 @@ def common_points(
 ) -> CommonPoints:
     """Find common points of two models: points of common photos, and points connected by matches.
 
-    tracks: by pair of image ids, (matches, 2) numbers of the features that belong together.
+    tracks: by pair of image ids, (matches, 2) numbers of the matching features.
     """
     pairs: set[tuple[int, int, int, int]] = set()  # point in first, point in second, photo of first, its feature
     in_first, in_second = set(first.reg_image_ids()), set(second.reg_image_ids())
@@ -128,8 +128,9 @@ def common_points(
 
 
 def align(first: pycolmap.Reconstruction, common: CommonPoints, *, seed: int) -> pycolmap.Sim3d | None:
-    """Return the similarity first_from_second that brings most common points to
-    where the first's photos see them, or None.
+    """Return the similarity first_from_second that moves most common points to where the first's photos see them.
+
+    Returns None if too few points agree.
     """
     count = len(common.first)
     if count < _LEAST_COMMON:
@@ -173,7 +174,7 @@ def _joined(
     threads: int,
     fixed: Sequence[int],
 ) -> pycolmap.Reconstruction:
-    """Merge the photos of both in the frame of the first; points found again from the matches of all, then adjusted."""
+    """Merge the photos of both in the frame of the first, triangulate points again from all matches, and adjust."""
     moved = pycolmap.Reconstruction(second)
     moved.transform(first_from_second)
     joined = pycolmap.Reconstruction(first)
@@ -207,7 +208,7 @@ def _joined(
 
 
 def _holds(joined: pycolmap.Reconstruction, first: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair]) -> bool:
-    """Return whether the matches between the old photos and the new ones agree with where they are now."""
+    """Return whether the matches between the old photos and the new ones agree with the joined model."""
     old = set(first.reg_image_ids())
     between = [pair for pair in pairs if (pair.one in old) != (pair.other in old)]
     found = agreements(joined, between)
@@ -216,7 +217,7 @@ def _holds(joined: pycolmap.Reconstruction, first: pycolmap.Reconstruction, pair
 
 
 def _matched_keypoints(database: pycolmap.Database) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Return by pair of image ids (matches, 2) numbers of the features that verified matches hold together."""
+    """Return, by pair of image ids, the (matches, 2) feature numbers of the verified matches."""
     pair_ids, counts = database.read_two_view_geometry_num_inliers()
     tracks = {}
     for pair_id, count in zip(pair_ids, counts, strict=True):

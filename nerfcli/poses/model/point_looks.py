@@ -1,4 +1,4 @@
-"""Looks of the points of a model, by the descriptors of the photos that see them, and what of them a photo shows."""
+"""Descriptors of a model's points, from the photos that see them, and their matches with the features of a photo."""
 
 from dataclasses import dataclass
 
@@ -9,23 +9,23 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# How far a point may be seen from where it is expected, as a share of the longer side, and pixels at least.
+# Largest distance of a point from its predicted position, as a fraction of the longer side, and at least in pixels.
 _TOLERANCE_SHARE, _LEAST_TOLERANCE_PX = 0.004, 3.0
-# A vote counts if the nearest other point looks this much less alike. Measured on photos 40 degrees apart: at 0.8 one
-# vote in four is right and there are too few, at 0.95 one in thirty.
+# A vote counts if the ratio of its distance to that of the nearest other point is below this. Measured on photos 40
+# degrees apart: at 0.8 one vote in four is right and there are too few, at 0.95 one in thirty.
 _RATIO = 0.9
 _MOST_VOTES = 600
-# Where a point is expected, a feature is the point if descriptors of length 1 are this near.
+# A feature at the predicted position of a point is that point if their descriptors of length 1 are nearer than this.
 ALIKE = 0.5
-# What is compared with; more of the points' descriptors take time and memory.
+# Descriptors of points that are compared with; more take time and memory.
 _MOST_DESCRIPTORS = 150_000
-# Of features, at a time.
+# Features compared at a time.
 BLOCK = 256
 
 
 @dataclass(frozen=True)
 class KnownPoints:
-    """What a model's points look like: ids (points,), places (points, 3), and descriptors of length 1.
+    """A model's points: ids (points,), positions `places` (points, 3), and descriptors of length 1.
 
     of: (descriptors,) index of the point. photos: (descriptors,) id of the image.
     """
@@ -48,15 +48,15 @@ class PhotoFeatures:
 
     @property
     def tolerance_px(self) -> float:
-        """How far from where it is expected a point may be seen."""
+        """Largest distance at which a point may be seen from its predicted position."""
         return max(_TOLERANCE_SHARE * max(self.camera.width, self.camera.height), _LEAST_TOLERANCE_PX)
 
 
 def known_points(model: pycolmap.Reconstruction, database: pycolmap.Database) -> KnownPoints:
-    """Return what the points of a model look like."""
+    """Return the points of a model with their descriptors."""
     ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
     most = max(1, _MOST_DESCRIPTORS // max(len(ids), 1))
-    features: dict[int, tuple[list[int], list[int]]] = {}  # by photo: features, and the points they are of
+    features: dict[int, tuple[list[int], list[int]]] = {}  # by photo: features, and their points
     for index, point_id in enumerate(ids):
         for element in model.point3D(int(point_id)).track.elements[:most]:
             numbers, points = features.setdefault(element.image_id, ([], []))
@@ -73,7 +73,7 @@ def known_points(model: pycolmap.Reconstruction, database: pycolmap.Database) ->
 
 
 def photo_features(model: pycolmap.Reconstruction, database: pycolmap.Database, image_id: int) -> PhotoFeatures | None:
-    """Return the features of a photo; None where nothing says its focal length, neither EXIF nor other photos."""
+    """Return the features of a photo; None if neither EXIF nor placed photos give its focal length."""
     camera_id = database.read_image(image_id).camera_id
     in_use = {model.image(placed).camera_id for placed in model.reg_image_ids()}
     camera = model.camera(camera_id) if camera_id in in_use else database.read_camera(camera_id)
@@ -95,7 +95,7 @@ def resembling(photo: PhotoFeatures, descriptors: NDArray[np.float32]) -> int:
 
 
 def votes(photo: PhotoFeatures, known: KnownPoints) -> tuple[Indices, Indices]:
-    """Features and the points that they choose, each point once."""
+    """Return features and the points that they vote for, each point once."""
     nearest = np.empty(len(photo.pixels), dtype=np.int64)
     ratios, cosines = np.empty(len(nearest)), np.empty(len(nearest))
     for start in range(0, len(nearest), BLOCK):

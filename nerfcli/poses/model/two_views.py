@@ -1,7 +1,7 @@
 """Compare verified pairs of photos with the poses of a model.
 
-The verified matches of a pair hold whatever the mapper made of them. A wrong model has small residuals because it has
-thrown away the observations that contradict it; they are still in the database, and are tested here.
+The verified matches of a pair do not depend on the mapper. A wrong model has small residuals because it has discarded
+the observations that contradict it; they are still in the database, and are tested here.
 
 Letters: p, q are unit rays of a match in the two cameras; R, t the pose of the second camera from the first.
 """
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# COLMAP verifies matches within 4 px of the epipolar line; a model that holds more than the pair may leave twice that.
+# COLMAP verifies matches within 4 px of the epipolar line; a model that fits more than the pair may leave twice that.
 TOLERANCE_PX = 8.0
-# Pairs whose relative pose is estimated anew; they are spread over the photos.
+# Pairs per photo whose relative pose is estimated again.
 _ROTATIONS_PER_PHOTO = 4
 # Below this median angle between the rays of a match, the relative pose of a pair is too weak to contradict anything.
 _ROTATION_MIN_ANGLE_DEG = 2.0
@@ -25,7 +25,7 @@ _ROTATION_MIN_ANGLE_DEG = 2.0
 
 @dataclass(frozen=True)
 class VerifiedPair:
-    """Two photos by their image ids, and the pixels (matches, 2) in each that two-view geometry holds for one point."""
+    """Two photos by their image ids, and the pixels (matches, 2) in each that two-view geometry verified as matches."""
 
     one: int
     other: int
@@ -42,9 +42,9 @@ class VerifiedPair:
 class Agreement:
     """Agreement of a pair's matches with the poses of a model.
 
-    matches: how many can be judged. share: of them within `TOLERANCE_PX` of the epipolar line and before both
-    cameras, or with rays that are parallel to within the tolerance: a point far away explains those, whatever the
-    baseline. angle_deg: the median angle between the rays of a match.
+    matches: how many can be judged. share: the fraction of them within `TOLERANCE_PX` of the epipolar line and in front
+    of both cameras, or with rays that are parallel within the tolerance, as for a far point whatever the baseline.
+    angle_deg: the median angle between the rays of a match.
     """
 
     one: int
@@ -55,7 +55,7 @@ class Agreement:
 
     @property
     def contradicts(self) -> bool:
-        """Whether most of the pair's matches are inconsistent with the model."""
+        """True if most of the pair's matches are inconsistent with the model."""
         return self.share < 0.5
 
 
@@ -80,13 +80,13 @@ def read_verified_pairs(database: pycolmap.Database, *, min_matches: int) -> lis
 
 
 def placed_pairs(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) -> list[VerifiedPair]:
-    """Return the pairs of which a model places both photos."""
+    """Return the pairs with both photos in a model."""
     placed = set(model.reg_image_ids())
     return [pair for pair in pairs if pair.one in placed and pair.other in placed]
 
 
 def agreements(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) -> list[Agreement]:
-    """Return each pair's matches against the model's poses and intrinsics; pairs without a finite ray are left out."""
+    """Compare each pair's matches with the model's poses and intrinsics; pairs without a finite ray are left out."""
     found = []
     for pair in placed_pairs(model, pairs):
         first, second = model.image(pair.one), model.image(pair.other)
@@ -100,7 +100,7 @@ def agreements(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) ->
         p, q = p[finite] @ R.T, q[finite]  # both in the second camera's axes
         focal_px = 0.5 * (camera.mean_focal_length() + other_camera.mean_focal_length())
         angles = _angles(p, q)
-        # Noise decides on which side of the cameras rays meet that are nearly parallel.
+        # Noise decides on which side of the cameras nearly parallel rays meet.
         far = angles * focal_px < TOLERANCE_PX
         fits = far | ((epipolar_angles(p, q, t) * focal_px < TOLERANCE_PX) & _in_front(p, q, t))
         found.append(Agreement(pair.one, pair.other, len(p), float(fits.mean()), float(np.degrees(np.median(angles)))))
@@ -108,16 +108,15 @@ def agreements(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) ->
 
 
 def rays(camera: pycolmap.Camera, pixels: Array) -> Array:
-    """Unit rays (n, 3) in the camera's axes; NaN where the lens model cannot be inverted."""
+    """Return unit rays (n, 3) in the camera's axes; NaN where the lens model cannot be inverted."""
     found = np.asarray(camera.cam_ray_from_img(pixels), dtype=np.float64).reshape(-1, 3)
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
 def epipolar_angles(p: Array, q: Array, t: Array) -> Array:
-    """Return the angle, radians, by
-    which the two rays of each match miss each other's epipolar plane, the larger of both.
+    """Return the angles, radians, by which the rays of each match miss each other's epipolar plane, the larger of two.
 
-    p and q are in the same axes, t is the baseline in them; without a baseline it is the angle between the rays.
+    p and q are in the same axes, t is the baseline in them; without a baseline, it is the angle between the rays.
     """
     if np.linalg.norm(t) < 1e-12:
         return _angles(p, q)
@@ -130,7 +129,7 @@ def epipolar_angles(p: Array, q: Array, t: Array) -> Array:
 
 @dataclass(frozen=True)
 class RotationError:
-    """The angle between a pair's own relative rotation and the model's, degrees; weight: the inliers behind it."""
+    """The angle between a pair's own relative rotation and the model's, degrees; weight: the number of its inliers."""
 
     one: int
     other: int
@@ -139,10 +138,10 @@ class RotationError:
 
 
 def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], *, seed: int) -> list[RotationError]:
-    """Relative poses from the matches of two photos alone, with the model's intrinsics, against the model.
+    """Compare relative rotations from the matches of two photos alone, with the model's intrinsics, with the model's.
 
-    Only the pairs with the most matches of each photo are used, and of these only those that have parallax: without
-    it the five-point problem may turn a camera about.
+    Only the pairs with the most matches of each photo are used, and only if they have parallax: without it, the
+    five-point algorithm may turn a camera around.
     """
     options = pycolmap.RANSACOptions()
     options.max_error = 4.0
@@ -183,7 +182,7 @@ def strongest(pairs: Sequence[VerifiedPair], *, per_photo: int) -> list[Verified
 
 
 def _angles(p: Array, q: Array) -> Array:
-    """Angles between unit vectors, radians; exact for small ones, where arccos is not."""
+    """Return the angles between unit vectors, radians; exact for small ones, where arccos is not."""
     return 2 * np.arcsin(np.clip(np.linalg.norm(p - q, axis=1) / 2, 0, 1))
 
 

@@ -1,6 +1,6 @@
-"""Photos as a graph: two are joined as strongly as they have matches in common.
+"""Photos as a graph: the strength of the join of two photos is the number of their matches.
 
-A chain of joins is as strong as its weakest; the bottleneck of two photos is the strongest chain between them.
+A chain of joins is as strong as its weakest join; the bottleneck of two photos is the strongest chain between them.
 """
 
 from collections.abc import Iterable, Sequence
@@ -12,7 +12,7 @@ Join = tuple[int, int, float]
 
 
 class Bottlenecks:
-    """The strongest chain between any two of some photos, along given joins (photo, photo, strength)."""
+    """Strengths of the strongest chains between photos, along given joins (photo, photo, strength)."""
 
     def __init__(self, photos: Sequence[int], joins: Iterable[Join]) -> None:
         self._index = {photo: index for index, photo in enumerate(photos)}
@@ -30,15 +30,15 @@ class Bottlenecks:
                 groups[index] = first
 
     def between(self, one: int, other: int) -> float:
-        """Strength of the strongest chain between two photos, 0 without any."""
+        """Return the strength of the strongest chain between two photos, 0 without any."""
         return float(self._strengths[self._index[one], self._index[other]])
 
 
 def consistent_groups(photos: Sequence[int], joins: Iterable[Join]) -> list[list[int]]:
-    """Divide photos into groups that the strongest evidence allows.
+    """Divide photos into groups that are consistent with the strongest evidence.
 
-    Joins with a strength above 0 speak for one group, those below 0 against it. The stronger one wins: in the order of
-    their absolute strength, a join for one group brings two groups together unless a stronger one keeps them apart.
+    Joins with a strength above 0 put photos in one group, those below 0 keep them apart. The stronger join wins: in the
+    order of absolute strength, a positive join merges two groups unless a stronger negative one keeps them apart.
 
     Args:
         photos: any numbers.

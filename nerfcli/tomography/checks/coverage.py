@@ -1,4 +1,4 @@
-"""Checks of what the rays pass through: whole object, all directions, enough views."""
+"""Checks of a scan's coverage: whole object, all directions, enough views."""
 
 import numpy as np
 
@@ -10,14 +10,14 @@ from nerfcli.tomography.geometry import ScanGeometry
 TRUNCATED_LOOK, TRUNCATED_BAD = 0.02, 0.2
 WEDGE_BAD_DEG = 30.0
 FEW_LOOK, FEW_BAD = 1.0, 0.05
-# Views that differ by less than this part of the usual step stand at one angle.
+# Views that differ by less than this fraction of the usual step count as views at the same angle.
 _SAME = 0.05
-# Pixels by which a scan may be off a circle to be looked at as one.
+# Largest deviation from a circle, in pixels, of a scan that is checked as a circular one.
 _ROUND_PX = 1.0
 
 
 def truncation(sample: Sample) -> Finding:
-    """Measure in how many views the object reaches the border of the detector."""
+    """Measure the fraction of views in which the object reaches the border of the detector."""
     reached = np.asarray(sample.border > sample.air_level)
     share = float(reached.any(axis=(1, 2)).mean())
     sides = reached[..., 0].any(), reached[..., 1].any()
@@ -72,7 +72,7 @@ def repeated_angles(sample: Sample) -> Finding | str:
 
 
 def missing_wedge(sample: Sample) -> Finding | str:
-    """Find the directions that no ray has."""
+    """Find the directions that no ray covers."""
     geometry = sample.scan.geometry
     angles = _angles(geometry)
     if angles is None:
@@ -83,7 +83,7 @@ def missing_wedge(sample: Sample) -> Finding | str:
     widest = int(np.argmax(gaps))
     gap = float(gaps[widest])
     fan = _fan(geometry)
-    # A source that leaves out a gap below a half turn less the fan meets each line from its other end.
+    # If the gap in the source's path is below half a turn minus the fan, each line is measured from its other end.
     span = 2 * np.pi - (gap if gap > 2 * step else 0.0)
     missing = np.pi - span - (step if geometry.beam == "parallel" else 0.0)
     missing = missing if missing > step / 2 else 0.0
@@ -140,7 +140,7 @@ def _angles(geometry: ScanGeometry) -> np.ndarray | None:
 
 
 def _step(angles: np.ndarray) -> float:
-    """Return the usual angle between neighbours."""
+    """Return the median angle between neighbouring views."""
     turned = np.sort(np.mod(angles, 2 * np.pi))
     gaps = np.diff(turned)
     gaps = gaps[gaps > 1e-9]
@@ -148,7 +148,7 @@ def _step(angles: np.ndarray) -> float:
 
 
 def _fan(geometry: ScanGeometry) -> float:
-    """Return the angle that the rays of a row open."""
+    """Return the fan angle of the middle row; 0 for parallel beams."""
     if geometry.beam == "parallel":
         return 0.0
     _, directions = geometry.rays(np.array([0]))

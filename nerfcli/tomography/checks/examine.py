@@ -29,9 +29,9 @@ class ScanDiagnosis:
     """Findings of the checks of a scan.
 
     Args:
-        sample: what was looked at.
-        findings: of all checks that could be made, in their order.
-        not_checked: names of the others, with the reason.
+        sample: the examined data.
+        findings: findings of all checks that could be made, in order.
+        not_checked: names of the checks that could not be made, with the reason.
     """
 
     sample: Sample

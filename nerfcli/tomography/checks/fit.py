@@ -1,4 +1,4 @@
-"""Checks that need a quick reconstruction: where the axis is, and whether the beam hardens."""
+"""Checks that need a quick reconstruction: the centre of rotation and beam hardening."""
 
 import numpy as np
 
@@ -6,13 +6,13 @@ from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_above
 from nerfcli.tomography.centre import FEWEST_VIEWS, FINE, centre_of
 from nerfcli.tomography.checks.sample import Sample
 from nerfcli.tomography.formats.assemble import axis_column
-from nerfcli.tomography.quick import Row, predicted, reconstructed, telling_row
+from nerfcli.tomography.quick import Row, highest_contrast_row, predicted, reconstructed
 
 CENTRE_LOOK, CENTRE_BAD = 0.3, 1.0
-# Views of a parallel beam that are half a turn apart to this part of a step show the same lines from the other end.
+# Views of a parallel beam that are half a turn apart, to within this many steps, count as opposite.
 _OPPOSITE = 1.01
 HARDENING_LOOK, HARDENING_BAD = 0.05, 0.25
-# Below this part of the variance explained, the object is not of one material, whose effect looks like beam hardening.
+# Below this fraction of explained variance, the object has several materials, whose effect looks like beam hardening.
 ONE_MATERIAL = 0.97
 
 
@@ -21,7 +21,7 @@ def centre(sample: Sample) -> Finding | str:
     scan = sample.scan
     if scan.geometry.views < FEWEST_VIEWS:
         return "too few views"
-    row = telling_row(scan)
+    row = highest_contrast_row(scan)
     stated = axis_column(scan.geometry)
     found = centre_of(row.thinned())
     column = stated - found.shift
@@ -63,10 +63,10 @@ def mirror_centre(row: Row) -> float | None:
 
 
 def beam_hardening(sample: Sample) -> Finding | str:
-    """Measure how far line integrals fall below path lengths through an object of one material."""
+    """Measure how far line integrals fall below proportionality to path lengths, in an object of one material."""
     if sample.scan.geometry.views < FEWEST_VIEWS:
         return "too few views"
-    row = telling_row(sample.scan).thinned().binned(FINE)
+    row = highest_contrast_row(sample.scan).thinned().binned(FINE)
     volume, grid = reconstructed(row)
     inside = volume > _otsu(volume)
     lengths = predicted(inside.astype(np.float32), row, grid)

@@ -27,7 +27,7 @@ def refuse_foreign(path: Path, source: Path) -> None:
     """Raise unless a page of this scan may be written at a path.
 
     Raises:
-        UserError: something else stands there.
+        UserError: the path holds something else.
     """
     page.refuse_foreign(path, page.Mark("doctor", source), about="scan")
 

@@ -7,11 +7,11 @@ import numpy as np
 from nerfcli.tomography.quick import filled
 from nerfcli.tomography.scan import Scan
 
-# Rows and views that are looked at; the others are like these.
+# Largest numbers of rows and views that are examined, as a sample of all.
 MOST_ROWS, MOST_VIEWS = 32, 400
-# Columns at each side that should see past the object, as a part of the width.
+# Columns at each side that should see past the object, as a fraction of the width.
 BORDER = 0.02
-# Median of |x| of a normal distribution, as a part of its deviation; variance of a second difference.
+# Median of |x| of a normal distribution as a fraction of its standard deviation; variance of a second difference.
 _MAD, _SECOND = 0.6745, 6.0
 
 
@@ -20,12 +20,12 @@ class Sample:
     """Line integrals of some rows.
 
     Args:
-        scan: of which.
-        views: indices of the views that are looked at.
-        rows: numbers of the rows.
+        scan: the scan.
+        views: indices of the examined views.
+        rows: indices of the examined rows.
         integrals: (V, rows, columns) float32, unusable pixels interpolated.
         noise: standard deviation of a line integral where there is little object.
-        object_level: line integral that hardly any pixel exceeds.
+        object_level: line integral that only 0.5 % of the pixels exceed.
     """
 
     scan: Scan

@@ -1,21 +1,22 @@
-"""Checks of what the detector measured: open beam, drift, rings, counts."""
+"""Checks of the measured values: open beam, drift, rings, counts."""
 
 import numpy as np
 
 from nerfcli.findings import Finding, several, verdict_above, verdict_below, worst
 from nerfcli.tomography.checks.sample import Sample
 
-# Deviations of the noise beyond which a pixel is brighter than the open beam.
+# Standard deviations of noise beyond which a pixel counts as brighter than the open beam.
 BEYOND_NOISE = 3.0
-# Noise that is normal puts 0.13 % of the air there.
+# Normal noise puts 0.13 % of the air pixels there.
 BRIGHT_LOOK, BRIGHT_BAD = 0.002, 0.05
-# Negative line integrals at all: noise makes half of the air so, but this part of all pixels is more than that.
+# Fraction of all pixels with line integrals below 0, by any amount; as noise makes half of the air pixels negative, the
+# median of the air has to be clearly below 0 as well.
 NEGATIVE_LOOK = 0.10
 DRIFT_LOOK, DRIFT_BAD = 0.005, 0.03
-# A pixel draws a ring that is off its neighbours by this much in the median over views, and to the same side in this
-# part of them: an edge of the object is on another side in other views.
+# A pixel causes a ring if its deviation from its neighbours, in the median over views, exceeds the floor and this many
+# deviations of noise, with the same sign in this fraction of views: at edges of the object, the sign varies.
 RING_FLOOR, RING_NOISE, RING_VIEWS = 0.005, 0.5, 0.95
-# Change over four columns, as a part of the object's line integral, that is a border.
+# Change over four columns, as a fraction of the object's line integral, that counts as a border.
 STEEP = 0.15
 RINGS_LOOK, RINGS_BAD = 0.002, 0.05
 PHOTONS_LOOK, PHOTONS_BAD = 100.0, 10.0
@@ -45,7 +46,7 @@ def above_open_beam(sample: Sample) -> Finding:
 
 
 def drift(sample: Sample) -> Finding | str:
-    """Measure how much the air differs between views; a text if that is impossible."""
+    """Measure how much the air differs between views; return the reason if that is impossible."""
     border = sample.border
     if float(np.median(border)) > sample.air_level:
         return "no column sees past the object"
@@ -53,7 +54,7 @@ def drift(sample: Sample) -> Finding | str:
     if len(means) < 4:
         return "too few views"
     low, high = np.quantile(means, [0.02, 0.98])
-    # What noise alone makes of a mean over these pixels.
+    # The spread that noise alone causes in a mean over these pixels.
     pixels = border.shape[1] * max(1, round(0.02 * sample.integrals.shape[2]))
     by_noise = 4 * sample.noise / np.sqrt(pixels)
     number = float(np.sqrt(max((high - low) ** 2 - by_noise**2, 0)))
@@ -74,12 +75,12 @@ def rings(sample: Sample) -> Finding | str:
     if views < 16 or columns < 32:
         return "too few views or columns"
     p = sample.integrals[:: max(1, views // 100), :: max(1, sample.integrals.shape[1] // 8)]
-    # Off the cubic through two neighbours on either side, which smooth objects follow.
+    # Deviation from the cubic through two neighbours on either side, which smooth objects follow.
     outer, near = p[..., :-4] + p[..., 4:], p[..., 1:-3] + p[..., 3:-1]
     offsets = p[..., 2:-2] - (4 * near - outer) / 6
     inner = np.median(offsets, axis=0)  # (rows, columns - 4)
     agree = np.maximum((offsets > 0).mean(0), (offsets < 0).mean(0))
-    # The border of a round object stands in the same columns in all views.
+    # The border of a round object is in the same columns in all views.
     steep = np.median(np.abs(p[..., 4:] - p[..., :-4]), axis=0) > STEEP * sample.object_level
     limit = max(RING_FLOOR, RING_NOISE * sample.noise)
     bad = (np.abs(inner) > limit) & (agree >= RING_VIEWS) & ~steep
@@ -98,7 +99,7 @@ def rings(sample: Sample) -> Finding | str:
 
 
 def counts(sample: Sample) -> Finding | str:
-    """Estimate the photons behind the thickest part."""
+    """Estimate the number of photons behind the thickest part of the object."""
     scan = sample.scan
     if scan.kind == "line_integral":
         return "line integrals do not contain the number of photons"
@@ -106,7 +107,7 @@ def counts(sample: Sample) -> Finding | str:
         return "how many photons a value stands for is not known: give --photons when converting"
     open_beam = 1.0 if scan.open_beam is None else float(np.median(scan.open_beam))
     photons = scan.photons_per_value * open_beam
-    # Means over neighbours: the least of single pixels tells of noise.
+    # Means over neighbours: the minimum over single pixels would only reflect noise.
     wide = max(1, min(5, sample.integrals.shape[2] // 8))
     through = np.exp(-sample.integrals[..., : sample.integrals.shape[2] // wide * wide])
     least = photons * float(np.quantile(through.reshape(*through.shape[:2], -1, wide).mean(-1), 0.005))

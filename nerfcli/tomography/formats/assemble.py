@@ -16,9 +16,9 @@ from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.open_beam import OpenBeam
 from nerfcli.tomography.scan import Kind, Scan, held_out_views
 
-# A scan with fewer finite values than this cannot be what it should be.
+# A scan with a smaller fraction of finite values than this is refused.
 LEAST_FINITE = 0.5
-# No transmission, and no line integral that a detector can see, is above these.
+# Largest plausible transmission, and largest line integral that a detector can measure.
 MOST_TRANSMISSION, MOST_INTEGRAL = 3.0, 30.0
 UNKNOWN_UNIT = "unit"
 _EMPTY = "the projections are empty: export them again"
@@ -32,16 +32,16 @@ class Found:
         path: the file or folder, for errors.
         form: name of the format.
         values: (V, rows, columns).
-        kind: of the values.
+        kind: type of the values.
         geometry: a circle where the format states one, else vectors.
-        unit: of lengths, "mm" or `UNKNOWN_UNIT`.
-        beam: of counts, the open beam.
-        photons: that a transmission of 1 stands for, where it is no count.
-        held_out: views that the format holds out; None if it says nothing.
-        names: of the views, for errors.
-        notes: for the user.
-        history: more for `Scan.history`.
-        stated_mm: millimetres of the unit that the file states, which are multiplied in already; 1 if it states none.
+        unit: unit of lengths, such as "mm" or `UNKNOWN_UNIT`.
+        beam: the open beam, for counts.
+        photons: number of photons for a transmission of 1, if the values are not counts.
+        held_out: views that the format holds out; None if it does not state any.
+        names: names of the views, for error messages.
+        notes: notes for the user.
+        history: further entries for `Scan.history`.
+        stated_mm: millimetres per unit of length in the file, already applied; 1 if the file states no unit.
     """
 
     path: Path
@@ -63,8 +63,7 @@ def scan_of(found: Found, given: Given) -> Scan:
     """Build the scan.
 
     Raises:
-        UserError: views and geometry do not fit together, values are not what they should be, or what the user said
-            does not fit.
+        UserError: views and geometry do not fit together, values are implausible, or the user's options do not fit.
     """
     notes = list(found.notes)
     values = _checked(found)
@@ -109,7 +108,7 @@ def scan_of(found: Found, given: Given) -> Scan:
 
 
 def _checked(found: Found) -> np.ndarray:
-    """Return the values as float32, if they can be what they are said to be."""
+    """Return the values as float32; raise if they are implausible for their kind."""
     values = np.asarray(found.values, dtype=np.float32)
     if values.ndim != 3 or 0 in values.shape:
         raise UserError(
@@ -140,7 +139,7 @@ def _checked(found: Found) -> np.ndarray:
 
 
 def _in_millimetres(found: Found, given: Given) -> tuple[str, Circle | ScanGeometry]:
-    """Return the unit that lengths are in, and the geometry in it."""
+    """Return the unit of lengths, and the geometry in that unit; it is mm if the user gave a unit."""
     if given.unit is None:
         return found.unit, found.geometry
     factor = MILLIMETRES.get(given.unit)
@@ -183,12 +182,12 @@ def axis_column(geometry: ScanGeometry) -> float:
 
 
 def _usable(found: Found, values: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the values with neutral numbers where they are not finite, and which may be believed."""
+    """Return the values with neutral numbers where they are not finite, and the mask of usable ones."""
     finite = np.isfinite(values)
     usable = None if found.beam is None or found.beam.usable.all() else found.beam.usable
     if usable is not None:
         notes.append(f"{several(int((~usable).sum()), 'dead pixel')} left out")
-    # A shutter that stayed shut, a frame that was not written.
+    # Empty frames come from a shutter that stayed shut, or were never written.
     empty = (
         (np.ptp(np.where(finite, values, 0), axis=(1, 2)) == 0) if values[0].size > 1 else np.zeros(len(values), bool)
     )
@@ -212,7 +211,7 @@ def _named(found: Found, which: np.ndarray) -> str:
 
 
 def _photons(found: Found, given: Given) -> float | None:
-    """Photons per value of counts, else photons of a transmission of 1."""
+    """Return the photons per detector value for counts, else per transmission of 1."""
     if given.photons is not None:
         if not (np.isfinite(given.photons) and given.photons > 0):
             raise UserError(f"--photons {given.photons:g}", "give the photons per pixel of the open beam, above 0")

@@ -6,7 +6,7 @@ import numpy as np
 
 from nerfcli.errors import UserError
 
-# Millimetres of a unit of length, by the names that files give it.
+# Millimetres per unit of length, keyed by the names of units in files.
 MILLIMETRES = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1e3),
     **dict.fromkeys(("cm", "centimetre", "centimeter"), 10.0),
@@ -14,11 +14,11 @@ MILLIMETRES = {
     **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometre", "micrometer", "micrometers"), 1e-3),
     **dict.fromkeys(("nm", "nanometre", "nanometer"), 1e-6),
 }
-# Sides of pixels that no scanner has, in mm: the unit is another one.
+# Range of plausible pixel sides in mm; outside of it, the unit must be wrong.
 PIXEL_MM = (1e-6, 20.0)
 _DEGREES = ("deg", "degree", "degrees", "°", "degs")
 _RADIANS = ("rad", "radian", "radians")
-# Angles in degrees that span less than this over many views are radians under a wrong name.
+# Angles said to be in degrees that span less than this over many views are in radians.
 _NARROW_DEG, _MANY_VIEWS = 6.5, 30
 
 
@@ -27,11 +27,11 @@ class Given:
     """The user's options.
 
     Args:
-        photons: that an open pixel counts in a view.
-        unit: of lengths in the file, a key of `MILLIMETRES`; it goes before what the file says.
+        photons: number of photons per pixel of the open beam in a view.
+        unit: unit of lengths in the file, a key of `MILLIMETRES`; overrides the unit that the file states.
         centre_column: the column that the axis of rotation is projected to, 0 for the middle of the first pixel.
-        holdout: a rule of `holdout.check_holdout` for views, which have the names 00000, 00001, ...
-        mirrored: whether columns are numbered from the other side than the file says.
+        holdout: a rule of `holdout.check_holdout` for views, which are named 00000, 00001, ...
+        mirrored: whether columns are numbered from the side opposite to the one that the file states.
     """
 
     photons: float | None = None
@@ -42,7 +42,7 @@ class Given:
 
 
 def millimetres(unit: str, *, where: str) -> float:
-    """Return the millimetres of a unit.
+    """Return the length of a unit in millimetres.
 
     Raises:
         UserError: it is not a unit of length.
@@ -58,9 +58,9 @@ def angles_in_radians(angles: np.ndarray, *, views: int, unit: str | None, where
 
     Args:
         angles: (V,).
-        views: how many there should be.
-        unit: as the file writes it; None where it says nothing, which is degrees.
-        where: the place in the file, for errors.
+        views: expected number of angles.
+        unit: unit as written in the file; None, for no unit, means degrees.
+        where: the place in the file, for error messages.
 
     Raises:
         UserError: there are too few or too many, some are not finite, all are the same, or the unit cannot be right.
@@ -93,7 +93,7 @@ def angles_in_radians(angles: np.ndarray, *, views: int, unit: str | None, where
 
 
 def check_pixel_size(size_mm: float, *, where: str) -> None:
-    """Raise if no detector has such pixels.
+    """Raise if the pixel size is impossible for a detector.
 
     Raises:
         UserError: the size is not positive, or its unit cannot be right.

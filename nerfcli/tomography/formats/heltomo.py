@@ -1,7 +1,7 @@
 """MATLAB files of HelTomo (University of Helsinki, with the Helsinki Tomography Challenge): fan beams, line integrals.
 
-Angles follow ASTRA: at angle 0 the source stands at -y, and turns counter-clockwise. Their reconstructions are in
-units of one effective pixel; here lengths are mm, so that attenuation is in 1/mm.
+Angles follow ASTRA: at angle 0 the source is at -y, and it moves counter-clockwise. HelTomo's reconstructions are in
+units of one effective pixel; here lengths are in mm, so that attenuation is in 1/mm.
 """
 
 from pathlib import Path

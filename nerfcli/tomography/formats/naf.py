@@ -1,7 +1,7 @@
 """Pickles of NAF (Neural Attenuation Fields) and of its successors SAX-NeRF and X-Gaussian; they are not executed.
 
-Lengths are mm. Projections were computed with lengths in metres, of volumes whose values count as 1/m: as line
-integrals they have no unit and stay as they are, and a value of the volume is 0.001/mm.
+Lengths are in mm. The projections were computed with lengths in metres, from volumes whose values are in 1/m. As line
+integrals have no unit, they are kept as they are; a value of 1 in the volume is 0.001/mm.
 """
 
 import io
@@ -20,7 +20,7 @@ from nerfcli.tomography.scan import Scan
 
 SUFFIXES = (".pickle", ".pkl")
 ATTENUATION_PER_VALUE = 1e-3
-# What rebuilds NumPy's arrays and scalars, under the names of NumPy 1 and 2. None of these runs what it is given.
+# Callables that rebuild NumPy's arrays and scalars, by their names in NumPy 1 and 2. None executes its arguments.
 _ARRAYS = {
     (module, name)
     for package in ("numpy.core", "numpy._core")
@@ -34,11 +34,11 @@ _HINT = "expected a pickle of NAF: a dict with DSD, DSO, nDetector, dDetector, m
 
 
 class _RefusedError(Exception):
-    """A pickle names something that is no array and no plain container."""
+    """A pickle refers to something other than arrays and plain containers."""
 
 
 class _PlainUnpickler(pickle.Unpickler):
-    """Rebuilds arrays, numbers, texts and plain containers, and refuses all else before it is imported or called."""
+    """Unpickler of arrays, numbers, texts and plain containers; refuses all else before it is imported or called."""
 
     def find_class(self, module_name: str, global_name: str) -> Any:
         if (module_name, global_name) in _ARRAYS:
@@ -58,7 +58,7 @@ def load_plain(path: Path) -> Any:
     """Load the content of a pickle of arrays and plain containers; nothing in it is executed.
 
     Raises:
-        UserError: it wants to run something, is damaged, or cannot be read.
+        UserError: it tries to call something else, is damaged, or cannot be read.
     """
     try:
         content = path.read_bytes()
@@ -129,7 +129,7 @@ def read_naf(path: Path, given: Given = Given()) -> Scan:
 def _detector(
     data: Mapping[str, Any], path: Path, *, rows: int, columns: int
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Width and height of a pixel, offsets to the right and down; in whichever order fits the projections.
+    """Return width and height of a pixel, and offsets to the right and down, in the order that fits the projections.
 
     NAF writes (columns, rows), and some of its successors (rows, columns).
     """
@@ -149,7 +149,7 @@ def _detector(
 
 
 def _truth(data: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Return where the volume is that the projections were computed from, if it has cubic voxels."""
+    """Describe the volume that the projections were computed from, if its voxels are cubic; else return nothing."""
     image = data.get("image")
     side = np.asarray(data.get("dVoxel", ()), dtype=np.float64).reshape(-1)
     if not isinstance(image, np.ndarray) or image.ndim != 3 or len(side) != 3 or np.ptp(side) > 1e-9 * side[0]:

@@ -13,12 +13,12 @@ _NAMES_SHOWN = 3
 
 
 def numbered(folder: Path, pattern: str = "*", *, without: str | None = None) -> list[Path]:
-    """Pictures in a folder whose names match a pattern, in the order of the last number in their names.
+    """Return the pictures in a folder whose names match a pattern, in the order of the last number in their names.
 
     Args:
-        folder: which.
-        pattern: of the file name, as in a shell.
-        without: a regular expression of names to pass over.
+        folder: the folder.
+        pattern: shell pattern of the file names.
+        without: regular expression of names to skip.
 
     Raises:
         UserError: a number between the first and the last one is missing, or is listed twice.
@@ -49,10 +49,10 @@ def numbered(folder: Path, pattern: str = "*", *, without: str | None = None) ->
 
 
 def read_stack(paths: Sequence[Path]) -> np.ndarray:
-    """Pictures as (views, rows, columns) float32, all pages of TIFF files; as they are stored, without any scaling.
+    """Read pictures as (views, rows, columns) float32, with all pages of TIFF files and without scaling the values.
 
     Raises:
-        UserError: one cannot be read, has colours, or another size than the first.
+        UserError: a picture cannot be read, has colours, or differs in size from the first.
     """
     frames: list[np.ndarray] = []
     for path in paths:
@@ -68,7 +68,7 @@ def read_stack(paths: Sequence[Path]) -> np.ndarray:
 
 
 def _pages(path: Path) -> np.ndarray:
-    """(pages, rows, columns) float32."""
+    """Read one picture as (pages, rows, columns) float32."""
     try:
         if path.suffix.lower() in (".tif", ".tiff"):
             import tifffile

@@ -1,7 +1,7 @@
 """Folders of R2-Gaussian: meta_data.json, one .npy of line integrals per projection, and the volume.
 
-Angles are radians, detector sizes are [v, u], the offset of the detector is [u, v] with v upwards as in TIGRE. Lengths
-have no unit: the volume is some two of them wide.
+Angles are in radians, detector sizes are [v, u], the offset of the detector is [u, v] with v upwards as in TIGRE.
+Lengths have no unit: the volume is about 2 wide.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ _HINT = "expected R2-Gaussian's meta_data.json: scanner, proj_train and proj_tes
 
 
 def read_r2_gaussian(path: Path, given: Given = Given()) -> Scan:
-    """Read a folder with meta_data.json, or that file; proj_test is held out.
+    """Read a folder with a meta_data.json, or the meta_data.json itself; proj_test is held out.
 
     Raises:
         UserError: it cannot be read, lacks something, or its parts do not fit together.
@@ -96,7 +96,7 @@ def _projection(file: Path, frame: dict[str, Any]) -> np.ndarray:
 
 
 def _truth(meta: Statement, scanner: Statement, file: Path) -> dict[str, Any]:
-    """Return where the volume is, if it has cubic voxels."""
+    """Describe the true volume, if its file exists and its voxels are cubic; else return nothing."""
     name = meta.value("vol", meta.value("ct"))
     if not isinstance(name, str) or not (file.parent / name).is_file():
         return {}

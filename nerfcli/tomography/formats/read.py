@@ -111,7 +111,7 @@ def _with_suffix(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def _has_transforms(folder: Path) -> bool:
-    """Return whether the transforms of a folder are of transmissions; those of photos say nothing of a measurement."""
+    """Return whether the transforms of a folder describe transmissions; those of photos do not state a measurement."""
     file = folder / transmission_transforms.TRANSFORMS[0]
     if not file.is_file() or not (folder / transmission_transforms.NAME).is_file():
         return False

@@ -1,7 +1,7 @@
-"""Bruker SkyScan scanners: a .log file beside 16-bit projections that are corrected by flats already.
+"""Bruker SkyScan scanners: a .log file beside 16-bit projections that are already corrected by flats.
 
-The pixel size in the log is that at the object. "Rotation Direction=CC" turns the object counter-clockwise, so that
-the source goes clockwise around it; columns run from right to left seen from the source, as ASTRA's reader has it.
+The log states the pixel size at the object. "Rotation Direction=CC" turns the object counter-clockwise, so that the
+source moves clockwise around it; columns run from right to left seen from the source, as in ASTRA's reader.
 """
 
 import re
@@ -19,9 +19,9 @@ from nerfcli.tomography.scan import Scan
 
 SUFFIXES = (".log",)
 _HINT = "a SkyScan .log has Object to Source (mm), Image Pixel Size (um), Rotation Step (deg) and Number of Files"
-# Pictures that are no projections: reconstructed slices, the preview, the extra views for the check of movement.
+# Pictures that are not projections: reconstructed slices, the preview, the extra views for the check of movement.
 _OTHERS = r"(_rec|_spr|_arc|_TS)\w*\.\w+$"
-# From here on the source is as good as infinitely far away, in lengths of the detector's width.
+# Distance of the source, in widths of the detector at the object, beyond which the beam counts as parallel.
 _PARALLEL = 1000.0
 
 
@@ -54,7 +54,7 @@ def read_skyscan(path: Path, given: Given = Given()) -> Scan:
     start = fields.number("Scanning Start Angle", 0.0)
     sign = -1 if fields.text("Rotation Direction", "CC").upper() == "CC" else 1
     angles = angles_in_radians(start + step * np.arange(views), views=views, unit="degrees", where=str(path))
-    # Lines count from the first row; the plane of the source crosses this one.
+    # The row that the plane of the source crosses, counted from the first one.
     line = fields.number("Optical Axis (line)", (rows - 1) / 2)
     circle = Circle(
         "cone",
@@ -76,7 +76,7 @@ def read_skyscan(path: Path, given: Given = Given()) -> Scan:
 
 
 def _white(fields: Statement, values: np.ndarray, notes: list[str]) -> float:
-    """Return the value of the open beam."""
+    """Return the detector value of the open beam."""
     if "Reference Intensity" in fields:
         return fields.positive("Reference Intensity")
     depth = fields.number("Depth (bits)", 16 if float(values.max()) > 255 else 8)
@@ -88,7 +88,7 @@ def _projections(path: Path, fields: Statement) -> list[Path]:
     prefix = fields.text("Filename Prefix", path.stem)
     paths = numbered(path.parent, f"{_escaped(prefix)}*", without=_OTHERS) or numbered(path.parent, without=_OTHERS)
     count = fields.whole("Number of Files")
-    # Some scanners count a last file that repeats the first angle, or do not.
+    # Some scanners also count a last file that repeats the first angle, which may be missing.
     if len(paths) not in (count, count - 1) or len(paths) == 0:
         raise UserError(
             f"{path.parent} holds {len(paths)} projections; {path.name} states {count}",

@@ -1,4 +1,4 @@
-"""Pictures with a scan.json that states what they are: for scanners whose own format is not read.
+"""Pictures with a scan.json that describes them, for scanners whose own format is not supported.
 
     {"projections": "proj/*.tif", "flats": "flats/*.tif", "darks": "darks/*.tif",
      "kind": "counts", "beam": "cone", "unit": "mm", "pixel_size": [0.2, 0.2],
@@ -15,13 +15,13 @@
 | pixel_size | width and height of a pixel of the detector, or one number |
 | source_origin, source_detector | distances, of cone beams |
 | angles_deg, angles_rad | a list; or first and step |
-| direction | of the source around the object, seen from above: counter-clockwise (default) or clockwise |
+| direction | rotation of the source around the object, seen from above: counter-clockwise (default) or clockwise |
 | mirrored | true if columns are numbered from right to left, seen from the source |
 | centre_of_rotation | the column that the axis is projected to; the middle if it is not given |
 | centre_row | the row that the plane of the source crosses; the middle if it is not given |
-| photons | that an open pixel counts |
+| photons | per pixel of the open beam |
 | held_out | list of views, from 0 |
-| truth | of a computed scan: volume (.npy, z x y x x, around the origin), voxel_size, attenuation_per_value |
+| truth | for a simulated scan: volume (.npy, z x y x x, around the origin), voxel_size, attenuation_per_value |
 | vectors | instead of angles and distances: views x 12 numbers as ASTRA's cone_vec or parallel3d_vec |
 """
 
@@ -51,7 +51,7 @@ _KEYS = (
 
 
 def read_stated_stack(path: Path, given: Given = Given()) -> Scan:
-    """Read a folder with scan.json, or that file.
+    """Read a folder with a scan.json, or the scan.json itself.
 
     Raises:
         UserError: it cannot be read, states something unknown, lacks something, or does not fit the pictures.
@@ -183,7 +183,7 @@ def _held_out(fields: Statement, views: int) -> list[int] | None:
 
 
 def _truth(fields: Statement, factor: float) -> dict[str, Any]:
-    """Return the true volume, attenuation in the inverse of the stated unit, with its middle at the origin."""
+    """Describe the true volume, centred on the origin; its stated attenuation is in the inverse of the stated unit."""
     if "truth" not in fields:
         return {}
     given = fields.value("truth")

@@ -1,4 +1,4 @@
-"""Descriptions in text files: "key = value" lines of scanners, and JSON; what is missing or no number is named."""
+"""Descriptions in text files: "key = value" lines of scanners, and JSON; errors name the missing or invalid field."""
 
 import json
 import re
@@ -12,7 +12,7 @@ from nerfcli.errors import UserError
 
 
 class Statement:
-    """Fields of a description, by names without case."""
+    """Fields of a description; their names are case-insensitive."""
 
     def __init__(self, path: Path, fields: Mapping[str, Any], *, hint: str):
         self.path, self.hint = path, hint
@@ -23,18 +23,18 @@ class Statement:
 
     @property
     def names(self) -> list[str]:
-        """Names of all fields, in small letters."""
+        """Names of all fields, in lower case."""
         return list(self._fields)
 
     def text(self, name: str, default: str | None = None) -> str:
-        """Return a field as it stands there."""
+        """Return a field as text, without spaces around it."""
         value = self._fields.get(name.lower(), default)
         if value is None:
             raise UserError(f"{self.path} has no {name}", self.hint)
         return str(value).strip()
 
     def number(self, name: str, default: float | None = None) -> float:
-        """Return a finite number; of a text, what it begins with."""
+        """Return the number that a field begins with."""
         if default is not None and name not in self:
             return default
         text = self.text(name)
@@ -51,14 +51,14 @@ class Statement:
         return value
 
     def whole(self, name: str) -> int:
-        """Return a count, above 0."""
+        """Return a whole number above 0."""
         value = self.positive(name)
         if value != round(value):
             raise UserError(f"{self.path}: {name} is {value:g}", "expected a whole number")
         return round(value)
 
     def value(self, name: str, default: Any = None) -> Any:
-        """Whatever stands there."""
+        """Return a field without conversion."""
         return self._fields.get(name.lower(), default)
 
 
@@ -84,7 +84,7 @@ def read_object(path: Path, *, hint: str) -> Statement:
     """Read a JSON object.
 
     Raises:
-        UserError: it cannot be read or is something else.
+        UserError: it cannot be read, or is not a JSON object.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

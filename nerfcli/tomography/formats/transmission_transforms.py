@@ -1,8 +1,8 @@
-"""Folders with a geometry.json and transforms_train.json, transforms_test.json whose pictures are transmissions.
+"""Folders with geometry.json, transforms_train.json and transforms_test.json, whose pictures are transmissions.
 
 The transforms are those of NeRF (OpenGL axes, principal point from the corner of the first pixel) with
 "measurement": "transmission"; 16-bit pictures hold I / I0 with 65535 for 1. A .npy of all projections beside them may
-be given instead: transmissions, or line integrals where its name says so. Test views are held out.
+be given instead: transmissions, or line integrals if its name contains line_integral. Test views are held out.
 """
 
 import re
@@ -71,7 +71,7 @@ def read_transmission_transforms(path: Path, given: Given = Given()) -> Scan:
 
 
 def _frames(folder: Path) -> tuple[list[dict[str, Any]], Statement]:
-    """Frames of both transforms in the order of their pictures' names, and the lens."""
+    """Return the frames of both transforms in the order of their pictures' names, and the fields of the lens."""
     frames: list[dict[str, Any]] = []
     lens = None
     for name in TRANSFORMS:
@@ -95,7 +95,7 @@ def _frames(folder: Path) -> tuple[list[dict[str, Any]], Statement]:
 
 
 def _values(path: Path, folder: Path, frames: list[dict[str, Any]]) -> tuple[np.ndarray, str, float | None]:
-    """Values, their kind, and the photons that the name of a .npy states."""
+    """Return the values, their kind, and the photons that the name of a .npy states."""
     if path.suffix == ".npy":
         try:
             values = np.load(path, allow_pickle=False)
@@ -108,7 +108,7 @@ def _values(path: Path, folder: Path, frames: list[dict[str, Any]]) -> tuple[np.
 
 
 def _truth(folder: Path, stated: Statement) -> dict[str, Any]:
-    """Return where the volume is that was measured, if it is there: 8-bit values, x fastest."""
+    """Describe the measured volume, 8-bit values with x fastest, if its file exists; else return nothing."""
     name = stated.value("volume")
     found = re.search(r"(\d+)x(\d+)x(\d+)_uint8", str(name))
     if not isinstance(name, str) or not found or not (folder / name).is_file() or "mu_per_unit_value" not in stated:
