@@ -11,7 +11,7 @@ from nerfcli.doctor.photo_list import find_subject
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
 from nerfcli.media.images import Exif
 from nerfcli.poses.input.photos import Photo, camera_groups, find_photos
-from nerfcli.poses.model.reasons import Evidence, dominant, reason
+from nerfcli.poses.model.reasons import NO_TRAINING_PHOTO, Evidence, dominant, reason
 
 NO_EXIF = Exif(
     make=None,
@@ -72,7 +72,7 @@ def test_text_and_truncated_files_are_left_out_with_their_reason(folder: Path):
 
 
 def test_photos_in_formats_that_are_not_read_are_named_and_not_passed_over(folder: Path):
-    """Of a raw file beside its JPEG nothing is said."""
+    """A raw file beside its JPEG is not mentioned."""
     for name in ("f.HEIC", "g.dng", "a.CR2", "notes.txt"):
         (folder / name).write_bytes(b"not for Pillow")
     photos = find_photos(folder)
@@ -173,5 +173,6 @@ def test_the_dominant_reason_brings_its_advice():
     kind, advice = dominant([reason(few), reason(alone), reason(alone), "unreadable: damaged"])
     assert kind == "matches no other photo well"
     assert "overlap" in advice
+    assert "--holdout" in dominant([NO_TRAINING_PHOTO])[1]
     with pytest.raises(ValueError, match="no reasons"):
         dominant([])

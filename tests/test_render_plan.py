@@ -1,4 +1,4 @@
-"""Plans of rendering and evaluating beside what these write, and through the commands."""
+"""Plans of rendering and evaluation compared with what these write, and through the commands."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ from nerfcli.workflows.views import Views
 
 
 def test_pictures_and_disk_space_are_those_of_the_rendering(spheres_run: Path, tmp_path: Path) -> None:
-    """Of 96 x 72 pixels nothing is reduced: the measured pictures are three of those that are rendered."""
+    """Pictures of 96 x 72 pixels are measured at full size: the measured ones are the three that are rendered."""
     views = Views("test")
     planned = plan_rendering(spheres_run, views=views, threads=1)
     assert (planned.pictures, planned.pixels) == (3, 3 * 96 * 72)
@@ -32,9 +32,12 @@ def test_a_plan_of_some_views_is_in_proportion_to_all(spheres_run: Path) -> None
 
 
 def test_a_plan_of_an_evaluation_counts_held_out_pixels_and_saved_pictures(spheres_run: Path) -> None:
-    plain, saving = (plan_evaluation(spheres_run, threads=1, predictions=kind) for kind in (None, "png"))
+    plain, saving, unrounded = (
+        plan_evaluation(spheres_run, threads=1, predictions=kind) for kind in (None, "png", "float")
+    )
     assert (plain.pictures, plain.pixels) == (3, 3 * 96 * 72)
     assert saving.disk_bytes - plain.disk_bytes == 6 * plain.pixels
+    assert unrounded.disk_bytes - saving.disk_bytes == 3 * 4 * plain.pixels  # one float32 picture
 
 
 def test_dry_runs_print_the_plan_and_write_nothing(spheres_run: Path) -> None:

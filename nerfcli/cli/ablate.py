@@ -86,7 +86,7 @@ def ablate(
     SSIM by the protocol of `nerfcli evaluate`, for example for a table in a paper; this takes longer.
 
     Writes SCENE-ablation/ with ablation.csv, ablation.json and all runs. Run the same command again to resume an
-    interrupted one; with --whole, completed trainings are measured again.
+    interrupted one, or with --whole to measure completed trainings on whole photos.
 
     \b
     Examples:

@@ -1,7 +1,7 @@
 """The operations on hard cases: inputs, answers, errors and bounds.
 
-The answers are those of the definitions in float64, on the very numbers that the tested precision holds. The tests hold
-the definitions themselves against answers in 60 digits.
+The answers come from the definitions in float64, on exactly the numbers of the tested precision. The tests compare the
+definitions themselves with answers of 60 digits.
 """
 
 import itertools
@@ -23,7 +23,7 @@ BACKGROUND = COLOUR_GRADIENT = (1.0, 0.5, 0.25)
 TRANSMITTANCE_GRADIENT = 0.5
 SHARES = (0.5, 0.05, 0.95)
 RATE, BETAS, EPS = 0.01, (0.9, 0.99), 1e-15
-# From this number of a pixel on, float32 does not tell neighbours apart.
+# From this pixel number on, float32 cannot distinguish neighbouring numbers.
 MANY = 2**24
 
 Inputs = dict[str, Tensor]
@@ -34,8 +34,8 @@ class Outcome:
     """Result of an operation.
 
     Args:
-        values, gradients: as many as the operation has; gradients are those of a weighted sum of the values.
-        sizes, value_sizes: what errors of gradients and values are relative to; empty for their own sizes.
+        values, gradients: outputs of the operation, and gradients of a weighted sum of them, if any.
+        sizes, value_sizes: magnitudes that errors of gradients and values are relative to; empty for their own.
     """
 
     values: tuple[Tensor, ...]
@@ -45,12 +45,12 @@ class Outcome:
 
 
 def exact(given: Tensor) -> Tensor:
-    """Return the numbers in float64 on the CPU."""
+    """Return a tensor on the CPU, in float64 if it is floating-point."""
     return given.detach().cpu().double() if given.is_floating_point() else given.cpu()
 
 
 def errors(got: Outcome, wanted: Outcome, *, tiny: float) -> Errors:
-    """Measure the largest errors of values and of gradients."""
+    """Measure the largest errors of the values and the gradients."""
     value = _largest(got.values, wanted.values, wanted.value_sizes, tiny=tiny)
     if not got.gradients:
         return Errors(value)
@@ -63,12 +63,12 @@ def _largest(got: Sequence[Tensor], wanted: Sequence[Tensor], sizes: Sequence[Te
 
 
 def both(roundings: float, precision: Precision) -> Errors:
-    """Bound values and gradients by so many roundings."""
+    """Bound values and gradients by a number of roundings."""
     return Errors(roundings * precision.unit, roundings * precision.unit)
 
 
 def gradients_of(function: Callable[[Tensor], Tensor], given: Tensor) -> Outcome:
-    """Return a function of numbers or points, and the gradient of a weighted sum relative to its largest."""
+    """Evaluate a function of numbers or points, and its gradient, of points relative to the largest component."""
     given = given.detach().requires_grad_()
     values = function(given)
     weights = torch.tensor(COLOUR_GRADIENT if given.ndim == 2 else 1.0).to(values)
@@ -82,7 +82,7 @@ def _offsets(counts: Sequence[int], precision: Precision) -> Tensor:
 
 
 def intervals(rays: Sequence[Segments], precision: Precision) -> Inputs:
-    """Pack densities and lengths of rays."""
+    """Pack the densities and lengths of rays."""
     return {
         "density": precision.tensor([x for ray in rays for x in ray.density]),
         "lengths": precision.tensor([x for ray in rays for x in ray.lengths]),
@@ -91,8 +91,8 @@ def intervals(rays: Sequence[Segments], precision: Precision) -> Inputs:
 
 
 def light_inputs(rays: Sequence[Segments], precision: Precision) -> Inputs:
-    """Pack rays with colours and what the loss gains by each output."""
-    if precision.dtype == torch.bfloat16:  # a sum of more terms than 16 has no digits left
+    """Pack rays with colours and the gradients of the loss by each output."""
+    if precision.dtype == torch.bfloat16:  # a sum of more than 16 terms has no digits left
         rays = [ray for ray in rays if len(ray.density) <= 16]
     numbers = [k for ray in rays for k in range(len(ray.density))]
     return {
@@ -105,7 +105,7 @@ def light_inputs(rays: Sequence[Segments], precision: Precision) -> Inputs:
 
 
 def light_bound(rays: Sequence[Segments], precision: Precision) -> Errors:
-    """Bound colours and weights of rays."""
+    """Bound the errors of colours and weights of rays."""
     if precision.compiled:
         return Errors(8 * precision.unit, 16 * precision.unit)
     if precision.dtype == torch.bfloat16:
@@ -118,12 +118,12 @@ def light_bound(rays: Sequence[Segments], precision: Precision) -> Errors:
 
 
 def surface_inputs(precision: Precision) -> Inputs:
-    """Return a far surface."""
+    """Return the weights of a far surface."""
     return {name: precision.tensor(values) for name, values in cases.FAR_SURFACE.items()}
 
 
 def composite(module: ModuleType, given: Inputs) -> Outcome:
-    """Colours, transmittances and weights; the sizes of the gradient by density are those of its terms."""
+    """Composite rays; errors of the gradient by density are relative to the magnitudes of its terms."""
     density, rgb = given["density"].detach().requires_grad_(), given["rgb"].detach().requires_grad_()
     colour, transmittance, weights = module.composite(
         density, rgb, given["lengths"], offsets=given["offsets"], background=given["background"]
@@ -145,14 +145,14 @@ def composite(module: ModuleType, given: Inputs) -> Outcome:
 
 
 def before(module: ModuleType, given: Inputs) -> Outcome:
-    """Optical depths in front of intervals."""
+    """Compute the optical depths in front of intervals."""
     density = _density_for(module, given)
     before = module.optical_depth_before(density, given["lengths"], offsets=given["offsets"])
     return Outcome((before.detach(),), _by(before, density))
 
 
 def distortion(module: ModuleType, given: Inputs) -> Outcome:
-    """Distortion of one ray."""
+    """Compute the distortion of one ray."""
     weights = given["weights"].detach().requires_grad_()
     offsets = torch.tensor([0, len(weights)], device=weights.device)
     value = module.distortion(weights, given["starts"], given["ends"], offsets)
@@ -160,29 +160,29 @@ def distortion(module: ModuleType, given: Inputs) -> Outcome:
 
 
 def _by(values: Tensor, density: Tensor) -> tuple[Tensor, ...]:
-    """Return the gradient of the sum of what is defined, where the operation has one."""
+    """Return the gradient of the sum of the defined values by density; empty if the operation has none."""
     if not values.requires_grad:
         return ()
     return torch.autograd.grad(torch.where(values.isnan(), 0.0, values).sum(), density, retain_graph=True)
 
 
 def depths_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Errors:
-    """Bound the depths of the rays of which a precision has digits."""
+    """Bound the depths of the rays that are meaningful in a precision."""
     return depth_bound(meaningful(rays, precision), factor, precision)
 
 
 def _density_for(module: ModuleType, given: Inputs) -> Tensor:
-    """Return the densities of rays; the compiled depths have no gradient by them."""
+    """Return the densities of rays, which need a gradient except in compiled operations, which have none."""
     return given["density"].detach().requires_grad_(module in (reference, textbook))
 
 
 def optical_depth(ray: Ray) -> float:
-    """Optical depth of a ray."""
+    """Return the optical depth of a ray."""
     return sum(sigma * (end - start) for sigma, start, end in zip(ray.density, ray.starts, ray.ends, strict=True))
 
 
 def depth_inputs(rays: Sequence[Ray], precision: Precision) -> Inputs:
-    """Rays for depths, and which of their quantiles rounding leaves where they are."""
+    """Pack rays for depths, and mark as settled the quantiles that rounding does not move far."""
     columns = ([r.density for r in rays], [r.starts for r in rays], [r.ends for r in rays])
     density, starts, ends = (precision.tensor([x for values in column for x in values]) for column in columns)
     offsets = _offsets([len(ray.density) for ray in rays], precision)
@@ -195,12 +195,12 @@ def depth_inputs(rays: Sequence[Ray], precision: Precision) -> Inputs:
 
 
 def meaningful(rays: Sequence[Ray], precision: Precision) -> list[Ray]:
-    """Choose the rays of which a precision has digits."""
+    """Choose the rays whose depths have correct digits in a precision."""
     return [ray for ray in rays if depth_bound([ray], 1, precision).value <= MEANINGLESS]
 
 
 def depth_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Errors:
-    """Bound depths of rays."""
+    """Bound the errors of the depths of rays."""
     if precision.compiled:
         return Errors(16 * factor * precision.unit)
     lengths = (tuple(end - start for start, end in zip(ray.starts, ray.ends, strict=True)) for ray in rays)
@@ -211,7 +211,7 @@ def depth_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Err
 
 
 def light_ends(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> Outcome:
-    """Return some of the depths of rays."""
+    """Compute the depths of rays that `columns` names."""
     density = _density_for(module, given)
     seen = module.light_ends(density, given["starts"], given["ends"], offsets=given["offsets"], shares=SHARES)
     named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
@@ -220,20 +220,18 @@ def light_ends(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> O
     return _depths([named[column] for column in columns], columns, given, density)
 
 
-def depth_by_textbook(columns: tuple[str, ...], given: Inputs) -> Outcome:
-    """Return the same depths by textbook formulas, which have the mean for that of the heaviest interval, too."""
+def textbook_depth(columns: tuple[str, ...], given: Inputs) -> Outcome:
+    """Compute the same depths by textbook formulas."""
     density = given["density"].detach().requires_grad_()
     named = textbook.depth(density, given["starts"], given["ends"], offsets=given["offsets"])
-    return _depths(
-        [named.get(column, density.new_zeros(len(given["settled"]))) for column in columns], columns, given, density
-    )
+    return _depths([named[column] for column in columns], columns, given, density)
 
 
 def _depths(values: list[Tensor], columns: tuple[str, ...], given: Inputs, density: Tensor) -> Outcome:
     if columns[0] == "median":
         settled = given["settled"].to(density.device)
         values = [torch.where(settled[:, i], value, 0.0) for i, value in enumerate(values)]
-    # The gradient of a spread is relative to terms that cancel; the tests know their sizes.
+    # Errors of the gradient of a spread are relative to terms that cancel, whose magnitudes only the tests know.
     gradients = (
         tuple(gradient for value in values for gradient in _by(value, density)) if columns != ("spread",) else ()
     )
@@ -246,21 +244,21 @@ def _depths(values: list[Tensor], columns: tuple[str, ...], given: Inputs, densi
 
 
 def mixture(module: ModuleType, given: Inputs) -> Outcome:
-    """Quantiles of the light of two rays together."""
+    """Compute quantiles of the combined light of two rays."""
     spans = (given["density"], given["starts"], given["ends"])
     pixels = {"offsets": given["offsets"], "rays_per_pixel": 2}
     return Outcome(tuple(module.mixture_quantile(*spans, **pixels, share=fraction) for fraction in cases.PIXEL_SHARES))
 
 
 def mixture_by_mean(given: Inputs) -> Outcome:
-    """Return the mean of the quantiles of two rays."""
+    """Compute the mean of the quantiles of two rays."""
     spans = (given["density"], given["starts"], given["ends"])
     seen = reference.light_ends(*spans, offsets=given["offsets"], shares=cases.PIXEL_SHARES)
     return Outcome(tuple(column.view(-1, 2).mean(1) for column in seen.quantiles.unbind(1)))
 
 
 def grid_inputs(points: Sequence[cases.Point], levels: int, precision: Precision) -> Inputs:
-    """Points and a table of features."""
+    """Return points and a table of features."""
     places = torch.tensor(points).tolist()  # the numbers that float32 holds
     return {
         "points": precision.tensor(places),
@@ -270,7 +268,7 @@ def grid_inputs(points: Sequence[cases.Point], levels: int, precision: Precision
 
 
 def encode(grids: tuple[int, ...], rounded: int, module: ModuleType, given: Inputs) -> Outcome:
-    """Features between the vertices of hash grids."""
+    """Interpolate features between the vertices of hash grids."""
     points, table = given["points"], given["table"].detach().requires_grad_()
     encoded = module.hash_encode(points, table, grids).view(len(points), len(grids), -1)
     (gradient,) = torch.autograd.grad((encoded * given["gains"]).sum(), table)
@@ -281,13 +279,13 @@ def encode(grids: tuple[int, ...], rounded: int, module: ModuleType, given: Inpu
 
 
 def encode_in_half(grids: tuple[int, ...], given: Inputs) -> Outcome:
-    """Return the same in half precision."""
+    """Interpolate the same features in half precision."""
     half = {name: values.half() for name, values in given.items()}
     return encode(grids, 0, reference, half)
 
 
 def pixel_inputs(precision: Precision) -> Inputs:
-    """First, last and only pixels of a photo of 16 megapixels, of one of one pixel and of one of six."""
+    """Return first, last and only pixels of photos of 16 megapixels, of one pixel, and of six pixels."""
     photos = torch.zeros(MANY + 7, 3, dtype=torch.uint8)
     photos[MANY:] = torch.arange(1, 22, dtype=torch.uint8).reshape(7, 3) * 12
     return {
@@ -303,14 +301,14 @@ def pixel_inputs(precision: Precision) -> Inputs:
 
 
 def pixel_rays(module: ModuleType, given: Inputs) -> Outcome:
-    """Rays and colours of chosen pixels."""
+    """Compute the rays and colours of chosen pixels."""
     table = PixelTable(*(given[name] for name in ("first_pixel", "first_bearing", "bearings", "poses", "photos")))
     origins, directions, colours = module.pixel_rays(given["chosen"], table)
     return Outcome((origins, directions, colours), value_sizes=(origins, torch.ones_like(directions), colours))
 
 
 def density(module: ModuleType, given: Inputs) -> Outcome:
-    """Densities of their logarithms; compiled, by networks of which one path for each sign carries the number."""
+    """Compute densities from logarithms; compiled, by networks with one path for each sign of the number."""
     logarithms = given["logarithms"]
     if module is reference:
         return gradients_of(density_from_log, logarithms)
@@ -329,27 +327,27 @@ def _layers(like: Tensor) -> tuple[Tensor, ...]:
 
 
 def adam(module: ModuleType, given: Inputs) -> Outcome:
-    """Adam's first step."""
+    """Compute Adam's first step."""
     table, first, second = (torch.zeros_like(given["gradients"]) for _ in range(3))
     module.adam_rows(table, given["gradients"].clone(), first, second, step=1, rate=RATE, betas=BETAS, eps=EPS)
     return Outcome((table,))
 
 
 def adam_in_half(given: Inputs) -> Outcome:
-    """Adam's first step with its state in half precision."""
+    """Compute Adam's first step with its state in half precision."""
     half = given["gradients"].half()
     moment, square = 0.1 * half, 0.01 * half * half
     return Outcome((-RATE * (moment / 0.1) / ((square / 0.01).sqrt() + EPS),))
 
 
 def contract_inputs(radii: Sequence[float], precision: Precision) -> Inputs:
-    """Points in a few directions."""
+    """Return points at some radii in a few directions."""
     points = [tuple(r * x for x in d) for r in radii for d in cases.DIRECTIONS]
     return {"points": precision.tensor(points)}
 
 
 def march_inputs(full: bool, precision: Precision) -> Inputs:
-    """Rays along axes through a cube of side 2, some in the plane of its side and of its cells' borders."""
+    """Return rays along axes through a cube of side 2, some in the plane of a face or of cell borders."""
     make = torch.ones if full else torch.zeros
     return {
         "origins": precision.tensor(
@@ -364,7 +362,7 @@ def march_inputs(full: bool, precision: Precision) -> Inputs:
 
 
 def chords(module: ModuleType, given: Inputs) -> Outcome:
-    """Return how much of each ray is kept, in a cube whose network gives no density."""
+    """Compute the length of each ray that is kept, in a cube whose network has all weights 0."""
     origins = given["origins"]
     rays = Rays(origins, given["directions"], origins.new_zeros(len(origins)))
     march = March(given["edges"], given["occupied"], "none", 1e9)
@@ -373,7 +371,7 @@ def chords(module: ModuleType, given: Inputs) -> Outcome:
 
 
 def volume_inputs(thickness: float, precision: Precision) -> Inputs:
-    """Return a volume, lines in float64, and what the loss gains by each line integral."""
+    """Return a volume, lines in float64, and the gradients of the loss by each line integral."""
     lines = torch.tensor(cases.LINES, dtype=torch.float64, device=precision.device)
     return {
         "volume": precision.tensor(cases.attenuations(thickness)),
@@ -384,7 +382,7 @@ def volume_inputs(thickness: float, precision: Precision) -> Inputs:
 
 
 def project(module: ModuleType, given: Inputs) -> Outcome:
-    """Line integrals, and the transpose, by the gradient and by its own operation."""
+    """Compute line integrals and their transpose, both as the gradient and as a separate operation."""
     volume, lines = given["volume"].detach().requires_grad_(), (given["origins"], given["directions"])
     grid = {"first": cases.VOLUME_FIRST, "size": cases.VOXEL}
     integrals = module.project(volume, *lines, **grid)
@@ -395,5 +393,5 @@ def project(module: ModuleType, given: Inputs) -> Outcome:
 
 
 def project_in_single(given: Inputs) -> Outcome:
-    """Return the same with lines in float32."""
+    """Compute the same with lines in float32."""
     return project(reference, {name: values.float() for name, values in given.items()})

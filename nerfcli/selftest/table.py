@@ -1,7 +1,7 @@
 """The table of hard cases: operation, inputs, bounds and the textbook's formula of each.
 
-The answers are those of the definitions in float64, on the very numbers that the tested precision holds. The tests hold
-the definitions themselves against answers in 60 digits.
+The answers come from the definitions in float64, on exactly the numbers of the tested precision. The tests compare the
+definitions themselves with answers of 60 digits.
 """
 
 import functools
@@ -19,7 +19,7 @@ from nerfcli.selftest import cases, operations, textbook
 from nerfcli.selftest.measure import Errors, Precision, Row
 
 SINGLE, HALF, COMPILED, OF_GPU = "float32", "bfloat16", "compiled", "GPU kernels"
-# What the kernels of a GPU compute in float32 without those of the reference.
+# Operations that the GPU kernels compute in float32 themselves, without the reference.
 OPERATIONS_OF_GPU = (
     *("composite", "optical_depth_before", "distortion", "light_ends"),
     *("hash_encode", "pixel_rays", "adam_rows", "visible_samples"),
@@ -32,16 +32,16 @@ class Check:
     """One hard case of one operation.
 
     Args:
-        case: what is hard.
+        case: the difficulty.
         operation: its name.
-        inputs: the numbers in a precision, rounded to it.
-        run: the operation of a module on them.
-        bound: of values and gradients in a precision.
-        reason: where the bounds come from.
-        precisions: that it is tried in.
-        formula: what textbooks do; "" where there is none.
+        inputs: returns the inputs, rounded to a precision.
+        run: runs a module's operation on the inputs.
+        bound: returns the bounds of values and gradients in a precision.
+        reason: derivation of the bounds.
+        precisions: names of the precisions to test.
+        formula: the textbook formula; "" if there is none.
         textbook: the operation by that formula.
-        no_gradient: why the compiled operation has none.
+        no_gradient: reason why the compiled operation has no gradient.
     """
 
     case: str
@@ -56,13 +56,13 @@ class Check:
     no_gradient: str = ""
 
     def is_for(self, precision: Precision) -> bool:
-        """Return whether it is tried in a precision, and has digits there."""
+        """Return True if the case is tested in a precision and has correct digits there."""
         tried = self.operation in OPERATIONS_OF_GPU if precision.for_gpu else precision.name in self.precisions
         return tried and self.bound(precision).value <= cases.MEANINGLESS
 
 
 def row_of(check: Check, precision: Precision) -> Row:
-    """Measure one operation on one hard case in one precision."""
+    """Measure the errors and time of one check in one precision."""
     inputs = check.inputs(precision)
     wanted = check.run(reference, {name: operations.exact(given) for name, given in inputs.items()})
     start = time.perf_counter()
@@ -143,7 +143,7 @@ def checks() -> Iterator[Check]:
                 "u (16 + (n + 2) (1 + tau)), compiled 16 u; of a spread 4 times that; 16 times for a gradient, "
                 "relative to the largest of its ray",
                 formula="weights by 1 - exp at midpoints, their sum clamped at 1e-10",
-                textbook=functools.partial(operations.depth_by_textbook, columns),
+                textbook=functools.partial(operations.textbook_depth, columns),
                 no_gradient=VALUE_ONLY,
             )
     yield Check(

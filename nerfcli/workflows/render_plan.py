@@ -1,4 +1,4 @@
-"""Time, memory and disk space of rendering or evaluating a run, measured on a few small pictures of it."""
+"""Estimate time, memory and disk space of rendering or evaluating a run from a few small pictures."""
 
 import tempfile
 import time
@@ -25,24 +25,25 @@ from nerfcli.workflows.notices import silent
 from nerfcli.workflows.render import USUAL
 from nerfcli.workflows.views import Views, chosen_frames
 
-# How many pictures are measured, and their longer side: large enough that memory is that of a full tile of rays.
+# Number of measured pictures, and their longer side: large enough to need the memory of a full tile of rays.
 _MEASURED, _LONGER_SIDE = 3, 160
-# Of a picture in memory: maps of all outputs, and what encoding or comparing them takes.
+# Memory per pixel of a picture: maps of all outputs, and encoding or comparing them.
 _BYTES_PER_PIXEL = 150
-# Of a picture saved by `evaluate --save-predictions`: two of 8-bit colours that hardly compress; two of floats.
-_PREDICTION_BYTES = {None: 0, "png": 6, "float": 30}
+# Bytes per pixel that `evaluate --save-predictions` writes: two 8-bit pictures that hardly compress; and the rendered
+# one as float32.
+_PREDICTION_BYTES = {None: 0, "png": 6, "float": 18}
 
 
 @dataclass(frozen=True)
 class RenderingPlan:
-    """Cost of rendering or evaluating a run, after the program has started and the model is read.
+    """Cost of rendering or evaluating a run, without the time to start the program and to load the model.
 
     Args:
-        pictures: how many.
-        pixels: of all of them.
-        seconds: on this machine.
-        memory_bytes: of the process, at its peak.
-        disk_bytes: of what is written, without videos.
+        pictures: number of pictures.
+        pixels: number of pixels of all pictures.
+        seconds: time on this machine.
+        memory_bytes: peak memory of the process.
+        disk_bytes: size of the written files, without videos.
     """
 
     pictures: int
@@ -73,13 +74,13 @@ def plan_rendering(
     step: float = 1.0,
     part: slice | None = None,
 ) -> RenderingPlan:
-    """Return what `render_run` would take, from three small pictures that are rendered and written elsewhere.
+    """Estimate the cost of `render_run` by rendering three small pictures into a temporary folder.
 
     Args:
-        run, views, settings, device, threads, step, part: as for `render_run`; by one process.
+        run, views, settings, device, threads, step, part: as for `render_run`, with one process.
 
     Raises:
-        UserError: see `render_run`; or outputs that need depths of photos or members first.
+        UserError: see `render_run`; or an output needs the depths of training photos, or members.
     """
     if settings.needs_visibility or settings.needs_members:
         raise UserError(
@@ -119,7 +120,7 @@ def plan_evaluation(
     align_colours: bool = False,
     predictions: str | None = None,
 ) -> RenderingPlan:
-    """Return what `evaluate_run` would take, from three held-out photos that are compared at a smaller size.
+    """Estimate the cost of `evaluate_run` by evaluating three held-out photos at a smaller size.
 
     Args:
         run, device, threads, align_poses, align_colours, predictions: as for `evaluate_run`.
@@ -146,7 +147,7 @@ def plan_evaluation(
         plan,
         pictures=len(test),
         pixels=pixels,
-        memory_bytes=plan.memory_bytes + 4 * pixels,  # of the photos, which stay there
+        memory_bytes=plan.memory_bytes + 4 * pixels,  # of the photos, which stay in memory
         disk_bytes=_PREDICTION_BYTES[predictions] * pixels + 2000 * len(test),
     )
 
@@ -163,20 +164,20 @@ def _plan(frames: Sequence[Frame], *, seconds: float, at_once: int, written: flo
 
 
 def _spread(frames: Sequence[Frame]) -> list[Frame]:
-    """Return a few of some frames, as far from each other in their order as can be."""
+    """Return at most `_MEASURED` frames, evenly spaced in their order."""
     count = min(_MEASURED, len(frames))
     return [frames[(2 * index + 1) * len(frames) // (2 * count)] for index in range(count)]
 
 
 def _small(frame: Frame) -> Camera:
-    """Return the camera of a frame for a picture of at most `_LONGER_SIDE`."""
+    """Return the camera of a frame, reduced to a longer side of at most `_LONGER_SIDE` pixels."""
     width, height = frame.camera.width, frame.camera.height
     reduction = max(1.0, max(width, height) / _LONGER_SIDE)
     return frame.camera.resized(max(1, round(width / reduction)), max(1, round(height / reduction)))
 
 
 def _fewer_pixels(photo: HeldOutPhoto) -> HeldOutPhoto:
-    """Return a photo with every n-th pixel: what it shows is no longer right, only its size matters."""
+    """Return a photo with every n-th pixel; its content is no longer right, but only its size matters."""
     stride = max(1, max(photo.pixels.shape[:2]) // _LONGER_SIDE)
     pixels = photo.pixels[::stride, ::stride]
     used = None if photo.used is None else photo.used[::stride, ::stride]
@@ -189,7 +190,7 @@ def _pixels(frames: Sequence[Frame]) -> int:
 
 
 def _second_run(work: Callable[[], object]) -> float:
-    """Return the seconds that something takes when all that is done once has been done."""
+    """Return the seconds that a second call takes, without the one-time costs of the first."""
     work()
     begin = time.perf_counter()
     work()

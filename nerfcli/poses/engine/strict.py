@@ -1,8 +1,8 @@
-"""Held-out photos that structure from motion has not seen: they are placed afterwards, with all else fixed.
+"""Place held-out photos after structure from motion, which has not seen them, with everything else fixed.
 
-The training photos alone give cameras, points and poses. Then the held-out photos are searched for features and
-compared with the training photos, and each gets the pose at which the points it sees project to where it sees them.
-Nothing else moves, not by a bit: a number that is measured on these photos owes them nothing but their own poses.
+Cameras, points and poses come from the training photos alone. Then features of the held-out photos are matched with
+the training photos, and each held-out photo gets the pose that best projects the matched points to its features.
+Nothing else changes, not by a bit: results measured on these photos depend on them only through their own poses.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from nerfcli.poses.engine.features import extract, match, start_matching
 from nerfcli.poses.engine.retrieval import with_neighbours
 from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.input.stages import stage_key
-from nerfcli.poses.model.reasons import FEW_MATCHES
+from nerfcli.poses.model.reasons import FEW_MATCHES, NO_TRAINING_PHOTO
 
 # As in pycolmap's mapper (abs_pose_max_error, abs_pose_min_inlier_ratio).
 _MOST_ERROR_PX = 12.0
@@ -28,7 +28,7 @@ _LEAST_INLIERS = 0.25
 
 @dataclass(frozen=True)
 class Placed:
-    """A located held-out photo: its name, the number of inliers of its pose, of how many points, and the error."""
+    """A located held-out photo: name, inliers of its pose, points that it matches, and mean error of the inliers."""
 
     name: str
     inliers: int
@@ -37,15 +37,13 @@ class Placed:
 
 
 def held_out_last(job: Job) -> Job:
-    """Return the job with cameras that took only held-out photos behind the others,
-    so that the others keep their numbers.
-    """
+    """Return the job with cameras of only held-out photos moved last, so that the others keep their numbers."""
     held_out = frozenset(job.held_out)
     return replace(job, groups=tuple(sorted(job.groups, key=lambda group: held_out.issuperset(group.photos))))
 
 
 def training_part(job: Job) -> Job:
-    """Return the job of the training photos alone; their files keep their numbers, and so their ids."""
+    """Return the job of the training photos alone; their numbered files, and so their image ids, stay the same."""
     held_out = frozenset(job.held_out)
     kept = [number for number in range(len(job.files)) if number not in held_out]
     place = {number: index for index, number in enumerate(kept)}
@@ -66,17 +64,17 @@ def training_part(job: Job) -> Job:
 
 
 def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Report) -> dict[str, Any]:
-    """Place the held-out photos of a job in the model that its training photos gave; the model on disk gets them too.
+    """Place the held-out photos of a job in the model of its training photos, and add them to the model on disk.
 
     Args:
         job: all photos.
         training: its `training_part`.
-        result: what the worker found for it.
-        report: receives ("extract", ...), ("match", ...) and ("map", photos done, in all).
+        result: the worker's result for `training`.
+        report: receives ("extract", ...), ("match", ...) and ("map", photos done, photos in all).
 
     Returns:
-        The result, for all photos of the job, with "strict": how each held-out photo was placed, and the fingerprint of
-        all that was there before, the same before and after.
+        The result for all photos of the job, with "strict": how each held-out photo was placed, and the fingerprints of
+        the training model before and after, which are equal.
     """
     folder = Path(job.folder) / "sparse" / "0"
     whole = _renumbered(job, training, result)
@@ -99,7 +97,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
         else:
             reasons[str(number)] = found
         report("map", done + 1, len(job.held_out))
-    # Held-out photos are points of view only: they are not among the images of which the fingerprint is.
+    # Held-out photos only add poses, so they are excluded from the fingerprint.
     after = fingerprint(model, without=frozenset(found.name for found in placed.values()))
     if after != before:
         raise AssertionError("locating held-out photos changed the model of the training photos")
@@ -120,9 +118,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
 
 
 def fingerprint(model: pycolmap.Reconstruction, *, without: frozenset[str] = frozenset()) -> str:
-    """Return a hash of every bit of cameras, points with their tracks,
-    and poses of the images that are not in `without`.
-    """
+    """Return a hash of every bit of cameras, points with tracks, and poses of the images that are not in `without`."""
     cameras = [(number, camera.model.name, _bits(camera.params)) for number, camera in sorted(model.cameras.items())]
     points = [
         (number, _bits(point.xyz), sorted((e.image_id, e.point2D_idx) for e in point.track.elements))
@@ -141,10 +137,10 @@ def _bits(values: Any) -> str:
 
 
 def _place(model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[tuple[int, int], ...]) -> Placed | str:
-    """Give one photo a pose in the model; or the reason why it has none."""
+    """Add one photo with its pose to the model, or return the reason why it has none."""
     camera_id = next(at for at, group in enumerate(job.groups, start=1) if number in group.photos)
     if camera_id not in model.cameras:
-        return "its camera took no training photo"
+        return NO_TRAINING_PHOTO
     pixels, points = _seen_points(model, job, number, pairs)
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = _MOST_ERROR_PX
@@ -174,9 +170,7 @@ def _place(model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[t
 def _seen_points(
     model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels (N, 2) of a photo and the points (N,
-    3) that its verified matches with placed photos say are there.
-    """
+    """Return pixels (N, 2) of a photo and their points (N, 3), from its verified matches with placed photos."""
     image_id = job.image_ids[number]
     seen: set[tuple[int, int]] = set()  # feature of the photo, point
     with closing(pycolmap.Database.open(str(job.database))) as database:
@@ -197,7 +191,7 @@ def _seen_points(
 
 
 def _renumbered(job: Job, training: Job, result: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a result of the training photos with the numbers that photos have among all."""
+    """Return a result of the training photos, renumbered to the photo numbers of the whole job."""
     number = {index: job.files.index(file) for index, file in enumerate(training.files)}
     by_number = {number[index]: known for index, known in enumerate(result["evidence"])}
     nothing = {"features": 0, "best_matches": 0, "best_partner": None}

@@ -4,10 +4,12 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-# Below this a photo is blank for our purposes: pycolmap's mapper asks for 100 common points to begin with.
+# Below this a photo is blank for our purposes: pycolmap's mapper needs 100 common points to begin.
 FEW_FEATURES = 100
 # pycolmap's mapper places a photo only with this many of its points known (abs_pose_min_num_inliers).
 FEW_MATCHES = 30
+# A held-out photo is placed with the lens that the training photos of its camera gave.
+NO_TRAINING_PHOTO = "its camera took no training photo"
 
 
 @dataclass(frozen=True)
@@ -15,7 +17,7 @@ class Evidence:
     """Evidence about one photo that did not register.
 
     features: keypoints found in it. best_matches: the most geometrically verified matches with any one photo,
-    best_partner: that photo's name. other_model_size: photos in the other model that holds it, 0 if none does.
+    best_partner: that photo's name. other_model_size: number of photos in another model with this photo, 0 without one.
     """
 
     features: int
@@ -25,7 +27,7 @@ class Evidence:
 
 
 def reason(evidence: Evidence) -> str:
-    """Return one phrase: the first of the conditions that by itself explains that the photo was left out."""
+    """Return a phrase for the first condition that by itself explains why the photo was left out."""
     if evidence.other_model_size:
         return f"in another model of {evidence.other_model_size} photos"
     if evidence.features < FEW_FEATURES:
@@ -42,7 +44,7 @@ _ADVICE = {
     "in another model": "take photos that connect the parts of the scene",
     "contradicts the rest": "take photos with more overlap around this one, or remove it",
     "matches too few points": "hold out photos that overlap with training photos, see --holdout",
-    "its camera took no photo": "hold out only photos of cameras that also took training photos, see --holdout",
+    NO_TRAINING_PHOTO: "hold out only photos of cameras that also took training photos, see --holdout",
     "rejected by the mapper": "take photos with more overlap and while moving sideways, or allow more features",
 }
 

@@ -1,7 +1,7 @@
 """DataExchange and NXtomo, both HDF5: parallel beams of synchrotrons, with flats and darks.
 
-The direction of rotation and the side that columns are numbered from are not written in these files. They are taken as
-counter-clockwise seen from +z and from left to right seen from the source.
+These files state neither the direction of rotation nor the side from which columns are numbered. The source is assumed
+to turn counter-clockwise seen from +z, and columns to run from left to right seen from the source.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from nerfcli.tomography.open_beam import open_beam_of
 from nerfcli.tomography.scan import Scan
 
 SUFFIXES = (".h5", ".hdf5", ".hdf", ".nxs", ".nx")
-# Names of the side of a pixel, in the order in which they are believed: that at the object before the camera's own.
+# Names of the pixel size, in order of preference: the size at the object before that of the camera.
 _PIXEL_WIDTH = (
     *("sample_x_pixel_size", "actual_pixel_size_x", "x_actual_pixel_size", "pixel_size_x"),
     *("x_pixel_size", "pixel_size", "resolution"),
@@ -84,10 +84,10 @@ def read_nxtomo(path: Path, given: Given = Given()) -> Scan:
 
 
 def hdf5_form(path: Path) -> str | None:
-    """Return "data-exchange", "nxtomo", or None for other HDF5 files and what is none.
+    """Return "data-exchange", "nxtomo", or None for other HDF5 files.
 
     Raises:
-        UserError: it has the name of an HDF5 file and cannot be opened.
+        UserError: the file cannot be opened as HDF5.
     """
     with _opened(path) as file:
         if "exchange/data" in file or "exchange" in file:
@@ -113,7 +113,7 @@ def _parallel(
                 f"{data.shape[2]} x {data.shape[1]}",
                 "flats and darks come from the detector of the projections: crop them the same way",
             )
-    notes = ["the file does not say which way the object turned: counter-clockwise is assumed"]
+    notes = ["the file does not say which way the source moved: counter-clockwise around the object is assumed"]
     width, height, stated = (1.0, 1.0, 1.0) if sides is None else sides
     circle = Circle("parallel", tuple(angles.tolist()), width, height, data.shape[1], data.shape[2])
     unit = "mm" if sides is not None else UNKNOWN_UNIT
@@ -167,7 +167,7 @@ def _frames(file: Any, name: str, path: Path) -> np.ndarray:
 
 
 def _walk(file: Any) -> Iterator[str]:
-    """Names of all datasets, in the order of the file."""
+    """Return the names of all datasets, in the order of the file."""
     import h5py
 
     names: list[str] = []
@@ -191,7 +191,7 @@ def _unit(dataset: Any) -> str | None:
 
 
 def _pixel_mm(file: Any, path: Path) -> tuple[float, float, float] | None:
-    """Width and height of a pixel in mm, and mm of the width's unit; None if the file does not say."""
+    """Return width and height of a pixel in mm, and the mm per unit of the width; None if the file has no size."""
     names = {found.rpartition("/")[2]: found for found in _walk(file)}
     width = next((names[name] for name in _PIXEL_WIDTH if name in names), None)
     if width is None:

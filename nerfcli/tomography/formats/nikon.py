@@ -1,8 +1,8 @@
 """Nikon (X-Tek) scanners: a .xtekct file beside 16-bit projections, cone beam, no flats but a white level.
 
-As the Core Imaging Library has it: the object turns clockwise seen from above, so that the source goes
-counter-clockwise around it; columns run from right to left seen from the source. Angles come from AngularStep; those
-recorded in *_ctdata.txt or .ang are taken where they agree with it to half a step.
+As in the Core Imaging Library, the object turns clockwise seen from above, so that the source moves counter-clockwise
+around it; columns run from right to left seen from the source. Angles come from AngularStep; those recorded in
+*_ctdata.txt or .ang are used instead if they agree with it to half a step, or if there is no AngularStep.
 """
 
 import re
@@ -53,7 +53,7 @@ def read_nikon(path: Path, given: Given = Given()) -> Scan:
         columns,
         to_object,
         to_detector,
-        # Columns run to the left: an axis towards higher columns stands to the left of the source.
+        # Columns run to the left: an axis at higher columns is to the left of the source.
         lateral=lateral * float(np.cos(lean)),
         tilt=lean,
         mirrored=True,
@@ -63,7 +63,7 @@ def read_nikon(path: Path, given: Given = Given()) -> Scan:
 
 
 def _angles(fields: Statement, views: int, recorded: np.ndarray | None, notes: list[str]) -> np.ndarray:
-    """(V,) radians that the stage has turned, with the initial angle."""
+    """Return the angles of the stage (V,) in radians, including the initial angle."""
     where = f"{fields.path}: angles"
     first = fields.number("InitialAngle", 0.0)
     step = fields.number("AngularStep", 0.0)
@@ -83,19 +83,19 @@ def _angles(fields: Statement, views: int, recorded: np.ndarray | None, notes: l
         if apart <= abs(step) / 2:
             turned = measured
         else:
-            notes.append(f"recorded angles are up to {apart:.3g} degrees off AngularStep; the recorded ones are used")
+            notes.append(f"recorded angles are up to {apart:.3g} degrees off AngularStep, whose angles are used")
     return angles_in_radians(first + turned, views=views, unit="degrees", where=where)
 
 
 def _recorded_angles(path: Path, views: int) -> np.ndarray | None:
-    """Angles of a _ctdata.txt or .ang file beside the .xtekct, in degrees; None if there is none."""
+    """Return the angles in degrees from a _ctdata.txt or .ang file beside the .xtekct; None if there is none."""
     beside = [path.with_name(f"{path.stem}_ctdata.txt"), path.with_name("_ctdata.txt"), path.with_suffix(".ang")]
     place = next((place for place in beside if place.is_file()), None)
     if place is None:
         return None
     lines = place.read_bytes().decode("latin-1").splitlines()
     found = [re.match(r"\s*(\d+)\s*:?\s+(-?\d+(?:\.\d*)?)", line) for line in lines]
-    # The first lines are a head, one of which may begin with two numbers: projections are numbered 1, 2, 3, ...
+    # The first lines are a header, one of which may begin with two numbers; projections are numbered 1, 2, 3, ...
     angles = [float(match[2]) for match in found if match]
     numbers = [int(match[1]) for match in found if match]
     begin = next((k for k in range(len(numbers)) if numbers[k : k + 2] == [1, 2]), None)
