@@ -79,11 +79,11 @@ def write(source: Path, out: Path, *, effects: tuple[str, ...], reduction: int) 
     (focal, x, y, k1, k2), names = known["camera"]["params"], sorted(image["name"] for image in known["images"])
     poses = {image["name"]: np.array(image["world_from_cam"]) for image in known["images"]}
     (out / "images").mkdir(parents=True, exist_ok=True)
-    told = dict(zip(names, truths(len(names), effects=effects), strict=True))
+    effects_by_photo = dict(zip(names, truths(len(names), effects=effects), strict=True))
     width, height = known["camera"]["width"] // reduction, known["camera"]["height"] // reduction
     for name in names:
         photo = Image.open(source / "images" / name).resize((width, height), Image.Resampling.BOX)
-        light = developed(linear_light(np.asarray(photo) / 255.0), told[name])
+        light = developed(linear_light(np.asarray(photo) / 255.0), effects_by_photo[name])
         curved = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
         levels = np.round(255 * curved.clip(0, 1)).astype(np.uint8)
         Image.fromarray(levels).save(out / "images" / f"{Path(name).stem}.png")
@@ -107,7 +107,7 @@ def write(source: Path, out: Path, *, effects: tuple[str, ...], reduction: int) 
         "frames": frames,
     }
     (out / "transforms.json").write_text(json.dumps(described, indent=1))
-    (out / "colours.json").write_text(json.dumps(told, indent=1))
+    (out / "colours.json").write_text(json.dumps(effects_by_photo, indent=1))
 
 
 if __name__ == "__main__":

@@ -252,14 +252,14 @@ class Child:
             signal.alarm(0)
         if line:
             return json.loads(line)
-        return self._again("crash", told=f"out-of-memory kills meanwhile: {out_of_memory_kills() - kills_before}")
+        return self._again("crash", remark=f"out-of-memory kills meanwhile: {out_of_memory_kills() - kills_before}")
 
     def _cpu_seconds(self) -> float:
         """Return the processor time of the process and of its children that have ended."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
         return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
-    def _again(self, why: str, told: str = "") -> dict[str, Any]:
+    def _again(self, why: str, remark: str = "") -> dict[str, Any]:
         if why == "crash":
             with suppress(subprocess.TimeoutExpired):  # let it end by itself, to see its own signal
                 self.process.wait(30)
@@ -268,7 +268,7 @@ class Child:
         said = self.log.read_text(errors="replace")[-2000:]
         self.start()
         name = signal.Signals(-code).name if code < 0 else f"status {code}"
-        return {"code": code, "raised": False, "text": f"{name} {told}\n{said}", "outcome": "", "verdict": why}
+        return {"code": code, "raised": False, "text": f"{name} {remark}\n{said}", "outcome": "", "verdict": why}
 
     def end(self) -> None:
         self.process.kill()

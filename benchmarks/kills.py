@@ -178,11 +178,11 @@ def kills(
             process = started(given, part)
             said = process.communicate()[1]
             wrong = differing(given.name, whole, part)
-            told = ", ".join(f"{times} {outcome}" for outcome, times in sorted(table.items()))
+            outcomes = ", ".join(f"{times} {outcome}" for outcome, times in sorted(table.items()))
             kept = before == [digests(path) for path in given.inputs]
             beside = sorted(path.name for path in part.parent.iterdir() if path != part)
             typer.echo(
-                f"{given.name}: begins at {begins:.1f} s, takes {seconds:.1f} s; {told}; then exit "
+                f"{given.name}: begins at {begins:.1f} s, takes {seconds:.1f} s; {outcomes}; then exit "
                 f"{process.returncode} {said.strip()[-200:]}; differing: {wrong or 'none'}; "
                 f"beside it: {beside or 'nothing'}; inputs {'unchanged' if kept else 'CHANGED'}"
             )

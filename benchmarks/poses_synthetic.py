@@ -122,8 +122,8 @@ def solve(name: str, capture: Capture, *, seed: int) -> Result:
         )
         job = synthetic.synthetic_job(folder, capture.views, seed=seed)
         start = time.process_time()
-        climbed = climb(job, lambda *told: None)
-        examined = examine(climbed.models, climbed.job, lambda *told: None, localised=climbed.localised)
+        climbed = climb(job, lambda *reported: None)
+        examined = examine(climbed.models, climbed.job, lambda *reported: None, localised=climbed.localised)
         seconds = time.process_time() - start
         model = examined.model
         failures = [f"{failure.kind}: {failure.evidence}" for failure in examined.verdict.failures]

@@ -15,9 +15,9 @@ class Finding:
     Args:
         check: its name.
         verdict: good; look: usable, but expect lower quality; bad: fix it before any long computation.
-        summary: the result, in words.
+        summary: one line that describes the result.
         number: the measured value; None if it is not a number.
-        threshold: the criteria for the number, in words.
+        threshold: description of the limits on the number.
         advice: what to do; empty if there is nothing to do.
         photos: (name, remark) of each photo concerned, worst first.
     """

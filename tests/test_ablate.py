@@ -54,7 +54,7 @@ def test_differences_are_taken_seed_by_seed_and_get_a_verdict():
     models.append(Variant("entropy=0.01", Components(entropy=0.01), True))
     psnr = {CHOSEN: (20.0, 22.0, 21.0), "view=0": (19.0, 21.1, 19.9), "entropy=0.01": (20.5, 21.5, 21.1)}
     measured = [
-        MeasuredTraining(name, seed, value, None, 60.0, 100, "as told")
+        MeasuredTraining(name, seed, value, None, 60.0, 100, "protocol")
         for name, values in psnr.items()
         for seed, value in enumerate(values)
     ]

@@ -383,15 +383,25 @@ def test_train_evaluate_render_info_in_a_row(capture):
     assert f"{metrics['mean']['psnr']:.2f} dB" in (run / "report.html").read_text(encoding="utf-8")
     both = nerfcli("report", run, run, "-o", run / "report.html")
     assert (both.exit_code, "is not a page of this report" in both.stderr) == (3, True)
-    told = json.loads(nerfcli("info", run, "--json").stdout)
-    assert (told["kind"], told["photos"], told["held_out"], told["step"]) == ("run", 4, 1, 1)
-    assert told["metrics"] == metrics["mean"]
+    result_json = json.loads(nerfcli("info", run, "--json").stdout)
+    assert (result_json["kind"], result_json["photos"], result_json["held_out"], result_json["step"]) == (
+        "run",
+        4,
+        1,
+        1,
+    )
+    assert result_json["metrics"] == metrics["mean"]
 
 
 def test_info_of_a_scene(capture):
-    told = json.loads(nerfcli("info", capture, "--json").stdout)
-    assert (told["path"], told["kind"], told["photos"], told["held_out"]) == (str(capture), "blender", 5, 1)
-    assert told["fingerprint"] == scene.fingerprint(scene.load(capture))
+    result_json = json.loads(nerfcli("info", capture, "--json").stdout)
+    assert (result_json["path"], result_json["kind"], result_json["photos"], result_json["held_out"]) == (
+        str(capture),
+        "blender",
+        5,
+        1,
+    )
+    assert result_json["fingerprint"] == scene.fingerprint(scene.load(capture))
     plain = nerfcli("info", capture).stdout
     assert plain.splitlines()[0] == str(capture)
     assert "  kind: blender" in plain
@@ -403,19 +413,19 @@ def test_the_doctor_writes_a_page_beside_the_photos_and_holds_it_against_a_gate(
     before = listing(folder)
     result = nerfcli("doctor", folder, "--json")
     assert (result.exit_code, listing(folder)) == (0, before)
-    told = json.loads(result.stdout)
-    assert told["path"] == str(tmp_path / "photos-doctor.html")
-    assert {finding["check"]: finding["verdict"] for finding in told["findings"]}["count"] == "bad"
+    result_json = json.loads(result.stdout)
+    assert result_json["path"] == str(tmp_path / "photos-doctor.html")
+    assert {finding["check"]: finding["verdict"] for finding in result_json["findings"]}["count"] == "bad"
     gated = nerfcli("doctor", folder, "--require", "look")  # its own page is replaced
-    assert (gated.exit_code, gated.stdout.strip()) == (GATE_NOT_MET, told["path"])
+    assert (gated.exit_code, gated.stdout.strip()) == (GATE_NOT_MET, result_json["path"])
     assert "count (bad)" in error_of(gated)[0]
     assert nerfcli("doctor", folder, "--require", "fine").exit_code == USAGE
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 50 10 20 20 25 5\n")
     unlike = nerfcli("doctor", folder, "--intrinsics", tmp_path / "cameras.txt")
     assert (unlike.exit_code, "has no camera for photo" in error_of(unlike)[0]) == (BAD_INPUT, True)
-    Path(told["path"]).write_text("mine")
+    Path(result_json["path"]).write_text("mine")
     refused = nerfcli("doctor", folder)
-    assert (refused.exit_code, Path(told["path"]).read_text()) == (BAD_INPUT, "mine")
+    assert (refused.exit_code, Path(result_json["path"]).read_text()) == (BAD_INPUT, "mine")
     error_of(refused)
     assert nerfcli("doctor", "-", "-o", tmp_path / "pages", "-q", stdin=f"{folder}\n").exit_code == 0
     assert (tmp_path / "pages" / "photos-doctor.html").exists()
@@ -449,8 +459,10 @@ def test_openmp_waits_briefly_unless_the_user_says_otherwise(given, used, monkey
 
 
 def test_python_m_nerfcli_is_the_program():
-    told = subprocess.run([sys.executable, "-m", "nerfcli", "--version"], check=True, stdout=subprocess.PIPE, text=True)
-    assert told.stdout.startswith("nerfcli ")
+    result_json = subprocess.run(
+        [sys.executable, "-m", "nerfcli", "--version"], check=True, stdout=subprocess.PIPE, text=True
+    )
+    assert result_json.stdout.startswith("nerfcli ")
 
 
 def test_there_is_no_place_beside_the_root():

@@ -75,12 +75,12 @@ def test_videos_and_folders_on_standard_input(clip, estimated):
     assert result.exit_code == BAD_INPUT
     assert result.stdout.splitlines() == ["photos-scene", "my clip-scene"]
     assert [folder for folder, _, _ in estimated] == ["photos", "my clip-frames"]
-    for told in (
+    for reported in (
         "photos is not a video: using all of its photos",
         "Error: sound.m4a contains no video stream",
         "cut.mp4 is truncated",
     ):
-        assert told in result.stderr
+        assert reported in result.stderr
     assert sorted(path.name for path in Path().iterdir() if "frames" in path.name) == ["my clip-frames"]
 
 

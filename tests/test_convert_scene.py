@@ -299,7 +299,7 @@ def test_a_scene_is_replaced_only_when_asked_and_after_a_fault_stands_again(tmp_
 
 
 @pytest.mark.parametrize(
-    ("form", "fault", "told"),
+    ("form", "fault", "message"),
     [
         ("colmap", {"colours": "other"}, "points have another colour"),
         ("transforms", {"colours": "other"}, "points have another colour"),
@@ -316,7 +316,7 @@ def test_a_scene_is_replaced_only_when_asked_and_after_a_fault_stands_again(tmp_
     ],
     ids=lambda value: value if isinstance(value, str) and " " not in value else "",
 )
-def test_what_stands_beside_the_cameras_is_compared(form, fault, told, tmp_path):
+def test_what_stands_beside_the_cameras_is_compared(form, fault, message, tmp_path):
     capture = masked(photographed(capture_of([SQUARE]), tmp_path / "images"), tmp_path / "masks", 1)
     capture = split_into(capture, "test", *["train"] * 5)
     bounds = np.array([(1.0, 9.0)] * 6)
@@ -345,7 +345,7 @@ def test_what_stands_beside_the_cameras_is_compared(form, fault, told, tmp_path)
     write = right.write
     assert write is not None
     spoiled = replace(right, write=lambda c, path: write(replace(c, **wrong[part][kind]), path))
-    with pytest.raises(UserError, match=told) as caught:
+    with pytest.raises(UserError, match=message) as caught:
         convert(capture, tmp_path / "out", source_format="made", wanted=TargetOptions(spoiled, allow_loss=True))
     assert caught.value.exit_code == GATE_NOT_MET
     done = convert(capture, tmp_path / "out", source_format="made", wanted=TargetOptions(right, allow_loss=True))

@@ -85,14 +85,14 @@ def test_dense_grids_by_the_worked_example():
 
 def test_a_picture_of_the_worked_example():
     """256 x 256 pixels at 64 samples: 4,194,304 queries."""
-    told = described_cost(HASH, occupancy_side=64, batch=2**16, samples_per_ray=64.0, picture_px=256 * 256)
-    assert told["per_picture"] == {
+    reported = described_cost(HASH, occupancy_side=64, batch=2**16, samples_per_ray=64.0, picture_px=256 * 256)
+    assert reported["per_picture"] == {
         "samples": 4_194_304,
         "operations": 4_194_304 * 8000,
         "bytes_moved": 4_194_304 * 1024,
     }
-    assert told["bytes"]["occupancy"] == 64**3
-    assert told["per_step"]["operations"] == 3 * 2**16 * 8000
+    assert reported["bytes"]["occupancy"] == 64**3
+    assert reported["per_step"]["operations"] == 3 * 2**16 * 8000
 
 
 @pytest.mark.parametrize(

@@ -201,14 +201,14 @@ def test_levels_are_within_half_a_level_of_the_depth(seed, size, tmp_path_factor
 def test_what_does_not_fit_into_levels_is_refused(tmp_path):
     """Values are neither wrapped nor clipped, and no depth becomes the level for "no depth"."""
     path = tmp_path / "a.png"
-    for value, told in (
+    for value, message in (
         (65.536, r"16 bits hold depth up to 65.535 at 0.001 per level, but the maximum is 65.536"),
         (math.inf, r"maximum is inf"),
         (4e-4, r"a depth of 0.0004 would become 0 \(no value\) in levels of 0.001"),
         (0.0, r"a depth of 0 would become 0"),
         (-2.0, r"a depth of -2 would become 0"),
     ):
-        with pytest.raises(UserError, match=told):
+        with pytest.raises(UserError, match=message):
             write_png16(path, np.full((2, 2), value, np.float32), META, units_per_level=1e-3)
     assert list(tmp_path.iterdir()) == []
     write_png16(path, np.full((2, 2), 65.5354, np.float32), META, units_per_level=1e-3)
@@ -238,7 +238,7 @@ def test_files_of_the_first_version_keep_their_meaning(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"convention": "median"}, "convention conditional and median"),
         ({"axis": "z"}, "axis ray and z"),
@@ -249,10 +249,10 @@ def test_files_of_the_first_version_keep_their_meaning(tmp_path):
         ({"units_per_level": 1e-3}, "units per level None and 0.001"),
     ],
 )
-def test_maps_of_another_meaning_are_not_mixed(change, told):
+def test_maps_of_another_meaning_are_not_mixed(change, message):
     other = replace(META, **change)
-    assert difference_of(META, other) == told
-    with pytest.raises(UserError, match=rf"b\.tiff and a\.tiff have different definitions: {told}"):
+    assert difference_of(META, other) == message
+    with pytest.raises(UserError, match=rf"b\.tiff and a\.tiff have different definitions: {message}"):
         refuse_mixing([(Path("a.tiff"), META), (Path("b.tiff"), other)])
 
 

@@ -222,7 +222,7 @@ def test_intrinsics_that_are_known_tell_how_far_things_are(tmp_path):
 
     def baseline_over_depth(focal_px: float) -> float:
         known = Calibration(Path("c"), (Camera.pinhole(2 * WIDTH, 2 * HEIGHT, 2 * focal_px),), {})
-        (pair,) = examine(find_subject(folder), threads=1, progress=lambda *told: None, calibration=known).pairs
+        (pair,) = examine(find_subject(folder), threads=1, progress=lambda *reported: None, calibration=known).pairs
         assert pair.views is not None
         return pair.views.baseline_over_depth
 

@@ -143,9 +143,9 @@ def test_a_few_far_pixels_do_not_make_levels_coarse(tmp_path):
         levels = np.asarray(Image.open(tmp_path / "depth16" / f"{name}.png"))
         near = np.where(np.isnan(depth) | (depth > 65.5), 0, depth.astype(np.float64) * 1000)
         np.testing.assert_array_equal(levels, np.rint(near))
-    told = depth_meta_of(tmp_path / "depth16" / "a.png")
-    assert told is not None
-    assert told.error_bounds["pixels_beyond_levels"] == 3
+    stated = depth_meta_of(tmp_path / "depth16" / "a.png")
+    assert stated is not None
+    assert stated.error_bounds["pixels_beyond_levels"] == 3
     # A requested length per level must hold all depths, or it is refused.
     with pytest.raises(UserError, match="maximum is 1000"):
         write_levels(tmp_path, ["a"], settings=replace(settings, depth_scale=1e-3), meaning=meaning)
@@ -187,15 +187,15 @@ def test_depth_without_a_meaning_is_not_read_into_a_clip(model, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("other", "told"),
+    ("other", "stated"),
     [
         (DepthRequest("median", "z", min_opacity=0.1), "convention conditional, not median"),
         (DepthRequest("conditional", "ray", min_opacity=0.1), "axis z, not ray"),
         (DepthRequest("conditional", "z", min_opacity=0.2), "min_opacity 0.1, not 0.2"),
     ],
 )
-def test_a_folder_of_another_meaning_is_told_as_that(other, told, model, tmp_path):
+def test_a_folder_of_another_meaning_is_told_as_that(other, stated, model, tmp_path):
     export(model, ordered([frame("a")], outputs=("depth",)), tmp_path / "views")
-    with pytest.raises(UserError, match=f"views contains depth with another definition: {told}"):
+    with pytest.raises(UserError, match=f"views contains depth with another definition: {stated}"):
         ordered([frame("a")], outputs=("depth",), depth=other).is_held_by(tmp_path / "views")
     assert ordered([frame("a")], outputs=("depth",)).is_held_by(tmp_path / "views")

@@ -153,11 +153,11 @@ def test_an_export_that_is_stopped_leaves_the_old_one(model, tmp_path):
 
 
 def test_parts_are_put_together_without_rendering(model, tmp_path, in_one_go):
-    folder, told = tmp_path / "views", []
+    folder, reported = tmp_path / "views", []
     for part in (range(3, 4), range(0, 3, 2), range(1, 4)):
-        export_part(model, order(), folder, part, on_rays=lambda rays: None, notify=told.append)
+        export_part(model, order(), folder, part, on_rays=lambda rays: None, notify=reported.append)
         assert not folder.exists()
-    assert [text.split(" frames are ")[0] for text in told] == ["1 of 4", "3 of 4", "resuming: 2 of 3", "4 of 4"]
+    assert [text.split(" frames are ")[0] for text in reported] == ["1 of 4", "3 of 4", "resuming: 2 of 3", "4 of 4"]
     done: list[int] = []
     export(model, order(), folder, on_rays=done.append)
     assert done == [4 * PIXELS]
@@ -229,7 +229,7 @@ def test_an_error_in_a_thread_ends_the_others_and_keeps_what_is_complete(model, 
 
 def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in_one_go):
     """One of two processes is killed after the first frame: another renders its frame, and each frame is reported."""
-    told: list[str] = []
+    reported: list[str] = []
     done: list[int] = []
 
     def kill_one(rays: int) -> None:
@@ -238,11 +238,14 @@ def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in
             multiprocessing.active_children()[-1].kill()
 
     export_frames(
-        *(model, order(), tmp_path / "views"), on_rays=kill_one, notify=told.append, workers=Workers(jobs=2, threads=2)
+        *(model, order(), tmp_path / "views"),
+        on_rays=kill_one,
+        notify=reported.append,
+        workers=Workers(jobs=2, threads=2),
     )
     assert done == [PIXELS] * 4
     assert contents(tmp_path / "views") == in_one_go
-    (death,) = [text for text in told if "process" in text]
+    (death,) = [text for text in reported if "process" in text]
     assert "was ended by signal 9 (SIGKILL) while rendering" in death
     assert not multiprocessing.active_children()
 
@@ -303,16 +306,16 @@ def test_processes_that_die_again_and_again_end_the_export(model, tmp_path, monk
         process.kill()
 
     monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start_and_kill)
-    told: list[str] = []
+    reported: list[str] = []
     with pytest.raises(UserError, match=f"keep failing on f[01]/v: .* signal {signal.SIGKILL:d}") as caught:
         export_frames(
             *(model, order(), tmp_path / "views"),
             on_rays=lambda rays: None,
-            notify=told.append,
+            notify=reported.append,
             workers=Workers(jobs=2, threads=2),
         )
     assert caught.value.exit_code == OUT_OF_MEMORY
-    assert "retrying it" in told[0]
+    assert "retrying it" in reported[0]
 
 
 # Videos, previews and levels from existing pictures
@@ -377,12 +380,12 @@ def test_a_video_says_what_it_shows(model, tmp_path):
     export(model, order(video=replace(VIDEO, formats=("mp4", "gif"))), tmp_path / "views")
     description = json.loads((tmp_path / "views/render.json").read_text())
     for name in ("rgb+depth.mp4", "rgb+depth.gif"):
-        told = description_of(tmp_path / "views" / name)
-        assert told is not None
-        assert (told["convention"], told["axis"], told["unit"]) == ("conditional", "z", "arbitrary")
-        assert told["ranges"] == {"depth": description["ranges"]["depth"]}
-        assert told["run"] == "a run"
-        assert told["nerfcli"] == description["nerfcli"]
+        reported = description_of(tmp_path / "views" / name)
+        assert reported is not None
+        assert (reported["convention"], reported["axis"], reported["unit"]) == ("conditional", "z", "arbitrary")
+        assert reported["ranges"] == {"depth": description["ranges"]["depth"]}
+        assert reported["run"] == "a run"
+        assert reported["nerfcli"] == description["nerfcli"]
 
 
 def test_side_by_side_holds_colour_and_depth_in_one_picture(model, tmp_path, monkeypatch):

@@ -223,8 +223,8 @@ def test_checkpoint_round_trip_is_bit_exact(tmp_path):
     path = tmp_path / "Ordner mit Ümlaut" / "a.safetensors"
     description = {"name": "Küche", "numbers": [1, 0.1, 1e-300], "nothing": None}
     save_tensors(path, awkward_tensors(), description)
-    loaded, told = load_tensors(path, "cpu")
-    assert told == description
+    loaded, stored = load_tensors(path, "cpu")
+    assert stored == description
     assert set(loaded) == set(awkward_tensors())
     for name, tensor in awkward_tensors().items():
         assert loaded[name].dtype == tensor.dtype
@@ -355,9 +355,9 @@ def test_a_bit_that_flips_anywhere_in_a_checkpoint_is_noticed(tmp_path):
         damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
         try:
-            again, told = load_tensors(path, "cpu")
+            again, stored = load_tensors(path, "cpu")
         except UserError:
             continue
         # Flips that go unnoticed lose nothing: they are in the spaces that pad the header.
-        assert told == description
+        assert stored == description
         assert {name: tensor.tolist() for name, tensor in again.items()} == {n: t.tolist() for n, t in tensors.items()}

@@ -31,8 +31,8 @@ def drifting(places: np.ndarray) -> np.ndarray:
 def test_gains_that_drift_are_those_between_the_neighbours_and_of_the_last_beyond():
     places = np.array([0, 1, 2, 4, 5, 6, 8])
     wanted = np.array([3, 7, 9])
-    told = gains_between(places, drifting(places), wanted)
-    assert told == pytest.approx(drifting(np.array([3.0, 7.0, 8.0])), abs=1e-12)
+    reported = gains_between(places, drifting(places), wanted)
+    assert reported == pytest.approx(drifting(np.array([3.0, 7.0, 8.0])), abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -139,9 +139,9 @@ def test_a_training_keeps_what_its_photos_tell_of_the_held_out_ones_which_it_doe
     train(scene, tmp_path / "run", settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
     model = load_model(tmp_path / "run" / "field.safetensors", "cpu")
     assert set(model.exposures) == {"7.png"}
-    told = log_gains_of(scene.test_frames, model)
-    assert told.tolist() == [list(model.exposures["7.png"])]
-    assert told.mean() == pytest.approx(log_ratio(144, 107), rel=0.3)
+    reported = log_gains_of(scene.test_frames, model)
+    assert reported.tolist() == [list(model.exposures["7.png"])]
+    assert reported.mean() == pytest.approx(log_ratio(144, 107), rel=0.3)
     assert log_gains_of(scene.train_frames, model) == pytest.approx(np.zeros((8, 3)))  # there is no EXIF
 
 

@@ -69,9 +69,9 @@ def settings(model: str, components: Components) -> TrainSettings:
 
 
 def fit(scene: Scene, run: Path, asked: TrainSettings) -> list[str]:
-    told: list[str] = []
-    train(scene, run, asked, resume=False, notify=told.append, on_progress=lambda progress: None)
-    return told
+    reported: list[str] = []
+    train(scene, run, asked, resume=False, notify=reported.append, on_progress=lambda progress: None)
+    return reported
 
 
 def is_held_out(name: str, capture: Path) -> bool:
@@ -150,7 +150,7 @@ def test_held_out_photos_that_are_gone_do_not_undo_a_training(capture, tmp_path)
     loaded = scenes.load(capture)
     for photo in (capture / HELD_OUT).glob("*.png"):
         photo.unlink()
-    told = fit(loaded, tmp_path / "run", replace(settings("default", Components()), steps=4))
+    reported = fit(loaded, tmp_path / "run", replace(settings("default", Components()), steps=4))
     assert (tmp_path / "run" / FIELD).exists()
-    assert any("PSNR on held-out photos could not be measured" in line for line in told)
+    assert any("PSNR on held-out photos could not be measured" in line for line in reported)
     assert "heldout_psnr" not in read_log(tmp_path / "run")[-1]

@@ -83,15 +83,15 @@ def test_facts_are_told_in_lines_that_a_terminal_holds():
 def test_a_depth_file_tells_all_that_it_knows(suffix, tmp_path):
     path, depth = tmp_path / f"a{suffix}", plain_depth()
     ALL[suffix](path, depth, FULL_META)
-    told = json.loads(info(path, "--json").stdout)
-    assert told["kind"] == "depth"
-    assert (told["width"], told["height"]) == (53, 37)
-    meaning = told["meaning"]
+    printed = json.loads(info(path, "--json").stdout)
+    assert printed["kind"] == "depth"
+    assert (printed["width"], printed["height"]) == (53, 37)
+    meaning = printed["meaning"]
     for name in ("convention", "axis", "unit", "unit_source", "opacity_floor", "background_distance", "view"):
         assert meaning[name] == getattr(FULL_META, name)
     assert meaning["provenance"] == FULL_META.provenance
     tolerance = 0.5e-3 + 1e-5 if suffix == ".png" else 1e-6
-    numbers = told["maps"]["depth"]
+    numbers = printed["maps"]["depth"]
     assert numbers["valid_share"] == pytest.approx(np.isfinite(depth).mean())
     for name, expected in (("min", np.nanmin), ("max", np.nanmax), ("median", np.nanmedian)):
         assert numbers[name] == pytest.approx(float(expected(depth)), abs=tolerance)
@@ -119,9 +119,9 @@ def test_several_maps_in_a_file_are_each_told(tmp_path):
     depth = plain_depth()
     meta = replace(META, layers={"spread": {"convention": "standard-deviation", "opacity_floor": 0.5}})
     write_exr(tmp_path / "a.exr", {"depth": depth, "spread": depth / 10, "opacity": np.ones_like(depth)}, meta)
-    told = json.loads(info(tmp_path / "a.exr", "--json").stdout)
-    assert set(told["maps"]) == {"depth", "spread", "opacity"}
-    assert told["maps"]["spread"]["max"] == pytest.approx(np.nanmax(depth) / 10)
+    printed = json.loads(info(tmp_path / "a.exr", "--json").stdout)
+    assert set(printed["maps"]) == {"depth", "spread", "opacity"}
+    assert printed["maps"]["spread"]["max"] == pytest.approx(np.nanmax(depth) / 10)
     assert "also in the file: spread (standard-deviation)" in info(tmp_path / "a.exr").stdout
 
 
@@ -133,11 +133,11 @@ def test_depth_of_another_program_is_told_as_what_nobody_states(tmp_path):
     Image.fromarray((np.nan_to_num(depth) * 1000).astype(np.uint16)).save(tmp_path / "a.png")
     OpenEXR.File({}, {"V": depth}).write(str(tmp_path / "a.exr"))
     for path in sorted(tmp_path.iterdir()):
-        told = json.loads(info(path, "--json").stdout)
-        assert told["meaning"] is None, path
-        assert told["note"].startswith(NOT_STATED), path
-        assert (told["width"], told["height"]) == (53, 37), path
-        (numbers,) = told["maps"].values()
+        printed = json.loads(info(path, "--json").stdout)
+        assert printed["meaning"] is None, path
+        assert printed["note"].startswith(NOT_STATED), path
+        assert (printed["width"], printed["height"]) == (53, 37), path
+        (numbers,) = printed["maps"].values()
         assert numbers["max"] == pytest.approx(np.nanmax(depth) * (1000 if path.suffix == ".png" else 1), rel=1e-4)
         assert NOT_STATED in info(path).stdout, path
     assert "often 1 mm" in info(tmp_path / "a.png").stdout
@@ -145,8 +145,8 @@ def test_depth_of_another_program_is_told_as_what_nobody_states(tmp_path):
 
 def test_arrays_that_are_no_pictures_are_told_by_their_shape(tmp_path):
     np.savez(tmp_path / "a.npz", poses=np.zeros((5, 3, 4)), names=np.array(["a", "b"]), empty=np.zeros((0, 3)))
-    told = json.loads(info(tmp_path / "a.npz", "--json").stdout)
-    assert {name: facts["shape"] for name, facts in told["maps"].items()} == {
+    printed = json.loads(info(tmp_path / "a.npz", "--json").stdout)
+    assert {name: facts["shape"] for name, facts in printed["maps"].items()} == {
         "poses": [5, 3, 4],
         "names": [2],
         "empty": [0, 3],
@@ -164,12 +164,12 @@ def test_a_preview_is_not_taken_for_numbers(tmp_path):
 def test_the_comment_of_a_video_is_read_back(tmp_path):
     """Includes everything that ffmpeg escapes: =, ;, #, backslash, line ends."""
     path = tmp_path / "a;b #1.mp4"
-    told = {**META.to_json(), "provenance": {"run": "a=b;c#d\\e\nf 北"}}
+    printed = {**META.to_json(), "provenance": {"run": "a=b;c#d\\e\nf 北"}}
     frames = np.zeros((3, 16, 16, 3), np.uint8).tobytes()
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "16x16"]
-    command += ["-r", "12", "-i", "-", "-metadata", f"comment={json.dumps(told, indent=1)}", f"file:{path}"]
+    command += ["-r", "12", "-i", "-", "-metadata", f"comment={json.dumps(printed, indent=1)}", f"file:{path}"]
     subprocess.run(command, input=frames, check=True)
-    assert description_of(path) == told
+    assert description_of(path) == printed
     content = json.loads(info(path, "--json").stdout)
     assert (content["kind"], content["width"], content["height"], content["frames"]) == ("video", 16, 16, 3)
     assert content["meaning"]["provenance"]["run"] == "a=b;c#d\\e\nf 北"
@@ -213,8 +213,8 @@ def test_renders_whose_depth_files_differ_are_refused(tmp_path):
     write_tiff(tmp_path / "depth" / "a.tiff", plain_depth(), META)
     write_tiff(tmp_path / "depth" / "b.tiff", plain_depth(), META)
     write_png16(tmp_path / "depth16" / "a.png", plain_depth(), META, units_per_level=1e-3)
-    told = json.loads(info(tmp_path, "--json").stdout)
-    assert (told["frames"], told["files"], told["meaning"]["axis"]) == (2, 3, "ray")
+    printed = json.loads(info(tmp_path, "--json").stdout)
+    assert (printed["frames"], printed["files"], printed["meaning"]["axis"]) == (2, 3, "ray")
     assert "3 depth files with the same definition" in info(tmp_path / RENDERS).stdout
     write_png16(tmp_path / "depth16" / "b.png", plain_depth(), META, units_per_level=2e-3)
     assert "units per level 0.001 and 0.002" in info(tmp_path).stderr

@@ -473,8 +473,8 @@ def test_starting_numba_leaves_the_thread_count_alone():
         "import torch; torch.set_num_threads(1); from nerfcli.kernels import numba_cpu; numba_cpu.warm_up(); "
         "from nerfcli.kernels.numba_cpu.threads import use_threads; print(torch.get_num_threads(), use_threads())"
     )
-    told = subprocess.run([sys.executable, "-c", program], check=True, stdout=subprocess.PIPE, text=True)
-    assert told.stdout.split() == ["1", "1"]
+    reported = subprocess.run([sys.executable, "-c", program], check=True, stdout=subprocess.PIPE, text=True)
+    assert reported.stdout.split() == ["1", "1"]
 
 
 @once

@@ -472,7 +472,7 @@ def test_a_lost_context_is_told_and_comes_back(opened):
 
 
 @pytest.mark.parametrize(
-    ("damage", "told"),
+    ("damage", "message"),
     [
         (lambda text: re.sub(r'(id="table"[^>]*>.{100})....', r"\1", text), "cannot be decompressed"),
         (lambda text: re.sub(r'(id="table"[^>]*>.{100})....', r"\1!!!!", text), "not base64"),
@@ -486,12 +486,12 @@ def test_a_lost_context_is_told_and_comes_back(opened):
     ],
     ids=["short", "letters", "empty", "missing", "old browser", "json"],
 )
-def test_a_damaged_page_says_so(damage, told, browser, spheres_page, tmp_path):
+def test_a_damaged_page_says_so(damage, message, browser, spheres_page, tmp_path):
     page = tmp_path / "damaged.html"
     page.write_text(damage(spheres_page.read_text(encoding="utf-8")), encoding="utf-8")
     browser.open(page)
     browser.wait("document.body.dataset.state === 'trouble'")
-    assert told in browser.run("document.getElementById('trouble').textContent")
+    assert message in browser.run("document.getElementById('trouble').textContent")
 
 
 def test_a_browser_without_webgl2_is_told(spheres_page, tmp_path):

@@ -176,7 +176,7 @@ def test_likeness_counts_the_features_that_two_photos_share():
     descriptors, truth = shared_descriptors(70)  # more than a block
     descriptors[5] = descriptors[5][:0]
     truth[5] = truth[:, 5] = 0
-    np.testing.assert_array_equal(likeness(descriptors, lambda *told: None), truth)
+    np.testing.assert_array_equal(likeness(descriptors, lambda *reported: None), truth)
 
 
 def test_look_alikes_are_the_neighbours_that_are_not_known():

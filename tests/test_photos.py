@@ -55,9 +55,9 @@ def test_photos_are_sorted_and_upright(folder: Path):
 
 def test_progress_counts_every_file(folder: Path):
     (folder / "f.jpg").write_text("not a readable picture")
-    told: list[tuple[int, int]] = []
-    find_photos(folder, lambda done, total: told.append((done, total)))
-    assert told == [(done, 6) for done in range(1, 7)]
+    reported: list[tuple[int, int]] = []
+    find_photos(folder, lambda done, total: reported.append((done, total)))
+    assert reported == [(done, 6) for done in range(1, 7)]
 
 
 def test_text_and_truncated_files_are_left_out_with_their_reason(folder: Path):

@@ -39,7 +39,9 @@ TRUE = Camera("OPENCV", 960, 720, (2 * FOCAL_PX, 2 * FOCAL_PX, 480, 360, 0, 0, 0
 def estimate(
     photos: Path, scene: Path, given: GivenIntrinsics | None, notify: Callable[[str], None] = lambda note: None
 ) -> PosesReport:
-    return estimate_poses(photos, scene, settings=ONE_THREAD, notify=notify, progress=lambda *told: None, given=given)
+    return estimate_poses(
+        photos, scene, settings=ONE_THREAD, notify=notify, progress=lambda *reported: None, given=given
+    )
 
 
 def worst_centre(scene: Path) -> float:

@@ -45,7 +45,7 @@ def estimate(
     scene: Path,
     settings: PoseSettings = ONE_THREAD,
     *,
-    progress: Progress = lambda *told: None,
+    progress: Progress = lambda *reported: None,
     limits: Limits = Limits(),
 ) -> PosesReport:
     return estimate_poses(photos, scene, settings=settings, notify=lambda n: None, progress=progress, limits=limits)
@@ -54,8 +54,8 @@ def estimate(
 def killed_at(stage: str, done: int) -> Progress:
     """Have the worker killed (SIGKILL) once it reports this much progress in a stage."""
 
-    def progress(told: str, told_done: int, total: int) -> None:
-        if told == stage and told_done >= done:
+    def progress(reported: str, told_done: int, total: int) -> None:
+        if reported == stage and told_done >= done:
             raise KilledError
 
     return progress
@@ -303,7 +303,7 @@ def test_memory_is_known_for_this_process_and_machine():
 
 def test_planning_writes_nothing(photos: Path):
     before = sorted(path.name for path in photos.parent.iterdir())
-    _, _, pairing, plan = plan_poses(photos, settings=ONE_THREAD, progress=lambda *told: None)
+    _, _, pairing, plan = plan_poses(photos, settings=ONE_THREAD, progress=lambda *reported: None)
     assert (plan.photos, plan.rule, plan.pairs) == (8, "exhaustive", 28)
     assert len(pairing.pairs) == 28
     assert sorted(path.name for path in photos.parent.iterdir()) == before

@@ -169,25 +169,25 @@ def write_noise(folder: Path) -> None:
 
 def estimate(photos: Path, scene_dir: Path, progress: Callable[[str, int, int], None] | None = None) -> PosesReport:
     return estimate_poses(
-        photos, scene_dir, settings=FAST, notify=lambda note: None, progress=progress or (lambda *told: None)
+        photos, scene_dir, settings=FAST, notify=lambda note: None, progress=progress or (lambda *reported: None)
     )
 
 
 def test_photos_without_overlap_are_too_few_and_leave_no_scene(tmp_path: Path):
     write_noise(tmp_path / "photos")
-    told: list[str] = []
+    reported: list[str] = []
     with pytest.raises(UserError, match=r"only 0 of 5 photos registered.*matches no other photo well") as caught:
         estimate_poses(
             tmp_path / "photos",
             tmp_path / "scene",
             settings=FAST,
-            notify=told.append,
-            progress=lambda stage, done, total: told.append(stage),
+            notify=reported.append,
+            progress=lambda stage, done, total: reported.append(stage),
         )
     # Attempts are reported while the work goes on, not after it.
-    announced = next(number for number, note in enumerate(told) if note.startswith("next: more features from"))
-    assert told.index("default thresholds: none of 5 photos registered") < announced
-    assert "match" in told[announced:]
+    announced = next(number for number, note in enumerate(reported) if note.startswith("next: more features from"))
+    assert reported.index("default thresholds: none of 5 photos registered") < announced
+    assert "match" in reported[announced:]
     assert caught.value.exit_code == TOO_FEW_PHOTOS
     assert "overlap" in caught.value.hint
     assert not (tmp_path / "scene" / "scene.json").exists()
@@ -218,7 +218,7 @@ def test_a_dying_worker_is_told_with_its_last_words(tmp_path: Path, monkeypatch:
     (tmp_path / "pycolmap.py").write_text("raise RuntimeError('another library of this name')")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=r"crashed \(exit status 1\) while starting: .*FileNotFoundError.*job\.json"):
-        supervise.run_worker(tmp_path / "job.json", threads=1, progress=lambda *told: None)
+        supervise.run_worker(tmp_path / "job.json", threads=1, progress=lambda *reported: None)
 
 
 def test_deaths_are_explained():
@@ -236,9 +236,9 @@ def test_deaths_are_explained():
     [("", 40_960), ("RuntimeError: SQL error: database or disk is full\n", 10**9), ("No space left on device", 10**9)],
 )
 def test_a_full_disk_is_told_even_where_no_log_could_be_written(log: str, free_bytes: int):
-    told = supervise.explain_death(1, "finding features (3 of 10 done)", log, free_bytes)
-    assert "stopped while finding features (3 of 10 done): the disk is full" in told.message
-    assert "run the same command again to continue" in told.hint
+    reported = supervise.explain_death(1, "finding features (3 of 10 done)", log, free_bytes)
+    assert "stopped while finding features (3 of 10 done): the disk is full" in reported.message
+    assert "run the same command again to continue" in reported.hint
 
 
 def test_a_scene_never_takes_the_place_of_the_photos(tmp_path: Path):
@@ -285,7 +285,7 @@ def test_too_few_photos_write_nothing(tmp_path: Path):
 def test_settings_out_of_range_are_refused(tmp_path: Path, settings: PoseSettings, words: str):
     with pytest.raises(ValueError, match=words):
         estimate_poses(
-            tmp_path, tmp_path / "scene", settings=settings, notify=lambda note: None, progress=lambda *told: None
+            tmp_path, tmp_path / "scene", settings=settings, notify=lambda note: None, progress=lambda *reported: None
         )
 
 
@@ -299,7 +299,7 @@ def test_one_thread_and_the_same_seed_give_the_same_poses(tmp_path: Path):
             tmp_path / name,
             settings=replace(FAST, threads=1),
             notify=lambda note: None,
-            progress=lambda *told: None,
+            progress=lambda *reported: None,
         )
         models.append((tmp_path / name / "sparse/0/images.bin").read_bytes())
     assert models[0] == models[1]

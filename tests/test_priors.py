@@ -218,12 +218,12 @@ def test_training_takes_all_of_them_at_once(capture, tmp_path):
 
 def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
     settings = TrainSettings(budget_seconds=None, steps=10, model="auto")
-    told: list[str] = []
-    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=told.append)
+    reported: list[str] = []
+    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=reported.append)
     assert prepared.settings.components == Components(points=0.1)
     assert prepared.points is not None
     assert [len(depths.numbers) for depths in prepared.points.sets] == [3]
-    assert "points=0.1: kept, 3 pixels see a 3D point at a known distance" in told
+    assert "points=0.1: kept, 3 pixels see a 3D point at a known distance" in reported
 
 
 @pytest.mark.parametrize("limit", [{"budget_seconds": None, "steps": 10}, {"budget_seconds": 1.0}])
@@ -244,11 +244,11 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
     facts = Facts("hash", has_alpha=False, has_exif=False, cameras=check, fixed=("cameras",))
     monkeypatch.setattr("nerfcli.train.preparation._facts", lambda *asked, **known: facts)
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(cameras=cameras), model="default")
-    told: list[str] = []
-    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=told.append)
+    reported: list[str] = []
+    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=reported.append)
     learns = cameras in ("focal", "all")
     assert prepared.log_focal == (check.log_focal if learns else 0.0)
-    assert any("suggest a focal length 1.88 %" in line for line in told) == learns
+    assert any("suggest a focal length 1.88 %" in line for line in reported) == learns
     refined = prepared.fitting().parts.cameras
     if learns:
         assert refined is not None

@@ -322,10 +322,10 @@ def test_model_error_is_found_where_it_is_put_in(generator: torch.Generator) -> 
 def test_centre_of_rotation_is_found(shift: float) -> None:
     geometry = cone(60, rows=5)
     scan = scan_of(geometry)
-    told = Scan(
+    misaligned = Scan(
         geometry.shifted(-shift), "counts", scan.values, scan.open_beam, photons_per_value=scan.photons_per_value
     )
-    found = centre_of(highest_contrast_row(told))
+    found = centre_of(highest_contrast_row(misaligned))
     assert found.shift == pytest.approx(shift, abs=0.15)
     assert found.is_off == (shift != 0)
 
@@ -333,15 +333,15 @@ def test_centre_of_rotation_is_found(shift: float) -> None:
 def test_centre_of_a_parallel_half_turn_is_found() -> None:
     geometry = circular_parallel(np.arange(90) * np.pi / 90, pixel_width=0.5, pixel_height=0.5, rows=1, columns=48)
     scan = scan_of(geometry)
-    told = Scan(geometry.shifted(-2.0), "counts", scan.values, scan.open_beam, photons_per_value=20.0)
-    assert centre_of(highest_contrast_row(told)).shift == pytest.approx(2.0, abs=0.15)
+    misaligned = Scan(geometry.shifted(-2.0), "counts", scan.values, scan.open_beam, photons_per_value=20.0)
+    assert centre_of(highest_contrast_row(misaligned)).shift == pytest.approx(2.0, abs=0.15)
 
 
 def test_tilt_of_the_detector_is_found() -> None:
     geometry = cone(30, rows=24)
     scan = scan_of(geometry, photons=2e5)
-    told = Scan(geometry.tilted(np.deg2rad(-1.0)), "counts", scan.values, scan.open_beam, photons_per_value=200.0)
-    found = detector_tilt(told)
+    misaligned = Scan(geometry.tilted(np.deg2rad(-1.0)), "counts", scan.values, scan.open_beam, photons_per_value=200.0)
+    found = detector_tilt(misaligned)
     assert np.rad2deg(found.value) == pytest.approx(1.0, abs=0.15)
     assert found.holds
 

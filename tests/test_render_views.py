@@ -106,7 +106,7 @@ def camera_path(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "reported"),
     [
         (transforms(w=0), "w and h are 0"),
         (transforms(h=float("nan")), "h is nan"),
@@ -117,12 +117,12 @@ def camera_path(**changes: Any) -> dict[str, Any]:
         (camera_path(camera_path=[{"camera_to_world": np.eye(4).ravel().tolist(), "fov": float("nan")}]), "fov is nan"),
     ],
 )
-def test_a_file_of_cameras_with_a_size_of_nothing_or_nan(content, told, finished, tmp_path):
+def test_a_file_of_cameras_with_a_size_of_nothing_or_nan(content, reported, finished, tmp_path):
     path = tmp_path / "views.json"
     path.write_text(json.dumps(content))
     result = nerfcli("render", finished, "--cameras", path)
     assert result.exit_code == BAD_INPUT
-    assert told in error_of(result)[0]
+    assert reported in error_of(result)[0]
     assert not (finished / "renders").exists()
 
 

@@ -145,7 +145,7 @@ def test_runs_are_shown_by_photos_that_all_of_them_hold_out():
 def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
     look, _ = seen
     text = page_html([facts()], [look], depths=[_meta()])
-    for told in (
+    for reported in (
         "23.46 dB",
         "0.7500",
         "1.50 M",
@@ -155,7 +155,7 @@ def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
         "conditional depth along the optical",
         ">20<",
     ):
-        assert told in text
+        assert reported in text
     assert not re.search(r"(src|href)=\"?http", text)
     data = re.search(r'<script type="application/json" id="views">(.*?)</script>', text, re.DOTALL)
     assert data is not None
@@ -253,7 +253,7 @@ def test_the_page_tells_what_saw_the_photos_what_was_chosen_and_how_new_the_view
         run, metrics=metrics, config=replace(run.config, selection=Selection(Components(), (decision,), 1.0))
     )
     text = page_html([chosen], [look], depths=[_meta()])
-    for told in (
+    for reported in (
         "0.123",
         "5.7",
         "extrapolation",
@@ -263,7 +263,7 @@ def test_the_page_tells_what_saw_the_photos_what_was_chosen_and_how_new_the_view
         "+0.50 ± 0.10",
         "-2%",
     ):
-        assert told in text
+        assert reported in text
     assert "view=0" not in page_html([run], [look], depths=[_meta()])
 
 
@@ -274,9 +274,9 @@ def test_numbers_that_must_not_be_compared_are_named():
     foreign = replace(
         one, config=RunConfig(split_sha256="2"), metrics={**one.metrics, "protocol": "x", "device": "cuda"}
     )
-    told = list(mismatches_of([one, foreign]))
-    assert len(told) == 3
-    assert "have different held-out photos" in told[0]
+    reported = list(mismatches_of([one, foreign]))
+    assert len(reported) == 3
+    assert "have different held-out photos" in reported[0]
 
 
 def test_everything_that_was_warned_about_is_listed():
@@ -290,13 +290,13 @@ def test_everything_that_was_warned_about_is_listed():
         poses=poses, metrics=None, config=RunConfig(missing_photos=("e.png",), warnings=("intrinsics were halved",))
     )
     run.log.append(logged(30, 0.01, rollbacks=2))
-    told = [f"{stage}: {text}" for stage, text in warnings_of(run)]
+    reported = [f"{stage}: {text}" for stage, text in warnings_of(run)]
     for part in (
         *("c.png (too few matches)", "9 times the width", "2 attempts", "d.png is uncertain by 3.2 px"),
         *("e.png", "intrinsics were halved", "non-finite 2 times", "nerfcli evaluate"),
     ):
-        assert sum(part in text for text in told) == 1, part
-    assert len(told) == 8
+        assert sum(part in text for text in reported) == 1, part
+    assert len(reported) == 8
     assert list(warnings_of(facts())) == []
 
 

@@ -111,8 +111,8 @@ def test_the_standard_error_of_distances_is_the_spread_of_estimates():
         for _ in range(2000)
     ]
     scatter = np.std([estimate.metres_per_unit for estimate in estimates])
-    told = np.sqrt(np.mean([(estimate.standard_error or 0) ** 2 for estimate in estimates]))
-    assert told == pytest.approx(scatter, rel=0.05)
+    stated_error = np.sqrt(np.mean([(estimate.standard_error or 0) ** 2 for estimate in estimates]))
+    assert stated_error == pytest.approx(scatter, rel=0.05)
     assert scatter == pytest.approx(3 * 0.01 / np.sqrt(5), rel=0.05)
 
 
@@ -261,13 +261,13 @@ def test_gps_gives_the_scale_and_the_directions(seed):
 
 def test_the_standard_error_of_gps_is_the_spread_of_estimates():
     rng = np.random.default_rng(1)
-    ratios, told = [], []
+    ratios, stated_error = [], []
     for _ in range(120):
         frames, gps, truth = photographed(rng, count=30, size=200.0, noise=3.0)
         estimate = scale_from_gps(frames, gps).estimate
         ratios.append(estimate.metres_per_unit / truth.scale)
-        told.append((estimate.standard_error or 0) / truth.scale)
-    assert np.sqrt(np.mean(np.square(told))) == pytest.approx(np.std(ratios), rel=0.25)
+        stated_error.append((estimate.standard_error or 0) / truth.scale)
+    assert np.sqrt(np.mean(np.square(stated_error))) == pytest.approx(np.std(ratios), rel=0.25)
     assert abs(np.mean(ratios) - 1) < 0.002
 
 
@@ -276,14 +276,14 @@ def test_the_standard_error_of_gps_knows_that_neighbours_err_alike():
     rng = np.random.default_rng(4)
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     walk = 150 * np.stack([np.cos(angle), np.sin(angle), np.zeros(60)], axis=1)
-    ratios, told = [], []
+    ratios, stated_error = [], []
     for _ in range(80):
         truth = random_similarity(rng)
         errors = 3 * np.repeat(rng.normal(size=(20, 3)), 3, axis=0)
         estimate = scale_from_gps(*with_gps(walk, errors, truth)).estimate
         ratios.append(estimate.metres_per_unit / truth.scale)
-        told.append((estimate.standard_error or 0) / truth.scale)
-    assert np.sqrt(np.mean(np.square(told))) == pytest.approx(np.std(ratios), rel=0.25)
+        stated_error.append((estimate.standard_error or 0) / truth.scale)
+    assert np.sqrt(np.mean(np.square(stated_error))) == pytest.approx(np.std(ratios), rel=0.25)
 
 
 def test_gps_is_refused_up_to_a_spread_of_three_times_the_noise():
@@ -550,5 +550,5 @@ def test_corners_through_distorted_lenses_and_how_well_their_error_is_told():
     assert estimate(0.0).metres_per_unit == pytest.approx(0.1, rel=1e-9)
     found = [estimate(0.2) for _ in range(30)]
     scatter = np.std([one.metres_per_unit for one in found])
-    told = np.sqrt(np.mean([(one.standard_error or 0) ** 2 for one in found]))
-    assert 0.6 < told / scatter < 1.7
+    stated_error = np.sqrt(np.mean([(one.standard_error or 0) ** 2 for one in found]))
+    assert 0.6 < stated_error / scatter < 1.7

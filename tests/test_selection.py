@@ -59,16 +59,16 @@ def judged(base: list[Trial], tried: list[Trial]) -> Decision:
     return judge_one(base, ("view", 0), tried, by_time=True)
 
 
-def told(gain_db: float) -> float:
+def reported(gain_db: float) -> float:
     """Return the reported gain if all photos gain alike: `FLOOR` times the mean error is added to both errors."""
     return 10.0 * math.log10((1.0 + FLOOR) / (10.0 ** (-gain_db / 10.0) + FLOOR))
 
 
 def test_a_gain_is_told_as_it_is_and_kept():
     decision = judged([trial(20.0), trial(21.0)], [trial(20.4), trial(21.6)])
-    assert decision.gain_db == pytest.approx((told(0.4) + told(0.6)) / 2, abs=1e-9)
+    assert decision.gain_db == pytest.approx((reported(0.4) + reported(0.6)) / 2, abs=1e-9)
     # Two seeds that differ by d have a variance of d^2 / 2, their mean one of d^2 / 4; all photos gain the same.
-    assert decision.error_db == pytest.approx((told(0.6) - told(0.4)) / 2, abs=1e-9)
+    assert decision.error_db == pytest.approx((reported(0.6) - reported(0.4)) / 2, abs=1e-9)
     assert decision.kept
     assert decision.cost == pytest.approx(0.0, abs=1e-12)
 
@@ -105,7 +105,7 @@ def test_a_gain_that_rests_on_a_few_photos_is_not_clear():
 def test_gains_that_differ_as_much_as_they_are_large_are_not_kept(first, second):
     """Two gains of mean m and distance d have an error of d / 2; kept if m exceeds the least gain by two errors."""
     decision = judged([trial(20.0), trial(20.0)], [trial(20.0 + first), trial(20.0 + second)])
-    expected = (told(first) + told(second)) / 2 > LEAST_GAIN_DB + abs(told(first) - told(second))
+    expected = (reported(first) + reported(second)) / 2 > LEAST_GAIN_DB + abs(reported(first) - reported(second))
     assert decision.kept == expected
 
 
@@ -137,9 +137,9 @@ def test_one_seed_is_enough_only_where_the_gain_is_clear():
     least = LEAST_GAIN_DB + CLEAR_ERRORS * SEED_DB
     for gain, kept in ((1.1 * least, False), (1.5 * least, True)):
         decision = judged([trial(20.0)], [trial(20.0 + gain)])
-        assert decision.gain_db == pytest.approx(told(gain), abs=1e-9)
+        assert decision.gain_db == pytest.approx(reported(gain), abs=1e-9)
         assert decision.error_db == pytest.approx(SEED_DB, abs=1e-9)
-        assert decision.kept == kept == (told(gain) > least)
+        assert decision.kept == kept == (reported(gain) > least)
 
 
 def test_the_margins_in_numbers():
@@ -161,7 +161,7 @@ def test_a_photo_without_pixels_to_judge_by_counts_nothing():
         return Trial(one.errors * none, one.halfway * none, one.counts * none, one.seconds, one.steps)
 
     base, tried = ([without_first(trial(20.0 + dB)), without_first(trial(21.0 + dB))] for dB in (0.0, 0.5))
-    assert judged(base, tried).gain_db == pytest.approx(told(0.5), abs=1e-9)
+    assert judged(base, tried).gain_db == pytest.approx(reported(0.5), abs=1e-9)
 
 
 SKY = (15.0, 24.0)
@@ -191,8 +191,8 @@ def test_proposals_leave_alone_what_the_user_decided_and_what_nothing_speaks_for
         tried, declined = proposals(Components(), signs(0.3, 0.05, sky), FITTED)
         assert (("background", "sphere") in tried) == is_tried
         if not is_tried:
-            (told,) = (one.in_words() for one in declined if one.component == "background")
-            assert told.endswith(
+            (reported,) = (one.in_words() for one in declined if one.component == "background")
+            assert reported.endswith(
                 "but viewing direction does not explain their colours: 15.9 dB with it, 15.0 dB with one colour"
             )
     (declined,) = proposals(Components(), signs(0.01), replace(FITTED, fixed=("cameras",)))[1]
@@ -265,7 +265,7 @@ def test_points_that_photos_share_are_in_the_model_from_the_start_unless_they_lo
     assert {model.points for model, _, _ in scripted.asked} == {chosen.components.points}
     assert list(scripted.from_psnr) == pytest.approx([20.0 + (gain if kept else 0.0)])
     (decision,) = (decision for decision in chosen.decisions if decision.component == "points")
-    assert (decision.kept, decision.gain_db) == (kept, pytest.approx(told(gain), abs=1e-9))
+    assert (decision.kept, decision.gain_db) == (kept, pytest.approx(reported(gain), abs=1e-9))
 
 
 def test_points_are_taken_untried_where_there_is_no_time_for_a_start():
@@ -376,8 +376,8 @@ def test_cameras_are_tried_where_photos_do_not_agree_or_nobody_knows():
     unknown = replace(FITTED, cameras_known=None)
     assert tried(FITTED) == []
     assert tried(unknown) == ["poses"]
-    told = [d.value for d in proposals(Components(), signs(0.0), unknown)[1] if d.component == "cameras"]
-    assert told == ["focal"]
+    reported = [d.value for d in proposals(Components(), signs(0.0), unknown)[1] if d.component == "cameras"]
+    assert reported == ["focal"]
     assert tried(replace(unknown, fixed=("cameras",))) == []
     assert tried(replace(unknown, cameras=CameraCheck(0.001, 0.001, (0.3, 0.3), 900))) == []
     assert tried(replace(unknown, cameras=CameraCheck(0.02, 0.01, (2.3, 2.2), 900))) == ["poses"]
@@ -400,12 +400,12 @@ def test_a_focal_length_that_matched_features_are_sure_of_is_taken(check, kept):
     assert components == Components(cameras="focal" if kept else "fixed")
     assert log_focal == (check.log_focal if kept else 0.0)
     assert decision.kept == kept
-    told = (
+    reported = (
         f"{100 * abs(math.expm1(check.log_focal)):.2f} % (±"
         if math.isfinite(check.error)
         else "is 1.10 px, more at other"
     )
-    assert told in decision.in_words()
+    assert reported in decision.in_words()
     assert with_known_cameras(Components(), replace(facts, fixed=("cameras",))) == (Components(), 0.0, [])
     assert with_known_cameras(Components(), FITTED) == (Components(), 0.0, [])
     for asked in (Components(cameras="focal"), Components(cameras="all")):

@@ -36,10 +36,10 @@ def views(spheres: Scene) -> Scene:
 
 
 def fit(scene: Scene, run: Path, settings: TrainSettings = FEW, *, resume: bool = False) -> list[str]:
-    """Train, and return what the user was told."""
-    told: list[str] = []
-    train(scene, run, settings, resume=resume, notify=told.append, on_progress=lambda progress: None)
-    return told
+    """Train, and return the messages for the user."""
+    reported: list[str] = []
+    train(scene, run, settings, resume=resume, notify=reported.append, on_progress=lambda progress: None)
+    return reported
 
 
 def weights(run: Path) -> dict[str, bytes]:
@@ -70,12 +70,12 @@ def test_a_failure_is_passed_with_smaller_steps_and_counted(views, tmp_path, mon
 
     monkeypatch.setattr(Fitting, "learning_rate", poisoned)
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
-    told = fit(views, tmp_path / "run")
-    (line,) = [line for line in told if "continuing from step" in line]
+    reported = fit(views, tmp_path / "run")
+    (line,) = [line for line in reported if "continuing from step" in line]
     # The rate is wrong in the eighth step; the table comes first among what it spoils. The loss shows it a step later.
     assert line.startswith("table is not finite at step 8")
     assert "continuing from step 4 with 0.5 of the learning rate (1 of 3 retries)" in line
-    assert told[-1].startswith("numbers became non-finite 1 times")
+    assert reported[-1].startswith("numbers became non-finite 1 times")
     last = read_log(tmp_path / "run")[-1]
     assert (last["step"], last["rollbacks"]) == (12, 1)
     load_model(tmp_path / "run" / "field.safetensors", "cpu")  # which refuses what is not finite
@@ -121,8 +121,8 @@ def test_a_fault_that_does_not_come_back_changes_nothing(bad_call, on_gpu, views
         return (rgb * math.nan if calls == bad_call else rgb), transmittance, shares
 
     monkeypatch.setattr(numba_cpu, "composite", flaky)  # the first call warms up
-    told = fit(views, tmp_path / "flaky")
-    assert any("but are finite when the step is repeated" in line for line in told)
+    reported = fit(views, tmp_path / "flaky")
+    assert any("but are finite when the step is repeated" in line for line in reported)
     assert weights(tmp_path / "flaky") == weights(tmp_path / "straight")
     assert not list((tmp_path / "flaky").glob("failure-*"))
 
@@ -138,8 +138,8 @@ def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, t
     with monkeypatch.context() as patched:
         patched.setattr(Fitting, "learning_rate", poisoned)
         patched.setattr(sentinel, "SNAPSHOT_EVERY", 4)
-        told = fit(views, tmp_path / "poisoned")
-    (line,) = [line for line in told if "continuing from step" in line]
+        reported = fit(views, tmp_path / "poisoned")
+    (line,) = [line for line in reported if "continuing from step" in line]
     assert line.startswith("table is not finite at step 8")
     _, description = load_tensors(tmp_path / "poisoned" / "failure-8.safetensors", "cpu")
     assert description["state"]["step"] == 7
@@ -152,8 +152,8 @@ def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, t
         return (rgb * math.nan if calls == 9 else rgb), transmittance, shares
 
     monkeypatch.setattr(numba_cpu, "composite", flaky)
-    told = fit(views, tmp_path / "flaky")
-    assert any("this device does not repeat results exactly" in line for line in told)
+    reported = fit(views, tmp_path / "flaky")
+    assert any("this device does not repeat results exactly" in line for line in reported)
 
 
 def test_a_poisoned_checkpoint_is_refused_by_name_and_kept(views, tmp_path):

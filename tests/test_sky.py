@@ -94,8 +94,8 @@ def test_too_few_pixels_tell_nothing():
 
 def test_it_is_told_the_same_where_no_gradients_are_kept():
     with torch.no_grad():
-        told = explained_by_direction(*seen_by_photos(stripes))
-    assert told == explained_by_direction(*seen_by_photos(stripes))
+        result = explained_by_direction(*seen_by_photos(stripes))
+    assert result == explained_by_direction(*seen_by_photos(stripes))
 
 
 def test_roughness_is_the_sum_of_squared_differences_between_neighbours():

@@ -527,7 +527,7 @@ def test_maps_are_those_that_colmap_reads(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         (("--to", "mesh", "--box", "1,2,3"), "'1,2,3'; write X0,Y0,Z0,X1,Y1,Z1"),
         (("--to", "mesh", "--box=1,0,0,0,1,1"), "the low corner comes first"),
@@ -537,10 +537,10 @@ def test_maps_are_those_that_colmap_reads(tmp_path):
         (("--to", "mesh", "-o", "a.stl"), "not have the suffix of a mesh"),
     ],
 )
-def test_wrong_usage_of_export(options, told, finished):
+def test_wrong_usage_of_export(options, message, finished):
     result = nerfcli("export", finished, *options)
     assert result.exit_code == 2
-    assert told in re.sub(r"\s+", " ", result.stderr)
+    assert message in re.sub(r"\s+", " ", result.stderr)
 
 
 def test_what_cannot_be_exported_is_told_in_two_lines(blocked, tmp_path):

@@ -416,9 +416,9 @@ def test_what_does_not_fit_is_refused_up_front(tmp_path):
     needs = Needs(photos=3 * 10**9, step=10**9, rest=10**9)
     assert storage_for(needs, None, folder=tmp_path)[0] is IN_MEMORY
     assert storage_for(needs, 4 * 10**9, folder=tmp_path)[0] is IN_MEMORY
-    room, told = storage_for(needs, 2 * 10**9, folder=tmp_path)
+    room, reported = storage_for(needs, 2 * 10**9, folder=tmp_path)
     assert isinstance(room, InFiles)
-    assert "about 4.00 GB needed, limit 2.00 GB: the photos (3.00 GB) are kept in temporary files" in told
+    assert "about 4.00 GB needed, limit 2.00 GB: the photos (3.00 GB) are kept in temporary files" in reported
     with pytest.raises(
         UserError, match=r"needs about 1\.00 GB of memory in addition to the photos, but the limit is 0\.90 GB"
     ) as caught:

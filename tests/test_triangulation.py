@@ -153,11 +153,11 @@ def test_points_of_exact_rays_are_exact_wherever_the_world_begins(offset):
     centres, points = rng.uniform(-1, 1, (5, 3)) + offset, rng.uniform(-1, 1, (40, 3)) * (2, 2, 1) + (0, 0, 5) + offset
     seen = [(photo, point) for point in range(40) for photo in rng.permutation(5)[: 2 + point % 4]]
     surface = triangulate(frames_at(centres), tracks_of(points, centres, seen))
-    told = ~np.isnan(surface.points[:, 0])
-    assert told.mean() > 0.9
-    np.testing.assert_allclose(surface.points[told], points[told], rtol=0, atol=1e-12 * (1 + 1e3 * offset))
+    is_solved = ~np.isnan(surface.points[:, 0])
+    assert is_solved.mean() > 0.9
+    np.testing.assert_allclose(surface.points[is_solved], points[is_solved], rtol=0, atol=1e-12 * (1 + 1e3 * offset))
     assert np.nanmax(surface.misses_px) < 1e-3
-    assert np.isnan(surface.misses_px).sum() == sum(not told[point] for _, point in seen)
+    assert np.isnan(surface.misses_px).sum() == sum(not is_solved[point] for _, point in seen)
 
 
 @given(st.lists(st.integers(-1, 6), max_size=30), st.integers(0, 5))

@@ -208,7 +208,7 @@ SETTINGS = PoseSettings(max_image_size=480, threads=1)
 def solved(photos: Path, scene_dir: Path, **options: object) -> tuple[dict, list[str]]:
     notes: list[str] = []
     settings = replace(SETTINGS, **options)
-    estimate_poses(photos, scene_dir, settings=settings, notify=notes.append, progress=lambda *told: None)
+    estimate_poses(photos, scene_dir, settings=settings, notify=notes.append, progress=lambda *reported: None)
     return json.loads((scene_dir / "poses_report.json").read_text(encoding="utf-8")), notes
 
 

@@ -83,8 +83,8 @@ def test_the_comment_is_in_the_file(tmp_path, kind):
             assert image.info["comment"].decode() == comment
     else:
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", path, "-f", "ffmetadata", "-"]
-        told = subprocess.run(command, capture_output=True, check=True).stdout.decode()
-        (line,) = re.findall("^comment=(.*)$", told, flags=re.MULTILINE | re.IGNORECASE)
+        reported = subprocess.run(command, capture_output=True, check=True).stdout.decode()
+        (line,) = re.findall("^comment=(.*)$", reported, flags=re.MULTILINE | re.IGNORECASE)
         assert re.sub(r"\\(.)", r"\1", line) == comment
 
 
@@ -108,12 +108,12 @@ def test_quality_follows_crf(tmp_path):
     assert (tmp_path / "0.mp4").stat().st_size > 5 * (tmp_path / "51.mp4").stat().st_size
 
 
-@pytest.mark.parametrize(("plays", "told"), [(0, 0), (1, None), (3, 2)])
-def test_a_gif_tells_the_player_how_often_it_plays(tmp_path, plays, told):
+@pytest.mark.parametrize(("plays", "reported"), [(0, 0), (1, None), (3, 2)])
+def test_a_gif_tells_the_player_how_often_it_plays(tmp_path, plays, reported):
     """Pillow reads the Netscape extension: the number of repetitions, 0 for ever, none for once."""
     write(tmp_path / "a.gif", smooth_frames(2, height=8, width=8), kind="gif", plays=plays)
     with Image.open(tmp_path / "a.gif") as image:
-        assert image.info.get("loop") == told
+        assert image.info.get("loop") == reported
 
 
 def test_other_videos_hold_the_clip_as_often_as_it_plays(tmp_path):

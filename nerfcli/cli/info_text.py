@@ -75,8 +75,8 @@ def _name(key: str) -> str:
 
 
 def _listed(facts: dict[str, Any]) -> str:
-    told = {key: value for key, value in facts.items() if value not in (None, []) and _USUAL.get(key) != value}
-    return ", ".join(f"{_name(key)} {_with_unit(key, value)}" for key, value in told.items())
+    shown = {key: value for key, value in facts.items() if value not in (None, []) and _USUAL.get(key) != value}
+    return ", ".join(f"{_name(key)} {_with_unit(key, value)}" for key, value in shown.items())
 
 
 def words_of(facts: dict[str, Any]) -> list[str]:

@@ -31,9 +31,9 @@ def align_gains(
         log_gains: the photo's exposure, as in `protocol.HeldOutPhoto`.
     """
     shown, wanted = (colours[used].astype(np.float64) for colours in (picture, photo))
-    told = ((shown >= DARKEST) & (shown <= BRIGHTEST) & (wanted >= DARKEST) & (wanted <= BRIGHTEST)).T
+    usable = ((shown >= DARKEST) & (shown <= BRIGHTEST) & (wanted >= DARKEST) & (wanted <= BRIGHTEST)).T
     found = list(log_gains)
-    for channel, rows in enumerate(told):
+    for channel, rows in enumerate(usable):
         if rows.sum() >= LEAST_PIXELS:
             ratios = linear_light(wanted[rows, channel]) / linear_light(shown[rows, channel])
             found[channel] = float(np.median(np.log(ratios)))

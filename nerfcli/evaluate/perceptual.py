@@ -1,7 +1,7 @@
 """LPIPS, if available: the distance of two pictures according to a network trained on human judgements.
 
 The network's weights are not part of any package: torchvision downloads AlexNet's (230 MB) on first use. Without
-torchmetrics, torchvision or the weights there is no LPIPS, and the user is told once.
+torchmetrics, torchvision or the weights, LPIPS is left out, with one warning.
 """
 
 import importlib

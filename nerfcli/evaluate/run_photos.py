@@ -30,10 +30,10 @@ def held_out_photos(
         UserError: a photo cannot be read.
     """
     photos = load_photos(frames, factor=downscale, threads=threads, masks=masks)
-    told = zip(photos, log_gains_of(frames, model).tolist(), gain_sources(frames, model), strict=True)
+    exposed = zip(photos, log_gains_of(frames, model).tolist(), gain_sources(frames, model), strict=True)
     return [
         HeldOutPhoto(photo.frame, photo.pixels, photo.used, log_gains=tuple(gains), gains_from=source)
-        for photo, gains, source in told
+        for photo, gains, source in exposed
     ]
 
 

@@ -1,7 +1,7 @@
 """Meshes and points as PLY, GLB and OBJ files, each with a description of its values.
 
 The description consists of plain values, the same for all formats: a comment `nerfcli` with JSON in PLY and OBJ,
-`asset.extras` in GLB. Further comments state the unit and the frame in words.
+`asset.extras` in GLB. Further comments name the unit and the coordinate frame.
 """
 
 import json

@@ -22,7 +22,7 @@ class Decision:
         cost: time per step relative to a step without the change, minus 1.
         gain_at_equal_time_db: gain minus what spending the extra time on more steps would bring.
         kept: whether the change is in the model.
-        why: the reason, in words.
+        why: reason for the decision, shown to the user.
     """
 
     component: str

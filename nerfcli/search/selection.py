@@ -62,7 +62,7 @@ class Facts:
         field: the kind of field.
         has_alpha: whether the photos have alpha: then nothing is behind the object.
         has_exif: whether exposures in EXIF differ.
-        cameras_known: in words, why the cameras can be trusted; None if they may be wrong.
+        cameras_known: reason to trust the cameras, shown to the user; None if they may be wrong.
         cameras: their check against matched features; None if there is none.
         points: number of pixels that see a point at a known distance.
         stereo: number of pixels with a depth from stereo matching.

@@ -339,7 +339,7 @@ def _exif(scene: Scene) -> np.ndarray:
 
 
 def _known(scene: Scene) -> str | None:
-    """Return in words why the cameras can be trusted; None if they may be wrong."""
+    """Return the reason to trust the cameras, shown to the user; None if they may be wrong."""
     if scene.kind == "blender":
         return "these cameras are exact: the pictures were rendered with them"
     return "structure from motion has already optimized the cameras" if len(scene.points) else None
