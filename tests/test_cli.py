@@ -458,6 +458,14 @@ def test_openmp_waits_briefly_unless_the_user_says_otherwise(given, used, monkey
     assert os.environ["GOMP_SPINCOUNT"] == used
 
 
+def test_the_program_keeps_freed_memory_before_any_command(monkeypatch):
+    order: list[str] = []
+    monkeypatch.setattr(cli, "keep_freed_memory", lambda: order.append("memory"))
+    monkeypatch.setattr(cli, "app", lambda prog_name: order.append("command"))
+    cli.main()
+    assert order == ["memory", "command"]
+
+
 def test_python_m_nerfcli_is_the_program():
     result_json = subprocess.run(
         [sys.executable, "-m", "nerfcli", "--version"], check=True, stdout=subprocess.PIPE, text=True
