@@ -28,7 +28,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.held_out_pixels import PIXELS
 
 # Fractions of the budget at which PSNR is measured.
-SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
+FRACTIONS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 
 
@@ -36,7 +36,7 @@ CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 class Moment:
     """A moment of a training: fraction of the budget, seconds, steps and samples so far, PSNR of held-out pixels."""
 
-    share: float
+    fraction: float
     seconds: float
     step: int
     samples: int
@@ -64,16 +64,16 @@ class Line:
 
 
 def fit(capture: Capture, settings: TrainSettings, *, budget: float, clock: str) -> tuple[Fitting, list[Moment]]:
-    """Train for `budget` seconds of a clock, and measure PSNR at every fraction of `SHARES`."""
+    """Train for `budget` seconds of a clock, and measure PSNR at every fraction of `FRACTIONS`."""
     fitting = Fitting(capture.pool, capture.extent.marching, contraction=capture.extent.contraction, settings=settings)
     now, used, samples, curve = CLOCKS[clock], 0.0, 0, []
-    due = list(SHARES)
+    due = list(FRACTIONS)
     while due:
         began = now()
         samples += fitting.advance(used / budget).samples
         used += now() - began
         if used / budget >= due[0]:
-            due = [share for share in due if share > used / budget]
+            due = [fraction for fraction in due if fraction > used / budget]
             psnr = capture.psnr(capture.model(fitting))
             curve.append(Moment(round(used / budget, 3), round(used, 2), fitting.step, samples, round(psnr, 3)))
     return fitting, curve

@@ -146,12 +146,12 @@ def main(
         (name, f"{inside.mean():.3f}", *(f"{psnr(errors[run][inside]):.2f}" for run in errors))
         for name, inside in groups.items()
     ]
-    shown_table = Table("pixels", "share", "one table (dB)", "four blocks (dB)")
+    shown_table = Table("pixels", "fraction", "one table (dB)", "four blocks (dB)")
     for row in table:
         shown_table.add_row(*row)
     Console().print(shown_table)
     with (output / "table.csv").open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([("pixels", "share", "whole_psnr", "blocks_psnr"), *table])
+        csv.writer(file).writerows([("pixels", "fraction", "whole_psnr", "blocks_psnr"), *table])
 
 
 if __name__ == "__main__":

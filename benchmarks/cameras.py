@@ -55,7 +55,7 @@ CASES = (
     ("desk", 2, "poses"),
     ("desk", 2, "focal"),
 )
-MIDDLE_POINTS, MIDDLE_SHARE = 200, 0.2
+MIDDLE_POINTS, MIDDLE_FRACTION = 200, 0.2
 ALIGNMENT_ROUNDS, ALIGNMENT_STEP = 4, 1e-4
 
 
@@ -106,7 +106,7 @@ class Pictures:
         away = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
         self._middle = np.linalg.lstsq(away.sum(0), (away @ centres[:, :, None])[..., 0].sum(0), rcond=None)[0]
         offsets = np.random.default_rng(0).uniform(-1, 1, (MIDDLE_POINTS, 3))
-        self._points = self._middle + MIDDLE_SHARE * self.reach * offsets
+        self._points = self._middle + MIDDLE_FRACTION * self.reach * offsets
 
     def off(self, poses: np.ndarray) -> np.ndarray:
         """Return the reprojection errors (N, 2) in pixels of the points in cameras with these poses (P, 4, 4)."""

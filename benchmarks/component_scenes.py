@@ -214,8 +214,8 @@ def surroundings(directions: np.ndarray) -> np.ndarray:
     sky = np.stack([0.35 + 0.4 * cloud, 0.5 + 0.3 * cloud, 0.75 + 0.15 * cloud], axis=-1)
     stripes = 0.5 + 0.5 * np.sin(14 * x + 11 * y)
     ground = np.stack([0.35 + 0.15 * stripes, 0.3 + 0.2 * stripes, 0.2 + 0.1 * stripes], axis=-1)
-    share = 1.0 / (1.0 + np.exp(-40.0 * (z - hills + 0.25)))
-    return share[..., None] * sky + (1.0 - share[..., None]) * ground
+    fraction = 1.0 / (1.0 + np.exp(-40.0 * (z - hills + 0.25)))
+    return fraction[..., None] * sky + (1.0 - fraction[..., None]) * ground
 
 
 def ball_views(
@@ -269,9 +269,9 @@ def surface_normals(tracer: ModuleType, points: np.ndarray) -> np.ndarray:
         off = np.abs(np.linalg.norm(local, axis=-1) - 1.0)
         normals[off < best] = local[off < best]
         best = np.minimum(off, best)
-    share = (points - np.array(tracer.BOX.centre)) / np.array(tracer.BOX.half_size)
-    largest = np.abs(share).max(axis=-1)
-    flat = np.where(np.abs(share) == largest[:, None], np.sign(share), 0.0)
+    fraction = (points - np.array(tracer.BOX.centre)) / np.array(tracer.BOX.half_size)
+    largest = np.abs(fraction).max(axis=-1)
+    flat = np.where(np.abs(fraction) == largest[:, None], np.sign(fraction), 0.0)
     nearer = np.abs(largest - 1.0) < best
     normals[nearer] = flat[nearer]
     return normals

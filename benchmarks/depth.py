@@ -40,7 +40,7 @@ from nerfcli.render.tracing import render_rays
 from nerfcli.runs.files import FIELD
 
 DEPTHS = (*CONVENTIONS, "quantile:0.05", "quantile:0.95")
-SHARES = (0.5, 0.05, 0.95)
+FRACTIONS = (0.5, 0.05, 0.95)
 # Every second pixel of every second row is measured, as neighbours are nearly equal.
 STRIDE = 2
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk"
@@ -141,11 +141,11 @@ def depths(model: Model, frame: Frame, *, min_opacity: float) -> dict[str, np.nd
     for chosen in torch.arange(len(rays.directions)).split(4096):
         directions = rays.directions[chosen]
         seen = render_rays(
-            model, rays.origin.expand_as(directions), directions, background=torch.zeros(3), shares=SHARES
+            model, rays.origin.expand_as(directions), directions, background=torch.zeros(3), fractions=FRACTIONS
         )
         for request in requests:
-            share = SHARES.index(request.share) if request.share is not None else 0
-            ends = seen.ends._replace(quantiles=seen.ends.quantiles[:, share : share + 1])
+            fraction = FRACTIONS.index(request.fraction) if request.fraction is not None else 0
+            ends = seen.ends._replace(quantiles=seen.ends.quantiles[:, fraction : fraction + 1])
             far = torch.full_like(ends.mean, model.marching.far)
             along_ray = requested(request, ends, background_distance=far) / scale
             z = torch.where(rays.valid[chosen], along_ray * rays.cosines[chosen], torch.nan)

@@ -42,15 +42,15 @@ def computed(case: Ray, backend: str) -> dict[str, float]:
     density, starts, ends = (torch.tensor(values, dtype=dtype) for values in single(case))
     offsets = torch.tensor([0, len(density)])
 
-    def light(*shares: float) -> LightEnds:
-        return module.light_ends(density, starts, ends, offsets=offsets, shares=shares)
+    def light(*fractions: float) -> LightEnds:
+        return module.light_ends(density, starts, ends, offsets=offsets, fractions=fractions)
 
     seen = light()
     values = {"opacity": seen.opacity.item(), "transmittance": seen.transmittance.item(), "spread": seen.spread.item()}
     for convention in DEPTHS:
         request = DepthRequest(convention, "ray", 0.0, FAR)
-        shares = () if request.share is None else (request.share,)
-        values[convention] = requested(request, light(*shares), background_distance=density.new_tensor([FAR])).item()
+        fractions = () if request.fraction is None else (request.fraction,)
+        values[convention] = requested(request, light(*fractions), background_distance=density.new_tensor([FAR])).item()
     return values
 
 

@@ -177,7 +177,7 @@ def stages(samples: int, log2_rows: int, device: Any, repeats: int) -> dict[str,
         "composite": composite,
         "composite, both ways": composite_both,
         "distortion": lambda: compositing.distortion(density, starts, ends, offsets),
-        "depth": lambda: depth.light_ends(density, starts, ends, offsets=offsets, shares=(0.5,)),
+        "depth": lambda: depth.light_ends(density, starts, ends, offsets=offsets, fractions=(0.5,)),
         "adam of all rows, with fill": adam,
     }
     return {name: 1e9 * timed(function, device, repeats) / count for name, function in functions.items()}

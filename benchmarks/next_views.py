@@ -54,7 +54,7 @@ def around(frames: Sequence[Frame]) -> list[Frame]:
 def suggested(run: Run, candidates: Sequence[Frame]) -> list[str]:
     """Return the names of the candidates that `doctor` would suggest, best first."""
     model = run.model()
-    photos = photo_depths(run, model, on_progress=lambda share: None, notify=print)
+    photos = photo_depths(run, model, on_progress=lambda fraction: None, notify=print)
     views = depth_maps(model, candidates, max_size=CANDIDATE_PX)
     box = scene_box(model, run.cameras.train)
     low, high = np.array(box[:3]), np.array(box[3:])

@@ -23,7 +23,7 @@ from rich.table import Table
 from nerfcli import kernels, scene
 from nerfcli.runs.components import differences
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.search.selection import SEARCH_SHARE
+from nerfcli.search.selection import SEARCH_FRACTION
 from nerfcli.train.preparation import prepare
 
 # Components that each scene needs beyond the default. Points help wherever photos share any, and are counted
@@ -49,7 +49,7 @@ def search(name: str, seed: int, steps: int) -> dict[str, object]:
     with tempfile.TemporaryDirectory() as folder:
         make(name, Path(folder) / name, seed)
         settings = TrainSettings(
-            budget_seconds=None, steps=round(steps / SEARCH_SHARE), downscale=1, seed=seed, model="auto"
+            budget_seconds=None, steps=round(steps / SEARCH_FRACTION), downscale=1, seed=seed, model="auto"
         )
         began = time.process_time()
         prepared = prepare(

@@ -40,8 +40,8 @@ def trained(folder: Path, seconds: float, threads: int) -> Fitting:
     pool = PixelPool(photos, extent.training_from_scene, torch.device("cpu"))
     fitting = Fitting(pool, extent.marching, contraction=extent.contraction, settings=settings)
     began = time.perf_counter()
-    while (share := (time.perf_counter() - began) / seconds) < 1.0:
-        fitting.advance(share)
+    while (fraction := (time.perf_counter() - began) / seconds) < 1.0:
+        fitting.advance(fraction)
     return fitting
 
 

@@ -38,13 +38,13 @@ def corners_of(coordinates: Tensor, side: int) -> tuple[Tensor, Tensor]:
     """Return the indices (8, N) of the vertices around points (N, 3) of the unit cube, and their weights (8, N)."""
     places = coordinates.clamp(0.0, 1.0) * side
     low = places.floor().clamp_max(side - 1)
-    share = places - low
+    fraction = places - low
     numbers, weights = [], []
     for corner in range(8):
         step = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2])
         at = low.long() + step
         numbers.append((at[:, 2] * (side + 1) + at[:, 1]) * (side + 1) + at[:, 0])
-        weights.append(torch.where(step == 1, share, 1.0 - share).prod(dim=1))
+        weights.append(torch.where(step == 1, fraction, 1.0 - fraction).prod(dim=1))
     return torch.stack(numbers), torch.stack(weights)
 
 
@@ -102,8 +102,8 @@ def logarithms(model: Model, origins: Tensor, directions: Tensor, variance: Tens
     """
     _, samples = marched(model, origins, directions)
     numbers, weights = corners_of(samples.coordinates, side)
-    shares = weights.square() / weights.square().sum(dim=0)
-    values = torch.log10((variance[numbers] * shares).sum(dim=0).sqrt() + 1e-12)
+    fractions = weights.square() / weights.square().sum(dim=0)
+    values = torch.log10((variance[numbers] * fractions).sum(dim=0).sqrt() + 1e-12)
     light, passed = reference.interval_weights(samples.density, samples.ends - samples.starts, samples.offsets)
     return reference.sum_along_rays(light.double() * values, samples.offsets) + passed * LEAST
 

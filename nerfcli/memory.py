@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 # Fraction of the memory of the machine or container; the rest is for other processes and the file cache.
-_DEFAULT_SHARE = 0.8
+_DEFAULT_FRACTION = 0.8
 _CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 # Parameters of glibc's mallopt, and thresholds: arrays of this size, and free memory beyond this, are always returned.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
@@ -34,7 +34,7 @@ def default_memory_limit(device: str = "cpu") -> int | None:
             total = min(total, int(Path(path).read_text()))
         except (OSError, ValueError):  # no such file, or the word "max"
             continue
-    return int(_DEFAULT_SHARE * total)
+    return int(_DEFAULT_FRACTION * total)
 
 
 def resident_bytes(pid: int) -> int:

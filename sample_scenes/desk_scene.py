@@ -190,8 +190,8 @@ def bookcase(
     for row in range(num_rows):
         bottom = 0.05 + thick + row * (shelf + thick)
         x = -width / 2 + 0.02
-        for share, tall, picture in t.shelf_row(rng, int(1500 * shelf), int(1500 * width)):
-            thickness = share * (width - 0.05)
+        for fraction, tall, picture in t.shelf_row(rng, int(1500 * shelf), int(1500 * width)):
+            thickness = fraction * (width - 0.05)
             x += thickness / 2
             reach = depth * float(rng.uniform(0.72, 0.92))
             book = g.placed(g.box((thickness * 0.96, reach, shelf * tall)), (x, -0.02 - reach / 2, bottom))

@@ -297,10 +297,10 @@ def shelf_row(rng: np.random.Generator, height: int, width: int) -> list[tuple[f
     """Books that fill a shelf: (share of the width, share of the height, picture of the spine) of each."""
     books, used = [], 0.0
     while used < 0.97:
-        share = float(rng.uniform(0.018, 0.05))
-        picture = spine(rng, max(int(share * width), 16), height, colour=pick(rng) if rng.random() < 0.85 else CREAM)
-        books.append((share, float(rng.uniform(0.7, 0.97)), np.rot90(picture, 1)))
-        used += share
+        fraction = float(rng.uniform(0.018, 0.05))
+        picture = spine(rng, max(int(fraction * width), 16), height, colour=pick(rng) if rng.random() < 0.85 else CREAM)
+        books.append((fraction, float(rng.uniform(0.7, 0.97)), np.rot90(picture, 1)))
+        used += fraction
     return books
 
 

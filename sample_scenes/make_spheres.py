@@ -108,8 +108,8 @@ def colour(thing: Ball | Box, points: np.ndarray) -> np.ndarray:
     if isinstance(thing, Ball):
         normal = local / thing.radius
     else:
-        share = np.abs(local) / np.array(thing.half_size)
-        normal = np.where(share == share.max(axis=-1, keepdims=True), np.sign(local), 0.0)
+        fraction = np.abs(local) / np.array(thing.half_size)
+        normal = np.where(fraction == fraction.max(axis=-1, keepdims=True), np.sign(local), 0.0)
     shading = 0.62 + 0.38 * np.clip(normal @ LIGHT, -1, 1)
     f = thing.frequency
     waves = np.stack(

@@ -136,8 +136,8 @@ class Browser:
         """Drag with the left button."""
         mouse = "Input.dispatchMouseEvent"
         self.send(mouse, type="mousePressed", x=start[0], y=start[1], button="left", clickCount=1)
-        for share in (0.5, 1.0):
-            x, y = (a + share * (b - a) for a, b in zip(start, end, strict=True))
+        for fraction in (0.5, 1.0):
+            x, y = (a + fraction * (b - a) for a, b in zip(start, end, strict=True))
             self.send(mouse, type="mouseMoved", x=x, y=y, button="left", buttons=1)
         self.send(mouse, type="mouseReleased", x=end[0], y=end[1], button="left", clickCount=1)
 

@@ -142,8 +142,8 @@ class PageField:
         seen = before < -np.log(0.1 * tolerance)
         depth, before, starts, lengths = depth[seen], before[seen], starts[seen], lengths[seen]
         weights = np.exp(-before) * -np.expm1(-depth)
-        share = np.where(depth < 1e-3, 0.5, 1 / np.maximum(depth, 1e-9) - 1 / np.expm1(np.clip(depth, 1e-9, 80)))
-        places, total = starts + lengths * share, weights.sum()
+        fraction = np.where(depth < 1e-3, 0.5, 1 / np.maximum(depth, 1e-9) - 1 / np.expm1(np.clip(depth, 1e-9, 80)))
+        places, total = starts + lengths * fraction, weights.sum()
         mean = (weights * places).sum() / total
         narrow = np.exp(-np.clip(depth, 1e-2, 80))
         variance = np.where(depth < 1e-2, 1 / 12, 1 / np.maximum(depth, 1e-9) ** 2 - narrow / (1 - narrow) ** 2)

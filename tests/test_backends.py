@@ -129,7 +129,7 @@ def test_a_picture_is_what_the_reference_gives_in_float64(name, count):
         rays, march = rays_and_march(count, dtype)
         background = torch.tensor([0.25, 0.5, 1.0], dtype=dtype)
         return field.backend.trace_rays(
-            rays, march, field.medium(), background=background, shares=(0.25, 0.5), negligible=1e-3
+            rays, march, field.medium(), background=background, fractions=(0.25, 0.5), negligible=1e-3
         )
 
     exact = seen("reference", torch.float64)
@@ -157,8 +157,8 @@ def test_where_the_light_of_samples_ends_is_what_the_reference_gives_in_float64(
     rays, march = rays_and_march(count, torch.float32)
     samples = field.backend.trace_rays(rays, march, field.medium(), background=torch.zeros(3)).intervals
     *spans, offsets = samples
-    exact = reference.light_ends(*(values.double() for values in spans), offsets=offsets, shares=(0.25, 0.5))
-    light = field.backend.light_ends(samples, shares=(0.25, 0.5))
+    exact = reference.light_ends(*(values.double() for values in spans), offsets=offsets, fractions=(0.25, 0.5))
+    light = field.backend.light_ends(samples, fractions=(0.25, 0.5))
     for key, expected in exact._asdict().items():
         value = getattr(light, key).double()
         torch.testing.assert_close(value, expected, rtol=1e-6, atol=1e-6, equal_nan=True, msg=key)

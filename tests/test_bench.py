@@ -33,7 +33,7 @@ from nerfcli.bench.sweep import (
     RenderSetting,
     ThreadSetting,
     affordable,
-    fraction,
+    as_text,
     render_settings,
     train_settings,
 )
@@ -177,7 +177,7 @@ def test_trainings_fit_into_their_time_and_the_first_ones_are_kept(seconds, over
     assert chosen == everything[: len(chosen)]
     if len(chosen) > 1:
         assert unit >= SHORTEST_TRAINING_SECONDS
-        assert sum(s.share for s in chosen) * unit + len(chosen) * overhead <= seconds * (1 + 1e-9)
+        assert sum(s.fraction for s in chosen) * unit + len(chosen) * overhead <= seconds * (1 + 1e-9)
 
 
 def test_every_setting_has_one_name_and_says_how_to_ask_for_it():
@@ -188,8 +188,8 @@ def test_every_setting_has_one_name_and_says_how_to_ask_for_it():
     assert RenderSetting(2, step=2.0, tolerance=1 / 255).options == "--step 2 --tolerance 1/255"
     assert RenderSetting(2, stored_in="float16").options is None
     assert ThreadSetting(1).options == "--threads 1"
-    assert fraction(1 / 1020) == "1/1020"
-    assert fraction(1.0) == "1"
+    assert as_text(1 / 1020) == "1/1020"
+    assert as_text(1.0) == "1"
     rows = next(setting for setting in train_settings() if setting.group == "rows")
     made = rows.settings(TrainSettings(seed=3), 10.0)
     assert rows.options == f"--log2-rows {made.log2_rows}"
@@ -307,14 +307,14 @@ def test_the_machine_is_named_and_a_busy_one_is_noticed():
 
 def test_a_line_that_a_kill_cut_short_is_left_out_and_not_continued(tmp_path):
     records = opened(tmp_path / "bench", {"source": "a"})
-    session = Session(records, 100.0, lambda share, doing: None, lambda text: None)
+    session = Session(records, 100.0, lambda fraction, doing: None, lambda text: None)
     session.record("time", point="default", seconds=1.0)
     with (tmp_path / "bench" / MEASURED).open("a") as file:
         file.write('{"kind": "time", "point": "ste')
     again = opened(tmp_path / "bench", {"source": "a"})
     again.append("time", point="step 2", seconds=2.0, took=7.0)
     assert [entry["point"] for entry in again.of_kind("time")] == ["default", "step 2"]
-    assert Session(again, 100.0, lambda share, doing: None, lambda text: None).spent == pytest.approx(7.0, abs=0.5)
+    assert Session(again, 100.0, lambda fraction, doing: None, lambda text: None).spent == pytest.approx(7.0, abs=0.5)
 
 
 def test_another_bench_and_other_files_are_not_touched(tmp_path):

@@ -27,7 +27,7 @@ from nerfcli.render.depth import CONVENTIONS, DepthRequest
 from nerfcli.render.model import Marching, Model, load_model, save_model
 from nerfcli.render.pictures import Quality, render_picture
 from nerfcli.render.tracing import deepest, render_rays, uniform_cuts
-from nerfcli.runs.blocks import LEAST_SHARE, MARGIN, PERCENTILES, Cell, Division, divide, joined
+from nerfcli.runs.blocks import LEAST_FRACTION, MARGIN, PERCENTILES, Cell, Division, divide, joined
 from nerfcli.runs.run import Run
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -81,7 +81,7 @@ def test_blocks_of_one_field_render_what_it_renders_in_float64(kind):
     origins, directions = random_rays(50, torch.float64)
     background = torch.tensor(alone.background, dtype=torch.float64)
     expected, seen = (
-        render_rays(model, origins, directions, background=background, shares=(0.05, 0.5, 0.9), tolerance=1e-13)
+        render_rays(model, origins, directions, background=background, fractions=(0.05, 0.5, 0.9), tolerance=1e-13)
         for model in (alone, together)
     )
     assert 0.5 < expected.ends.opacity.median() < 0.999
@@ -173,7 +173,7 @@ def test_light_passes_from_block_to_block_by_the_law_of_absorption():
     first, second = 0.25, 0.8 * np.exp(0.7)  # densities in 1 / scene unit
     scale = model.training_from_scene.scale
     origin = torch.tensor(model.training_from_scene.apply(np.array([[-1.0, 0.2, 0.1]])), dtype=torch.float32)
-    seen = render_rays(model, origin, torch.tensor([[1.0, 0.0, 0.0]]), background=torch.zeros(3), shares=(0.5,))
+    seen = render_rays(model, origin, torch.tensor([[1.0, 0.0, 0.0]]), background=torch.zeros(3), fractions=(0.5,))
     near = 0.03 * min(1 / 0.25, 1 / 0.8)
     before = first * (1.4 - near)
     assert seen.ends.quantiles[0, 0].item() / scale == pytest.approx(1.4 + (np.log(2) - before) / second, abs=0.005)
@@ -203,18 +203,18 @@ def test_a_joined_field_is_the_same_when_it_is_read_again(tmp_path):
     assert torch.equal(first, second)
 
 
-@pytest.mark.parametrize("share", [0.67, 0.003])
-def test_occupied_cells_of_a_joined_field_hold_all_that_its_blocks_have(share):
+@pytest.mark.parametrize("fraction", [0.67, 0.003])
+def test_occupied_cells_of_a_joined_field_hold_all_that_its_blocks_have(fraction):
     """A lone cell of a block also extends into joined cells of which it contains no vertex."""
     models = [cloudy(Similarity(1.0 + n, np.eye(3), np.full(3, n / 5)), seed=n) for n in range(4)]
-    models = [replace(model, occupied=torch.rand(16, 16, 16) < share) for model in models]
+    models = [replace(model, occupied=torch.rand(16, 16, 16) < fraction) for model in models]
     model = joined(models, division())
     points = torch.rand(200000, 3, generator=torch.Generator().manual_seed(0))
     assert isinstance(model.field, BlocksField)
     side = len(model.occupied)
     x, y, z = (points * side).long().clamp_max(side - 1).unbind(-1)
     assert not (model.field.is_occupied(points) & ~model.occupied[z, y, x]).any()
-    assert 0.2 * share < model.field.is_occupied(points).float().mean() < 1.8 * share
+    assert 0.2 * fraction < model.field.is_occupied(points).float().mean() < 1.8 * fraction
 
 
 @pytest.fixture
@@ -264,10 +264,10 @@ def test_photos_belong_to_the_blocks_whose_points_they_see(captured):
     side = np.where(seen.frame_index < 6, 0, 1)
     kept = np.array([p in far[s] for p, s in zip(seen.point_index.tolist(), side.tolist(), strict=True)])
     # Photo 5 sees more of the other side than the least fraction, and photo 4 less.
-    share = np.flatnonzero((seen.frame_index == 5) & np.isin(seen.point_index, list(far[1])))
-    kept[share[: round(2 * LEAST_SHARE * 200)]] = True
-    share = np.flatnonzero((seen.frame_index == 4) & np.isin(seen.point_index, list(far[1])))
-    kept[share[: round(0.5 * LEAST_SHARE * 200)]] = True
+    fraction = np.flatnonzero((seen.frame_index == 5) & np.isin(seen.point_index, list(far[1])))
+    kept[fraction[: round(2 * LEAST_FRACTION * 200)]] = True
+    fraction = np.flatnonzero((seen.frame_index == 4) & np.isin(seen.point_index, list(far[1])))
+    kept[fraction[: round(0.5 * LEAST_FRACTION * 200)]] = True
     # The second block's margin extends beyond its border: photo 3 sees points in it, and photo 2 only outside of it.
     spread = np.ptp(np.percentile(places[places[:, axis] >= border, axis], PERCENTILES))
     beyond = (border - places[seen.point_index, axis]) / (MARGIN * spread)

@@ -24,7 +24,7 @@ from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.multiview.features import Matches
 
 
-def silent(share: float, detail: str) -> None:
+def silent(fraction: float, detail: str) -> None:
     """Ignore progress."""
 
 
@@ -172,7 +172,7 @@ def test_points_alone_tell_axes(tmp_path):
     assert "the visibility of" in found.evidence
     assert [question.name for question in found.questions] == ["axes and direction"]
     best = found.questions[0].answers[0]
-    assert best.inlier_share == 1
+    assert best.inlier_fraction == 1
 
 
 # Photos

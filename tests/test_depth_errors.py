@@ -79,7 +79,7 @@ def test_where_too_little_was_measured_there_is_no_interval():
     assert (again.pixels, again.photos) == (errors.pixels, 2)
 
 
-def matched_by_truth(share: float = 1.0) -> Callable[..., list[DenseDepth]]:
+def matched_by_truth(fraction: float = 1.0) -> Callable[..., list[DenseDepth]]:
     """Return a replacement for stereo matching: true distances for a fraction of the held-out photos' pixels."""
 
     def dense_depths(photos: Sequence[LoadedPhoto], tracks: Tracks, **_: object) -> list[DenseDepth]:
@@ -90,7 +90,7 @@ def matched_by_truth(share: float = 1.0) -> Callable[..., list[DenseDepth]]:
             if "test" in photo.frame.name:
                 truth = tifffile.imread(path).astype(np.float64)
                 rows, columns = np.nonzero(np.isfinite(truth))
-                kept = slice(round(share * len(rows)))
+                kept = slice(round(fraction * len(rows)))
                 pixels, distances = np.stack([columns, rows], axis=1)[kept], truth[rows, columns][kept]
             found.append(DenseDepth(pixels, distances, np.zeros(len(pixels))))
         return found

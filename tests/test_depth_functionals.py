@@ -14,7 +14,7 @@ from oracles import quadrature_of_end_density, quadrature_of_squares
 
 from nerfcli.kernels import LightEnds, numba_cpu, reference
 from nerfcli.kernels.reference import depth
-from nerfcli.render.depth import DepthRequest, disagreement, requested, shares, spread
+from nerfcli.render.depth import DepthRequest, disagreement, fractions, requested, spread
 
 
 def ray(seed, count=5, scale=1.0):
@@ -53,9 +53,9 @@ def test_splitting_an_interval_changes_nothing_but_max_weight(seed, cut, at, exp
         torch.cat([starts[: cut + 1], middle[None], starts[cut + 1 :]]),
         torch.cat([ends[:cut], middle[None], ends[cut:]]),
         offsets=torch.tensor([0, 6]),
-        shares=(0.05, 0.5, 0.9),
+        fractions=(0.05, 0.5, 0.9),
     )
-    whole = depth.light_ends(density, starts, ends, offsets=offsets, shares=(0.05, 0.5, 0.9))
+    whole = depth.light_ends(density, starts, ends, offsets=offsets, fractions=(0.05, 0.5, 0.9))
     for name in ("opacity", "transmittance", "mean", "spread", "quantiles"):
         # Lengths are differences of distances, which are below 6.
         torch.testing.assert_close(
@@ -67,7 +67,7 @@ def test_splitting_an_interval_changes_nothing_but_max_weight(seed, cut, at, exp
 @pytest.mark.parametrize("seed", range(4))
 def test_spread_is_the_standard_deviation_of_the_end_density(seed):
     density, starts, ends, offsets = ray(seed)
-    light = depth.light_ends(density, starts, ends, offsets=offsets, shares=())
+    light = depth.light_ends(density, starts, ends, offsets=offsets, fractions=())
     mean = light.mean.item()
     mass, first = quadrature_of_end_density(density.numpy(), starts.numpy() - mean, ends.numpy() - mean)
     assert first / mass == pytest.approx(0, abs=1e-8)
@@ -117,7 +117,7 @@ def test_gradcheck(name, scale):
     arguments = tuple(x.clone().requires_grad_() for x in (density, starts, ends))
 
     def function(*values):
-        result = getattr(depth.light_ends(*values, offsets=offsets, shares=(0.001, 0.4)), name)
+        result = getattr(depth.light_ends(*values, offsets=offsets, fractions=(0.001, 0.4)), name)
         return result[~result.isnan()]
 
     assert len(function(*arguments)) >= 2
@@ -127,7 +127,7 @@ def test_gradcheck(name, scale):
 def test_gradients_are_finite_at_the_extremes():
     density = torch.tensor([0.0, 1e-12, 1e6, 0.0], dtype=torch.float64, requires_grad=True)
     starts = torch.arange(4, dtype=torch.float64)
-    light = depth.light_ends(density, starts, starts + 1, offsets=torch.tensor([0, 1, 4]), shares=(0.5,))
+    light = depth.light_ends(density, starts, starts + 1, offsets=torch.tensor([0, 1, 4]), fractions=(0.5,))
     total = sum(torch.where(values.isnan(), 0.0, values).sum() for values in light)
     assert isinstance(total, torch.Tensor)
     (gradient,) = torch.autograd.grad(total, density)
@@ -151,9 +151,9 @@ def many_rays(seed, counts, *, low, high):
 @pytest.mark.parametrize(("low", "high"), [(-12, -3), (-3, 1), (-1, 6), (-12, 6)])
 def test_the_fast_kernel_agrees_with_the_definition_in_float64(counts, low, high):
     density, starts, ends, offsets = many_rays(3, counts, low=low, high=high)
-    shares = (0.9, 0.05, 0.5)
-    fast = numba_cpu.light_ends(density, starts, ends, offsets=offsets, shares=shares)
-    exact = depth.light_ends(density.double(), starts.double(), ends.double(), offsets=offsets, shares=shares)
+    fractions = (0.9, 0.05, 0.5)
+    fast = numba_cpu.light_ends(density, starts, ends, offsets=offsets, fractions=fractions)
+    exact = depth.light_ends(density.double(), starts.double(), ends.double(), offsets=offsets, fractions=fractions)
     for name, value, wanted in zip(LightEnds._fields, fast, exact, strict=True):
         assert value.dtype == torch.float32
         torch.testing.assert_close(
@@ -167,23 +167,23 @@ def test_quantiles_of_a_mixture_of_rays(module):
     # Two rays: a wall at 1 and one at 3. The light of both together ends half here, half there.
     density, starts = torch.tensor([1e6, 1e6]), torch.tensor([1.0, 3.0])
     pair = {"offsets": torch.tensor([0, 1, 2]), "rays_per_pixel": 2}
-    for share, wanted in ((0.25, 1.0), (0.49, 1.0), (0.51, 3.0), (0.75, 3.0)):
-        value = module.mixture_quantile(density, starts, starts + 0.5, share=share, **pair)
+    for fraction, wanted in ((0.25, 1.0), (0.49, 1.0), (0.51, 3.0), (0.75, 3.0)):
+        value = module.mixture_quantile(density, starts, starts + 0.5, fraction=fraction, **pair)
         torch.testing.assert_close(value, torch.tensor([wanted]), rtol=1e-5, atol=0)
     # A wall beside nothing: half of the light passes.
     lone = {"offsets": torch.tensor([0, 0, 1]), "rays_per_pixel": 2}
-    assert module.mixture_quantile(density[1:], starts[1:], starts[1:] + 0.5, share=0.6, **lone).isnan().all()
+    assert module.mixture_quantile(density[1:], starts[1:], starts[1:] + 0.5, fraction=0.6, **lone).isnan().all()
 
 
 @pytest.mark.parametrize("rays_per_pixel", [1, 4])
 def test_the_fast_quantile_of_a_mixture_agrees_with_the_definition(rays_per_pixel):
     density, starts, ends, offsets = many_rays(5, [3, 0, 9, 1, 4, 4, 20, 6], low=-2, high=1)
-    group = {"offsets": offsets, "rays_per_pixel": rays_per_pixel, "share": 0.3}
+    group = {"offsets": offsets, "rays_per_pixel": rays_per_pixel, "fraction": 0.3}
     fast = numba_cpu.mixture_quantile(density, starts, ends, **group)
     exact = depth.mixture_quantile(density.double(), starts.double(), ends.double(), **group)
     torch.testing.assert_close(fast.double(), exact, rtol=1e-6, atol=0, equal_nan=True)
     if rays_per_pixel == 1:  # a mixture of one ray is that ray
-        alone = depth.quantile(density.double(), starts.double(), ends.double(), offsets=offsets, share=0.3)
+        alone = depth.quantile(density.double(), starts.double(), ends.double(), offsets=offsets, fraction=0.3)
         torch.testing.assert_close(exact, alone, rtol=1e-9, atol=0, equal_nan=True)
 
 
@@ -191,7 +191,7 @@ def test_median_crossing_in_a_later_interval_and_through_a_gap():
     density = torch.tensor([0.2, 0.0, 1.0], dtype=torch.float64)
     starts = torch.tensor([1.0, 2.0, 5.0], dtype=torch.float64)
     ends = torch.tensor([2.0, 3.0, 9.0], dtype=torch.float64)
-    median = depth.quantile(density, starts, ends, offsets=torch.tensor([0, 3]), share=0.5)
+    median = depth.quantile(density, starts, ends, offsets=torch.tensor([0, 3]), fraction=0.5)
     assert median.item() == pytest.approx(5.0 + math.log(2) - 0.2, rel=1e-14)
 
 
@@ -201,7 +201,7 @@ def test_gradient_of_a_median_that_lies_on_an_edge(dtype):
     and 0 for the second. Minima that split the gradient between equal arguments once gave only part of this."""
     density = torch.full((2,), math.log(2), dtype=dtype, requires_grad=True)
     starts = torch.tensor([1.0, 2.0], dtype=dtype)
-    median = depth.quantile(density, starts, starts + 1, offsets=torch.tensor([0, 2]), share=0.5)
+    median = depth.quantile(density, starts, starts + 1, offsets=torch.tensor([0, 2]), fraction=0.5)
     (gradient,) = torch.autograd.grad(median.sum(), density)
     assert median.item() == pytest.approx(2.0, rel=1e-6)
     assert gradient.tolist() == pytest.approx([-1 / math.log(2), 0.0], rel=1e-6)
@@ -215,7 +215,7 @@ def test_a_median_that_rounding_puts_into_thin_air_stays_inside_an_interval():
     density = torch.cat([wall[None], torch.full((100,), 1e-6)])
     starts = torch.cat([torch.zeros(1), torch.arange(2.0, 102.0)])
     ends = starts + torch.cat([torch.ones(1), torch.full((100,), 2.0**-10)])
-    median = depth.quantile(density, starts, ends, offsets=torch.tensor([0, 101]), share=0.5)
+    median = depth.quantile(density, starts, ends, offsets=torch.tensor([0, 101]), fraction=0.5)
     assert ((starts <= median) & (median <= ends)).any()
 
 
@@ -224,7 +224,7 @@ def test_gradient_of_the_mean_of_a_far_thin_surface():
     distance, and was once lost in the rounding of the distance."""
     density = torch.tensor([0.5], requires_grad=True)
     start, length = torch.tensor([200.0]), 2.0**-12
-    mean = depth.light_ends(density, start, start + length, offsets=torch.tensor([0, 1]), shares=()).mean
+    mean = depth.light_ends(density, start, start + length, offsets=torch.tensor([0, 1]), fractions=()).mean
     (gradient,) = torch.autograd.grad(mean.sum(), density)
     assert gradient.item() == pytest.approx(-(length**2) / 12, rel=1e-3)
 
@@ -234,11 +234,11 @@ def test_undefined_depths_are_nan_and_only_those():
     offsets = torch.tensor([0, 0, 1, 2])
     density = torch.tensor([-math.log(0.9), 50.0], dtype=torch.float64)
     starts, ends = torch.tensor([1.0, 1.0], dtype=torch.float64), torch.tensor([2.0, 2.0], dtype=torch.float64)
-    light = depth.light_ends(density, starts, ends, offsets=offsets, shares=(0.5,))
+    light = depth.light_ends(density, starts, ends, offsets=offsets, fractions=(0.5,))
 
     def undefined(convention, min_opacity):
         request = DepthRequest(convention, "ray", min_opacity, 7.0)
-        light = depth.light_ends(density, starts, ends, offsets=offsets, shares=shares(request))
+        light = depth.light_ends(density, starts, ends, offsets=offsets, fractions=fractions(request))
         far = torch.full((3,), 7.0, dtype=torch.float64)
         return requested(request, light, background_distance=far).isnan().tolist()
 
@@ -273,5 +273,5 @@ def test_max_weight_takes_the_nearest_of_equals():
     # Weights that are equal to the last bit, in the definition and in the compiled kernel.
     density, starts = torch.tensor([1e-30, 1e-30, 1e-30]), torch.tensor([1.0, 3.0, 5.0])
     for module in (depth, numba_cpu):
-        light = module.light_ends(density, starts, starts + 1, offsets=torch.tensor([0, 3]), shares=())
+        light = module.light_ends(density, starts, starts + 1, offsets=torch.tensor([0, 3]), fractions=())
         assert light.heaviest.tolist() == [1.5]

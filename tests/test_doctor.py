@@ -403,7 +403,7 @@ def test_damaged_files_are_named_and_the_rest_is_examined(tmp_path):
     folder = write(tmp_path / "photos", [view((0.2 * step, 0, 0)) for step in range(3)])
     (folder / "cut <b>.jpg").write_bytes((folder / "00.jpg").read_bytes()[:3000])
     (folder / "empty.png").touch()
-    diagnosis = examine(find_subject(folder), threads=2, progress=lambda share, detail: None)
+    diagnosis = examine(find_subject(folder), threads=2, progress=lambda fraction, detail: None)
     found = finding(diagnosis, "files")
     assert (found.verdict, found.names) == (BAD, ("cut <b>.jpg", "empty.png"))
     assert finding(diagnosis, "count").verdict == BAD
@@ -419,7 +419,7 @@ def test_a_check_that_raises_is_listed_and_the_others_are_made(tmp_path, monkeyp
 
     monkeypatch.setattr("nerfcli.doctor.geometry.movement", singular)
     monkeypatch.setattr("nerfcli.doctor.quality.stops", singular)
-    diagnosis = examine(find_subject(folder), threads=2, progress=lambda share, detail: None)
+    diagnosis = examine(find_subject(folder), threads=2, progress=lambda fraction, detail: None)
     why = "could not be computed: LinAlgError: singular matrix"
     assert dict(diagnosis.not_checked).items() >= {"movement": why, "stops": why}.items()
     assert finding(diagnosis, "count").verdict == BAD
@@ -431,7 +431,7 @@ def test_a_check_that_raises_is_listed_and_the_others_are_made(tmp_path, monkeyp
 
 def test_nothing_readable_is_a_finding_too(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"no picture")
-    diagnosis = examine(find_subject(tmp_path), threads=1, progress=lambda share, detail: None)
+    diagnosis = examine(find_subject(tmp_path), threads=1, progress=lambda fraction, detail: None)
     assert [f.verdict for f in diagnosis.findings] == [BAD, BAD]
     assert "a.jpg" in page_html(diagnosis)
 
@@ -456,7 +456,7 @@ def test_only_a_page_of_the_same_capture_is_replaced(clean, tmp_path):
 
 def test_the_same_photos_give_the_same_findings(clean, tmp_path):
     folder = write(tmp_path / "again", list(clean.photos[:3]))
-    runs = [content(examine(find_subject(folder), threads=t, progress=lambda share, detail: None)) for t in (1, 3)]
+    runs = [content(examine(find_subject(folder), threads=t, progress=lambda fraction, detail: None)) for t in (1, 3)]
     assert runs[0] == runs[1]
 
 

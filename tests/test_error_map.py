@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.fit.error_map import BLOCK_PX, GUIDED_SHARE, ErrorMap
+from nerfcli.fit.error_map import BLOCK_PX, GUIDED_FRACTION, ErrorMap
 from nerfcli.photos.loading import LoadedPhoto, load_photos
 from nerfcli.photos.pool import PixelPool
 from nerfcli.scene import Scene
@@ -58,7 +58,7 @@ def test_pixels_are_drawn_where_the_error_is(photos):
     row, column = numbers // width, numbers % width
     inside = (row // BLOCK_PX == 1) & (column // BLOCK_PX == 2)
     area = BLOCK_PX**2
-    expected = GUIDED_SHARE + (1 - GUIDED_SHARE) * area / (height * width)
+    expected = GUIDED_FRACTION + (1 - GUIDED_FRACTION) * area / (height * width)
     assert inside.double().mean().item() == pytest.approx(expected, abs=0.01)
     counts = torch.bincount((row[inside] % BLOCK_PX) * BLOCK_PX + column[inside] % BLOCK_PX, minlength=area)
     assert counts.min() > 0.4 * counts.double().mean()

@@ -179,12 +179,12 @@ def test_a_fresh_field_is_a_thin_grey_fog():
     assert (rgb.mean(0) - 0.5).abs().max() < 0.25
 
 
-@pytest.mark.parametrize(("share", "learning"), [(None, 6), (0.0, 4), (0.24, 4), (0.26, 5), (0.5, 6), (1.0, 6)])
-def test_fine_levels_learn_later(share, learning):
+@pytest.mark.parametrize(("fraction", "learning"), [(None, 6), (0.0, 4), (0.24, 4), (0.26, 5), (0.5, 6), (1.0, 6)])
+def test_fine_levels_learn_later(fraction, learning):
     """Of 6 levels, 4 learn from the start and the others open one by one until half of the budget; a field read from a
     file has all. Levels that do not learn have no gradient, nor do the weights that read them."""
     field = HashField(HashFieldSettings(contraction="none", levels=6, log2_rows=8, coarsest=4, finest=64, width=16))
-    detail = {} if share is None else {"detail": share}
+    detail = {} if fraction is None else {"detail": fraction}
     directions = torch.nn.functional.normalize(torch.randn(5, 3), dim=-1)
     density, rgb = radiance_of(field, torch.rand(50, 3), directions, torch.arange(50) // 10, **detail)
     (density.sum() + rgb.sum()).backward()

@@ -98,7 +98,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_no_held_out_photo_is_opened_before_the_training_is_over(case, capture, opened, tmp_path, monkeypatch):
     monkeypatch.setattr(selection, "FEWEST_STEPS", 1)
-    monkeypatch.setattr(preparation, "SEARCH_SHARE", 1.0)
+    monkeypatch.setattr(preparation, "SEARCH_FRACTION", 1.0)
     until_then: list[str] = []
     measure = waypoints.measure_waypoints
 
@@ -129,7 +129,7 @@ def test_no_held_out_photo_is_opened_before_the_training_is_over(case, capture, 
 @pytest.mark.parametrize("case", ["default", "auto"])
 def test_the_field_does_not_depend_on_what_is_in_held_out_photos(case, capture, tmp_path, monkeypatch):
     monkeypatch.setattr(selection, "FEWEST_STEPS", 1)
-    monkeypatch.setattr(preparation, "SEARCH_SHARE", 1.0)
+    monkeypatch.setattr(preparation, "SEARCH_FRACTION", 1.0)
     # A budget in steps gives trials of equal length; seconds would differ.
     asked = settings(*CASES[case])
     fit(scenes.load(capture), tmp_path / "run", asked)

@@ -184,10 +184,10 @@ def test_a_damaged_file_is_told_in_two_lines(suffix, tmp_path, capfd):
     else:
         ALL[suffix](path, plain_depth(), META)
     whole = path.read_bytes()
-    for share in (0.0, 0.001, 0.02, 0.3, 0.6, 0.9, 0.99):
-        path.write_bytes(whole[: int(share * len(whole))])
+    for fraction in (0.0, 0.001, 0.02, 0.3, 0.6, 0.9, 0.99):
+        path.write_bytes(whole[: int(fraction * len(whole))])
         result = info(path)
-        assert (result.exit_code, result.stdout) == (3, ""), share
+        assert (result.exit_code, result.stdout) == (3, ""), fraction
         lines = result.stderr.splitlines()
         assert len(lines) == 2, lines
         assert lines[0].startswith("Error: ")

@@ -114,7 +114,7 @@ def test_photos_without_a_mask_are_named(photos, masks, tmp_path):
         "2 of 4 photos have no mask and are used completely: p 0.png, p 3.png",
         "1 masks are completely black, so their photos are not used: p 2.png",
     ]
-    assert [mask.used_share for mask in result] == [1, 1, 0, 1]
+    assert [mask.used_fraction for mask in result] == [1, 1, 0, 1]
     assert [bool(mask.key) for mask in result] == [False, True, True, False]
     assert sorted(path.name for path in (tmp_path / "work").iterdir()) == [f"{n:05d}.png.png" for n in range(4)]
     white = [read_image(tmp_path / "work" / f"{number:05d}.png.png").min() for number in range(4)]

@@ -41,7 +41,7 @@ def learned(pool: PixelPool, residual_of: Callable[[int, np.ndarray, np.ndarray]
         noise = rng.normal(0.0, 0.1, (height, width, 3))
         residuals.append((residual_of(photo, rows, columns) + noise).reshape(-1, 3))
     movers.learn(
-        torch.arange(len(pool.colours)), torch.from_numpy(np.concatenate(residuals)).float(), share=BEGINS, step=0
+        torch.arange(len(pool.colours)), torch.from_numpy(np.concatenate(residuals)).float(), fraction=BEGINS, step=0
     )
     return movers
 
@@ -84,17 +84,17 @@ def test_pixels_count_again_when_the_field_agrees(photos):
     numbers = torch.arange(len(pool.colours))
     assert movers.weights(numbers).min() == 0.0
     for _ in range(10):
-        movers.learn(numbers, torch.zeros(len(numbers), 3), share=BEGINS, step=0)
+        movers.learn(numbers, torch.zeros(len(numbers), 3), fraction=BEGINS, step=0)
     assert movers.weights(numbers).min() == 1.0
 
 
 def test_nothing_moves_at_the_beginning(photos):
     """Before `BEGINS` the field explains no photo; and nothing is known about blocks without a seen pixel."""
     movers = Movers(PixelPool(photos, SAME, CPU))
-    movers.learn(torch.arange(500), torch.ones(500, 3), share=0.9 * BEGINS, step=0)
+    movers.learn(torch.arange(500), torch.ones(500, 3), fraction=0.9 * BEGINS, step=0)
     assert not movers.moving.any()
     unseen = Movers(PixelPool(photos, SAME, CPU))
-    unseen.learn(torch.arange(1), torch.ones(1, 3), share=BEGINS, step=0)
+    unseen.learn(torch.arange(1), torch.ones(1, 3), fraction=BEGINS, step=0)
     assert not unseen.moving.any()
 
 

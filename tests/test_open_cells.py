@@ -48,7 +48,7 @@ def cells_of(field: Any, covered: Tensor | None = None) -> OpenCells:
 
 def refresh(cells: OpenCells, step: int, ranks: Alone = ALONE) -> None:
     generator = torch.Generator().manual_seed(step)
-    cells.refresh(step, share=1.0, detail=1.0, marching=MARCHING, generator=generator, ranks=ranks)
+    cells.refresh(step, fraction=1.0, detail=1.0, marching=MARCHING, generator=generator, ranks=ranks)
 
 
 def visit(cells: OpenCells, where: tuple[int, int, int], depth: float) -> None:

@@ -297,8 +297,8 @@ def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_fro
     assert outlook.update("extract", 10, 10) == (pytest.approx(0.5), pytest.approx(10.0))
     assert outlook.update("enlarge", 0, 5) == (pytest.approx(0.5), pytest.approx(15.0 + 10.0))
     now = 22.0
-    share, left = outlook.update("enlarge", 4, 5)
-    assert (share, left) == (pytest.approx(22.0 / 35.0), pytest.approx(3.0 + 10.0))
+    fraction, left = outlook.update("enlarge", 4, 5)
+    assert (fraction, left) == (pytest.approx(22.0 / 35.0), pytest.approx(3.0 + 10.0))
     # Later stages scale with the speed of the machine, not with the number of photos that were searched twice.
     now = 25.0
     outlook.update("enlarge", 5, 5)
@@ -392,6 +392,6 @@ def test_another_attempt_lowers_the_share():
     outlook.update("map", 10, 10)
     now = 22.0
     assert outlook.update("check", 4, 4)[0] == 1.0
-    share, left = outlook.update("map", 0, 10)
+    fraction, left = outlook.update("map", 0, 10)
     assert left > 5.0
-    assert share == pytest.approx(22.0 / (22.0 + left))
+    assert fraction == pytest.approx(22.0 / (22.0 + left))

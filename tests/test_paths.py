@@ -83,10 +83,10 @@ def test_focus_of_cameras_that_look_outwards_is_not_behind_them():
         focus_point([])
 
 
-@pytest.mark.parametrize("share", [0.4, 1.0, 1.5])
-def test_up_is_exact_for_level_cameras_however_they_tilt(share):
+@pytest.mark.parametrize("fraction", [0.4, 1.0, 1.5])
+def test_up_is_exact_for_level_cameras_however_they_tilt(fraction):
     """Part of a ring looking down steeply: the mean of the pictures' up leans over, their level axes do not."""
-    frames = ring(np.zeros(3), height=3.0, turns=share)
+    frames = ring(np.zeros(3), height=3.0, turns=fraction)
     similarity = Similarity(3.0, Rotation.from_euler("xyz", [1, 2, 3]).as_matrix(), np.ones(3))
     np.testing.assert_allclose(up_direction(moved(frames, similarity)), similarity.rotation @ UP, rtol=0, atol=1e-9)
 

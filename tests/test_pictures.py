@@ -126,9 +126,9 @@ def test_a_pixel_of_several_samples_is_their_mixture(convention):
         case "max-weight":
             expected = z.min() if near > 0 else z.max()
         case _:
-            share = request.share
-            assert share is not None
-            expected = np.sort(z)[int(np.floor(share * 8))]
+            fraction = request.fraction
+            assert fraction is not None
+            expected = np.sort(z)[int(np.floor(fraction * 8))]
     assert value == pytest.approx(expected, abs=3 * STEP)
     assert picture.spread is not None
     assert picture.spread[0, 0] == pytest.approx(z.std(), abs=3 * STEP)

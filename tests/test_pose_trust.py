@@ -426,7 +426,7 @@ def test_points_far_away_agree_whichever_side_noise_makes_their_rays_meet():
     (pair,) = common_pixels(views, points, noise_px=0.5)
     (agreement,) = agreements(synthetic.true_model(views), [pair])
     assert agreement.matches > 300
-    assert agreement.share == 1
+    assert agreement.fraction == 1
     turned = Rotation.from_euler("x", 3, degrees=True).as_matrix() @ views[1].cam_from_world
     (agreement,) = agreements(synthetic.true_model([views[0], View(WIDE, turned)]), [pair])
     assert agreement.contradicts

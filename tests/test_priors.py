@@ -16,7 +16,7 @@ from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.fit.losses import opacity_entropy
-from nerfcli.fit.point_depth import LAST_SHARE, PointRays, fading, point_depths
+from nerfcli.fit.point_depth import LAST_FRACTION, PointRays, fading, point_depths
 from nerfcli.kernels import reference
 from nerfcli.multiview.camera_check import CameraCheck
 from nerfcli.multiview.correspondences import Shared
@@ -92,8 +92,8 @@ def test_points_are_found_at_their_pixels_with_their_distances_and_trust(capture
     assert (off[[1, 2, 4, 5]] <= math.sqrt(0.5) / 12 + 1e-6).all()
     # The rays to the first point are e = 0.5 px apart in height where they meet at the angle a: the point nearest to
     # both is at a^2 / (a^2 + e^2) of the way.
-    share = (0.2 / 3) ** 2 / ((0.2 / 3) ** 2 + (0.5 / 12) ** 2)
-    assert known.distances[[0, 3]].tolist() == pytest.approx([0.5 * 3 * share] * 2, rel=0.01)
+    fraction = (0.2 / 3) ** 2 / ((0.2 / 3) ** 2 + (0.5 / 12) ** 2)
+    assert known.distances[[0, 3]].tolist() == pytest.approx([0.5 * 3 * fraction] * 2, rel=0.01)
     assert pool.photo_of(known.numbers).tolist() == [0, 0, 0, 1, 1, 1]
     misses = triangulate(pool.frames, tracks_in(capture)).misses_px
     assert misses[[0, 3]].min() > 0.2
@@ -173,13 +173,13 @@ def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
 
 
 def test_points_fade_out():
-    assert [fading(share) for share in (0.0, LAST_SHARE / 2, LAST_SHARE, 1.0)] == [1.0, 0.5, 0.0, 0.0]
+    assert [fading(fraction) for fraction in (0.0, LAST_FRACTION / 2, LAST_FRACTION, 1.0)] == [1.0, 0.5, 0.0, 0.0]
 
 
 def test_undecided_rays_have_the_largest_entropy_and_decided_ones_no_infinite_slope():
     assert opacity_entropy(torch.tensor([0.5])).item() == pytest.approx(math.log(2))
-    share = torch.tensor([0.3, 0.9, 0.02], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(opacity_entropy, (share,))
+    fraction = torch.tensor([0.3, 0.9, 0.02], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(opacity_entropy, (fraction,))
     extremes = torch.tensor([0.0, 1.0], requires_grad=True)
     values = opacity_entropy(extremes)
     values.sum().backward()

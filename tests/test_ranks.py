@@ -78,8 +78,8 @@ def train_until(step: int, run: Path, settings: TrainSettings) -> None:
     assert settings.steps is not None
     stop = step / settings.steps
 
-    def progress(share: float, detail: str) -> None:
-        if share >= stop:
+    def progress(fraction: float, detail: str) -> None:
+        if fraction >= stop:
             raise KeyboardInterrupt
 
     with suppress(KeyboardInterrupt):

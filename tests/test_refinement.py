@@ -29,7 +29,7 @@ from nerfcli.fit.extent import Extent
 from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.gauge import mean_similarity, without_mean
 from nerfcli.fit.newton import NewtonSteps
-from nerfcli.fit.refinement import LAST_SHARE, LENS_RATE, PoseRefinement, Refinement, rate_at
+from nerfcli.fit.refinement import LAST_FRACTION, LENS_RATE, PoseRefinement, Refinement, rate_at
 from nerfcli.fit.whitening import BETAS, DAMPING, EPS, WhitenedAdam, whitening
 from nerfcli.photos.loading import load_photos
 from nerfcli.photos.pool import PixelPool
@@ -231,7 +231,7 @@ def test_how_the_picture_moves_with_a_pose(small):
     pose = look_at(np.array([3.0, 0.0, 0.0]), np.zeros(3), np.array([0, 0, 1]))
     x, y = ((np.arange(6) + 0.5) / 6 * side for side in (camera.width, camera.height))
     bearings, _ = camera.bearings(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    points = np.concatenate([3 * share * bearings for share in (2 / 3, 1.0, 2.0)])
+    points = np.concatenate([3 * fraction * bearings for fraction in (2 / 3, 1.0, 2.0)])
     columns = []
     for twist in np.eye(6):
         ahead, behind = (
@@ -368,9 +368,9 @@ def steps_of(monkeypatch: pytest.MonkeyPatch, twist: float) -> list[dict[str, fl
 def test_poses_are_damped_less_and_less_and_held_once_it_is_known_what_was_wrong(monkeypatch):
     asked = steps_of(monkeypatch, 1e-9)
     refinement = PoseRefinement(random_poses(np.random.default_rng(0), 4), [Camera.pinhole(40, 30, 40.0)] * 4)
-    shares = (0.11, 0.2, 0.21, 0.35, 0.5, 0.8, 0.97)
-    for share in shares:
-        refinement.step(*NO_RAYS, share, rate=1.0)
+    fractions = (0.11, 0.2, 0.21, 0.35, 0.5, 0.8, 0.97)
+    for fraction in fractions:
+        refinement.step(*NO_RAYS, fraction, rate=1.0)
     damping, holding = ([one[name] for one in asked] for name in ("damping", "holding"))
     assert damping[:2] == pytest.approx([1.0, 1.0])
     assert damping[-2:] == pytest.approx([0.1, 0.1])
@@ -414,7 +414,7 @@ def test_a_step_of_all_hands_each_part_what_it_needs(small, monkeypatch):
     monkeypatch.setattr(
         refinement.poses,
         "step",
-        lambda slopes, losses, photos, share, *, rate, ranks: given.update(slopes=slopes, rate=rate),
+        lambda slopes, losses, photos, fraction, *, rate, ranks: given.update(slopes=slopes, rate=rate),
     )
     numbers = torch.arange(50)
     drawn = refinement.refined(pool.rays_of(numbers))
@@ -430,11 +430,11 @@ def test_a_step_of_all_hands_each_part_what_it_needs(small, monkeypatch):
 
 
 def test_rates_rise_from_nothing_and_end_at_nothing():
-    shares = np.linspace(0, 1, 201)
-    rates = np.array([rate_at(share) for share in shares])
+    fractions = np.linspace(0, 1, 201)
+    rates = np.array([rate_at(fraction) for fraction in fractions])
     assert rates.max() == 1.0
     assert (rates[[0, -1]] == 0).all()
-    assert (rates[shares >= LAST_SHARE] == 0).all()
+    assert (rates[fractions >= LAST_FRACTION] == 0).all()
     assert np.abs(np.diff(rates)).max() < 0.11
 
 

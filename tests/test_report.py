@@ -82,11 +82,11 @@ def seen() -> tuple[list[Seen], np.ndarray]:
     cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     model = fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
     photo = np.full((8, 10, 3), 128, np.uint8)
-    shares: list[float] = []
+    fractions: list[float] = []
     held_out = [HeldOutPhoto(camera_at(name, (0.0, 0.0, -2.0)), photo, None) for name in ("a.png", EVIL)]
     photos = depth_maps(model, [camera_at("c.png", (0.0, 0.0, -2.0)), camera_at("d.png", (0.0, 0.0, 2.0))])
-    look = look_through(model, held_out, depth=DEPTH, photo_depths=photos, on_progress=shares.append)
-    assert shares == [0.5, 1.0]
+    look = look_through(model, held_out, depth=DEPTH, photo_depths=photos, on_progress=fractions.append)
+    assert fractions == [0.5, 1.0]
     return look, photo
 
 

@@ -72,10 +72,10 @@ def without(folder: Path, name: str) -> Path:
     return folder
 
 
-def cut(path: Path, share: float) -> Path:
+def cut(path: Path, fraction: float) -> Path:
     """A file of which only the first part was copied."""
     content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
+    path.write_bytes(content[: int(fraction * len(content))])
     return path
 
 

@@ -24,7 +24,7 @@ from nerfcli.search.judgement import (
     judge_removal,
     judge_supported,
 )
-from nerfcli.search.race import COSTS_MORE, NO_TIME, ONCE, REMOVAL_SHARE, SearchBudget
+from nerfcli.search.race import COSTS_MORE, NO_TIME, ONCE, REMOVAL_FRACTION, SearchBudget
 from nerfcli.search.selection import (
     MOST_START_STEPS,
     Facts,
@@ -506,9 +506,9 @@ def test_of_values_that_gain_as_much_the_plainest_is_kept():
 def test_leaving_out_may_not_use_up_a_limit_of_time_but_may_use_up_steps():
     purse = SearchBudget(100.0, None)
     assert purse.can_afford(3, of_steps=0, seconds_each=30.0)
-    assert not purse.can_afford(3, of_steps=0, seconds_each=30.0, share_of_time=REMOVAL_SHARE)
-    assert purse.can_afford(1, of_steps=0, seconds_each=60.0, share_of_time=REMOVAL_SHARE)
-    assert SearchBudget(None, 100).can_afford(2, of_steps=50, seconds_each=math.inf, share_of_time=REMOVAL_SHARE)
+    assert not purse.can_afford(3, of_steps=0, seconds_each=30.0, fraction_of_time=REMOVAL_FRACTION)
+    assert purse.can_afford(1, of_steps=0, seconds_each=60.0, fraction_of_time=REMOVAL_FRACTION)
+    assert SearchBudget(None, 100).can_afford(2, of_steps=50, seconds_each=math.inf, fraction_of_time=REMOVAL_FRACTION)
 
 
 @pytest.mark.parametrize(("gain", "kept"), [(0.04, True), (-0.04, True), (-0.3, False)])
@@ -564,8 +564,8 @@ def test_exposures_are_kept_on_evidence():
 def test_a_sky_that_pixels_look_like_is_tried_and_kept_if_it_does_not_lose():
     change = ("background", "sphere")
     nearby = signs(0.0, 0.0)
-    assert change not in proposals(Components(), nearby, replace(FITTED, sky_share=0.04))[0]
-    facts = replace(FITTED, sky_share=0.2)
+    assert change not in proposals(Components(), nearby, replace(FITTED, sky_fraction=0.04))[0]
+    facts = replace(FITTED, sky_fraction=0.2)
     assert change in proposals(Components(), nearby, facts)[0]
     assert rules([change], nearby, facts) == {change: judge_supported}
     assert change not in proposals(Components(), nearby, replace(facts, has_alpha=True))[0]

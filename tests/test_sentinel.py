@@ -65,8 +65,8 @@ def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_fa
 def test_a_failure_is_passed_with_smaller_steps_and_counted(views, tmp_path, monkeypatch):
     rate = Fitting.learning_rate
 
-    def poisoned(self: Fitting, share: float) -> float:
-        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, share)
+    def poisoned(self: Fitting, fraction: float) -> float:
+        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, fraction)
 
     monkeypatch.setattr(Fitting, "learning_rate", poisoned)
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
@@ -88,11 +88,11 @@ def test_the_way_back_is_exact(views, tmp_path, monkeypatch):
     # After the rollback, training equals one whose learning rate is halved from the snapshot on.
     rate = Fitting.learning_rate
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
-    monkeypatch.setattr(Fitting, "learning_rate", lambda self, share: rate(self, share) * (self.step < 4 or 0.5))
+    monkeypatch.setattr(Fitting, "learning_rate", lambda self, fraction: rate(self, fraction) * (self.step < 4 or 0.5))
     fit(views, tmp_path / "known")
 
-    def poisoned(self: Fitting, share: float) -> float:
-        return math.inf if self.step == 6 and self.rollbacks == 0 else rate(self, share)
+    def poisoned(self: Fitting, fraction: float) -> float:
+        return math.inf if self.step == 6 and self.rollbacks == 0 else rate(self, fraction)
 
     monkeypatch.setattr(Fitting, "learning_rate", poisoned)
     fit(views, tmp_path / "found")
@@ -117,8 +117,8 @@ def test_a_fault_that_does_not_come_back_changes_nothing(bad_call, on_gpu, views
     def flaky(*args: torch.Tensor, **named: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         nonlocal calls
         calls += 1
-        rgb, transmittance, shares = composite(*args, **named)
-        return (rgb * math.nan if calls == bad_call else rgb), transmittance, shares
+        rgb, transmittance, fractions = composite(*args, **named)
+        return (rgb * math.nan if calls == bad_call else rgb), transmittance, fractions
 
     monkeypatch.setattr(numba_cpu, "composite", flaky)  # the first call warms up
     reported = fit(views, tmp_path / "flaky")
@@ -132,8 +132,8 @@ def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, t
     monkeypatch.setattr(NumbaBackend, "deterministic", False)
     rate = Fitting.learning_rate
 
-    def poisoned(self: Fitting, share: float) -> float:
-        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, share)
+    def poisoned(self: Fitting, fraction: float) -> float:
+        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, fraction)
 
     with monkeypatch.context() as patched:
         patched.setattr(Fitting, "learning_rate", poisoned)
@@ -148,8 +148,8 @@ def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, t
     def flaky(*args: torch.Tensor, **named: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         nonlocal calls
         calls += 1
-        rgb, transmittance, shares = composite(*args, **named)
-        return (rgb * math.nan if calls == 9 else rgb), transmittance, shares
+        rgb, transmittance, fractions = composite(*args, **named)
+        return (rgb * math.nan if calls == 9 else rgb), transmittance, fractions
 
     monkeypatch.setattr(numba_cpu, "composite", flaky)
     reported = fit(views, tmp_path / "flaky")

@@ -393,8 +393,8 @@ def test_the_time_budget_is_kept_within_a_step(views, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))
     progress = fit(views, tmp_path / "run", replace(FEW, budget_seconds=0.5, steps=None))
     assert progress[-2].seconds < 0.5 <= progress[-1].seconds
-    assert progress[-1].share == 1
-    assert [p.share for p in progress] == sorted(p.share for p in progress)
+    assert progress[-1].fraction == 1
+    assert [p.fraction for p in progress] == sorted(p.fraction for p in progress)
 
 
 def test_the_first_limit_that_is_reached_ends_the_training(views, tmp_path):

@@ -35,8 +35,8 @@ def trials(spheres) -> Trials:
 def start(trials) -> Iterator[TrialStart]:
     """A start early in a schedule, without closing cells: within a few dozen steps they would leave nothing to see."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nerfcli.search.trials.FORK_SHARE", 0.02)
-        patch.setattr("nerfcli.fit.open_cells.CLOSING_SHARE", 1e9)
+        patch.setattr("nerfcli.search.trials.FORK_FRACTION", 0.02)
+        patch.setattr("nerfcli.fit.open_cells.CLOSING_FRACTION", 1e9)
         yield trials.begin(Components(view=0), steps=20)
 
 
@@ -62,7 +62,7 @@ def clock(monkeypatch: pytest.MonkeyPatch, seconds: Iterable[float]) -> list[int
     """Make each step do nothing but report the next of `seconds`; return the list of steps taken, which grows."""
     times, gone = iter(seconds), []
 
-    def advance(self: Trials, fitting: Fitting, share: float) -> float:
+    def advance(self: Trials, fitting: Fitting, fraction: float) -> float:
         fitting.step += 1
         gone.append(fitting.step)
         return next(times)
@@ -109,7 +109,7 @@ def test_the_learning_rate_falls_by_half_a_cosine_after_its_warm_up(trials):
     fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
     assert fitting.learning_rate(0.0) == pytest.approx(0.01 / 50)
     fitting.step = 1000
-    rates = [fitting.learning_rate(share) for share in (0.0, 0.25, 0.5, 1.0, 1.5)]
+    rates = [fitting.learning_rate(fraction) for fraction in (0.0, 0.25, 0.5, 1.0, 1.5)]
     assert rates == pytest.approx([0.01, 0.001 + 0.009 * (0.5 + 0.125**0.5), 0.0055, 0.001, 0.001])
 
 
@@ -226,7 +226,7 @@ def test_photos_of_one_exposure_have_no_spread_and_an_empty_photo_is_left_alone(
     from_beyond = torch.linspace(0.0, 1.0, len(photos))
     signs = diagnose(rendered, measured.clamp(0.0, 1.0), photos, directions=rendered, from_beyond=from_beyond, count=8)
     assert signs.exposure_spread < 0.02
-    assert signs.far_share == 0.5
+    assert signs.far_fraction == 0.5
     assert signs.log_gains[5].tolist() == [0.0] * 3
 
 

@@ -141,7 +141,7 @@ class TestTogether:
     def test_background_around_an_object_is_found(self) -> None:
         said = self.of((0, 0, 1, 1))
         assert said.found
-        assert said.share == 1
+        assert said.fraction == 1
         assert said.photos >= 20
 
     @pytest.mark.parametrize("box", [(0.75, 0.93, 0.99, 0.99), (0.0, 0.94, 1.0, 1.0), (0.85, 0.02, 0.98, 0.15)])
@@ -155,7 +155,7 @@ class TestTogether:
         assert self.of((0, 0, 1, 1), copies=40).found
         copies = together([(i, i + 1, motions(*staying(200, seed=i), SIZE)) for i in range(40)])
         assert not copies.found
-        assert copies.share == 0
+        assert copies.fraction == 0
 
     def test_few_such_pairs_among_others_are_not_enough(self) -> None:
         pairs = [(i, j, motions(*moving, SIZE)) for i, j, moving in ring_pairs()]

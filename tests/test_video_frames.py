@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
-from nerfcli.poses.input.frame_choice import MOVED_SHARE, FrameMeasure, FrameMeter, MotionPicture, choose_frames
+from nerfcli.poses.input.frame_choice import MOVED_FRACTION, FrameMeasure, FrameMeter, MotionPicture, choose_frames
 from nerfcli.poses.input.pairs import capture_order
 from nerfcli.poses.input.video_frames import FRAMES_FILE, extract_frames, frames_folder
 
@@ -29,16 +29,16 @@ def clip(tmp_path_factory) -> Path:
 def extract(path: Path, folder: Path, *, count: int | None = None, overwrite: bool = False) -> list[str]:
     """Extract frames and return the notes."""
     notes: list[str] = []
-    shares: list[float] = []
+    fractions: list[float] = []
     extract_frames(
         path,
         folder,
         count=count,
         overwrite=overwrite,
         notify=notes.append,
-        progress=lambda share, what: shares.append(share),
+        progress=lambda fraction, what: fractions.append(fraction),
     )
-    assert shares == sorted(shares)
+    assert fractions == sorted(fractions)
     return notes
 
 
@@ -55,7 +55,7 @@ def test_motion_is_the_share_of_the_longer_side(shift):
 
 def test_another_scene_has_moved_and_a_blank_wall_has_not():
     (one,), other = pan([0.0]), np.random.default_rng(1).integers(0, 255, (120, 160, 3), dtype=np.uint8)
-    assert MotionPicture(one).moved_to(MotionPicture(other)) > MOVED_SHARE
+    assert MotionPicture(one).moved_to(MotionPicture(other)) > MOVED_FRACTION
     grey = np.full((120, 160), 100, np.uint8)
     assert MotionPicture(grey).moved_to(MotionPicture(grey + 1)) == 0
     assert MotionPicture(grey).moved_to(MotionPicture(grey + 50)) == np.inf
@@ -93,7 +93,7 @@ def test_a_camera_that_stands_still_gets_no_frames_for_it(tmp_path):
     assert len(numbers) == 20
     assert np.sum((numbers > 52) & (numbers < 148)) <= 2
     distances = np.diff(np.array(offsets)[numbers]) / 160
-    assert distances.min() > 0.9 * MOVED_SHARE
+    assert distances.min() > 0.9 * MOVED_FRACTION
 
 
 def test_a_camera_that_never_moves_is_told(tmp_path):

@@ -40,7 +40,9 @@ def clip(frames, tmp_path_factory) -> Path:
 
 def measured_levels(video: Video) -> tuple[np.ndarray, list[float]]:
     """Return the time of each frame and the mean grey of its fourth quarter."""
-    found = measure_frames(video, lambda f: float(f[26:-2, 34:-2].mean()), longer_side=999, progress=lambda share: None)
+    found = measure_frames(
+        video, lambda f: float(f[26:-2, 34:-2].mean()), longer_side=999, progress=lambda fraction: None
+    )
     assert found.errors == 0
     return found.seconds, found.values
 
@@ -105,7 +107,7 @@ def test_turned_and_mirrored_as_the_metadata_say_and_once(clip, frames, tmp_path
     assert (video.height, video.width) == expected.shape[:2]
     (found,) = read_frames(video, [5])
     assert np.abs(found.astype(int) - expected).max() <= 3
-    grey = measure_frames(video, np.copy, longer_side=32, progress=lambda share: None).values[5]
+    grey = measure_frames(video, np.copy, longer_side=32, progress=lambda fraction: None).values[5]
     assert grey.shape == tuple(size // 2 for size in expected.shape[:2])
     luma = expected.astype(float) @ [0.299, 0.587, 0.114]  # BT.601, as the clip was encoded
     assert np.abs(grey - luma[::2, ::2]).max() <= 2
@@ -120,11 +122,11 @@ def test_pixels_become_square(clip, tmp_path):
 
 
 def test_progress_rises_to_the_end(clip):
-    shares: list[float] = []
-    measure_frames(open_video(clip), np.mean, longer_side=64, progress=shares.append)
-    assert shares == sorted(shares)
-    assert len(shares) == COUNT
-    assert shares[-1] == pytest.approx(1, abs=0.05)
+    fractions: list[float] = []
+    measure_frames(open_video(clip), np.mean, longer_side=64, progress=fractions.append)
+    assert fractions == sorted(fractions)
+    assert len(fractions) == COUNT
+    assert fractions[-1] == pytest.approx(1, abs=0.05)
 
 
 def test_frames_come_one_at_a_time(clip):
@@ -137,7 +139,7 @@ def test_frames_come_one_at_a_time(clip):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        measure_frames(open_video(clip), stop, longer_side=64, progress=lambda share: None)
+        measure_frames(open_video(clip), stop, longer_side=64, progress=lambda fraction: None)
     assert len(seen) == 3
 
 

@@ -247,23 +247,23 @@ def test_limits_need_depth(run):
 
 def test_depths_of_photos_are_kept_for_the_field_they_belong_to(run, monkeypatch):
     trained = Run(run)
-    shares: list[float] = []
-    maps = photo_depths(trained, trained.model(), on_progress=shares.append, notify=pytest.fail)
-    assert shares[-1] == 1.0
+    fractions: list[float] = []
+    maps = photo_depths(trained, trained.model(), on_progress=fractions.append, notify=pytest.fail)
+    assert fractions[-1] == 1.0
     again = photo_depths(
-        trained, trained.model(), on_progress=lambda share: pytest.fail("rendered"), notify=pytest.fail
+        trained, trained.model(), on_progress=lambda fraction: pytest.fail("rendered"), notify=pytest.fail
     )
     for one, other in zip(maps, again, strict=True):
         np.testing.assert_array_equal(one.distances, other.distances)
         assert one.frame.camera == other.frame.camera
     # Another field, or a damaged file: rendered again.
-    shares.clear()
-    photo_depths(trained, replace(trained.model(), sha256="ab"), on_progress=shares.append, notify=pytest.fail)
-    assert len(shares) == 21
+    fractions.clear()
+    photo_depths(trained, replace(trained.model(), sha256="ab"), on_progress=fractions.append, notify=pytest.fail)
+    assert len(fractions) == 21
     content = (run / PHOTO_DEPTHS).read_bytes()
     (run / PHOTO_DEPTHS).write_bytes(content[: len(content) // 2])
-    photo_depths(trained, trained.model(), on_progress=shares.append, notify=pytest.fail)
-    assert len(shares) == 42
+    photo_depths(trained, trained.model(), on_progress=fractions.append, notify=pytest.fail)
+    assert len(fractions) == 42
 
 
 def test_a_photo_sees_nothing_where_its_mask_covers_it(run, tmp_path):
@@ -277,9 +277,9 @@ def test_a_photo_sees_nothing_where_its_mask_covers_it(run, tmp_path):
         Image.fromarray(mask).save(tmp_path / name)
     train[0] = replace(first, image=tmp_path / "photo.png", mask=tmp_path / "mask.png")
     masked.__dict__["cameras"] = RunCameras(tuple(train), trained.cameras.test)
-    whole, *others = photo_depths(trained, trained.model(), on_progress=lambda share: None, notify=pytest.fail)
+    whole, *others = photo_depths(trained, trained.model(), on_progress=lambda fraction: None, notify=pytest.fail)
     (run / PHOTO_DEPTHS).unlink()  # cached for the photos of the run, whose masks do not change
-    part, *same = photo_depths(masked, masked.model(), on_progress=lambda share: None, notify=pytest.fail)
+    part, *same = photo_depths(masked, masked.model(), on_progress=lambda fraction: None, notify=pytest.fail)
     half = whole.distances.shape[1] // 2
     assert np.isfinite(whole.distances[:, :half]).any()
     assert np.isnan(part.distances[:, :half]).all()

@@ -90,8 +90,8 @@ def test_median_of_slabs_is_inside_the_interval(slabs, dtype):
     # T falls to 1/2 exactly at the end of the first slab, t = 1; with twice the density, half way through it.
     density, _, lengths = slabs
     starts = torch.tensor([0.0, 1.0, 2.0], dtype=dtype)
-    close(depth.quantile(density, starts, starts + lengths, offsets=OFFSETS, share=0.5), [1.0], dtype)
-    close(depth.quantile(2 * density, starts, starts + lengths, offsets=OFFSETS, share=0.5), [0.5], dtype)
+    close(depth.quantile(density, starts, starts + lengths, offsets=OFFSETS, fraction=0.5), [1.0], dtype)
+    close(depth.quantile(2 * density, starts, starts + lengths, offsets=OFFSETS, fraction=0.5), [0.5], dtype)
 
 
 @pytest.mark.parametrize(("optical_depth", "length"), [(1e-12, 2.0), (0.1, 1.0), (1.0, 3.0), (30.0, 0.5), (1e6, 1.0)])

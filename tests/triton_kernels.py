@@ -340,13 +340,13 @@ def test_distortion(samples, far, generator):
 
 @pytest.mark.parametrize("samples", SIZES)
 @pytest.mark.parametrize("magnitude", [0.01, 3.0, 100.0])
-@pytest.mark.parametrize("shares", [(), (0.9, 0.1, 0.5)])
-def test_light_ends(samples, magnitude, shares, generator):
+@pytest.mark.parametrize("fractions", [(), (0.9, 0.1, 0.5)])
+def test_light_ends(samples, magnitude, fractions, generator):
     density, _, starts, ends, offsets = samples_along(samples, magnitude, generator)
     if samples == 123:
         density[60:90] = 0.0
-    exact = reference.light_ends(*(x.double() for x in (density, starts, ends)), offsets=offsets, shares=shares)
-    fast = depth.light_ends(*on_device(density, starts, ends), offsets=offsets.to(DEVICE), shares=shares)
+    exact = reference.light_ends(*(x.double() for x in (density, starts, ends)), offsets=offsets, fractions=fractions)
+    fast = depth.light_ends(*on_device(density, starts, ends), offsets=offsets.to(DEVICE), fractions=fractions)
     for name in exact._fields:
         torch.testing.assert_close(
             getattr(fast, name).cpu().double(), getattr(exact, name), rtol=2e-5, atol=1e-7, equal_nan=True,
@@ -365,7 +365,7 @@ def test_a_far_thin_surface_has_its_spread():
             ends,
         ),
         offsets=torch.tensor([0, 2]).to(DEVICE),
-        shares=(),
+        fractions=(),
     )
     torch.testing.assert_close(found.spread.cpu(), torch.tensor([1e-4]), rtol=1e-4, atol=0)
 
@@ -450,7 +450,7 @@ def test_a_picture_is_what_the_reference_gives_in_float64(generator):
     layers = layers_of(32, generator)
     resolutions = tuple(round(4 * 1.22**level) for level in range(8))
     background = torch.tensor([0.25, 0.5, 1.0])
-    named = {"shares": (0.25, 0.5), "negligible": 0.3}
+    named = {"fractions": (0.25, 0.5), "negligible": 0.3}
     fast = TritonBackend(DEVICE).trace_rays(
         rays,
         march,

@@ -56,8 +56,8 @@ def view(
         layer = cv2.warpPerspective(picture, large, size, flags=cv2.INTER_AREA)
         cover = cv2.warpPerspective(np.full(picture.shape[:2], 255, np.uint8), large, size)
         layer, cover = (cv2.resize(part, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for part in (layer, cover))
-        share = cover[..., None] / 255
-        photo = np.rint(layer * share + photo * (1 - share)).astype(np.uint8)
+        fraction = cover[..., None] / 255
+        photo = np.rint(layer * fraction + photo * (1 - fraction)).astype(np.uint8)
     return photo
 
 

@@ -11,7 +11,7 @@ import torch
 _CPU_INFO = Path("/proc/cpuinfo")
 _STATUS, _CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 # If other programs use more than this fraction of the processors, measured times suffer.
-BUSY_SHARE = 0.25
+BUSY_FRACTION = 0.25
 
 
 def describe_machine(device: str, threads: int) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def load_average() -> float | None:
 
 def is_busy(load: float | None) -> bool:
     """Return whether a load average from before the start shows that other programs use the processors."""
-    return load is not None and load > BUSY_SHARE * (os.cpu_count() or 1)
+    return load is not None and load > BUSY_FRACTION * (os.cpu_count() or 1)
 
 
 @dataclass(frozen=True)

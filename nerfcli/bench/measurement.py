@@ -24,11 +24,11 @@ from nerfcli.runs.files import FIELD
 
 SWEEPS = ("both", "render", "train")
 # Fraction of the budget for rendering where training is measured as well: renderings are short, trainings are not.
-_RENDERING_SHARE = 0.4
+_RENDERING_FRACTION = 0.4
 # Fraction of the budget that is reserved for the report.
 _KEPT_BACK = 0.03
 # Fraction of the budget that rendering gets even if training took longer than planned.
-_LEAST_SHARE = 0.1
+_LEAST_FRACTION = 0.1
 COMPLETE = "complete"
 THIS_RUN = "this run"
 
@@ -110,7 +110,7 @@ def _measure_run(subject: BenchedRun, run: Path, wanted: BenchOptions, session: 
     if model.sha256 != subject.identity:
         raise UserError(f"{run / FIELD} was replaced while bench started", "wait until the training has finished")
     if wanted.sweep != "train":
-        fraction = _RENDERING_SHARE if wanted.sweep == "both" and subject.scene is not None else 1.0
+        fraction = _RENDERING_FRACTION if wanted.sweep == "both" and subject.scene is not None else 1.0
         _render(subject, model, session, ends=fraction * ends)
     if wanted.sweep == "render":
         return
@@ -135,7 +135,7 @@ def _measure_scene(subject: BenchedRun, wanted: BenchOptions, session: Session) 
     assert subject.scene is not None
     ends = (1.0 - _KEPT_BACK) * wanted.budget_seconds
     settings = train_settings()
-    fraction = {"both": 1.0 - _RENDERING_SHARE, "train": 1.0, "render": _RENDERING_SHARE}[wanted.sweep]
+    fraction = {"both": 1.0 - _RENDERING_FRACTION, "train": 1.0, "render": _RENDERING_FRACTION}[wanted.sweep]
     if wanted.sweep == "render":
         settings = settings[:1]  # rendering needs one trained field
     trainings = Trainings(subject.scene, subject.base, subject.shown, kept=settings[0].name)
@@ -146,7 +146,7 @@ def _measure_scene(subject: BenchedRun, wanted: BenchOptions, session: Session) 
 
 
 def _render(subject: BenchedRun, model: Model, session: Session, *, ends: float) -> None:
-    seconds = max(ends - session.spent, _LEAST_SHARE * session.budget_seconds)
+    seconds = max(ends - session.spent, _LEAST_FRACTION * session.budget_seconds)
     measure_rendering(model, subject.held_out(model), _ways_to_render(subject), session=session, seconds=seconds)
 
 

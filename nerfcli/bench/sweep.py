@@ -48,7 +48,7 @@ class RenderSetting:
         if self.step != 1.0:
             parts.append(f"step {self.step:g}")
         if self.tolerance != TOLERANCE:
-            parts.append(f"tolerance {fraction(self.tolerance)}")
+            parts.append(f"tolerance {as_text(self.tolerance)}")
         if self.rays_per_tile != RAYS_PER_TILE:
             parts.append(f"{self.rays_per_tile} rays a tile")
         if self.stored_in != "float32":
@@ -61,7 +61,7 @@ class RenderSetting:
         if self.rays_per_tile != RAYS_PER_TILE or self.stored_in != "float32":
             return None
         step = [f"--step {self.step:g}"] if self.step != 1.0 else []
-        tolerance = [f"--tolerance {fraction(self.tolerance)}"] if self.tolerance != TOLERANCE else []
+        tolerance = [f"--tolerance {as_text(self.tolerance)}"] if self.tolerance != TOLERANCE else []
         return " ".join([*step, *tolerance])
 
     def to_json(self) -> dict[str, Any]:
@@ -87,12 +87,12 @@ class TrainSetting:
 
     Args:
         group: the parameter that is varied: "default", "seed", "time", "rows", "levels", "width" or "batch".
-        share: training time relative to the planned time of one point.
+        fraction: training time relative to the planned time of one point.
         changed: values that differ from the defaults of `TrainSettings`, by name.
     """
 
     group: str
-    share: float = 1.0
+    fraction: float = 1.0
     seed: int = 0
     changed: tuple[tuple[str, int], ...] = ()
 
@@ -104,7 +104,7 @@ class TrainSetting:
             case "seed":
                 return f"default, seed {self.seed}"
             case "time":
-                return f"{self.share:g} x time"
+                return f"{self.fraction:g} x time"
             case "rows":
                 return f"2^{values['log2_rows']} rows"
             case "levels" | "width":
@@ -118,7 +118,7 @@ class TrainSetting:
         values = dict(self.changed)
         if "samples_per_step" in values:
             values["first_samples_per_step"] = min(base.first_samples_per_step, values["samples_per_step"])
-        seconds = self.share * unit_seconds
+        seconds = self.fraction * unit_seconds
         return replace(base, budget_seconds=seconds, steps=None, seed=base.seed + self.seed, **values)  # type: ignore[arg-type]
 
     def to_json(self) -> dict[str, Any]:
@@ -186,18 +186,18 @@ def affordable(
         overhead: seconds that each takes besides its training.
 
     Returns:
-        The settings, and seconds for a share of 1: at least `SHORTEST_TRAINING_SECONDS` if there are two or more.
+        The settings, and seconds for a fraction of 1: at least `SHORTEST_TRAINING_SECONDS` if there are two or more.
     """
-    shares = accumulate(setting.share for setting in settings)
-    units = [(seconds - overhead * count) / total for count, total in enumerate(shares, start=1)]
+    fractions = accumulate(setting.fraction for setting in settings)
+    units = [(seconds - overhead * count) / total for count, total in enumerate(fractions, start=1)]
     count = max((n for n, unit in enumerate(units, start=1) if unit >= SHORTEST_TRAINING_SECONDS), default=1)
     return list(settings[:count]), max(units[count - 1], 1.0)
 
 
-def fraction(value: float) -> str:
+def as_text(value: float) -> str:
     """Format a number, as a fraction such as 1/255 if it is the reciprocal of a whole number."""
-    fraction = Fraction(value).limit_denominator(10**6)
-    return str(fraction) if fraction.numerator == 1 and value < 1 else f"{value:g}"
+    ratio = Fraction(value).limit_denominator(10**6)
+    return str(ratio) if ratio.numerator == 1 and value < 1 else f"{value:g}"
 
 
 def _fewer(threads: int) -> list[int]:

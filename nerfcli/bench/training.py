@@ -59,7 +59,7 @@ def measure_trainings(
     for number, setting in enumerate(planned, start=1):
         if setting.name in done:
             continue
-        needs = setting.share * plan["unit_seconds"] + _overhead(session)
+        needs = setting.fraction * plan["unit_seconds"] + _overhead(session)
         if done and session.spent + needs > ends:
             session.notify(f"skipping the training {setting.name} for lack of time (about {needs:.0f} s)")
             continue
@@ -113,7 +113,7 @@ def _run_worker(job: Path, say: Callable[[str], None]) -> dict[str, Any]:
         messages = child.messages(worker)
         try:
             for last in messages:
-                if "share" in last:
+                if "fraction" in last:
                     say(last["detail"])
         finally:
             messages.close()

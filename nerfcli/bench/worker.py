@@ -1,7 +1,7 @@
 """The child process of one training: run as `python -m nerfcli.bench.worker JOB.json`.
 
 It is a separate process, so that its peak memory is that of this training alone. It writes pictures where the job says,
-and prints lines of JSON on stdout: {"share", "detail"} while it works, then {"result"}, or {"error"} for errors that
+and prints lines of JSON on stdout: {"fraction", "detail"} while it works, then {"result"}, or {"error"} for errors that
 the user can fix.
 """
 
@@ -95,13 +95,13 @@ def _train_and_measure(job: dict[str, Any], send: Callable[[dict[str, Any]], Non
         nonlocal reported_at
         if time.monotonic() - reported_at > 1.0:
             reported_at = time.monotonic()
-            send({"share": progress.share, "detail": f"step {progress.step}"})
+            send({"fraction": progress.fraction, "detail": f"step {progress.step}"})
 
     train(scene, run, settings, resume=False, notify=lambda text: None, on_progress=on_progress)
     trained = Run(run)
     summary, model = trained.summary, trained.model(settings.device)
     assert summary is not None
-    send({"share": 1.0, "detail": "comparing with held-out photos"})
+    send({"fraction": 1.0, "detail": "comparing with held-out photos"})
     held_out = held_out_photos(
         scene.test_frames,
         model,

@@ -141,7 +141,7 @@ def lens_of(model: str, values: dict[str, float]) -> Lens:
         focal_names = ("f", "f") if "f" in values else ("fx", "fy")
         focal, centre = tuple(values[name] for name in focal_names), (values["cx"], values["cy"])
         inner += [{name: 1.0} for name in (*focal_names, "cx", "cy")]
-    spread = np.array([[shares.get(name, 0.0) for name in values] for shares in inner])
+    spread = np.array([[fractions.get(name, 0.0) for name in values] for fractions in inner])
     return Lens(projection, distortions, np.array(focal)[:, None], np.array(centre)[:, None], spread)
 
 

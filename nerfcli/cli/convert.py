@@ -269,9 +269,8 @@ def _table(found: "Detection") -> list[str]:
             if place < SHOWN or answer.as_format_says:
                 verdict = _verdict(question) if place == 0 else ""
                 error = "behind" if answer.median_px == float("inf") else f"{answer.median_px:.3f} px"
-                line = (
-                    f"    {_hypothesis(question, answer):<50}{error:>14}{100 * answer.inlier_share:>7.1f} %  {verdict}"
-                )
+                inliers = f"{100 * answer.inlier_fraction:>7.1f} %"
+                line = f"    {_hypothesis(question, answer):<50}{error:>14}{inliers}  {verdict}"
                 lines.append(line.rstrip())
     if found.as_format_says:
         lines.append("  Nothing contradicts the convention of the format.")

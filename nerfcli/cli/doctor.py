@@ -107,8 +107,8 @@ def _examine_run(path: Path, folder: Path, console: Console, *, count: int, thre
         found = examine_run(
             path, folder, count=count, threads=threads, overwrite=overwrite, notify=console.note, progress=update
         )
-    shares = [(f"{name} of {found.photos}", f"{100 * share:.1f} %") for name, share in found.shares.items()]
-    console.table(("photos that see it", "surface"), shares, styles={})
+    fractions = [(f"{name} of {found.photos}", f"{100 * fraction:.1f} %") for name, fraction in found.fractions.items()]
+    console.table(("photos that see it", "surface"), fractions, styles={})
     if not found.views:
         console.note("no further view would see a part of the surface that fewer than two photos see")
         return

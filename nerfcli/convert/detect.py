@@ -21,7 +21,7 @@ SCALES = (1.0, 0.125, 0.25, 0.5, 2.0, 4.0, 8.0)
 
 # A hypothesis holds if at least this fraction of the items agrees with it, and if it is better than the next by this
 # factor and by more than the noise: the 99 % interval of the difference under resampling of photos.
-LEAST_SHARE = 0.5
+LEAST_FRACTION = 0.5
 LEAST_RATIO = 1.2
 _RESAMPLES = 400
 _LEAST_GROUPS = 5
@@ -43,7 +43,7 @@ class Answer:
     convention: Convention
     as_format_says: bool
     median_px: float
-    inlier_share: float
+    inlier_fraction: float
 
 
 @dataclass(frozen=True)
@@ -203,18 +203,18 @@ def _question(
         for convention, errors in ranked
     )
     (_, best), (_, second) = ranked[:2]
-    by_share = not 0 < answers[0].median_px < np.inf and not answers[0].median_px < answers[1].median_px
-    if by_share:
-        ratio = answers[0].inlier_share / max(answers[1].inlier_share, 1e-9)
+    by_fraction = not 0 < answers[0].median_px < np.inf and not answers[0].median_px < answers[1].median_px
+    if by_fraction:
+        ratio = answers[0].inlier_fraction / max(answers[1].inlier_fraction, 1e-9)
         low, high = _interval(
             best, second, evidence.groups, lambda errors: -float(np.mean(errors <= evidence.threshold_px))
         )
-        what = f"the inlier ratios differ by {100 * (answers[0].inlier_share - answers[1].inlier_share):.1f} %"
+        what = f"the inlier ratios differ by {100 * (answers[0].inlier_fraction - answers[1].inlier_fraction):.1f} %"
     else:
         ratio = answers[1].median_px / max(answers[0].median_px, 1e-9)
         low, high = _interval(best, second, evidence.groups, lambda errors: float(np.median(errors)))
         what = f"the medians differ by {answers[1].median_px - answers[0].median_px:.2g} px"
-    if answers[0].inlier_share < LEAST_SHARE and not isinstance(evidence, FrustumEvidence):
+    if answers[0].inlier_fraction < LEAST_FRACTION and not isinstance(evidence, FrustumEvidence):
         return Question(name, answers, "none holds", ratio, "most of the evidence contradicts each of them")
     if not (low > 0 and ratio >= LEAST_RATIO):
         noise = (high - low) / 2

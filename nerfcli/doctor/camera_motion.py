@@ -27,14 +27,14 @@ class TwoViews:
         baseline_over_depth: distance between the camera positions, relative to the distance of the scene.
     """
 
-    homography_share: float
+    homography_fraction: float
     rotation_deg: float
     baseline_over_depth: float
 
     @property
     def flat(self) -> bool:
         """True if a homography explains the pair, so that it shows no depth."""
-        return self.homography_share >= _EXPLAINS
+        return self.homography_fraction >= _EXPLAINS
 
 
 def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float]) -> TwoViews | None:

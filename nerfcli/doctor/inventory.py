@@ -107,15 +107,15 @@ def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
     """Check whether the focal lengths in EXIF fit the files; they do not after cropping."""
     found = [(photo, focal_evidence(photo.exif)) for photo in photos]
     doubtful = [(photo.name, evidence.doubt) for photo, evidence in found if evidence.doubt]
-    shares = [
+    fractions = [
         evidence.focal_px / evidence.whole_px[0]
         for _, evidence in found
         if evidence.focal_px is not None and evidence.holds
     ]
     if doubtful:
         summary = f"EXIF does not match {several(len(doubtful), 'file')}: {doubtful[0][1]}"
-    elif shares:
-        summary = f"{np.median(shares):.2f} times the longer side, from EXIF ({several(len(shares), 'photo')})"
+    elif fractions:
+        summary = f"{np.median(fractions):.2f} times the longer side, from EXIF ({several(len(fractions), 'photo')})"
     else:
         summary = "not in EXIF; structure from motion will estimate it"
     return Finding(

@@ -23,7 +23,7 @@ _LEAST_IN_PATCH = 10
 # Fraction of the matches in a patch that must not follow the camera.
 _DOMINANT = 0.7
 # Largest fraction of the picture's matches in one patch; beyond, it is unclear whether the patch or the rest moved.
-_LARGEST_SHARE = 0.35
+_LARGEST_FRACTION = 0.35
 # A candidate is rejected if one geometry explains more than this fraction of both the patch and the rest.
 _EXPLAINED = 0.8
 _STILL_PX = 1.5
@@ -55,7 +55,7 @@ def moving_patches(x: np.ndarray, y: np.ndarray, agree: np.ndarray, *, within_px
     found = []
     for group in _moving_together(x[away], y[away]):
         members = away[group]
-        if len(members) <= _LARGEST_SHARE * len(x) and _is_patch(x, y, agree, members=members, within_px=within_px):
+        if len(members) <= _LARGEST_FRACTION * len(x) and _is_patch(x, y, agree, members=members, within_px=within_px):
             shift = np.median(np.linalg.norm(y[members] - x[members], axis=1))
             found.append(Patch(_box(x[members]), _box(y[members]), len(members), bool(shift < _STILL_PX)))
     return tuple(found)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.findings import LOOK, Finding
-from nerfcli.multiview.stationary import LEAST_SHARE, together
+from nerfcli.multiview.stationary import LEAST_FRACTION, together
 
 
 def turning_object(pairs: Sequence[Pair]) -> Finding | None:
@@ -23,8 +23,8 @@ def turning_object(pairs: Sequence[Pair]) -> Finding | None:
         LOOK,
         f"an object moves in front of a static background, as on a turntable: {said.two} of "
         f"{said.two + said.still + said.moved} pairs show both motions",
-        said.share,
-        f"look if {100 * LEAST_SHARE:g} % of the pairs with a moving object also show a static background",
+        said.fraction,
+        f"look if {100 * LEAST_FRACTION:g} % of the pairs with a moving object also show a static background",
         "nerfcli poses creates masks of the object and uses only its motion; if it finds none, give --masks that are "
         "white on the object, or use a plain cloth as background",
     )

@@ -89,7 +89,7 @@ def render_sampled(
             some,
             cuts=cuts.to(some),
             background=behind[begin : begin + len(some)],
-            shares=(),
+            fractions=(),
             tolerance=tolerance,
             cones=rays.cones[begin : begin + len(some)].to(dtype),
         ).rgb

@@ -14,7 +14,7 @@ from nerfcli.kernels import HashGrid, reference, spherical_harmonics
 GEOMETRY = 16
 HARMONICS = 16
 # Number of levels that learn from the start, and fraction of the budget after which all levels do.
-FIRST_LEVELS, ALL_LEVELS_SHARE = 4, 0.5
+FIRST_LEVELS, ALL_LEVELS_FRACTION = 4, 0.5
 # Number of levels that `HashField.start_randomly` fills: those with a row for each vertex.
 RANDOM_LEVELS = 2
 # Trainings of smaller tables are too short to learn the details.
@@ -129,7 +129,7 @@ class HashField(Field):
 def _resolutions_at(detail: float, resolutions: tuple[int, ...]) -> tuple[int, ...]:
     """Return the resolutions of the levels that learn at a fraction of the budget, and 0 for later levels."""
     first = min(FIRST_LEVELS, len(resolutions))
-    learning = max(1, first + math.floor((len(resolutions) - first) * detail / ALL_LEVELS_SHARE))
+    learning = max(1, first + math.floor((len(resolutions) - first) * detail / ALL_LEVELS_FRACTION))
     return tuple(side if level < learning else 0 for level, side in enumerate(resolutions))
 
 

@@ -17,7 +17,7 @@ from nerfcli.runs.components import LEARNED_BACKGROUNDS, Components
 # Learning rates as multiples of the field's. After 300 steps at 0.3, the photos' gains have come a tenth of the way to
 # the true ones; at 2, half way; at 5, no further.
 BACKGROUND_RATE, EXPOSURE_RATE = 5.0, 2.0
-# A field whose cameras learn gets its detail later, see `Appearance.share_of_detail`. Balls, photos rotated by 0.5
+# A field whose cameras learn gets its detail later, see `Appearance.fraction_of_detail`. Balls, photos rotated by 0.5
 # degree, 800 steps: 31.1 dB with the usual fractions, 31.2 with 0.7 of them, 31.9 and 32.0 with these values.
 DETAIL_DELAY, DETAIL_SLOPE = 0.125, 0.875
 # At or above this level, a photo tells only that the light was at least that bright.
@@ -83,7 +83,7 @@ class Appearance(nn.Module):
         learned = [(list(part.parameters()), rate) for part, rate in rates if part is not None]
         return [{"params": tensors, "multiple": rate} for tensors, rate in learned if tensors[0].requires_grad]
 
-    def share_of_detail(self, fraction: float) -> float:
+    def fraction_of_detail(self, fraction: float) -> float:
         """Return the fraction of the budget whose detail the field may have.
 
         Cameras find their poses in a coarse field; a fine field learns to show each photo from its wrong pose.

@@ -7,7 +7,7 @@ from nerfcli.photos.pool import Drawn, PixelPool
 
 BLOCK_PX = 16
 # This fraction of a step's pixels is drawn in proportion to the error of their block, the others uniformly.
-GUIDED_SHARE = 0.5
+GUIDED_FRACTION = 0.5
 # Weight of a block's previous error when some of its pixels are seen again.
 KEPT = 0.8
 # The fraction of the budget at which this begins; before, photos are explained badly everywhere.
@@ -41,7 +41,7 @@ class ErrorMap:
     def draw(self, count: int, generator: torch.Generator) -> Drawn:
         """Draw `count` pixels, with the weight of each in the loss."""
         pool, device = self._pool, self.errors.device
-        guided = round(GUIDED_SHARE * count)
+        guided = round(GUIDED_FRACTION * count)
         mass = self._known_errors() * self._extent.prod(-1)
         sums = mass.double().cumsum(0)
         uniform = torch.rand(guided, generator=generator, device=device, dtype=torch.float64)
@@ -58,7 +58,7 @@ class ErrorMap:
             replaced = (~usable).double().mean().float() if guided else 0.0
             numbers = torch.cat([torch.where(usable, numbers, anywhere[:guided]), anywhere[guided:]])
         relative = self._known_errors()[self._blocks_of(numbers)] / sums[-1].float() * pool.usable_count
-        density = 1.0 - GUIDED_SHARE + GUIDED_SHARE * (relative + replaced)
+        density = 1.0 - GUIDED_FRACTION + GUIDED_FRACTION * (relative + replaced)
         return pool.rays_of(numbers)._replace(weights=1.0 / density)
 
     def learn(self, numbers: Tensor, errors: Tensor) -> None:

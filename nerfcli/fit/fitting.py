@@ -39,7 +39,7 @@ SKY_WEIGHT = 0.1
 # without it, Adam makes large steps from the little light that leaks through surfaces, and their colours are arbitrary.
 ROUGHNESS_WEIGHT = 1e-6
 # The warm-up ends by this fraction of the budget at the latest, however few steps that is.
-WARMUP_SHARE = 0.1
+WARMUP_FRACTION = 0.1
 # After this many steps, fields of long trainings, with large tables, have the detail that other fields have at the end.
 LARGE_TABLE_STEPS = 400
 
@@ -137,11 +137,11 @@ class Fitting:
         self.loss: float | None = None  # the last one that was read
         self._losses = Delayed()
 
-    def advance(self, share: float, watch: Watch = UNWATCHED) -> StepResult:
+    def advance(self, fraction: float, watch: Watch = UNWATCHED) -> StepResult:
         """Take one optimiser step.
 
         Args:
-            share: fraction of the budget that is used, in [0, 1]; it determines the learning rate.
+            fraction: of the budget that is used, in [0, 1]; it determines the learning rate.
             watch: observes the tensors of the step, and the state before and after it.
 
         Raises:
@@ -150,20 +150,20 @@ class Fitting:
         """
         self.in_step = True
         watch.state(self.state)
-        self.furthest = max(self.furthest, share)
-        of_cameras = max(0.0, share - self._cameras_from) / (1.0 - self._cameras_from)
-        ranks, whole = self.ranks, self.draw(share)
+        self.furthest = max(self.furthest, fraction)
+        of_cameras = max(0.0, fraction - self._cameras_from) / (1.0 - self._cameras_from)
+        ranks, whole = self.ranks, self.draw(fraction)
         drawn = self.parts.with_learning_rays(whole.every(ranks.rank, ranks.count), of_cameras)
         rays = len(whole.origins)
-        edges = self.edges[:: stride_at(share, self.step)].contiguous()
-        loss, losses, samples = self._loss(drawn, whole=whole, edges=edges, fraction=share, watch=watch)
+        edges = self.edges[:: stride_at(fraction, self.step)].contiguous()
+        loss, losses, samples = self._loss(drawn, whole=whole, edges=edges, fraction=fraction, watch=watch)
         self.optimiser.zero_grad()
         self.parts_optimiser.zero_grad()
         if samples > 0:
             loss.backward()
         samples = self._add_up_gradients(drawn, samples)
         value = self._finite_loss(loss, drawn, watch)
-        rate = self.learning_rate(share)
+        rate = self.learning_rate(fraction)
         self.step += 1
         self.optimiser.step(self.step, rate)
         self.parts_optimiser.step(rate)
@@ -178,7 +178,7 @@ class Fitting:
         settings = self.settings
         self.cells.refresh(
             self.step,
-            share=self.furthest,
+            fraction=self.furthest,
             detail=self._detail,
             marching=self.marching,
             generator=self.generator,
@@ -201,7 +201,7 @@ class Fitting:
         settings = self.settings
         left = 0.5 * (1.0 + math.cos(math.pi * min(1.0, fraction)))
         rate = settings.final_learning_rate + left * (settings.learning_rate - settings.final_learning_rate)
-        warmup = min(1.0, max((self.step + 1) / settings.warmup_steps, fraction / WARMUP_SHARE))
+        warmup = min(1.0, max((self.step + 1) / settings.warmup_steps, fraction / WARMUP_FRACTION))
         return self.rate_factor * warmup * rate
 
     def _loss(
@@ -227,7 +227,7 @@ class Fitting:
         losses = colour_losses(rendered, measured)
         if self.movers is not None:
             residuals = self.ranks.joined((rendered - measured).detach(), count)
-            self.movers.learn(whole.numbers, residuals, share=self.furthest, step=self.step)
+            self.movers.learn(whole.numbers, residuals, fraction=self.furthest, step=self.step)
             losses = losses * self.movers.weights(drawn.numbers)
         if self.error_map is not None:
             self.error_map.learn(whole.numbers, self.ranks.joined(losses.detach(), count))
@@ -283,7 +283,7 @@ class Fitting:
             return self.furthest
         if self.parts.cameras is None and self.field.settings.detailed:
             return min(1.0, max(self.furthest, self.step / LARGE_TABLE_STEPS))
-        return self.parts.share_of_detail(self.furthest)
+        return self.parts.fraction_of_detail(self.furthest)
 
     def _march(self, edges: Tensor, occupied: Tensor) -> March:
         return March(edges, occupied, self.field.settings.contraction, DEEPEST)

@@ -42,13 +42,13 @@ class Movers:
         self.sums = torch.zeros(blocks, 4, device=device)  # of the residuals of three channels, and of the pixels
         self.moving = torch.zeros(blocks, dtype=torch.bool, device=device)
 
-    def learn(self, numbers: Tensor, residuals: Tensor, *, share: float, step: int) -> None:
+    def learn(self, numbers: Tensor, residuals: Tensor, *, fraction: float, step: int) -> None:
         """Record the residuals (N, 3), rendered - measured in sRGB, of one step's pixels (N,); if it is time, decide
         which blocks move.
         """
         self.sums *= KEPT
         self.sums.index_add_(0, self._blocks_of(numbers), torch.cat([residuals, torch.ones_like(residuals[:, :1])], -1))
-        if share >= BEGINS and step % REFRESH_EVERY == 0:
+        if fraction >= BEGINS and step % REFRESH_EVERY == 0:
             self._refresh()
 
     def _refresh(self) -> None:

@@ -15,7 +15,7 @@ REFRESH_TURNS = 8
 # fog and surfaces are not known; then more and more, so that surfaces have to become compact.
 FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
 # The final threshold is reached by this fraction of the budget at the latest, however few steps that is.
-CLOSING_SHARE = 0.3
+CLOSING_FRACTION = 0.3
 # Detailed fields also have a fine grid. At a refresh, the optical depth of a visited cell decays by this factor, unless
 # the samples there were larger. Every few steps, rays sample all cells that the coarse grid leaves open, so that closed
 # fine cells can open again.
@@ -55,7 +55,7 @@ class OpenCells:
         self,
         step: int,
         *,
-        share: float,
+        fraction: float,
         detail: float,
         marching: Marching,
         generator: torch.Generator,
@@ -64,7 +64,7 @@ class OpenCells:
         """Update the open cells from the field, every few steps.
 
         Args:
-            share: fraction of the budget that is used, in [0, 1].
+            fraction: of the budget that is used, in [0, 1].
             detail: of the field, see `Field.medium`.
             generator: source of the random points of the coarse grid.
             ranks: the processes whose samples are combined.
@@ -89,7 +89,7 @@ class OpenCells:
             before = depths[visited]
             depths[visited] = torch.where(before.isinf(), 0.0, before * DECAY).maximum(visits[visited])
             visits[visited] = UNVISITED
-        closed = min(1.0, max(step / self._field.closing_steps, share / CLOSING_SHARE))
+        closed = min(1.0, max(step / self._field.closing_steps, fraction / CLOSING_FRACTION))
         self._open(FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed)
 
     def _open(self, threshold: float) -> None:

@@ -34,26 +34,26 @@ LENS_RATE = 3e-4
 _FARTHEST_STEP = 2e-3
 # Fractions of the budget. Until the first there is fog, from which cameras learn nothing; until the second, the rate
 # rises. From the third to the fourth it falls to the last rate: the steps' noise averages out and the field can settle.
-FIRST_SHARE, FULL_SHARE, FALLING_SHARE, LAST_SHARE, LAST_RATE = 0.1, 0.15, 0.5, 0.98, 0.03
+FIRST_FRACTION, FULL_FRACTION, FALLING_FRACTION, LAST_FRACTION, LAST_RATE = 0.1, 0.15, 0.5, 0.98, 0.03
 # Rotations and translations look much alike, and an early field confuses them: poorly determined changes are damped
 # strongly at first, and less between these fractions of the budget.
-DAMPING_SHARES, DAMPINGS = (0.2, 0.8), (1.0, 0.1)
+DAMPING_FRACTIONS, DAMPINGS = (0.2, 0.8), (1.0, 0.1)
 # Cameras are held from the first fraction on, see `NewtonSteps.change`; before, it is not clear which errors they have.
-HOLDING_SHARES, HOLDINGS = (0.2, 0.5), (1e-3, 0.05)
+HOLDING_FRACTIONS, HOLDINGS = (0.2, 0.5), (1e-3, 0.05)
 
 
 def rate_at(fraction: float) -> float:
     """Return the learning rate of cameras at a fraction of the budget: linear warm-up, constant, exponential decay."""
-    if not FIRST_SHARE < fraction < LAST_SHARE:
+    if not FIRST_FRACTION < fraction < LAST_FRACTION:
         return 0.0
-    if fraction < FULL_SHARE:
-        return (fraction - FIRST_SHARE) / (FULL_SHARE - FIRST_SHARE)
-    return _between(fraction, (FALLING_SHARE, LAST_SHARE), (1.0, LAST_RATE))
+    if fraction < FULL_FRACTION:
+        return (fraction - FIRST_FRACTION) / (FULL_FRACTION - FIRST_FRACTION)
+    return _between(fraction, (FALLING_FRACTION, LAST_FRACTION), (1.0, LAST_RATE))
 
 
-def _between(fraction: float, shares: tuple[float, float], values: tuple[float, float]) -> float:
+def _between(fraction: float, fractions: tuple[float, float], values: tuple[float, float]) -> float:
     """Return the first value up to the first fraction, the second from the second on, exponential in between."""
-    return float(np.exp(np.interp(fraction, shares, np.log(values))))
+    return float(np.exp(np.interp(fraction, fractions, np.log(values))))
 
 
 class PoseRefinement(nn.Module):
@@ -125,8 +125,8 @@ class PoseRefinement(nn.Module):
         twists = rate * self.newton.change(
             self.newton.learn(gradients, losses, photos, ranks),
             torch.from_numpy(so_far),
-            damping=_between(fraction, DAMPING_SHARES, DAMPINGS),
-            holding=_between(fraction, HOLDING_SHARES, HOLDINGS) if fraction > HOLDING_SHARES[0] else 0.0,
+            damping=_between(fraction, DAMPING_FRACTIONS, DAMPINGS),
+            holding=_between(fraction, HOLDING_FRACTIONS, HOLDINGS) if fraction > HOLDING_FRACTIONS[0] else 0.0,
         )
         seen = (twists[:, None] @ self.picture @ twists[..., None])[..., 0].sqrt()  # (P, 1) radians
         twists = (twists * (_FARTHEST_STEP / seen.clamp_min(_FARTHEST_STEP))).numpy()

@@ -6,7 +6,7 @@ STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
 DETAILED_STEPS = 2500
 
 
-def stride_at(share: float, step: int) -> int:
+def stride_at(fraction: float, step: int) -> int:
     """Return the number of shortest ray steps to combine into one, at a fraction of the budget and at step `step`."""
-    share = min(share, step / DETAILED_STEPS)
-    return next(stride for until, stride in STRIDES if share <= until)
+    fraction = min(fraction, step / DETAILED_STEPS)
+    return next(stride for until, stride in STRIDES if fraction <= until)

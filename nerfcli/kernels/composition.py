@@ -51,11 +51,11 @@ class Parts(Protocol):
     def distortion(self, weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor: ...
 
     def light_ends(
-        self, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, shares: tuple[float, ...]
+        self, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fractions: tuple[float, ...]
     ) -> LightEnds: ...
 
     def mixture_quantile(
-        self, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, share: float
+        self, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, fraction: float
     ) -> Tensor: ...
 
 
@@ -69,14 +69,14 @@ class ComposedBackend(abc.ABC):
     def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
         return self.parts.pixel_rays(chosen, pixels)
 
-    def light_ends(self, intervals: Intervals, *, shares: tuple[float, ...]) -> LightEnds:
+    def light_ends(self, intervals: Intervals, *, fractions: tuple[float, ...]) -> LightEnds:
         density, starts, ends, offsets = intervals
-        return self.parts.light_ends(density, starts, ends, offsets=offsets, shares=shares)
+        return self.parts.light_ends(density, starts, ends, offsets=offsets, fractions=fractions)
 
-    def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, share: float) -> Tensor:
+    def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, fraction: float) -> Tensor:
         density, starts, ends, offsets = intervals
         return self.parts.mixture_quantile(
-            density, starts, ends, offsets=offsets, rays_per_pixel=rays_per_pixel, share=share
+            density, starts, ends, offsets=offsets, rays_per_pixel=rays_per_pixel, fraction=fraction
         )
 
     def render_rays(
@@ -132,7 +132,7 @@ class ComposedBackend(abc.ABC):
         medium: HashGrid | Medium,
         *,
         background: Tensor,
-        shares: tuple[float, ...] = (),
+        fractions: tuple[float, ...] = (),
         negligible: float = 0.0,
         keep_intervals: bool = True,
     ) -> RaysSeen:
@@ -152,7 +152,7 @@ class ComposedBackend(abc.ABC):
         colour, transmittance, _ = self.parts.composite(
             density, rgb, lengths, offsets=offsets, background=background.expand(len(rays.origins), 3)
         )
-        light = self.parts.light_ends(density, starts, ends, offsets=offsets, shares=shares)
+        light = self.parts.light_ends(density, starts, ends, offsets=offsets, fractions=fractions)
         stopped = transmittance <= math.exp(-march.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
         behind = torch.maximum(background, 1.0 - background).amax(-1)  # largest difference from the background's colour
         left_out = UNSEEN * self._sum_along_rays(torch.where(unseen, weights, 0.0), offsets)

@@ -256,7 +256,7 @@ class Backend(Protocol):
         medium: HashGrid | Medium,
         *,
         background: Tensor,
-        shares: tuple[float, ...] = (),
+        fractions: tuple[float, ...] = (),
         negligible: float = 0.0,
         keep_intervals: bool = True,
     ) -> RaysSeen:
@@ -264,17 +264,17 @@ class Backend(Protocol):
 
         Args:
             background: (R, 3) or (3,) sRGB.
-            shares: quantiles to compute, each between 0 and 1.
+            fractions: of light for the quantiles to compute, each between 0 and 1.
             negligible: largest total weight of the samples of a ray whose colours are not evaluated.
             keep_intervals: whether to return the samples; a backend may return them even if this is False.
         """
         ...
 
-    def light_ends(self, intervals: Intervals, *, shares: tuple[float, ...]) -> LightEnds:
+    def light_ends(self, intervals: Intervals, *, fractions: tuple[float, ...]) -> LightEnds:
         """Return where the light of rays is absorbed, without gradients; see `reference.light_ends`."""
         ...
 
-    def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, share: float) -> Tensor:
+    def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, fraction: float) -> Tensor:
         """Return the distance (R / rays_per_pixel,) by which a fraction of the light of a group of rays is absorbed."""
         ...
 

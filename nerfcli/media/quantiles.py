@@ -7,7 +7,7 @@ import numpy as np
 _HALF = 2**16
 
 
-def quantiles(maps: Callable[[], Iterable[np.ndarray]], shares: Sequence[float]) -> list[float]:
+def quantiles(maps: Callable[[], Iterable[np.ndarray]], fractions: Sequence[float]) -> list[float]:
     """Return exact quantiles of all finite values of many arrays, in memory that does not depend on their number.
 
     Floats are ordered by their bits. The first pass counts all values by their upper 16 bits; the second pass counts
@@ -15,7 +15,7 @@ def quantiles(maps: Callable[[], Iterable[np.ndarray]], shares: Sequence[float])
 
     Args:
         maps: returns the arrays, float32 of any shape; called twice, and must return the same both times.
-        shares: fractions in [0, 1].
+        fractions: in [0, 1].
 
     Returns:
         For each fraction, the smallest value that at least this fraction of all values does not exceed; an empty list
@@ -27,7 +27,7 @@ def quantiles(maps: Callable[[], Iterable[np.ndarray]], shares: Sequence[float])
     total = int(upper_counts.sum())
     if total == 0:
         return []
-    ranks = [min(max(int(np.ceil(fraction * total)) - 1, 0), total - 1) for fraction in shares]
+    ranks = [min(max(int(np.ceil(fraction * total)) - 1, 0), total - 1) for fraction in fractions]
     below = np.cumsum(upper_counts)
     uppers = [int(np.searchsorted(below, rank, side="right")) for rank in ranks]
     lower_counts = {upper: np.zeros(_HALF, dtype=np.int64) for upper in uppers}

@@ -105,8 +105,8 @@ class _Pair:
         """Return the angles (N,) between rays and their epipolar planes, in units of MISS_PX."""
         # Lagrange polynomials of the nodes.
         apart = NODES[:, None] - NODES[None, :] + np.eye(len(NODES))
-        shares = np.prod(np.where(np.eye(len(NODES), dtype=bool), 1.0, (log_focal - NODES[None, :]) / apart), axis=1)
-        one, other = (np.tensordot(shares, ray, axes=1) for ray in self._rays)
+        fractions = np.prod(np.where(np.eye(len(NODES), dtype=bool), 1.0, (log_focal - NODES[None, :]) / apart), axis=1)
+        one, other = (np.tensordot(fractions, ray, axes=1) for ray in self._rays)
         away = []
         for ray, partner in ((one, other), (other, one)):
             normal = np.cross(self._baseline, partner)

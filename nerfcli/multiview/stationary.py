@@ -36,9 +36,9 @@ _MOST_AGREEING = 0.7
 # Cells (columns, rows) of the picture in which still matches are counted.
 _CELLS = (16, 12)
 
-# Least `Stationary.share`, the fraction of the pairs with any motion that show two motions. Measured: all of them on
+# Least `Stationary.fraction`, the fraction of the pairs with any motion that show two motions. Measured: all of them on
 # turntables, none on captures with a moving camera.
-LEAST_SHARE = 0.5
+LEAST_FRACTION = 0.5
 _LEAST_PAIRS = 3
 # Still matches that cover less of the picture are a time stamp or a watermark, not a background.
 _LEAST_CELLS = 12
@@ -107,14 +107,14 @@ class Stationary:
     extent: float
 
     @property
-    def share(self) -> float:
+    def fraction(self) -> float:
         """Fraction of the informative pairs with two motions; 0 without such pairs."""
         return self.two / max(self.two + self.moved, 1)
 
     @property
     def two_motions(self) -> bool:
         """Whether most pairs show two motions, however small the static part is."""
-        return self.two >= _LEAST_PAIRS and self.share >= LEAST_SHARE
+        return self.two >= _LEAST_PAIRS and self.fraction >= LEAST_FRACTION
 
     @property
     def wide(self) -> bool:

@@ -175,8 +175,8 @@ def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:
     """
     failures = report.verdict["failures"]
     # A user who requests a smaller model knows that it has few of the photos.
-    least_share = report.settings.min_registered if report.settings.component == 1 else 0.0
-    enough = report.registered >= max(MIN_PHOTOS, least_share * report.total)
+    least_fraction = report.settings.min_registered if report.settings.component == 1 else 0.0
+    enough = report.registered >= max(MIN_PHOTOS, least_fraction * report.total)
     if failures and (enough or "baseline" in failures[0]["kind"]):
         first = failures[0]
         text = f"the poses of {photos_dir} cannot be trusted: {first['kind']}: {first['evidence']}"

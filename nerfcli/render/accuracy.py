@@ -15,7 +15,7 @@ from torch import Tensor
 from nerfcli.cameras.frame import Frame
 from nerfcli.field.background import colours_behind
 from nerfcli.kernels import RaysSeen
-from nerfcli.render.depth import DepthRequest, requested, shares
+from nerfcli.render.depth import DepthRequest, fractions, requested
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import RenderedPicture
 from nerfcli.render.rays import CENTRES, pixel_rays
@@ -115,8 +115,8 @@ def measure_error(
 
 def refined(cuts: Tensor, parts: int) -> Tensor:
     """Return the distances (S * parts + 1,) that cut each interval of `cuts` (S + 1,) into equal parts."""
-    share = torch.arange(parts, dtype=cuts.dtype, device=cuts.device) / parts
-    inner = cuts[:-1, None] + cuts.diff()[:, None] * share
+    fraction = torch.arange(parts, dtype=cuts.dtype, device=cuts.device) / parts
+    inner = cuts[:-1, None] + cuts.diff()[:, None] * fraction
     return torch.cat([inner.flatten(), cuts[-1:]])
 
 
@@ -135,7 +135,7 @@ def _renderings(
             directions,
             cuts=refined(cuts, parts).to(directions),
             background=background,
-            shares=shares(depth) if depth is not None else (),
+            fractions=fractions(depth) if depth is not None else (),
             tolerance=wanted,
             cones=rays.cones[rays.valid],
             keep_intervals=False,

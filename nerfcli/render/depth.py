@@ -64,7 +64,7 @@ class DepthRequest:
             raise ValueError(f"unknown depth axis {self.axis!r}")
 
     @property
-    def share(self) -> float | None:
+    def fraction(self) -> float | None:
         """Fraction of light of a quantile or the median; None for other definitions."""
         if self.convention == "median":
             return MEDIAN
@@ -85,12 +85,12 @@ def effective_floor(request: DepthRequest) -> float:
     """Return the opacity below which a pixel has no depth: 0 for conventions that are defined for every ray."""
     if request.convention in ("moment", "background"):
         return 0.0
-    return max(request.min_opacity, request.share or 0.0)
+    return max(request.min_opacity, request.fraction or 0.0)
 
 
-def shares(request: DepthRequest) -> tuple[float, ...]:
+def fractions(request: DepthRequest) -> tuple[float, ...]:
     """Return the quantiles that a picture needs: the median, and the requested one."""
-    return (MEDIAN,) if request.share in (None, MEDIAN) else (MEDIAN, request.share)
+    return (MEDIAN,) if request.fraction in (None, MEDIAN) else (MEDIAN, request.fraction)
 
 
 def requested(request: DepthRequest, ends: LightEnds, *, background_distance: Tensor) -> Tensor:
@@ -98,7 +98,7 @@ def requested(request: DepthRequest, ends: LightEnds, *, background_distance: Te
 
     Args:
         request: the definition of depth.
-        ends: where light ends, with the quantiles of `shares(request)`, along the requested axis and in its unit.
+        ends: where light ends, with the quantiles of `fractions(request)`, along the requested axis and in its unit.
         background_distance: (R,) that of the request, along the same axis and in the same unit.
     """
     moment = torch.where(ends.mean.isnan(), 0.0, ends.mean * ends.opacity)

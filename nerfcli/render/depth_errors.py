@@ -9,7 +9,7 @@ import numpy as np
 # Least coverage of each stratum. Where no photo sees the surface, no error can be measured.
 STRATA = (1, 2, 4)
 # Quantiles of the errors in a stratum that are kept: every half per cent.
-_SHARES = np.linspace(0.0, 1.0, 201)
+_FRACTIONS = np.linspace(0.0, 1.0, 201)
 # Measured pixels and photos that a stratum needs; several photos, because errors within one are correlated.
 LEAST_PIXELS, LEAST_PHOTOS = 200, 2
 
@@ -38,7 +38,7 @@ class DepthErrors:
             inside = _stratum(coverage) == number
             counts.append(int(inside.sum()))
             enough = counts[-1] >= LEAST_PIXELS and len(np.unique(photos[inside])) >= LEAST_PHOTOS
-            rows.append(np.quantile(errors[inside], _SHARES) if enough else np.full(len(_SHARES), np.nan))
+            rows.append(np.quantile(errors[inside], _FRACTIONS) if enough else np.full(len(_FRACTIONS), np.nan))
         return cls(np.stack(rows), tuple(counts), len(np.unique(photos)), matched)
 
     def bounds(self, median: np.ndarray, coverage: np.ndarray, *, level: float) -> tuple[np.ndarray, np.ndarray]:
@@ -51,8 +51,8 @@ class DepthErrors:
         """
         number = _stratum(coverage)
         sides = []
-        for share in ((1 - level) / 2, (1 + level) / 2):
-            of_strata = np.array([np.interp(share, _SHARES, row) for row in self.quantiles])
+        for fraction in ((1 - level) / 2, (1 + level) / 2):
+            of_strata = np.array([np.interp(fraction, _FRACTIONS, row) for row in self.quantiles])
             factor = np.where(number >= 0, 1.0 + of_strata[number], np.nan)
             sides.append((median * factor).astype(np.float32))
         return sides[0], sides[1]
@@ -64,7 +64,9 @@ class DepthErrors:
         in `bounds`.
         """
         number = _stratum(coverage)
-        of_strata = np.array([np.diff(np.interp((-tolerance, tolerance), row, _SHARES))[0] for row in self.quantiles])
+        of_strata = np.array(
+            [np.diff(np.interp((-tolerance, tolerance), row, _FRACTIONS))[0] for row in self.quantiles]
+        )
         return np.where(number >= 0, of_strata[number], np.nan).astype(np.float32)
 
     def to_json(self) -> dict[str, Any]:
@@ -77,7 +79,7 @@ class DepthErrors:
     def from_json(cls, content: dict[str, Any]) -> Self:
         """Return the errors that `to_json` described."""
         rows: Sequence[Any] = content["quantiles"]
-        empty = np.full(len(_SHARES), np.nan)
+        empty = np.full(len(_FRACTIONS), np.nan)
         quantiles = np.stack([empty if row is None else np.array(row) for row in rows])
         return cls(quantiles, tuple(content["pixels"]), content["photos"], content["matched"])
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.background import Background, colours_behind
-from nerfcli.render.depth import DepthRequest, disagreement, median, requested, shares, spread
+from nerfcli.render.depth import DepthRequest, disagreement, fractions, median, requested, spread
 from nerfcli.render.model import Model
 from nerfcli.render.pixels import pixels_of_rays
 from nerfcli.render.rays import PictureRays, successive_rays
@@ -20,7 +20,7 @@ RAYS_PER_TILE = 2**14
 RAYS_PER_GPU_TILE = 2**16
 # A tile on a GPU takes at most this fraction of its memory, even if every step of its rays is in an occupied cell and
 # takes this many bytes.
-SHARE_OF_GPU, BYTES_PER_STEP = 1 / 8, 110
+FRACTION_OF_GPU, BYTES_PER_STEP = 1 / 8, 110
 # Rays and their background are computed in blocks of this many, so that their last bits do not depend on the tile.
 RAYS_PER_BLOCK = 2**18
 
@@ -148,7 +148,7 @@ def default_rays_per_tile(model: Model) -> int:
     if model.device.type != "cuda":
         return RAYS_PER_TILE
     total = torch.cuda.get_device_properties(model.device).total_memory
-    fitting = int(SHARE_OF_GPU * total / (BYTES_PER_STEP * len(model.marching.edges())))
+    fitting = int(FRACTION_OF_GPU * total / (BYTES_PER_STEP * len(model.marching.edges())))
     return min(RAYS_PER_GPU_TILE, max(RAYS_PER_TILE, fitting))
 
 
@@ -178,14 +178,14 @@ def _render_tile(
     disagreement and median.
     """
     directions, count = rays.directions[part], quality.samples_per_pixel
-    wanted = shares(depth) if depth is not None else ()
+    wanted = fractions(depth) if depth is not None else ()
     behind = background[part]
     seen = render_rays(
         model,
         rays.origin.expand_as(directions),
         directions,
         background=behind,
-        shares=wanted,
+        fractions=wanted,
         tolerance=quality.tolerance,
         cones=rays.cones[part],
         keep_intervals=count > 1,
@@ -202,7 +202,7 @@ def _render_tile(
         valid=rays.valid[part],
         background=behind,
         factor=factor,
-        shares=wanted,
+        fractions=wanted,
         count=count,
         backend=model.field.backend,
     )

@@ -38,24 +38,24 @@ def pixels_of_rays(
     valid: Tensor,
     background: Tensor,
     factor: Tensor,
-    shares: tuple[float, ...],
+    fractions: tuple[float, ...],
     count: int,
     backend: Backend,
 ) -> Pixels:
     """Combine `count` adjacent rays into each pixel.
 
     Args:
-        seen: rendered values of R rays, with the quantiles `shares`.
+        seen: rendered values of R rays, with the quantiles `fractions`.
         valid: (R,) whether the rays exist.
         background: (R, 3) sRGB; a pixel that is not valid has the background of its first ray.
         factor: (R,) > 0, by which distances along the ray are multiplied to get the requested ones.
-        shares: fractions of light of the quantiles.
+        fractions: of light for the quantiles.
         count: rays per pixel, a divisor of R.
         backend: backend of the field.
     """
     rgb, error, ends, to_background = seen.rgb, seen.truncation_error, _scaled(seen.ends, factor), factor
     if count > 1:
-        ends = _mixture(seen, ends, factor=factor, shares=shares, count=count, backend=backend)
+        ends = _mixture(seen, ends, factor=factor, fractions=fractions, count=count, backend=backend)
         rgb, error, valid = rgb.view(-1, count, 3).mean(1), error.view(-1, count).mean(1), valid.view(-1, count).all(1)
         # The rays are weighted by the light that passes along them.
         passing = seen.ends.transmittance.view(-1, count) + torch.finfo(factor.dtype).tiny
@@ -79,7 +79,7 @@ def _scaled(ends: LightEnds, factor: Tensor) -> LightEnds:
 
 
 def _mixture(
-    seen: RaysSeen, ends: LightEnds, *, factor: Tensor, shares: tuple[float, ...], count: int, backend: Backend
+    seen: RaysSeen, ends: LightEnds, *, factor: Tensor, fractions: tuple[float, ...], count: int, backend: Backend
 ) -> LightEnds:
     """Return where the light of pixels of `count` rays ends; `ends` are those of the rays, scaled by `factor`."""
     opacity = ends.opacity.view(-1, count)
@@ -95,7 +95,7 @@ def _mixture(
     density, starts, stops, offsets = seen.intervals
     own = factor[kernels.ray_indices(offsets)]
     along = Intervals(density / own, starts * own, stops * own, offsets)
-    quantiles = [backend.mixture_quantile(along, rays_per_pixel=count, share=share) for share in shares]
+    quantiles = [backend.mixture_quantile(along, rays_per_pixel=count, fraction=fraction) for fraction in fractions]
     return LightEnds(
         opacity=opacity.mean(1),
         transmittance=ends.transmittance.view(-1, count).mean(1),

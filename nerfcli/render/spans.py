@@ -16,7 +16,7 @@ def trace_in_spans(
     march: March,
     *,
     background: Tensor,
-    shares: tuple[float, ...],
+    fractions: tuple[float, ...],
     negligible: float,
 ) -> RaysSeen:
     """Render rays as `Backend.trace_rays` does, without jitter and with the samples kept.
@@ -62,7 +62,7 @@ def trace_in_spans(
             transmittance[own] = passed * through
             seen_spans.append((own, seen.intervals))
     packed = _joined(seen_spans, rays)
-    light = field.backend.light_ends(packed, shares=shares)
+    light = field.backend.light_ends(packed, fractions=fractions)
     behind = torch.maximum(background, 1.0 - background).amax(-1)
     error = left_out + torch.where(light.transmittance <= stop, light.transmittance * behind, 0.0)
     return RaysSeen(rgb + light.transmittance[:, None] * background, light, error, packed)

@@ -21,12 +21,12 @@ from nerfcli.render.spans import trace_in_spans
 # The default: a quarter of a grey level.
 TOLERANCE = 1 / 1020
 # Fraction of the tolerance for the early stop. Surfaces end rays at once, so a deep stop costs little.
-STOP_SHARE = 0.1
+STOP_FRACTION = 0.1
 
 
 def deepest(tolerance: float) -> float:
     """Return the optical depth at which rays stop."""
-    return -math.log(STOP_SHARE * tolerance)
+    return -math.log(STOP_FRACTION * tolerance)
 
 
 def render_rays(
@@ -35,7 +35,7 @@ def render_rays(
     directions: Tensor,
     *,
     background: Tensor,
-    shares: tuple[float, ...] = (),
+    fractions: tuple[float, ...] = (),
     tolerance: float = TOLERANCE,
     cones: Tensor | None = None,
     keep_intervals: bool = True,
@@ -46,7 +46,7 @@ def render_rays(
         model: the trained model.
         origins, directions: (R, 3) in the training frame, unit directions.
         background: (3,) or (R, 3) sRGB.
-        shares: quantiles to compute.
+        fractions: of light for the quantiles to compute.
         tolerance: bound on the truncation error of a colour, > 0.
         cones: (R,) footprint of each ray per distance, see `kernels.Rays`; None for lines.
         keep_intervals: whether to return the samples.
@@ -58,7 +58,7 @@ def render_rays(
         directions,
         cuts=cuts,
         background=background,
-        shares=shares,
+        fractions=fractions,
         tolerance=tolerance,
         cones=cones,
         keep_intervals=keep_intervals,
@@ -79,7 +79,7 @@ def render_cut_rays(
     *,
     cuts: Tensor,
     background: Tensor,
-    shares: tuple[float, ...],
+    fractions: tuple[float, ...],
     tolerance: float,
     cones: Tensor | None = None,
     keep_intervals: bool = True,
@@ -90,15 +90,15 @@ def render_cut_rays(
     rays = Rays(origins, directions, torch.zeros_like(directions[:, 0]), cones)
     march = March(edges, model.occupied, model.contraction, deepest(tolerance))
     # All negligible samples of a ray together use at most the rest of the tolerance.
-    negligible = (1.0 - STOP_SHARE) * tolerance / UNSEEN
+    negligible = (1.0 - STOP_FRACTION) * tolerance / UNSEEN
     if isinstance(field, BlocksField):
-        return trace_in_spans(field, rays, march, background=background, shares=shares, negligible=negligible)
+        return trace_in_spans(field, rays, march, background=background, fractions=fractions, negligible=negligible)
     return field.backend.trace_rays(
         rays,
         march,
         field.medium(),
         background=background,
-        shares=shares,
+        fractions=fractions,
         negligible=negligible,
         keep_intervals=keep_intervals,
     )

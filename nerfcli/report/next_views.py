@@ -39,7 +39,7 @@ def next_views_html(
     run: Path,
     *,
     photos: Sequence[Frame],
-    shares: Mapping[str, float],
+    fractions: Mapping[str, float],
     seen_twice: tuple[float, float],
     views: Sequence[NextView],
 ) -> str:
@@ -48,7 +48,7 @@ def next_views_html(
     Args:
         run: the folder; its name is the title.
         photos: the training photos.
-        shares: fractions of the surface, by the number of photos that see it.
+        fractions: of the surface, by the number of photos that see it.
         seen_twice: fraction of the surface that at least two photos see, before and after adding the views.
         views: best first.
     """
@@ -57,8 +57,8 @@ def next_views_html(
         title=escape(run.resolve().name),
         photos=len(photos),
         rows="".join(
-            f'<tr><td>{escape(name)}</td><td class="number">{100 * share:.1f} %</td></tr>'
-            for name, share in shares.items()
+            f'<tr><td>{escape(name)}</td><td class="number">{100 * fraction:.1f} %</td></tr>'
+            for name, fraction in fractions.items()
         ),
         seen=f"Two photos or more see {100 * before:.1f} % of the surface, with the views below {100 * after:.1f} %."
         if views

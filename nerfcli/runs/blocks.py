@@ -25,7 +25,7 @@ from nerfcli.scene import Scene, model_folder
 # Margin of a cell, as a fraction of the extent of its points.
 MARGIN = 0.15
 # A photo belongs to a block if at least this fraction of the points that it sees is in the block's cell or margin.
-LEAST_SHARE = 0.05
+LEAST_FRACTION = 0.05
 # Fewest points and photos of a block.
 LEAST_POINTS, LEAST_PHOTOS = 50, 2
 # Percentiles of points between which cells are measured: at the edge of the scene, some are far away or wrong.
@@ -98,8 +98,8 @@ def divide(scene: Scene, count: int) -> Division:
         own = cell.contains(places)
         margins = MARGIN * np.ptp(np.percentile(places[own], PERCENTILES, axis=0), axis=0)
         near = cell.contains(places, margins)
-        share = np.bincount(photos, near[points], minlength=len(names)) / np.maximum(total, 1)
-        of_block = _with_photos(scene, set(names[share >= LEAST_SHARE].tolist()))
+        fraction = np.bincount(photos, near[points], minlength=len(names)) / np.maximum(total, 1)
+        of_block = _with_photos(scene, set(names[fraction >= LEAST_FRACTION].tolist()))
         if len(of_block.train_frames) < LEAST_PHOTOS:
             only = len(of_block.train_frames)
             raise UserError(f"block {number} of {count} is seen by {only} training photos of {scene.root}", fewer)
@@ -137,15 +137,15 @@ def joined(models: Sequence[Model], division: Division) -> Model:
     )
     field = BlocksField(settings, [model.field for model in models], torch.stack([model.occupied for model in models]))
     relative = (radii / radius).tolist()
-    spans = [(model.marching, share) for model, share in zip(models, relative, strict=True)]
+    spans = [(model.marching, fraction) for model, fraction in zip(models, relative, strict=True)]
     return replace(
         models[0],
         field=field,
         occupied=_occupied(field, cells=math.ceil(settings.occupancy_side / min(relative))),
         marching=Marching(
-            near=min(marching.near * share for marching, share in spans),
-            far=max(marching.far * share for marching, share in spans),
-            shortest_step=min(marching.shortest_step * share for marching, share in spans),
+            near=min(marching.near * fraction for marching, fraction in spans),
+            far=max(marching.far * fraction for marching, fraction in spans),
+            shortest_step=min(marching.shortest_step * fraction for marching, fraction in spans),
             growth=min(marching.growth for marching, _ in spans),
         ),
         training_from_scene=Similarity(1.0 / radius, np.eye(3), -centre / radius),

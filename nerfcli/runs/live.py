@@ -32,10 +32,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Status:
-    """State of a training: `share` is the fraction of the budget spent, `fields` the number written for viewers."""
+    """State of a training: `fraction` is the fraction of the budget spent, `fields` the number written for viewers."""
 
     count: int
-    share: float
+    fraction: float
     step: int
     seconds: float
     loss: float

@@ -31,7 +31,7 @@ class Diagnostics:
 
     log_gains: Tensor
     exposure_spread: float
-    far_share: float
+    far_fraction: float
     sky_psnr: tuple[float, float]
 
 
@@ -54,7 +54,7 @@ def diagnose(
     ratios = (linear_from_srgb(measured).log() - linear_from_srgb(rendered.clamp_min(DARKEST)).log()).cpu().numpy()
     of_photo = photos.cpu().numpy()
     far = from_beyond > 0.5
-    far_share = float(far.float().mean())
+    far_fraction = float(far.float().mean())
     sky_psnr = explained_by_direction(directions[far], measured[far], photos[far])
     gains, errors = np.zeros((count, 3)), np.full(count, np.nan)
     for photo in range(count):
@@ -67,7 +67,9 @@ def diagnose(
             errors[photo] = _OF_MEDIAN * deviation / np.sqrt(good.sum())
     finite = np.isfinite(errors)
     if finite.sum() < 2:
-        return Diagnostics(torch.zeros(count, 3), 0.0, far_share, sky_psnr)
+        return Diagnostics(torch.zeros(count, 3), 0.0, far_fraction, sky_psnr)
     gains[finite] -= gains[finite].mean(0)
     excess = gains[finite].mean(-1).var(ddof=1) - np.square(errors[finite]).mean()
-    return Diagnostics(torch.tensor(gains, dtype=torch.float32), float(np.sqrt(max(0.0, excess))), far_share, sky_psnr)
+    return Diagnostics(
+        torch.tensor(gains, dtype=torch.float32), float(np.sqrt(max(0.0, excess))), far_fraction, sky_psnr
+    )

@@ -24,7 +24,7 @@ from nerfcli.search.trials import Trial, Trials, TrialStart
 STEPS_OF_START = 0.5
 SEEDS = 2
 # A removal saves only a little time in the training: its trials have to end within this fraction of a time budget.
-REMOVAL_SHARE = 0.65
+REMOVAL_FRACTION = 0.65
 # They may take this fraction of the budget: 2 % of a training whose search has 15 %. View dependence takes 5 % of the
 # time, and was removed on one scene of three.
 REMOVAL_COST = 0.13
@@ -49,10 +49,10 @@ class SearchBudget:
         """Seconds spent so far."""
         return time.perf_counter() - self._began
 
-    def can_afford(self, trials: int, *, of_steps: int, seconds_each: float, share_of_time: float = 1.0) -> bool:
+    def can_afford(self, trials: int, *, of_steps: int, seconds_each: float, fraction_of_time: float = 1.0) -> bool:
         """Return whether the budget still allows some trials; only a fraction of a time budget may be used."""
         if self._seconds is not None:
-            return self.spent + trials * seconds_each <= share_of_time * self._seconds
+            return self.spent + trials * seconds_each <= fraction_of_time * self._seconds
         return self._gone + trials * of_steps <= (self._steps or 0)
 
     def is_cheap(self, trials: int, *, of_steps: int, seconds_each: float) -> bool:
@@ -120,7 +120,7 @@ class Race:
                 self._try_once(list(self._once))
         for change in removals:
             trials = 2 * SEEDS - len(self._base)  # all seeds, for a sure answer
-            if not self._can_run(trials, share_of_time=REMOVAL_SHARE):
+            if not self._can_run(trials, fraction_of_time=REMOVAL_FRACTION):
                 continue
             if not self._budget.is_cheap(trials, of_steps=self._length, seconds_each=self._seconds_each):
                 self.decisions[change] = untried(*change, COSTS_MORE)
@@ -187,9 +187,9 @@ class Race:
         others = ", ".join(name for name, _ in self.kept)
         return replace(decision, why=f"{decision.why}, in addition to {others}") if others else decision
 
-    def _can_run(self, trials: int, *, share_of_time: float = 1.0) -> bool:
+    def _can_run(self, trials: int, *, fraction_of_time: float = 1.0) -> bool:
         return self._budget.can_afford(
-            trials, of_steps=self._length, seconds_each=self._seconds_each, share_of_time=share_of_time
+            trials, of_steps=self._length, seconds_each=self._seconds_each, fraction_of_time=fraction_of_time
         )
 
     def _trial(self, changes: Sequence[Change], *, seed: int) -> Trial:

@@ -20,7 +20,7 @@ from nerfcli.search.race import Race, SearchBudget
 from nerfcli.search.trials import Trials
 
 # Fraction of the budget for all trials together, and fraction of that for the training that they continue.
-SEARCH_SHARE, START_SHARE = 0.15, 0.2
+SEARCH_FRACTION, START_FRACTION = 0.15, 0.2
 # A search whose first training would have fewer steps tells nothing, and is skipped.
 FEWEST_STEPS = 120
 # No machine takes that many steps in less time than this, and a vain attempt would cost the training time.
@@ -35,10 +35,10 @@ LEAST_EXPOSURE_SPREAD, LIKELY_EXPOSURE_SPREAD = 0.06, 0.11
 # Fraction of pixels that show distant things. Below the first number, the field itself shows a sky as well; above the
 # second, a sky is likely, and a smaller gain in the trial is enough. Measured after 120 to 500 steps: 14 to 26 % with a
 # sky, 0 to 3 % on most real captures.
-LEAST_FAR_SHARE, LIKELY_FAR_SHARE = 0.01, 0.1
+LEAST_FAR_FRACTION, LIKELY_FAR_FRACTION = 0.01, 0.1
 # If a larger fraction of pixels looks like a sky, there is one: measured 24 and 11 % with a sky, at most 2.9 % on eight
 # captures without.
-LEAST_SKY_SHARE = 0.05
+LEAST_SKY_FRACTION = 0.05
 # A colour by direction predicts a sky better than one colour by at least this: measured 7.0 to 10.2 dB for a sky, 0.0
 # to 0.8 on surfaces that a coarse field has put far away. Or it predicts it this well: an overcast sky has one colour.
 LEAST_SKY_DB, LEAST_SKY_PSNR = 1.0, 22.0
@@ -49,7 +49,7 @@ LEAST_MISS_PX = 0.6
 SURELY_MISSED_PX = 1.2
 # The focal length from matches is used if it differs from the given one by this many standard errors and this much in
 # the logarithm, and reduces the epipolar error to this fraction.
-FOCAL_ERRORS, LEAST_FOCAL, MISS_SHARE = 5.0, 0.003, 0.85
+FOCAL_ERRORS, LEAST_FOCAL, MISS_FRACTION = 5.0, 0.003, 0.85
 # Values of "cameras" with which focal lengths are learned.
 LEARN_FOCAL = ("focal", "all")
 
@@ -78,7 +78,7 @@ class Facts:
     cameras: CameraCheck | None = None
     points: int = 0
     stereo: int = 0
-    sky_share: float = 0.0
+    sky_fraction: float = 0.0
     exposure_spread: float = 0.0
     fixed: tuple[str, ...] = ()
 
@@ -108,7 +108,7 @@ def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components,
         )
     is_sure = abs(check.log_focal) > max(LEAST_FOCAL, FOCAL_ERRORS * check.error)
     # With wrong poses, any focal length may seem best; the right one leaves hardly any error.
-    is_sure = is_sure and changed < min(MISS_SHARE * given, LEAST_MISS_PX)
+    is_sure = is_sure and changed < min(MISS_FRACTION * given, LEAST_MISS_PX)
     if is_sure:
         value = requested.cameras if learns else "focal"
         return replace(requested, cameras=value), check.log_focal, [untried("cameras", value, reason, kept=True)]
@@ -192,7 +192,7 @@ def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list
         declined.append(untried("cameras", "poses", reason))
     else:
         candidates.append(("cameras", "poses"))
-    against_sky = None if facts.sky_share > LEAST_SKY_SHARE else _against_sky(signs)
+    against_sky = None if facts.sky_fraction > LEAST_SKY_FRACTION else _against_sky(signs)
     if not facts.has_alpha and against_sky is None:
         candidates.append(("background", "sphere"))
     elif not facts.has_alpha:
@@ -206,8 +206,8 @@ def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list
 
 def _against_sky(signs: Diagnostics) -> str | None:
     """Return why no sky is expected; None if there may be one."""
-    far = f"{100.0 * signs.far_share:.1f} % of the pixels see mostly distant surfaces"
-    if signs.far_share <= LEAST_FAR_SHARE:
+    far = f"{100.0 * signs.far_fraction:.1f} % of the pixels see mostly distant surfaces"
+    if signs.far_fraction <= LEAST_FAR_FRACTION:
         return f"only {far}"
     one, painted = signs.sky_psnr
     if painted < LEAST_SKY_PSNR and painted - one < LEAST_SKY_DB:
@@ -224,9 +224,9 @@ def rules(candidates: Sequence[Change], signs: Diagnostics, facts: Facts) -> dic
     for change in candidates:
         if change[0] == "cameras" and facts.cameras is not None:
             found[change] = judge_supported  # photos disagree
-        if change[0] == "background" and facts.sky_share > LEAST_SKY_SHARE:
+        if change[0] == "background" and facts.sky_fraction > LEAST_SKY_FRACTION:
             found[change] = judge_supported  # pixels look like a sky
-        elif change[0] == "background" and signs.far_share > LIKELY_FAR_SHARE:
+        elif change[0] == "background" and signs.far_fraction > LIKELY_FAR_FRACTION:
             found[change] = judge_likely
         if change[0] == "exposure" and signs.exposure_spread > LIKELY_EXPOSURE_SPREAD:
             found[change] = judge_likely
@@ -249,8 +249,8 @@ def _without_poses(model: Components) -> Components:
 def is_worth_a_search(seconds: float | None, steps: int | None) -> bool:
     """Return whether the budget is large enough for a search; see `select`."""
     if seconds is not None:
-        return START_SHARE * SEARCH_SHARE * seconds >= LEAST_START_SECONDS
-    return round(START_SHARE * SEARCH_SHARE * (steps or 0)) >= FEWEST_STEPS
+        return START_FRACTION * SEARCH_FRACTION * seconds >= LEAST_START_SECONDS
+    return round(START_FRACTION * SEARCH_FRACTION * (steps or 0)) >= FEWEST_STEPS
 
 
 def select(
@@ -277,12 +277,12 @@ def select(
         The selection; if the budget is too small for a first training of `FEWEST_STEPS`, only what needs no trial.
     """
     budget = SearchBudget(seconds, steps)
-    first_steps = MOST_START_STEPS if seconds is not None else round(START_SHARE * (steps or 0))
+    first_steps = MOST_START_STEPS if seconds is not None else round(START_FRACTION * (steps or 0))
     model, decided = with_evidence(requested, facts)
     start = trials.begin(
         _without_poses(model),
         steps=min(first_steps, MOST_START_STEPS),
-        seconds=math.inf if seconds is None else START_SHARE * seconds,
+        seconds=math.inf if seconds is None else START_FRACTION * seconds,
         fewest=FEWEST_STEPS,
     )
     if start is None:

@@ -36,10 +36,10 @@ from nerfcli.search.sky import paint
 # Photos are judged on squares of this side, or of a quarter of a small photo's side: single pixels between known
 # neighbours would test interpolation only.
 BLOCK_PX = 12
-BLOCK_SHARE = 0.06
+BLOCK_FRACTION = 0.06
 JUDGED_PIXELS = 8192
 # Fraction of the schedule at which the first training stops and the trials continue.
-FORK_SHARE = 0.6
+FORK_FRACTION = 0.6
 # After this many steps, the number of steps that the time allows is known within this factor, even on a machine slowed
 # down by other work. If it is too small, the rest would be in vain.
 PROBE_STEPS, PROBE_FACTOR = 10, 1.25
@@ -151,7 +151,7 @@ class Trials:
     def begin(
         self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0
     ) -> TrialStart | None:
-        """Train from the beginning to `FORK_SHARE` of a schedule.
+        """Train from the beginning to `FORK_FRACTION` of a schedule.
 
         Args:
             components: of the model.
@@ -166,15 +166,15 @@ class Trials:
         fitting = self._fitting(components, seed=self._settings.seed, log_gains=gains, cameras_from=0.0)
         took: list[float] = []
 
-        def share() -> float:
+        def fraction() -> float:
             enough = fitting.step / fewest if fewest else math.inf
             return max(fitting.step / steps, sum(took) / (2.0 * seconds), min(sum(took) / seconds, enough))
 
         def is_in_vain() -> bool:
             return len(took) == PROBE_STEPS and statistics.median(took) * fewest > 2.0 * PROBE_FACTOR * seconds
 
-        while share() < 1.0 and not is_in_vain():
-            took.append(self._advance(fitting, FORK_SHARE * share()))
+        while fraction() < 1.0 and not is_in_vain():
+            took.append(self._advance(fitting, FORK_FRACTION * fraction()))
         if fitting.step < fewest:
             return None
         drawn = self._pool.draw(JUDGED_PIXELS, fitting.generator)
@@ -207,7 +207,7 @@ class Trials:
         """
         learned = start.signs.log_gains if self._log_gains is None else self._log_gains
         gains = {"exif": self._exif, "learned": learned}.get(components.exposure)
-        fitting = self._fitting(components, seed=seed, log_gains=gains, cameras_from=FORK_SHARE)
+        fitting = self._fitting(components, seed=seed, log_gains=gains, cameras_from=FORK_FRACTION)
         self._take_up(fitting, start)
         if fitting.parts.background is not None:
             paint(fitting.parts.background, self._draws())
@@ -215,7 +215,7 @@ class Trials:
         for done in range(steps):
             if halfway is None and 2 * done >= steps:
                 halfway = self._errors(fitting)
-            seconds.append(self._advance(fitting, FORK_SHARE + (1.0 - FORK_SHARE) * done / steps))
+            seconds.append(self._advance(fitting, FORK_FRACTION + (1.0 - FORK_FRACTION) * done / steps))
         errors = self._errors(fitting)
         # A median, so that other work on the machine does not look like the cost of a component.
         took = statistics.median(seconds) * steps if seconds else 0.0
@@ -285,7 +285,7 @@ def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarra
     """Return the pixels of a photo in judged blocks, (H, W) bool; there is at least one block."""
     block = max(1, min(BLOCK_PX, min(shape[:2]) // 4))
     rows, columns = (-(-side // block) for side in shape[:2])
-    chosen = generator.random((rows, columns)) < BLOCK_SHARE
+    chosen = generator.random((rows, columns)) < BLOCK_FRACTION
     chosen.flat[generator.integers(chosen.size)] = True
     return np.kron(chosen, np.ones((block, block), bool))[: shape[0], : shape[1]]
 

@@ -166,7 +166,7 @@ PIXELS: tuple[tuple[Ray, Ray], ...] = (
     (even("far fog", [0.015625] * 100, 200.0, 1.0), even("far wall", [2.0**10], 250.0, 1.0)),
     (even("thick", [64.0, 0.0, 64.0], 0.25, 0.25), even("empty", [0.0] * 3, 0.25, 0.25)),
 )
-PIXEL_SHARES = (0.04, 0.25, 0.75)
+PIXEL_FRACTIONS = (0.04, 0.25, 0.75)
 
 
 def thick_and_thin(precision: Precision) -> list[Segments]:

@@ -21,7 +21,7 @@ from nerfcli.selftest.measure import Errors, Precision, largest_error
 
 BACKGROUND = COLOUR_GRADIENT = (1.0, 0.5, 0.25)
 TRANSMITTANCE_GRADIENT = 0.5
-SHARES = (0.5, 0.05, 0.95)
+FRACTIONS = (0.5, 0.05, 0.95)
 RATE, BETAS, EPS = 0.01, (0.9, 0.99), 1e-15
 # From this pixel number on, float32 cannot distinguish neighbouring numbers.
 MANY = 2**24
@@ -187,9 +187,9 @@ def depth_inputs(rays: Sequence[Ray], precision: Precision) -> Inputs:
     density, starts, ends = (precision.tensor([x for values in column for x in values]) for column in columns)
     offsets = _offsets([len(ray.density) for ray in rays], precision)
     off = min(0.5, depth_bound(rays, 1, precision).value)
-    near = [1 - (1 - fraction) ** (1 + x) for x in (-off, off) for fraction in SHARES]
+    near = [1 - (1 - fraction) ** (1 + x) for x in (-off, off) for fraction in FRACTIONS]
     spans = map(exact, (density, starts, ends))
-    low, high = reference.light_ends(*spans, offsets=offsets.cpu(), shares=tuple(near)).quantiles.split(3, dim=1)
+    low, high = reference.light_ends(*spans, offsets=offsets.cpu(), fractions=tuple(near)).quantiles.split(3, dim=1)
     settled = (low.isnan() & high.isnan()) | ((high - low).abs() <= 8 * off * low)
     return {"density": density, "starts": starts, "ends": ends, "offsets": offsets, "settled": settled}
 
@@ -213,7 +213,7 @@ def depth_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Err
 def light_ends(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> Outcome:
     """Compute the depths of rays that `columns` names."""
     density = _density_for(module, given)
-    seen = module.light_ends(density, given["starts"], given["ends"], offsets=given["offsets"], shares=SHARES)
+    seen = module.light_ends(density, given["starts"], given["ends"], offsets=given["offsets"], fractions=FRACTIONS)
     named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
     named |= {"conditional": seen.mean, "max-weight": seen.heaviest}
     named |= dict(zip(("median", "0.05", "0.95"), seen.quantiles.unbind(1), strict=True))
@@ -247,13 +247,15 @@ def mixture(module: ModuleType, given: Inputs) -> Outcome:
     """Compute quantiles of the combined light of two rays."""
     spans = (given["density"], given["starts"], given["ends"])
     pixels = {"offsets": given["offsets"], "rays_per_pixel": 2}
-    return Outcome(tuple(module.mixture_quantile(*spans, **pixels, share=fraction) for fraction in cases.PIXEL_SHARES))
+    return Outcome(
+        tuple(module.mixture_quantile(*spans, **pixels, fraction=fraction) for fraction in cases.PIXEL_FRACTIONS)
+    )
 
 
 def mixture_by_mean(given: Inputs) -> Outcome:
     """Compute the mean of the quantiles of two rays."""
     spans = (given["density"], given["starts"], given["ends"])
-    seen = reference.light_ends(*spans, offsets=given["offsets"], shares=cases.PIXEL_SHARES)
+    seen = reference.light_ends(*spans, offsets=given["offsets"], fractions=cases.PIXEL_FRACTIONS)
     return Outcome(tuple(column.view(-1, 2).mean(1) for column in seen.quantiles.unbind(1)))
 
 

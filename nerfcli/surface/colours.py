@@ -74,7 +74,7 @@ def _looked_at(
             towards,
             cuts=cuts.to(origins),
             background=torch.zeros(3, device=model.device),
-            shares=(),
+            fractions=(),
             tolerance=_TOLERANCE,
         )
         opacity = seen.ends.opacity

@@ -185,8 +185,8 @@ def fit_hash(
         order = torch.randperm(count, generator=generator)
         for chosen in order.split(rays_of_step):
             spent = time.perf_counter() - begun
-            share = max(done / passes if passes else 0.0, 0.0 if seconds is None else spent / max(seconds, 1e-9))
-            if share >= 1:
+            fraction = max(done / passes if passes else 0.0, 0.0 if seconds is None else spent / max(seconds, 1e-9))
+            if fraction >= 1:
                 return
             origins, directions = geometry.rays_of_pixels(chosen.numpy())
             rays = torch.from_numpy(origins), torch.from_numpy(directions)
@@ -201,7 +201,7 @@ def fit_hash(
             optimiser.zero_grad()
             torch.autograd.backward(outputs, gradients)
             step += 1
-            rate = RATE * (LAST_RATE / RATE) ** share
+            rate = RATE * (LAST_RATE / RATE) ** fraction
             for group in optimiser.param_groups:
                 group["lr"] = rate
             optimiser.step()
@@ -210,4 +210,4 @@ def fit_hash(
             done += len(chosen) / count
             volume.passes += len(chosen) / count
             if progress is not None:
-                progress(share, f"pass {math.ceil(volume.passes)}")
+                progress(fraction, f"pass {math.ceil(volume.passes)}")

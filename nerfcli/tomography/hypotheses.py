@@ -77,7 +77,7 @@ class Judgement:
         return " ".join(options)
 
 
-def judge(scan: Scan, *, progress: Progress = lambda share, detail: None) -> Judgement:
+def judge(scan: Scan, *, progress: Progress = lambda fraction, detail: None) -> Judgement:
     """Rank hypotheses by how well they predict views that they were not fitted to.
 
     Raises:

@@ -47,8 +47,8 @@ def marks(geometry: ScanGeometry, grid: VoxelGrid) -> np.ndarray:
             for z in ends
         ]
         across = np.zeros(x.shape, dtype=bool)
-        for k, share in enumerate(np.linspace(0, 1, grid.shape[0])):
-            pixel = (1 - share) * layers[0] + share * layers[1]
+        for k, fraction in enumerate(np.linspace(0, 1, grid.shape[0])):
+            pixel = (1 - fraction) * layers[0] + fraction * layers[1]
             # A voxel centred less than half a pixel beyond the detector's edge still counts as seen.
             with np.errstate(invalid="ignore"):
                 across = (pixel[..., 0] > -1) & (pixel[..., 0] < geometry.columns)
@@ -71,8 +71,8 @@ def marks(geometry: ScanGeometry, grid: VoxelGrid) -> np.ndarray:
 
 def marks_in_words(found: np.ndarray, chosen: tuple[int, ...] = tuple(MEANINGS)) -> list[str]:
     """Describe the percentage of voxels with each mark."""
-    shares = {mark: 100 * float(((found & mark) > 0).mean()) for mark in chosen}
-    return [f"{share:.3g} % of the voxels: {MEANINGS[mark]}" for mark, share in shares.items() if share > 0]
+    fractions = {mark: 100 * float(((found & mark) > 0).mean()) for mark in chosen}
+    return [f"{fraction:.3g} % of the voxels: {MEANINGS[mark]}" for mark, fraction in fractions.items() if fraction > 0]
 
 
 def _directions(geometry: ScanGeometry, view: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:

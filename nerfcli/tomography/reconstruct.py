@@ -197,7 +197,7 @@ def reconstruct(
             volume = moved
             if progress is not None:
                 progress(
-                    _share(done + (number + 1) / len(subsets), passes, time.perf_counter() - begun, seconds),
+                    _fraction(done + (number + 1) / len(subsets), passes, time.perf_counter() - begun, seconds),
                     f"pass {fit.passes + done + 1}",
                 )
         done += 1
@@ -239,6 +239,6 @@ def _subsets(count: int, number: int) -> list[np.ndarray]:
     return [np.arange(s, count, number) for s in order]
 
 
-def _share(done: float, passes: int | None, spent: float, seconds: float | None) -> float:
-    shares = [done / passes if passes else 0.0, spent / seconds if seconds else 0.0]
-    return min(1.0, max(shares))
+def _fraction(done: float, passes: int | None, spent: float, seconds: float | None) -> float:
+    fractions = [done / passes if passes else 0.0, spent / seconds if seconds else 0.0]
+    return min(1.0, max(fractions))

@@ -19,10 +19,10 @@ from nerfcli.photos.held_out_exposure import exif_slope
 from nerfcli.photos.pool import Album, PixelPool
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.search.selection import LEAST_SKY_SHARE
+from nerfcli.search.selection import LEAST_SKY_FRACTION
 
 # Fraction of the budget that stereo matching may take.
-STEREO_SHARE = 0.06
+STEREO_FRACTION = 0.06
 # Seconds that it may take if the budget is one of steps only.
 MOST_SECONDS = 60.0
 # Fewer photos with EXIF exposures cannot confirm the matched ones.
@@ -54,7 +54,7 @@ class Evidence:
         self.stereo_seconds = 0.0
         budget = settings.budget_seconds
         # A training by steps must give the same result on all machines: without a time budget, ignore the threads.
-        seconds, threads = (MOST_SECONDS, 1) if budget is None else (STEREO_SHARE * budget, settings.threads)
+        seconds, threads = (MOST_SECONDS, 1) if budget is None else (STEREO_FRACTION * budget, settings.threads)
         self.side_px = affordable_side_px(album.photos, seconds=seconds, threads=threads)
 
     @cached_property
@@ -108,14 +108,14 @@ class Evidence:
         return torch.from_numpy(np.concatenate([mask.ravel() for mask in masks])).to(self._pool.colours.device)
 
     @property
-    def sky_share(self) -> float:
+    def sky_fraction(self) -> float:
         """Fraction of the pixels that look like a sky."""
         return float(self._plain.float().mean())
 
     @property
     def sky(self) -> Tensor | None:
         """Pixels of the pool that look like a sky, (pixels,) bool; None if they are too few to be one."""
-        return self._plain if self.sky_share > LEAST_SKY_SHARE else None
+        return self._plain if self.sky_fraction > LEAST_SKY_FRACTION else None
 
     @cached_property
     def of_stereo(self) -> PointDepths:

@@ -29,7 +29,7 @@ from nerfcli.train.live import LiveTraining
 from nerfcli.train.moving_masks import write_moving_masks
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
-from nerfcli.train.waypoints import SHARES, forget_waypoints, keep_waypoint, measure_waypoints
+from nerfcli.train.waypoints import FRACTIONS, forget_waypoints, keep_waypoint, measure_waypoints
 
 CHECKPOINT_SECONDS = 30.0
 # Time that a page that is open when the training ends has to load the last checkpoint.
@@ -40,7 +40,7 @@ _LAST_LOOK_SECONDS = 2.0
 class Progress:
     """State of a training: fraction of the budget, steps, training seconds, loss, speed."""
 
-    share: float
+    fraction: float
     step: int
     seconds: float
     loss: float
@@ -114,7 +114,9 @@ def train(
             on_progress(progress)
             prepared.storage.release_pages()
             interrupts.raise_if_pending()
-            live.after_step(fraction=progress.share, step=progress.step, seconds=progress.seconds, loss=progress.loss)
+            live.after_step(
+                fraction=progress.fraction, step=progress.step, seconds=progress.seconds, loss=progress.loss
+            )
 
         try:
             seconds = _run(fitting, totals, sentinel=sentinel, checkpoints=checkpoints, run=run, on_progress=after_step)
@@ -208,9 +210,9 @@ def _run(
         append_log(run, entry)
         logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
 
-    waypoints = [fraction for fraction in SHARES if fraction > _share(settings, fitting.step, totals)]
+    waypoints = [fraction for fraction in FRACTIONS if fraction > _fraction(settings, fitting.step, totals)]
     try:
-        while (fraction := _share(settings, fitting.step, totals)) < 1.0:
+        while (fraction := _fraction(settings, fitting.step, totals)) < 1.0:
             began = time.perf_counter()
             fitting.ranks.announce(fraction)
             result = sentinel.advance(fraction)
@@ -219,13 +221,13 @@ def _run(
             totals.samples += result.samples
             totals.rays += result.rays
             loss = result.loss
-            fraction = _share(settings, fitting.step, totals)
+            fraction = _fraction(settings, fitting.step, totals)
             on_progress(Progress(fraction, fitting.step, totals.seconds, loss, speeds()[0]))
             checkpoint_due = totals.seconds - last_saved >= CHECKPOINT_SECONDS
             if checkpoint_due or (waypoints and fraction >= waypoints[0]):
                 fitting.ranks.announce(SETTLE)
                 sentinel.settle()
-                fraction = _share(settings, fitting.step, totals)
+                fraction = _fraction(settings, fitting.step, totals)
             if waypoints and fraction >= waypoints[0]:
                 waypoints = [later for later in waypoints if later > fraction]
                 keep_waypoint(run, fitting.step, checkpoints.model())
@@ -242,7 +244,7 @@ def _run(
     return last_steps
 
 
-def _share(settings: TrainSettings, step: int, totals: Totals) -> float:
+def _fraction(settings: TrainSettings, step: int, totals: Totals) -> float:
     """Return the used fraction of the budget: the larger of that of time, without the search, and that of steps."""
     left = settings.budget_seconds - totals.searched if settings.budget_seconds else 0.0
     by_time = (totals.seconds - totals.searched) / left if left > 0 else 0.0

@@ -35,7 +35,7 @@ from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.scene import Scene, refuse_without_training_photos
 from nerfcli.search.selection import (
     LEARN_FOCAL,
-    SEARCH_SHARE,
+    SEARCH_FRACTION,
     Facts,
     is_worth_a_search,
     may_use_points,
@@ -50,7 +50,7 @@ from nerfcli.train.evidence import Evidence
 # Budget of a search that has no time left.
 LEAST_SECONDS = 1e-3
 # Fraction of a search that matching photos may take.
-MATCHING_SHARE = 0.5
+MATCHING_FRACTION = 0.5
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def _facts(
     lacks_points = album.fills_frame and len(scene.points) == 0
     budget = settings.budget_seconds
     has_time = is_worth_a_search(budget, settings.steps) and (
-        budget is None or shared.matching_seconds <= MATCHING_SHARE * SEARCH_SHARE * budget
+        budget is None or shared.matching_seconds <= MATCHING_FRACTION * SEARCH_FRACTION * budget
     )
     facts = Facts(
         settings.field,
@@ -259,7 +259,7 @@ def _facts(
         fixed=settings.fixed,
     )
     if not facts.has_alpha and "background" not in facts.fixed:
-        facts = replace(facts, sky_share=evidence.sky_share)
+        facts = replace(facts, sky_fraction=evidence.sky_fraction)
     if may_use_points(settings.components, facts) and (shared.of_model.count or has_time or settings.components.points):
         facts = replace(facts, points=len(evidence.of_tracks.numbers))
         if may_use_stereo(settings.components, facts, has_time=bool(evidence.side_px)):
@@ -312,13 +312,15 @@ def _search(
         storage=storage,
     )
     took = time.perf_counter() - began
-    notify(f"selecting components, for up to {100 * SEARCH_SHARE:.0f} % of the budget")
+    notify(f"selecting components, for up to {100 * SEARCH_FRACTION:.0f} % of the budget")
     selection = select(
         trials,
         requested,
         facts,
-        seconds=None if budget is None else max(LEAST_SECONDS, SEARCH_SHARE * budget - took + evidence.stereo_seconds),
-        steps=None if steps is None else round(SEARCH_SHARE * steps),
+        seconds=None
+        if budget is None
+        else max(LEAST_SECONDS, SEARCH_FRACTION * budget - took + evidence.stereo_seconds),
+        steps=None if steps is None else round(SEARCH_FRACTION * steps),
     )
     if not selection.decisions:
         notify("the budget is too short for trials; using the default components")

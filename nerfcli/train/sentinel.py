@@ -50,20 +50,20 @@ class Sentinel:
         self._pool = pool
         self._run = run
         self._notify = notify
-        self._shares: list[float] = []  # budget fractions of the steps since the copy
+        self._fractions: list[float] = []  # budget fractions of the steps since the copy
         self._tensors, self._description = _copied(*fitting.state())
 
-    def advance(self, share: float) -> StepResult:
+    def advance(self, fraction: float) -> StepResult:
         """Take one step, see `Fitting.advance`; after a failure, it may be the repetition of an earlier one.
 
         Raises:
             UserError: numbers become non-finite despite smaller steps, exit code 5.
         """
-        self._shares.append(share)
+        self._fractions.append(fraction)
         try:
-            if len(self._shares) > SNAPSHOT_EVERY:
-                self._take_snapshot(share)
-            return self._fitting.advance(share)
+            if len(self._fractions) > SNAPSHOT_EVERY:
+                self._take_snapshot(fraction)
+            return self._fitting.advance(fraction)
         except NonFiniteError:
             return self._answer()
 
@@ -91,7 +91,7 @@ class Sentinel:
             self._description = description
         else:  # Adam has no moments before its first step
             self._tensors, self._description = _copied(tensors, description)
-        self._shares = [fraction]
+        self._fractions = [fraction]
 
     def _go_back(self) -> None:
         self._fitting.restore(*_copied(self._tensors, self._description))
@@ -103,10 +103,10 @@ class Sentinel:
         deterministic = fitting.field.backend.deterministic
         before = self._tensors, self._description
         done, bad, result = 0, None, None
-        while bad is None and done < len(self._shares):
+        while bad is None and done < len(self._fractions):
             if not deterministic:  # this state cannot be reproduced
                 before = _copied(*fitting.state())
-            result, bad = _watched_step(fitting, self._shares[done])
+            result, bad = _watched_step(fitting, self._fractions[done])
             bad = _first_of_ranks(fitting, bad)
             done += 1
         if bad is None:
@@ -123,9 +123,9 @@ class Sentinel:
             return result
         fitting.restore(*_copied(*before))
         if deterministic:
-            for fraction in self._shares[: done - 1]:
+            for fraction in self._fractions[: done - 1]:
                 fitting.advance(fraction)
-        path, text = self._keep(self._shares[done - 1], bad)
+        path, text = self._keep(self._fractions[done - 1], bad)
         self._go_back()
         if fitting.rollbacks == MOST_ROLLBACKS:
             raise UserError(
@@ -140,7 +140,7 @@ class Sentinel:
             f"{fitting.rollbacks} of {MOST_ROLLBACKS} retries); {path} has the state before the failure"
         )
         self._description = fitting.state()[1]  # a later failure keeps these smaller steps
-        first, self._shares = self._shares[0], []
+        first, self._fractions = self._fractions[0], []
         return self.advance(first)
 
     def _keep(self, fraction: float, bad: BadTensor) -> tuple[Path, str]:

@@ -19,7 +19,7 @@ from nerfcli.runs.log import add_to_log
 from nerfcli.train.held_out_pixels import HeldoutPixels
 from nerfcli.train.preparation import Prepared
 
-SHARES = (0.25, 0.5, 0.75, 1.0)
+FRACTIONS = (0.25, 0.5, 0.75, 1.0)
 FOLDER = "waypoints"
 
 

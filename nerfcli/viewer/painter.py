@@ -110,7 +110,7 @@ def render_tile(model: Model, view: View, tile: Tile) -> np.ndarray:
         rays.origin.expand_as(rays.directions),
         rays.directions,
         background=colours_behind(model.background, rays.directions),
-        shares=(MEDIAN, 0.05, 0.95, view.quantile),
+        fractions=(MEDIAN, 0.05, 0.95, view.quantile),
         cones=rays.cones,
         keep_intervals=False,
     )

@@ -15,7 +15,7 @@ from nerfcli.viewer.pictures import view_of
 
 WIDTH, HEIGHT = 64, 48
 CAMERAS = 3
-SHARE = 0.25
+FRACTION = 0.25
 # Maps of the proof after the colour, in this order; see `compare` in check.js.
 MAPS = (
     *("opacity", "conditional", "median", "max-weight", "moment", "background", "quantile"),
@@ -50,7 +50,7 @@ def make_proof(model: Model, frames: Sequence[Frame]) -> Proof:
     description = {
         "width": WIDTH,
         "height": HEIGHT,
-        "share": SHARE,
+        "share": FRACTION,
         "maps": list(MAPS),
         "cameras": [view_of(frame) for frame in small],
     }
@@ -68,7 +68,7 @@ def _maps(model: Model, frame: Frame) -> list[np.ndarray]:
     farthest = model.marching.far / model.training_from_scene.scale
     pictures = {}
     for name in MAPS[1:-2]:
-        convention = f"quantile:{SHARE}" if name == "quantile" else name
+        convention = f"quantile:{FRACTION}" if name == "quantile" else name
         request = DepthRequest(convention, "z", background_distance=farthest)
         pictures[name] = render_picture(model, frame, background=model.background, depth=request)
     first = pictures["conditional"]

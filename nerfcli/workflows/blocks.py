@@ -85,8 +85,8 @@ def train_blocks(
     chosen = numbers if only is None else [only]
     for place, number in enumerate(chosen):
 
-        def of_all(share: float, words: str, before: int = place, number: int = number) -> None:
-            progress((before + share) / len(chosen), f"block {number} of {count}  {words}")
+        def of_all(fraction: float, words: str, before: int = place, number: int = number) -> None:
+            progress((before + fraction) / len(chosen), f"block {number} of {count}  {words}")
 
         train_or_continue(
             folder,

@@ -121,7 +121,7 @@ def detection_record(found: detect.Detection, form: str) -> dict[str, Any]:
                         "intrinsics_scale": answer.convention.intrinsics_scale,
                         "as_format_says": answer.as_format_says,
                         "median_px": None if answer.median_px == float("inf") else answer.median_px,
-                        "inlier_share": answer.inlier_share,
+                        "inlier_share": answer.inlier_fraction,
                     }
                     for answer in question.answers
                 ],

@@ -148,7 +148,7 @@ def _export_page(
     seen = photo_depths(
         run,
         model,
-        on_progress=lambda share: progress(0.1 + 0.3 * share, "depths of the training photos"),
+        on_progress=lambda fraction: progress(0.1 + 0.3 * fraction, "depths of the training photos"),
         notify=notify,
     )
     numbers = PageNumbers.of(packed, proof, seen_cells(model, seen))

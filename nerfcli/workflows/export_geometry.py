@@ -102,7 +102,7 @@ def export_volume(
     maps = sample_volume(model, grid, on_progress=_part(progress, 0.05, 1.0, "evaluating the field"))
     per_unit = {"metre": "1/m"}.get(model.unit, "1 / unit")
     described = _description(run, model, "volume", grid) | {
-        "density": f"share of light that ends per length, {per_unit}; 0 where rays pass over cells",
+        "density": f"fraction of light that ends per length, {per_unit}; 0 where rays pass over cells",
         "colour": "sRGB, mean over six directions; 0 where a voxel takes less than a thousandth of the light",
     }
     _write_volume(path, Volume(maps, grid.centres(np.zeros(3)), grid.voxel_size, described), "density")
@@ -166,7 +166,7 @@ def _seen(
 
 
 def _part(progress: Progress, start: float, end: float, words: str) -> Callable[[float], None]:
-    return lambda share: progress(start + (end - start) * share, words)
+    return lambda fraction: progress(start + (end - start) * fraction, words)
 
 
 def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any]:

@@ -91,8 +91,8 @@ def train_members(
     for place, number in enumerate(chosen):
         path, settings = run.path / MEMBERS / str(number), all_settings[number - 1]
 
-        def of_all(share: float, words: str, before: int = place, number: int = number) -> None:
-            progress((before + share) / len(chosen), f"member {number} of {count}  {words}")
+        def of_all(fraction: float, words: str, before: int = place, number: int = number) -> None:
+            progress((before + fraction) / len(chosen), f"member {number} of {count}  {words}")
 
         train_again(
             run,

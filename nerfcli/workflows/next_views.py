@@ -40,7 +40,7 @@ class RunCoverage:
     Args:
         photos: number of training photos.
         box: x0, y0, z0, x1, y1, z1 in the scene's frame; only the surface inside it counts.
-        shares: fractions of the surface by the number of photos that see it, with the keys of `STRATA`.
+        fractions: of the surface, by the number of photos that see it, with the keys of `STRATA`.
         views: where to take further photos, best first.
         gains: for each view, the fraction of the surface that it would be the first or second to see.
         seen_twice: fraction of the surface that at least two photos see, without and with the suggested views.
@@ -48,7 +48,7 @@ class RunCoverage:
 
     photos: int
     box: tuple[float, ...]
-    shares: dict[str, float]
+    fractions: dict[str, float]
     views: tuple[Frame, ...]
     gains: tuple[float, ...]
     seen_twice: tuple[float, float]
@@ -62,7 +62,7 @@ class RunCoverage:
         return {
             "photos": self.photos,
             "box": list(self.box),
-            "shares": self.shares,
+            "shares": self.fractions,
             "seen_twice": list(self.seen_twice),
             "next_views": views,
         }
@@ -97,13 +97,18 @@ def examine_run(
     trained = Run(run)
     torch.set_num_threads(thread_count(threads))
     model, frames = trained.model(), trained.cameras.train
-    photos = photo_depths(trained, model, on_progress=lambda share: progress(0.4 * share, "photos"), notify=notify)
+    photos = photo_depths(
+        trained, model, on_progress=lambda fraction: progress(0.4 * fraction, "photos"), notify=notify
+    )
     box = scene_box(model, frames)
     low, high = np.array(box[:3]), np.array(box[3:])
     grid = Grid.over(box, float((high - low).max()) / CELLS)
     candidates = candidate_frames(frames, depth_hint=1.0 / model.training_from_scene.scale)
     rendered = depth_maps(
-        model, candidates, max_size=CANDIDATE_PX, on_progress=lambda share: progress(0.4 + 0.5 * share, "candidates")
+        model,
+        candidates,
+        max_size=CANDIDATE_PX,
+        on_progress=lambda fraction: progress(0.4 + 0.5 * fraction, "candidates"),
     )
     views = in_free_space(rendered, photos)
     points = surface_points([*photos, *views], grid)
@@ -121,7 +126,7 @@ def examine_run(
     examined = RunCoverage(
         photos=len(frames),
         box=box,
-        shares={
+        fractions={
             name: float(((coverage >= low) & (coverage < high)).mean())
             for name, low, high in zip(STRATA, bounds[:-1], bounds[1:], strict=True)
         },
@@ -142,7 +147,7 @@ def _write_page(found: RunCoverage, path: Path, run: Run, model: Model, photos: 
         picture = render_picture(model, small_frame(frame, PICTURE_PX), background=model.background)
         views.append(NextView(frame, gain, to_8_bit(picture.rgb), coverage_map(model, frame, photos)))
     text = next_views_html(
-        run.path, photos=run.cameras.train, shares=found.shares, seen_twice=found.seen_twice, views=views
+        run.path, photos=run.cameras.train, fractions=found.fractions, seen_twice=found.seen_twice, views=views
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_page(text, path)

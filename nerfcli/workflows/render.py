@@ -82,7 +82,10 @@ def render_run(
     provenance: dict[str, Any] = {"cameras": views.cameras, "run": trained.path.name, "field_sha256": model.sha256}
     if settings.needs_visibility:
         seen = photo_depths(
-            trained, model, on_progress=lambda share: progress(share, "depths of the training photos"), notify=notify
+            trained,
+            model,
+            on_progress=lambda fraction: progress(fraction, "depths of the training photos"),
+            notify=notify,
         )
         provenance["training_photos"] = len(seen)
     errors = None
@@ -92,7 +95,7 @@ def render_run(
             model,
             seen,
             threads=cores,
-            on_progress=lambda share: progress(share, "depth of the held-out photos"),
+            on_progress=lambda fraction: progress(fraction, "depth of the held-out photos"),
             notify=notify,
         )
         provenance["measured_photos"] = errors.photos

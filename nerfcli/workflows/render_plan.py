@@ -140,8 +140,8 @@ def plan_evaluation(
     extras = Extras(train, align_poses=align_poses, align_colours=align_colours)
     seconds = _second_run(lambda: evaluate_model(model, small, on_image=lambda done, total: None, extras=extras))
     frames = [photo.frame for photo in photos]
-    share = _pixels(frames) / _pixels([photo.frame for photo in small]) * len(test) / len(photos)
-    plan = _plan(frames, seconds=reading + share * seconds, at_once=1, written=0.0)
+    fraction = _pixels(frames) / _pixels([photo.frame for photo in small]) * len(test) / len(photos)
+    plan = _plan(frames, seconds=reading + fraction * seconds, at_once=1, written=0.0)
     pixels = round(_pixels(frames) * len(test) / len(frames))
     return replace(
         plan,

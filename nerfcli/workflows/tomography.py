@@ -44,7 +44,7 @@ from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, war
 STRENGTH_FRACTION = 0.15
 COARSE_FRACTION = 0.1
 # Minimum fraction of the budget for the fit, even if the trials before it took longer than planned.
-LEAST_SHARE = 0.25
+LEAST_FRACTION = 0.25
 COARSE_PASSES = 6
 # Maximum number of passes of a fit that is limited only by time.
 MOST_PASSES = 200
@@ -229,10 +229,10 @@ class Limit:
 
     @property
     def seconds(self) -> float | None:
-        """Seconds left, at least `LEAST_SHARE` of the total."""
+        """Seconds left, at least `LEAST_FRACTION` of the total."""
         if self.total_seconds is None:
             return None
-        return max(self.total_seconds - (time.perf_counter() - self.begun), LEAST_SHARE * self.total_seconds)
+        return max(self.total_seconds - (time.perf_counter() - self.begun), LEAST_FRACTION * self.total_seconds)
 
 
 def _fit_voxels(problem: Problem, fit: Fit, strength: float, limit: Limit, *, progress: Progress) -> tuple[Fit, bool]:

@@ -149,8 +149,12 @@ def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
         np.where(np.take(result.marks, k, number) & UNSEEN, np.nan, np.take(result.volume, k, number))
         for k in (low, high)
     ]
-    share = place - low
-    return ((1 - share) * layers[0] + share * layers[1]).astype(np.float32) if share else layers[0].astype(np.float32)
+    fraction = place - low
+    return (
+        ((1 - fraction) * layers[0] + fraction * layers[1]).astype(np.float32)
+        if fraction
+        else layers[0].astype(np.float32)
+    )
 
 
 def residual_of(likelihood: Likelihood, integrals: torch.Tensor, views: torch.Tensor) -> torch.Tensor:

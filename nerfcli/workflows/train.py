@@ -324,7 +324,7 @@ def _fit(
     def on_progress(state: loop.Progress) -> None:
         on_begin()
         speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
-        progress(state.share, f"step {state.step}  loss {state.loss:.4f}  {speed}")
+        progress(state.fraction, f"step {state.step}  loss {state.loss:.4f}  {speed}")
 
     progress(0.0, "")
     loop.train(

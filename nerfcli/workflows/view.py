@@ -208,7 +208,7 @@ class RunShow:
             return {
                 "state": "paused" if status.paused else "training",
                 "version": self._version,
-                "share": status.share,
+                "share": status.fraction,
                 "step": status.step,
                 "seconds": round(status.seconds, 1),
                 "loss": status.loss,

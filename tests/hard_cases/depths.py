@@ -10,17 +10,17 @@ import torch
 from torch import Tensor
 
 from hard_cases import exact, exact_depths
-from hard_cases.exact_depths import SHARES, quantile_name
+from hard_cases.exact_depths import FRACTIONS, quantile_name
 from nerfcli.kernels import LightEnds
 from nerfcli.kernels.reference.depth import BISECTIONS
 from nerfcli.selftest import textbook
-from nerfcli.selftest.cases import MEANINGLESS, PIXEL_SHARES, PIXELS, Ray, Segments, depth_rays, lit, thick_and_thin
+from nerfcli.selftest.cases import MEANINGLESS, PIXEL_FRACTIONS, PIXELS, Ray, Segments, depth_rays, lit, thick_and_thin
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
 # Rays with at most this many intervals form the coarse group; all others form the fine one.
 FEW = 15
 GRADIENT_BOUND = 3
-_SHARES = {quantile_name(share): share for share in SHARES}
+_FRACTIONS = {quantile_name(fraction): fraction for fraction in FRACTIONS}
 VALUE_ONLY = "the compiled kernel has none: where one is wanted, plain torch gives both"
 
 
@@ -42,7 +42,7 @@ _DEPTHS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("mean depth of the interval that stops most light", ("max-weight",)),
     (
         "median and quantiles, not reached and inside intervals (no gradient where they jump over a gap)",
-        tuple(quantile_name(share) for share in SHARES),
+        tuple(quantile_name(fraction) for fraction in FRACTIONS),
     ),
 )
 
@@ -65,7 +65,7 @@ def _depth_rows(rays: list[Ray], precision: Precision, *, cut: str) -> Iterator[
     density.requires_grad_(not precision.compiled)
     module = precision.parts
     start = time.perf_counter()
-    seen = _columns(module.light_ends(density, starts, ends, offsets=offsets, shares=SHARES))
+    seen = _columns(module.light_ends(density, starts, ends, offsets=offsets, fractions=FRACTIONS))
     slopes = _gradients(seen, density)
     seconds = time.perf_counter() - start
     plain = textbook.depth(density, starts, ends, offsets=offsets)
@@ -114,7 +114,7 @@ def _nearest(
     for i, (ray, answer) in enumerate(zip(rays, wanted, strict=True)):
         for column in columns:
             bound, depth = _bound(ray, at), answer.depths[column]
-            if column in _SHARES and not exact_depths.is_settled(ray, _SHARES[column], within=bound):
+            if column in _FRACTIONS and not exact_depths.is_settled(ray, _FRACTIONS[column], within=bound):
                 continue
             if column == "spread" and depth.value > 0:
                 bound *= 1 + abs(answer.depths["conditional"].value - answer.anchor) / depth.value
@@ -166,7 +166,7 @@ def _bound(ray: Ray, precision: Precision) -> float:
 def _columns(seen: LightEnds) -> dict[str, Tensor]:
     named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
     named |= {"conditional": seen.mean, "max-weight": seen.heaviest}
-    return named | {quantile_name(share): seen.quantiles[:, i] for i, share in enumerate(SHARES)}
+    return named | {quantile_name(fraction): seen.quantiles[:, i] for i, fraction in enumerate(FRACTIONS)}
 
 
 def _rounded(ray: Ray, precision: Precision) -> Ray:
@@ -183,14 +183,14 @@ def _mixture_row(precision: Precision) -> Row:
     module = precision.parts
     got, means, wanted = [], [], []
     start = time.perf_counter()
-    for share in PIXEL_SHARES:
-        pixels = {"offsets": offsets, "rays_per_pixel": 2, "share": share}
+    for fraction in PIXEL_FRACTIONS:
+        pixels = {"offsets": offsets, "rays_per_pixel": 2, "fraction": fraction}
         got.append(module.mixture_quantile(density, starts, ends, **pixels))
     seconds = time.perf_counter() - start
-    for share in PIXEL_SHARES:
-        alone = module.light_ends(density, starts, ends, offsets=offsets, shares=(share,)).quantiles
+    for fraction in PIXEL_FRACTIONS:
+        alone = module.light_ends(density, starts, ends, offsets=offsets, fractions=(fraction,)).quantiles
         means.append(alone.view(-1, 2).mean(1))
-        wanted += [exact.mixture_quantile(rays[i : i + 2], share) for i in range(0, len(rays), 2)]
+        wanted += [exact.mixture_quantile(rays[i : i + 2], fraction) for i in range(0, len(rays), 2)]
     return Row(
         case="quantiles of several rays of a pixel, of which some hit nothing",
         operation="mixture_quantile",

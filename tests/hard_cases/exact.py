@@ -88,7 +88,7 @@ def optical_depths(ray: Segments) -> list[float]:
         return [float(depth) for depth in accumulate(parts, initial=Decimal(0))]
 
 
-def mixture_quantile(rays: Sequence[Ray], share: float) -> float:
+def mixture_quantile(rays: Sequence[Ray], fraction: float) -> float:
     """Return the distance at which a fraction of the rays' combined light has ended, by bisection.
 
     NaN if less light than that ends anywhere.
@@ -99,7 +99,7 @@ def mixture_quantile(rays: Sequence[Ray], share: float) -> float:
             [tuple(map(Decimal, values)) for values in zip(ray.density, ray.starts, ray.ends, strict=True)]
             for ray in rays
         ]
-        wanted = 1 - Decimal(share)
+        wanted = 1 - Decimal(fraction)
 
         def passed(t: Decimal) -> Decimal:
             depths = (

@@ -12,7 +12,7 @@ from itertools import pairwise
 from hard_cases.exact import DIGITS
 from nerfcli.selftest.cases import Ray
 
-SHARES = (0.5, 0.05, 0.95)
+FRACTIONS = (0.5, 0.05, 0.95)
 # Optical depths below which sixty digits are too few for the closed forms: of mean and variance, and of the
 # variance's derivative.
 _THIN, _THIN_SLOPE = Decimal("1e-15"), Decimal("1e-6")
@@ -41,7 +41,7 @@ class LightEnds:
     """All depths of a ray by name, and the start of its heaviest interval.
 
     Args:
-        depths: opacity, transmittance, conditional, spread, max-weight, median and the quantiles of `SHARES`.
+        depths: opacity, transmittance, conditional, spread, max-weight, median and the quantiles of `FRACTIONS`.
         anchor: start of the interval in which most light ends; NaN without light.
     """
 
@@ -106,23 +106,23 @@ def _light_ends(numbers: _Numbers) -> LightEnds:
             depths["max-weight"] = _depth(one.mean, slopes, sizes)
         else:
             depths |= dict.fromkeys(("conditional", "spread", "max-weight"), _undefined(ray))
-        depths |= {quantile_name(share): _quantile(ray, intervals, _target(share)) for share in SHARES}
+        depths |= {quantile_name(fraction): _quantile(ray, intervals, _target(fraction)) for fraction in FRACTIONS}
         return LightEnds(depths, float(intervals[near[0]].start) if near else float("nan"))
 
 
-def quantile_name(share: float) -> str:
+def quantile_name(fraction: float) -> str:
     """Return the name of the depth by which a fraction of all light has ended."""
-    return "median" if share == 0.5 else f"quantile:{share:g}"
+    return "median" if fraction == 0.5 else f"quantile:{fraction:g}"
 
 
-def is_settled(ray: Ray, share: float, *, within: float) -> bool:
+def is_settled(ray: Ray, fraction: float, *, within: float) -> bool:
     """Return whether a quantile changes smoothly under a relative error `within` of the optical depths.
 
     Beside a gap, an interval of another density or the end of the light, it would jump.
     """
     with localcontext() as context:
         context.prec = DIGITS
-        intervals, target = _intervals(_Numbers(ray)), _target(share)
+        intervals, target = _intervals(_Numbers(ray)), _target(fraction)
         least, most = (_crossed(intervals, target * (1 + Decimal(x))) for x in (-within, within))
         if least is None or most is None:
             return least is most
@@ -220,9 +220,9 @@ def _quantile(ray: Ray, intervals: list[_Interval], target: Decimal) -> Depth:
     return _depth(one.start + inside, slopes, [*before, size, *none])
 
 
-def _target(share: float) -> Decimal:
+def _target(fraction: float) -> Decimal:
     """Return the optical depth at which a fraction of all light has ended."""
-    return -(1 - Decimal(share)).ln()
+    return -(1 - Decimal(fraction)).ln()
 
 
 def _crossed(intervals: list[_Interval], target: Decimal) -> int | None:

@@ -100,8 +100,8 @@ def _corners(point: Point, resolution: int) -> list[tuple[int, Fraction]]:
     for corner in itertools.product((0, 1), repeat=3):
         x, y, z = (c + d for c, d in zip(cell, corner, strict=True))
         hashed = (x ^ y * 2654435761 ^ z * 805459861) % 2**32 % ROWS
-        shares = [s - c if d else 1 - (s - c) for s, c, d in zip(scaled, cell, corner, strict=True)]
-        found.append(((z * side + y) * side + x if side**3 <= ROWS else hashed, math.prod(shares)))
+        fractions = [s - c if d else 1 - (s - c) for s, c, d in zip(scaled, cell, corner, strict=True)]
+        found.append(((z * side + y) * side + x if side**3 <= ROWS else hashed, math.prod(fractions)))
     return found
 
 

@@ -129,7 +129,7 @@ def _empty_row(precision: Precision) -> Row:
     density, background = torch.zeros_like(starts), precision.tensor([[0.25, 0.5, 1.0]] * 3)
     rgb = starts.new_zeros(len(starts), 3)
     colour, passing, _ = module.composite(density, rgb, ends - starts, offsets=offsets, background=background)
-    light = module.light_ends(density, starts, ends, offsets=offsets, shares=(0.5,))
+    light = module.light_ends(density, starts, ends, offsets=offsets, fractions=(0.5,))
     seconds = time.perf_counter() - begin
     got = torch.cat([colour.flatten(), passing, light.opacity, light.mean, light.quantiles.flatten()])
     wanted = [0.25, 0.5, 1.0] * 3 + [1.0] * 3 + [0.0] * 3 + [math.nan] * 6

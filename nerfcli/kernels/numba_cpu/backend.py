@@ -37,18 +37,20 @@ class NumbaBackend(ComposedBackend):
         medium: HashGrid | Medium,
         *,
         background: Tensor,
-        shares: tuple[float, ...] = (),
+        fractions: tuple[float, ...] = (),
         negligible: float = 0.0,
         keep_intervals: bool = True,
     ) -> RaysSeen:
         if not isinstance(medium, HashGrid) or not _fits(medium, medium.layers):
-            return super().trace_rays(rays, march, medium, background=background, shares=shares, negligible=negligible)
+            return super().trace_rays(
+                rays, march, medium, background=background, fractions=fractions, negligible=negligible
+            )
         return numba_cpu.trace_rays(
             rays.detached(),
             march,
             medium,
             background=background,
-            shares=shares,
+            fractions=fractions,
             negligible=negligible,
             keep_intervals=keep_intervals,
         )

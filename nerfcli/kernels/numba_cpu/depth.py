@@ -83,28 +83,28 @@ def _light_ends(density: Any, starts: Any, ends: Any, offsets: Any, targets: Any
 
 
 def light_ends(
-    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, shares: tuple[float, ...]
+    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fractions: tuple[float, ...]
 ) -> LightEnds:
     """See `depth.light_ends`; float32 on the CPU, without gradients."""
     use_threads()
-    sums, quantiles, targets = new_sums(len(offsets) - 1, shares)
+    sums, quantiles, targets = new_sums(len(offsets) - 1, fractions)
     arrays = [x.detach().contiguous().numpy() for x in (density, starts, ends, offsets)]
     _light_ends(arrays[0], arrays[1], arrays[2], arrays[3], targets, sums, quantiles)
-    return light_ends_of(sums, quantiles, shares)
+    return light_ends_of(sums, quantiles, fractions)
 
 
-def new_sums(rays: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def new_sums(rays: int, fractions: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return sums (R, COLUMNS) of 0, quantiles (R, Q) of NaN, and the sorted optical depths of the quantiles (Q,)."""
-    targets = np.sort(-np.log1p(-np.asarray(shares, dtype=np.float64)), kind="stable")
-    return np.zeros((rays, COLUMNS)), np.full((rays, len(shares)), np.nan, np.float32), targets
+    targets = np.sort(-np.log1p(-np.asarray(fractions, dtype=np.float64)), kind="stable")
+    return np.zeros((rays, COLUMNS)), np.full((rays, len(fractions)), np.nan, np.float32), targets
 
 
-def light_ends_of(sums: np.ndarray, quantiles: np.ndarray, shares: tuple[float, ...]) -> LightEnds:
+def light_ends_of(sums: np.ndarray, quantiles: np.ndarray, fractions: tuple[float, ...]) -> LightEnds:
     """Return the results of rays from their sums, after all their intervals have been added."""
     depth, mass, mean, squares, heaviest, largest, _ = torch.from_numpy(sums).unbind(1)
     seen = mass > 0.0
     spread = torch.sqrt(squares / torch.where(seen, mass, 1.0))
-    back = np.argsort(np.argsort(shares, kind="stable"), kind="stable")
+    back = np.argsort(np.argsort(fractions, kind="stable"), kind="stable")
     return LightEnds(
         opacity=-torch.expm1(-depth).float(),
         transmittance=torch.exp(-depth).float(),
@@ -151,12 +151,12 @@ def _mixture_quantile(density: Any, starts: Any, ends: Any, offsets: Any, out: A
 
 
 def mixture_quantile(
-    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, share: float
+    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, fraction: float
 ) -> Tensor:
     """See `depth.mixture_quantile`; float32 on the CPU."""
     use_threads()
     out = torch.empty((len(offsets) - 1) // rays_per_pixel)
-    wanted = torch.tensor([float(rays_per_pixel), 1.0 - share], dtype=torch.float64)
+    wanted = torch.tensor([float(rays_per_pixel), 1.0 - fraction], dtype=torch.float64)
     tensors = (density, starts, ends, offsets, out, wanted)
     _mixture_quantile(*(x.detach().contiguous().numpy() for x in tensors))
     return out

@@ -72,18 +72,18 @@ def _project(volume: Any, origins: Any, directions: Any, first: Any, size: Any, 
             place_b, place_c = start_b + k * slope_b, start_c + k * slope_c
             floor_b, floor_c = np.floor(place_b), np.floor(place_c)
             i, j = int(floor_b), int(floor_c)
-            share_b, share_c = place_b - floor_b, place_c - floor_c
+            fraction_b, fraction_c = place_b - floor_b, place_c - floor_c
             at = k * step_a + i * step_b + j * step_c
             if i >= 0 and i < counts[b]:
                 if j >= 0 and j < counts[c]:
-                    total += (1.0 - share_b) * (1.0 - share_c) * volume[at]
+                    total += (1.0 - fraction_b) * (1.0 - fraction_c) * volume[at]
                 if j >= -1 and j + 1 < counts[c]:
-                    total += (1.0 - share_b) * share_c * volume[at + step_c]
+                    total += (1.0 - fraction_b) * fraction_c * volume[at + step_c]
             if i >= -1 and i + 1 < counts[b]:
                 if j >= 0 and j < counts[c]:
-                    total += share_b * (1.0 - share_c) * volume[at + step_b]
+                    total += fraction_b * (1.0 - fraction_c) * volume[at + step_b]
                 if j >= -1 and j + 1 < counts[c]:
-                    total += share_b * share_c * volume[at + step_b + step_c]
+                    total += fraction_b * fraction_c * volume[at + step_b + step_c]
         out[r] = total * length
 
 
@@ -104,18 +104,18 @@ def _back_project(values: Any, origins: Any, directions: Any, first: Any, size: 
                     place_b, place_c = start_b + k * slope_b, start_c + k * slope_c
                     floor_b, floor_c = np.floor(place_b), np.floor(place_c)
                     i, j = int(floor_b), int(floor_c)
-                    share_b, share_c = place_b - floor_b, place_c - floor_c
+                    fraction_b, fraction_c = place_b - floor_b, place_c - floor_c
                     at = k * step_a + i * step_b + j * step_c
                     if i >= 0 and i < counts[b]:
                         if j >= 0 and j < counts[c]:
-                            out[at] += value * (1.0 - share_b) * (1.0 - share_c)
+                            out[at] += value * (1.0 - fraction_b) * (1.0 - fraction_c)
                         if j >= -1 and j + 1 < counts[c]:
-                            out[at + step_c] += value * (1.0 - share_b) * share_c
+                            out[at + step_c] += value * (1.0 - fraction_b) * fraction_c
                     if i >= -1 and i + 1 < counts[b]:
                         if j >= 0 and j < counts[c]:
-                            out[at + step_b] += value * share_b * (1.0 - share_c)
+                            out[at + step_b] += value * fraction_b * (1.0 - fraction_c)
                         if j >= -1 and j + 1 < counts[c]:
-                            out[at + step_b + step_c] += value * share_b * share_c
+                            out[at + step_b + step_c] += value * fraction_b * fraction_c
 
 
 def project(

@@ -139,7 +139,7 @@ def trace_rays(
     grid: HashGrid,
     *,
     background: Tensor,
-    shares: tuple[float, ...],
+    fractions: tuple[float, ...],
     negligible: float,
     keep_intervals: bool = True,
 ) -> RaysSeen:
@@ -151,7 +151,7 @@ def trace_rays(
     room = (threads, -(-count // threads) * intervals if keep_intervals else 0)
     owner, record = np.empty(room, np.int64), np.empty((*room, 3), np.float32)
     counts, found = np.zeros(count if keep_intervals else 0, np.int64), np.zeros(threads, np.int64)
-    sums, quantiles, targets = new_sums(count, shares)
+    sums, quantiles, targets = new_sums(count, fractions)
     colours, unseen = np.zeros((count, 3)), np.zeros(count)
     _trace_all(
         rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
@@ -167,7 +167,7 @@ def trace_rays(
     if keep_intervals:
         _sort(borders, offsets, owner, record, found, spans.numpy())
     starts, ends, density = spans
-    light, left = light_ends_of(sums, quantiles, shares), torch.from_numpy(np.exp(-sums[:, 0]))
+    light, left = light_ends_of(sums, quantiles, fractions), torch.from_numpy(np.exp(-sums[:, 0]))
     seen = torch.from_numpy(colours + UNSEEN * unseen[:, None]) + left[:, None] * background
     stopped = left <= math.exp(-along.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
     behind = torch.maximum(background, 1.0 - background).amax(-1)  # largest difference from the background's colour

@@ -148,14 +148,14 @@ def max_weight(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
     return _nearest(torch.where((weights == largest) & (weights > 0), means, torch.inf), offsets)
 
 
-def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, share: float) -> Tensor:
-    """Compute the distance (R,) by which a fraction `share` of a ray's light is absorbed, solved inside its interval.
+def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fraction: float) -> Tensor:
+    """Compute the distance (R,) by which a fraction of a ray's light is absorbed, solved inside its interval.
 
-    T(t) = 1 - share, so t = t0 + (-log(1 - share) - tau_before) / density in the interval where the optical depth
-    passes -log(1 - share). `share`, between 0 and 1, is a fraction of all light, not of the absorbed light: NaN for a
+    T(t) = 1 - fraction, so t = t0 + (-log(1 - fraction) - tau_before) / density in the interval where the optical depth
+    passes -log(1 - fraction). The fraction, between 0 and 1, is one of all light, not of the absorbed light: NaN for a
     ray of less opacity. Differentiable where defined; the value jumps where the crossing moves across empty space.
     """
-    target = -math.log1p(-share)
+    target = -math.log1p(-fraction)
     lengths, rays = ends - starts, ray_indices(offsets)
     before = optical_depth_before(density, lengths, offsets)
     # The depth behind an interval is the one before the next, to the last bit: else rounding might find no crossing.
@@ -175,7 +175,7 @@ def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, 
 
 
 def light_ends(
-    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, shares: tuple[float, ...]
+    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fractions: tuple[float, ...]
 ) -> LightEnds:
     """Compute all statistics of where the light of rays is absorbed.
 
@@ -183,12 +183,12 @@ def light_ends(
         density: (N,) >= 0, finite; density * length from 0 to 1e6 and beyond.
         starts, ends: (N,) increasing along each ray.
         offsets: (R + 1,).
-        shares: fractions of light for the quantiles, each between 0 and 1.
+        fractions: of light for the quantiles, each between 0 and 1.
 
     Returns:
         opacity (R,), transmittance (R,); mean (R,) distance of the absorbed light, and its standard deviation `spread`
-        (R,); heaviest (R,): `max_weight`, and largest (R,): that weight, 0 without samples; quantiles (R, len(shares)).
-        Undefined values are NaN, and no others.
+        (R,); heaviest (R,): `max_weight`, and largest (R,): that weight, 0 without samples; quantiles
+        (R, len(fractions)). Undefined values are NaN, and no others.
 
     Differentiable in density, starts and ends. Opacity and transmittance keep full precision where they are small.
     """
@@ -197,26 +197,26 @@ def light_ends(
     means = interval_means(density, starts, ends)
     mean, width = mean_and_spread(weights, density, starts, ends, offsets=offsets)
     total = opacity(sum_along_rays(density * lengths, offsets))
-    columns = [quantile(density, starts, ends, offsets=offsets, share=share) for share in shares]
+    columns = [quantile(density, starts, ends, offsets=offsets, fraction=fraction) for fraction in fractions]
     quantiles = torch.stack(columns, dim=-1) if columns else density.new_empty(len(offsets) - 1, 0)
     heaviest, largest = max_weight(weights, means, offsets), _largest(weights, offsets)
     return LightEnds(total, transmittance, mean, width, heaviest, largest, quantiles)
 
 
 def mixture_quantile(
-    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, share: float
+    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, fraction: float
 ) -> Tensor:
-    """Compute the distance by which a fraction `share` of the light of a group of equally weighted rays is absorbed.
+    """Compute the distance by which a fraction of the light of a group of equally weighted rays is absorbed.
 
-    mean_k T_k(t) = 1 - share, solved by bisection to 1e-12 of the group's farthest sample.
+    mean_k T_k(t) = 1 - fraction, solved by bisection to 1e-12 of the group's farthest sample.
 
     Args:
         density, starts, ends, offsets: as in `light_ends`; groups are `rays_per_pixel` consecutive rays.
         rays_per_pixel: rays per group, a divisor of R.
-        share: between 0 and 1.
+        fraction: of the light, between 0 and 1.
 
     Returns:
-        (R / rays_per_pixel,); NaN where the mean opacity stays below `share`. Without gradients.
+        (R / rays_per_pixel,); NaN where the mean opacity stays below `fraction`. Without gradients.
     """
     with torch.no_grad():
         rays, rows = ray_indices(offsets), len(offsets) - 1
@@ -231,11 +231,11 @@ def mixture_quantile(
             return torch.exp(-(sigma * inside).sum(-1)).view(-1, rays_per_pixel).mean(-1)
 
         high = torch.nn.functional.pad(last, (0, 1)).amax(-1).view(-1, rays_per_pixel).amax(-1)
-        reached = (passed(high) <= 1.0 - share) & (high > 0)
+        reached = (passed(high) <= 1.0 - fraction) & (high > 0)
         low = torch.zeros_like(high)
         for _ in range(BISECTIONS):
             middle = (low + high) / 2
-            enough = passed(middle) <= 1.0 - share
+            enough = passed(middle) <= 1.0 - fraction
             low, high = torch.where(enough, low, middle), torch.where(enough, middle, high)
         return torch.where(reached, high, torch.nan).to(density.dtype)
 

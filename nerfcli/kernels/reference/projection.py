@@ -93,10 +93,10 @@ def _taps(
     for other in (b, c):
         place = start[:, other, None] + (plane - start[:, axis, None]) * slope[:, other, None]  # (R, planes)
         low = place.floor()
-        share = place - low
+        fraction = place - low
         both = torch.stack([low, low + 1], dim=-1).long()  # (R, planes, 2)
         inside = (both >= 0) & (both < counts[other])
-        part = torch.stack([1 - share, share], dim=-1) * inside
+        part = torch.stack([1 - fraction, fraction], dim=-1) * inside
         index = (index[..., :, None] + (both.clamp(0, counts[other] - 1) * strides[other])[..., None, :]).flatten(-2)
         weight = (weight[..., :, None] * part[..., None, :]).flatten(-2)
     return index, weight

@@ -48,7 +48,7 @@ def _variance_fraction(x, alpha):
 @jit
 def _light_ends(
     density, starts, ends, offsets, targets, weights, opacity, transmittance,
-    mean, spread, heaviest, largest, quantiles, rays, SHARES: tl.constexpr,
+    mean, spread, heaviest, largest, quantiles, rays, FRACTIONS: tl.constexpr,
     RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
     ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
@@ -110,8 +110,8 @@ def _light_ends(
     tl.store(spread + ray, tl.where(ended, tl.sqrt(squares / mass), undefined), mask=there)
     tl.store(heaviest + ray, tl.where(ended, start + inside, undefined), mask=there)
     tl.store(largest + ray, most, mask=there)
-    for share in range(SHARES):
-        target = tl.load(targets + share)
+    for fraction in range(FRACTIONS):
+        target = tl.load(targets + fraction)
         depth = tl.zeros([RAYS], tl.float32)
         found = tl.zeros([RAYS], tl.int32) + NOWHERE
         crossing = tl.zeros([RAYS], tl.float32)
@@ -134,20 +134,20 @@ def _light_ends(
             crossing = tl.where(place < found, chosen, crossing)
             found = tl.minimum(place, found)
             depth += tl.sum(ahead, 1)
-        tl.store(quantiles + ray * SHARES + share, tl.where(found < NOWHERE, crossing, undefined), mask=there)
+        tl.store(quantiles + ray * FRACTIONS + fraction, tl.where(found < NOWHERE, crossing, undefined), mask=there)
 
 
 def light_ends(
-    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, shares: tuple[float, ...]
+    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fractions: tuple[float, ...]
 ) -> LightEnds:
     """See `reference.light_ends`; float32, without gradients."""
     density, starts, ends = (x.detach().contiguous() for x in (density, starts, ends))
     rays, device = len(offsets) - 1, density.device
-    targets = device_floats(tuple(-math.log1p(-share) for share in shares) or (0.0,), device)
+    targets = device_floats(tuple(-math.log1p(-fraction) for fraction in fractions) or (0.0,), device)
     columns = [torch.empty(rays, device=device) for _ in range(6)]
-    quantiles = torch.empty(rays, len(shares), device=device)
+    quantiles = torch.empty(rays, len(fractions), device=device)
     launch(
         _light_ends, blocks_of(rays), density, starts, ends, offsets, targets, torch.empty_like(density), *columns,
-        quantiles, rays, SHARES=len(shares), RAYS=RAYS, STEPS=STEPS,
+        quantiles, rays, FRACTIONS=len(fractions), RAYS=RAYS, STEPS=STEPS,
     )  # fmt: skip
     return LightEnds(*columns, quantiles=quantiles)

@@ -34,7 +34,7 @@ def warm_up(device: torch.device) -> None:
                 rays, march, grid, Targets(distortion=True), background=torch.zeros(2, 3, device=device), sink=sink
             )
             (sums.rgb.sum() + sums.distortion.sum()).backward()
-        backend.trace_rays(rays.detached(), march, grid, background=torch.zeros(3, device=device), shares=(0.5,))
+        backend.trace_rays(rays.detached(), march, grid, background=torch.zeros(3, device=device), fractions=(0.5,))
     backend.density(torch.full((2, 3), 0.5, device=device), grid)
     backend.adam_rows(table, sink, first, second, step=1, rate=0.0, betas=(0.9, 0.99), eps=1e-15)
     if device.type == "cuda":

@@ -16,7 +16,7 @@ from nerfcli.poses.input.plan import duration, limit_seconds, matching_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
 # A photo with this fraction of the requested features has enough; measured poses are no better with more.
-_RICH_SHARE = 0.5
+_RICH_FRACTION = 0.5
 # Largest factor by which a mask raises the feature limit: more would only add fine features at noise level.
 _MOST_FEATURES_FOR_MASK = 8
 # Matches are written after each block, so that progress is visible and kept.
@@ -53,7 +53,7 @@ def extract(job: Job, report: Report) -> None:
     first = [number for number, image_id in enumerate(job.image_ids) if str(image_id) not in enlarged]
     _extract_octaves(job, first, watched=range(len(job.image_ids)), first_octave=0, report=report)
     counts = feature_counts(job)
-    poor = [number for number in first if counts[number] < _RICH_SHARE * job.max_features]
+    poor = [number for number in first if counts[number] < _RICH_FRACTION * job.max_features]
     # Features are removed before photos are listed for the second pass: a listed photo with features has had it.
     forget_features(job, [job.image_ids[number] for number in poor])
     enlarged |= {str(job.image_ids[number]): keys[str(job.image_ids[number])] for number in poor}
@@ -168,8 +168,8 @@ def _by_limit(job: Job, numbers: Iterable[int]) -> dict[int, list[str]]:
     """
     limits: dict[int, list[str]] = {}
     for number in numbers:
-        share = job.masks[number].used_share if job.masks else 1.0
-        factor = min(_MOST_FEATURES_FOR_MASK, 2 ** int(math.log2(1 / share))) if share > 0 else 1
+        fraction = job.masks[number].used_fraction if job.masks else 1.0
+        factor = min(_MOST_FEATURES_FOR_MASK, 2 ** int(math.log2(1 / fraction))) if fraction > 0 else 1
         limits.setdefault(job.max_features * factor, []).append(job.files[number])
     return limits
 

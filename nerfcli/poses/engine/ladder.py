@@ -33,13 +33,13 @@ from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
 from nerfcli.poses.model.two_views import read_verified_pairs
 
 # Registered fraction below which mapping is tried again; if only a photo or two are missing, they are often at fault.
-_GOOD_SHARE = 0.9
+_GOOD_FRACTION = 0.9
 # Below this registered fraction, several times the work done so far is worthwhile.
-_FEW_SHARE = 0.75
+_FEW_FRACTION = 0.75
 # From this many photos, mapping from scratch takes two minutes and more, which is not worth it for a few photos.
 _MANY_PHOTOS = 250
 # Below this registered fraction, the initial focal length from EXIF is doubted.
-_LITTLE_SHARE = 0.5
+_LITTLE_FRACTION = 0.5
 # Beyond this, comparing every pair, or searching full-size photos, takes longer than taking better photos.
 _MOST_PAIRS = 12_000
 _MOST_FULL_SIZE = 150
@@ -196,7 +196,7 @@ class _Ladder:
         if _placed(models) > _placed(self.best.models):
             self.best = Mapped(models, job, self.rungs)
 
-    def share(self, candidates: int) -> float:
+    def fraction(self, candidates: int) -> float:
         """Return the best model's number of photos as a fraction of `candidates`, the number that could register."""
         return _placed(self.best.models) / max(candidates, 1)
 
@@ -218,22 +218,22 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     ladder = _Ladder(job, report, tell)
     ladder.attempt("default thresholds", job, MapperOptions())
     featured = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
-    if ladder.share(featured) < _GOOD_SHARE and _only_turns(job):
+    if ladder.fraction(featured) < _GOOD_FRACTION and _only_turns(job):
         ladder.tell_results()
         tell("not trying anything else: the camera turned on the spot")
         return ladder.result()
-    job = _without_exif(ladder, job, report, tell, share=ladder.share(featured))
-    job = _with_fisheye(ladder, job, report, share=ladder.share(featured))
+    job = _without_exif(ladder, job, report, tell, fraction=ladder.fraction(featured))
+    job = _with_fisheye(ladder, job, report, fraction=ladder.fraction(featured))
     _other_starts(ladder, job, tell)
     compared = set(job.pairs)
     few_more = 0 < math.comb(len(job.files), 2) - len(compared) <= _MOST_PAIRS
-    if few_more and ladder.share(featured) < _GOOD_SHARE and ladder.has_time():
+    if few_more and ladder.fraction(featured) < _GOOD_FRACTION and ladder.has_time():
         rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
         job = replace(job, pairs=(*job.pairs, *rest))
         ladder.match(job, rest)
         ladder.attempt("match all pairs", job, SMALLER_BASELINE)
-    if _can_have_more_features(job) and ladder.share(featured) < _FEW_SHARE and ladder.has_time():
-        _with_more_features(ladder, job, report, tell, missing=1 - ladder.share(featured))
+    if _can_have_more_features(job) and ladder.fraction(featured) < _FEW_FRACTION and ladder.has_time():
+        _with_more_features(ladder, job, report, tell, missing=1 - ladder.fraction(featured))
     ladder.find_left_out("remaining photos one by one, from the 3D points they see")
     if len(ladder.rungs) > 1:
         ladder.tell_results()
@@ -274,10 +274,10 @@ def _with_more_features(ladder: _Ladder, job: Job, report: Report, tell: Tell, *
     matching = _search_seconds(replace(more, max_image_size=0))
     full = _search_seconds(replace(more, max_image_size=FULL_SIZE)) - matching
     allowed = _MOST_FOR_MORE * missing * so_far - matching
-    share = min(1.0, max(allowed, 0.0) / full) ** 0.5  # of the longer side: time is proportional to area
-    size = max(round(share * longest), job.max_image_size)
-    what = "more features from full-size photos" if share == 1 else f"more features from photos of {size} pixels"
-    more = replace(more, max_image_size=FULL_SIZE if share == 1 else size)
+    fraction = min(1.0, max(allowed, 0.0) / full) ** 0.5  # of the longer side: time is proportional to area
+    size = max(round(fraction * longest), job.max_image_size)
+    what = "more features from full-size photos" if fraction == 1 else f"more features from photos of {size} pixels"
+    more = replace(more, max_image_size=FULL_SIZE if fraction == 1 else size)
     ladder.announce(what, takes=_search_seconds(more) / so_far)
     extract(more, report)
     start_matching(more, more.pairs)
@@ -296,7 +296,7 @@ def _search_seconds(job: Job) -> float:
 def _other_starts(ladder: _Ladder, job: Job, tell: Tell) -> None:
     """Try other ways to start, until nearly all photos that are connected by matches are placed."""
     candidates = len(connected_groups(job.image_ids, [(one, other) for _, one, other in _strong_pairs(job)])[0])
-    if len(job.files) >= _MANY_PHOTOS and _FEW_SHARE <= ladder.share(candidates) < _GOOD_SHARE:
+    if len(job.files) >= _MANY_PHOTOS and _FEW_FRACTION <= ladder.fraction(candidates) < _GOOD_FRACTION:
         ladder.tell_results()
         takes = duration(mapping_seconds(len(job.files)))
         tell(f"not trying other starts, which take about {takes} each: most photos are registered")
@@ -309,15 +309,15 @@ def _other_starts(ladder: _Ladder, job: Job, tell: Tell) -> None:
         lambda: ladder.attempt("start from low angles", job, LOW_ANGLES),
     ]
     for step in steps:
-        if ladder.share(candidates) >= _GOOD_SHARE:
+        if ladder.fraction(candidates) >= _GOOD_FRACTION:
             return
         step()
 
 
-def _without_exif(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, share: float) -> Job:
+def _without_exif(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, fraction: float) -> Job:
     """Map without EXIF's focal lengths if few photos are placed with them; return the job of the better result."""
     bare = replace(job, groups=tuple(group.without_exif() for group in job.groups))
-    if share >= _LITTLE_SHARE or bare.groups == job.groups or not ladder.has_time():
+    if fraction >= _LITTLE_FRACTION or bare.groups == job.groups or not ladder.has_time():
         return job
     what = "without EXIF's focal length"
     ladder.announce(what)
@@ -332,9 +332,9 @@ def _without_exif(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, shar
     return job
 
 
-def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, share: float) -> Job:
+def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, fraction: float) -> Job:
     """Map from a fisheye if the result suggests it and pairs of photos confirm it; return the better result's job."""
-    if share >= _GOOD_SHARE and not ladder.is_wide():
+    if fraction >= _GOOD_FRACTION and not ladder.is_wide():
         return job
     fisheye = as_fisheye(job)
     if fisheye is None or not ladder.has_time():

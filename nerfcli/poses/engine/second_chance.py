@@ -242,7 +242,7 @@ def _core(model: pycolmap.Reconstruction, job: Job) -> _Core:
     with closing(pycolmap.Database.open(str(job.database))) as database:
         pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
     found = agreements(model, pairs)
-    joins = [(a.one, a.other, -a.matches if a.contradicts else a.matches * a.share) for a in found]
+    joins = [(a.one, a.other, -a.matches if a.contradicts else a.matches * a.fraction) for a in found]
     groups = consistent_groups(sorted(model.reg_image_ids()), joins)
     group_of = {photo: number for number, group in enumerate(groups) for photo in group}
     rest = pycolmap.Reconstruction(model)

@@ -278,7 +278,7 @@ def _judged(
     white = np.quantile([mask.mean() for mask in found], [0, 0.5, 1])
     right = float(np.median(moving)), float(np.median(staying))
     facts: dict[str, Any] = {
-        "white_share": [round(float(share), 4) for share in white],
+        "white_share": [round(float(fraction), 4) for fraction in white],
         "object_matches_in_white": round(right[0], 4),
         "background_matches_in_black": round(right[1], 4),
     }

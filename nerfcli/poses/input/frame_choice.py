@@ -17,19 +17,19 @@ _MOTION_SIZE_PX = 320
 
 # The picture has moved when half of its corners moved by this fraction of its longer side: about what is needed for
 # parallax, and more than the shake of a hand that holds still.
-MOVED_SHARE = 0.01
+MOVED_FRACTION = 0.01
 # Fewer corners than this do not measure motion; then pictures that differ by less than this, of 255, are the same.
 _MIN_CORNERS = 12
 _SAME_LEVELS = 3.0
 # If less than this fraction of the corners is found again, another part of the scene is in view.
-_LOST_SHARE = 0.5
+_LOST_FRACTION = 0.5
 
 
 @dataclass(frozen=True)
 class FrameMeasure:
     """Sharpness of a frame (comparable within a video), and its motion since the anchor.
 
-    The anchor is the last earlier frame that had moved by `MOVED_SHARE`. moved is a fraction of the longer side,
+    The anchor is the last earlier frame that had moved by `MOVED_FRACTION`. moved is a fraction of the longer side,
     infinite if the two show different things.
     """
 
@@ -47,7 +47,7 @@ class FrameMeter:
         """Return the measures of the next frame, uint8 (height, width), at `SHARPNESS_SIZE_PX`."""
         picture = MotionPicture(grey)
         moved = self._anchor.moved_to(picture) if self._anchor else np.inf
-        if moved >= MOVED_SHARE:
+        if moved >= MOVED_FRACTION:
             self._anchor = picture
         return FrameMeasure(sharpness(grey), moved)
 
@@ -76,7 +76,7 @@ class MotionPicture:
             self._grey, other._grey, self._corners, room, winSize=(15, 15), maxLevel=4
         )
         found = status.ravel() == 1
-        if found.mean() < _LOST_SHARE:
+        if found.mean() < _LOST_FRACTION:
             return float("inf")
         lengths = np.linalg.norm((followed - self._corners)[found].reshape(-1, 2), axis=1)
         return float(np.median(lengths) / max(self._grey.shape))
@@ -113,7 +113,7 @@ def _path(seconds: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
     The speed is taken to be constant between successive anchors, and the usual speed is the median over these steps.
     """
-    anchors = np.flatnonzero(moved >= MOVED_SHARE)
+    anchors = np.flatnonzero(moved >= MOVED_FRACTION)
     # Before the first step and after the last one, the picture moves by less than can be measured.
     times = seconds[anchors]
     steps = np.diff(times)

@@ -49,7 +49,7 @@ class LaidOutMask:
     """Mask of one photo: a hash of the used pixels, "" without a mask, and their fraction."""
 
     key: str = ""
-    used_share: float = 1.0
+    used_fraction: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def lay_out_masks(
     if without:
         notify(f"{len(without)} of {len(photos.names)} photos have no mask and are used completely: {_some(without)}")
     done = tuple(mask for mask in laid_out if isinstance(mask, LaidOutMask))
-    hidden = [name for name, mask in zip(photos.names, done, strict=True) if mask.used_share == 0]
+    hidden = [name for name, mask in zip(photos.names, done, strict=True) if mask.used_fraction == 0]
     if hidden:
         notify(f"{len(hidden)} masks are completely black, so their photos are not used: {_some(hidden)}")
     return done

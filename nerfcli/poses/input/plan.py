@@ -25,7 +25,7 @@ _FEATURES_PER_PIXEL = 0.015
 # 54 s.
 _MAP_SECONDS_PER_PHOTO, _MAP_SECONDS_PER_TWO = 0.38, 0.0005
 # Time for merging sub-models, as a fraction of the mapping time.
-_MERGE_SHARE = 0.2
+_MERGE_FRACTION = 0.2
 # For each photo that is located from 3D points.
 _SECONDS_PER_LOCATED = 0.7
 # For the global mapper.
@@ -35,7 +35,7 @@ _CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.13
 _GROWTH = {"map": 1.3}
 # Fraction of the time of the checks after 0...4 of the four steps: single photos take 2 %, lens models half.
 # Measured on 11, 16, 20 and 50 photos.
-_CHECK_SHARES = (0.0, 0.02, 0.5, 0.8, 1.0)
+_CHECK_FRACTIONS = (0.0, 0.02, 0.5, 0.8, 1.0)
 # Time limit as a multiple of the planned seconds: most captures take a third to twice these, more on a busy machine.
 _MOST_TIMES_PLANNED = 10
 # Memory: of the libraries, per photo in the mapper, and per pixel of a picture that a thread searches enlarged.
@@ -170,7 +170,7 @@ class Outlook:
         self._stretches: list[float] = []  # of earlier stages: their seconds over the planned ones for that work
         self._latest = (0.0, 0.0)  # of the current stage: its seconds, and the planned ones for that work
         self._seconds = dict(plan.seconds)
-        self._share = 0.0
+        self._fraction = 0.0
         self._at = ("", 0, 0)
 
     def update(self, stage: str, done: int, total: int) -> tuple[float, float]:
@@ -183,12 +183,12 @@ class Outlook:
         if stage == "enlarge":
             self._plan_enlarging(total)
         if stage == "merge":
-            self._plan_before_checks(stage, _MERGE_SHARE * self._plan.seconds.get("map", 0.0))
+            self._plan_before_checks(stage, _MERGE_FRACTION * self._plan.seconds.get("map", 0.0))
         if stage == "locate":
             self._plan_before_checks(stage, _SECONDS_PER_LOCATED * total)
-        ratio = _share_done(stage, done, total)
+        ratio = _fraction_done(stage, done, total)
         if self._begins_again(stage, ratio):
-            self._share = 0.0
+            self._fraction = 0.0
         if stage != self._stage or ratio < self._ratio:
             took, of_plan = self._latest
             if of_plan > _telling(self._stage) * self._seconds.get(self._stage, 0.0):
@@ -212,8 +212,8 @@ class Outlook:
         later = stages[stages.index(stage) + 1 :] if stage in stages else []
         left += stretch * sum(self._seconds[name] for name in later)
         spent = now - self._start
-        self._share = max(self._share, spent / (spent + left) if left > 0 else 1.0)
-        return self._share, left
+        self._fraction = max(self._fraction, spent / (spent + left) if left > 0 else 1.0)
+        return self._fraction, left
 
     def _begins_again(self, stage: str, ratio: float) -> bool:
         """Return whether the work has gone back for another attempt. Stages without a plan are taken to be last."""
@@ -223,8 +223,8 @@ class Outlook:
 
     def _plan_matching(self, features: int) -> None:
         """Rescale the planned matching time to the actual number of features per photo."""
-        share = features / max(self._plan.features, 1)
-        self._seconds = {name: s * (share if name == "match" else 1.0) for name, s in self._seconds.items()}
+        fraction = features / max(self._plan.features, 1)
+        self._seconds = {name: s * (fraction if name == "match" else 1.0) for name, s in self._seconds.items()}
 
     def _plan_enlarging(self, photos: int) -> None:
         """Insert the second search for features after the first."""
@@ -239,10 +239,10 @@ class Outlook:
         self._seconds = {**before, stage: seconds, "check": self._plan.seconds.get("check", 0.0)}
 
 
-def _share_done(stage: str, done: int, total: int) -> float:
+def _fraction_done(stage: str, done: int, total: int) -> float:
     """Return the fraction of a stage's time that has passed."""
-    if stage == "check" and total == len(_CHECK_SHARES) - 1:
-        return _CHECK_SHARES[done]
+    if stage == "check" and total == len(_CHECK_FRACTIONS) - 1:
+        return _CHECK_FRACTIONS[done]
     return (done / total) ** _GROWTH.get(stage, 1.0) if total else 1.0
 
 

@@ -23,7 +23,7 @@ SIDE_PX = 480
 _MOST_PHOTOS = 40
 LEAST_PHOTOS = 6
 # The background is the colour that a pixel has most consistently in this fraction of the photos.
-_SHARE = 0.3
+_FRACTION = 0.3
 # Tolerance of a pixel: levels of 255, plus a multiple of its noise, plus the effect of edges displaced by this much.
 _LEVELS = 9.0
 _NOISES = 3.0
@@ -68,7 +68,7 @@ def background(pictures: Sequence[np.ndarray], places: np.ndarray) -> Background
     """
     chosen = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), _MOST_PHOTOS)).astype(int))
     stack = np.stack([pictures[index] for index in chosen]).astype(np.float32)  # (n, h, w, 3)
-    window = max(3, round(_SHARE * len(stack)))
+    window = max(3, round(_FRACTION * len(stack)))
     light = stack.mean(axis=3)
     order = np.argsort(light, axis=0)
     ranked = np.take_along_axis(light, order, axis=0)

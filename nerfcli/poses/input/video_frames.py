@@ -18,7 +18,7 @@ from nerfcli.atomic import atomic_folder, write_json
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.media.video_input import MeasuredFrames, Video, measure_frames, open_video, read_frames
 from nerfcli.poses.input.frame_choice import (
-    MOVED_SHARE,
+    MOVED_FRACTION,
     SHARPNESS_SIZE_PX,
     FrameMeasure,
     FrameMeter,
@@ -34,7 +34,7 @@ _JPEG_QUALITY = 97
 # A file is identified without reading all of it, by its size and this many bytes at each end.
 _END_BYTES = 1 << 20
 # Approximate fraction of the time for measuring, which decodes and examines every frame; extracting only decodes.
-_MEASURING_SHARE = 0.7
+_MEASURING_FRACTION = 0.7
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def extract_frames(
         video,
         meter.measure,
         longer_side=SHARPNESS_SIZE_PX,
-        progress=lambda share: progress(_MEASURING_SHARE * share, "looking for sharp frames"),
+        progress=lambda fraction: progress(_MEASURING_FRACTION * fraction, "looking for sharp frames"),
     )
     if measured.errors:
         notify(f"{path.name} is damaged in {measured.errors} places; nearby frames may show block artifacts")
@@ -105,7 +105,7 @@ def extract_frames(
             video,
             numbers,
             measured,
-            lambda share: progress(_MEASURING_SHARE + (1 - _MEASURING_SHARE) * share, "writing frames"),
+            lambda fraction: progress(_MEASURING_FRACTION + (1 - _MEASURING_FRACTION) * fraction, "writing frames"),
         )
         if len(frames) < MIN_PHOTOS:
             raise UserError(
@@ -147,7 +147,7 @@ def _different(
     first: MotionPicture | None = None
     for number, picture in frames:
         motion = MotionPicture(picture)
-        if best is not None and first is not None and first.moved_to(motion) < MOVED_SHARE:
+        if best is not None and first is not None and first.moved_to(motion) < MOVED_FRACTION:
             if measures[number].sharpness > measures[best[0]].sharpness:
                 best = number, picture
             continue
@@ -206,7 +206,7 @@ def _description(video: Video, request: dict[str, Any], *, total: int, frames: S
         "frames_in_video": total,
         "frames": [vars(frame) for frame in frames],
         "settings": {
-            "moved_share": MOVED_SHARE,
+            "moved_share": MOVED_FRACTION,
             "sharpness_size_px": SHARPNESS_SIZE_PX,
             "jpeg_quality": _JPEG_QUALITY,
         },

@@ -114,7 +114,7 @@ def judge(
         "contradictions", lambda: strong_contradictions(model, [*found, *agreements(model, held)]), otherwise=nothing
     )
     total = sum(a.matches for a in found)
-    share = sum(c.matches for c in contradictions) / total if total else 0.0
+    fraction = sum(c.matches for c in contradictions) / total if total else 0.0
     geometry = run("geometry of points and cameras", lambda: _geometry(model), otherwise=_UNKNOWN_GEOMETRY)
     focal = [_focal_measure(camera) for camera in _cameras_in_use(model)]
     unused = run(
@@ -125,7 +125,7 @@ def judge(
     measures = {
         "pairs": _pair_measure(found),
         "strong_contradictions": [asdict(c) for c in contradictions[:_MOST_LISTED]],
-        "strong_contradictions_share": share,
+        "strong_contradictions_share": fraction,
         "rotations": _rotation_measure(rotations),
         "parallax_px": None if turn is None else turn.parallax_px,
         **geometry,
@@ -135,7 +135,7 @@ def judge(
     }
     failures = [
         *_no_baseline(turn, geometry),
-        *_contradicted(contradictions, share, found, names=names),
+        *_contradicted(contradictions, fraction, found, names=names),
         *_turned(measures["rotations"]),
         *_implausible(model, measures, given=given),
     ]
@@ -209,7 +209,7 @@ def _pair_measure(found: Sequence[Agreement]) -> dict[str, Any]:
     return {
         "judged": len(found),
         "contradicting": sum(a.contradicts for a in found),
-        "share_of_matches_that_agree": sum(a.matches * a.share for a in found) / matches if matches else None,
+        "share_of_matches_that_agree": sum(a.matches * a.fraction for a in found) / matches if matches else None,
     }
 
 
@@ -242,14 +242,14 @@ def _no_baseline(turn: Turn | None, geometry: Mapping[str, Any]) -> list[Failure
 
 def _contradicted(
     contradictions: Sequence[Contradiction],
-    share: float,
+    fraction: float,
     found: Sequence[Agreement],
     *,
     names: Mapping[str, str],
 ) -> list[Failure]:
     rivals = sum(c.matches for c in contradictions if c.is_rival)
     outweighing = [c for c in contradictions if c.outweighs]
-    if share > _MOST_RIVALS and rivals > sum(c.matches for c in contradictions) / 2:
+    if fraction > _MOST_RIVALS and rivals > sum(c.matches for c in contradictions) / 2:
         count = sum(a.contradicts for a in found)
         return [
             Failure(

@@ -84,7 +84,7 @@ def leave_out_contradicting(
 def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[Agreement]) -> list[Contradiction]:
     """Return pairs that contradict a model, more than half as strong as the chain that supports it, strongest first."""
     chains = Bottlenecks(
-        sorted(model.reg_image_ids()), [(a.one, a.other, a.matches * a.share) for a in found if not a.contradicts]
+        sorted(model.reg_image_ids()), [(a.one, a.other, a.matches * a.fraction) for a in found if not a.contradicts]
     )
     pairs = []
     for a in sorted((a for a in found if a.contradicts), key=lambda a: -a.matches):

@@ -118,11 +118,11 @@ def determine(
         free = tried if distance > 1 else free
     found = evidence.estimate(free)
     # If the focal length is undetermined, so is distortion: neither can be estimated without the other.
-    share = found.deviation("f") / camera.mean_focal_length()
-    if not named and not share <= (_OPEN_DEVIATION if exif_focal_px is None else _EXIF_DEVIATION):
+    fraction = found.deviation("f") / camera.mean_focal_length()
+    if not named and not fraction <= (_OPEN_DEVIATION if exif_focal_px is None else _EXIF_DEVIATION):
         focal_px = exif_focal_px or _between_px(mapped, camera_id, seed=seed, fixed=fixed)
         return Determined(_held(mapped.cameras[camera_id], focal_px), False, True, tuple(steps))
-    if not named and "k2" not in free and share <= _EXIF_DEVIATION:
+    if not named and "k2" not in free and fraction <= _EXIF_DEVIATION:
         free, found = _with_or_without_distortion(evidence, free, found, camera, steps)
     return Determined(_camera(camera, found, named=named), "cx" in free, False, tuple(steps))
 

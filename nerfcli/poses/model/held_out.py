@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_SHARE = 0.1
+_FRACTION = 0.1
 # Beyond this, more observations cost time and change nothing; a part of the points is adjusted instead.
 _MOST_OBSERVATIONS = 40_000
 # A robust adjustment downweights observations from this many times the usual error: 95 % efficient for normal noise.
@@ -40,13 +40,13 @@ def split(model: pycolmap.Reconstruction, *, seed: int) -> tuple[pycolmap.Recons
     rng = np.random.default_rng(seed)
     copy = pycolmap.Reconstruction(model)
     point_ids = np.array(sorted(copy.point3D_ids()), dtype=np.int64)
-    kept_share = min(1.0, _MOST_OBSERVATIONS / max(copy.compute_num_observations(), 1))
-    dropped = rng.uniform(size=len(point_ids)) >= kept_share
+    kept_fraction = min(1.0, _MOST_OBSERVATIONS / max(copy.compute_num_observations(), 1))
+    dropped = rng.uniform(size=len(point_ids)) >= kept_fraction
     for point_id in point_ids[dropped]:
         copy.delete_point3D(int(point_id))
     lengths = np.array([copy.point3D(int(point_id)).track.length() for point_id in point_ids[~dropped]])
     # One observation of each of as many points as needed to take a tenth of all observations.
-    taken = (lengths >= _MIN_TRACK) & (rng.uniform(size=len(lengths)) < _SHARE * lengths)
+    taken = (lengths >= _MIN_TRACK) & (rng.uniform(size=len(lengths)) < _FRACTION * lengths)
     images, points, pixels = [], [], []
     for point_id, length in zip(point_ids[~dropped][taken], lengths[taken], strict=True):
         element = copy.point3D(int(point_id)).track.elements[int(rng.integers(length))]

@@ -32,7 +32,7 @@ START_FISHEYE = "OPENCV_FISHEYE"
 
 # The gain must be this many standard errors, and this fraction of the error; a smaller one changes no picture.
 _GAIN_DEVIATIONS = 2.0
-_GAIN_SHARE = 0.001
+_GAIN_FRACTION = 0.001
 # Errors are clipped at this value: one wrong match must not decide on a lens.
 _CLIP_PX = 4.0
 # An added parameter must be this many standard deviations from zero.
@@ -336,7 +336,7 @@ class _Choice:
         gain, significance = _gain(best.errors, trial.errors), _significance(best, trial, self.camera_id)
         pays = bool(
             gain > _GAIN_DEVIATIONS
-            and trial.errors.mean() < (1 - _GAIN_SHARE) * best.errors.mean()
+            and trial.errors.mean() < (1 - _GAIN_FRACTION) * best.errors.mean()
             and significance > _PARAMETER_DEVIATIONS
             and is_centred(trial.model.cameras[self.camera_id])
         )

@@ -20,7 +20,7 @@ from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL
 Array = NDArray[np.float64]
 
 # Focal lengths to try, as a fraction of the longer side: an equidistant lens shows 1 / fraction radians along it.
-_FOCAL_SHARES = np.geomspace(0.25, 0.85, 8)
+_FOCAL_FRACTIONS = np.geomspace(0.25, 0.85, 8)
 # More matches must agree by this factor.
 _CLEARLY = 1.1
 _PAIRS_ASKED = 8
@@ -61,7 +61,7 @@ def _fisheye_focal_px(group: CameraGroup, job: Job, database: pycolmap.Database)
     freely = sum(_agreeing(pycolmap.estimate_two_view_geometry, camera, pair, options) for pair in pairs)
     longer = max(group.width, group.height)
     found = []
-    for focal_px in longer * _FOCAL_SHARES:
+    for focal_px in longer * _FOCAL_FRACTIONS:
         start = _fisheye(group, float(focal_px))
         camera = pycolmap.Camera.create_from_model_name(1, start.model, focal_px, group.width, group.height)
         camera.params = list(start.params or ())

@@ -46,7 +46,7 @@ _BESIDE = (6.0, 9.0)
 _HERE = np.zeros(2)
 _CLEARLY = 2.5
 # A second pose with this fraction of the votes makes the first one ambiguous.
-_RIVAL_SHARE = 0.5
+_RIVAL_FRACTION = 0.5
 # Least fraction of the picture over which the found features must spread. Measured: 0.02 where a detail looks like one
 # that is elsewhere, 0.13 and more where the pose was right.
 _LEAST_AREA = 0.05
@@ -192,7 +192,7 @@ def _place(photo: PhotoFeatures, known: KnownPoints, *, seed: int) -> tuple[_Pla
         return None, replace(attempt, refused=f"only {agreeing} of {len(features)} features agree on a pose")
     others = ~np.isin(features, first.features)
     second = _pose(photo, known, features[others], points[others], seed=seed)
-    if second is not None and len(second.features) >= _RIVAL_SHARE * agreeing and not _alike(first, second, known):
+    if second is not None and len(second.features) >= _RIVAL_FRACTION * agreeing and not _alike(first, second, known):
         return None, replace(
             attempt, refused=f"{len(second.features)} features agree on a different pose than the {agreeing} others"
         )

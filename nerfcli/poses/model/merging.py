@@ -213,7 +213,7 @@ def _holds(joined: pycolmap.Reconstruction, first: pycolmap.Reconstruction, pair
     between = [pair for pair in pairs if (pair.one in old) != (pair.other in old)]
     found = agreements(joined, between)
     matches = sum(a.matches for a in found)
-    return matches > 0 and sum(a.matches * a.share for a in found) > _LEAST_AGREEMENT * matches
+    return matches > 0 and sum(a.matches * a.fraction for a in found) > _LEAST_AGREEMENT * matches
 
 
 def _matched_keypoints(database: pycolmap.Database) -> dict[tuple[int, int], NDArray[np.int64]]:

@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 # Largest distance of a point from its predicted position, as a fraction of the longer side, and at least in pixels.
-_TOLERANCE_SHARE, _LEAST_TOLERANCE_PX = 0.004, 3.0
+_TOLERANCE_FRACTION, _LEAST_TOLERANCE_PX = 0.004, 3.0
 # A vote counts if the ratio of its distance to that of the nearest other point is below this. Measured on photos 40
 # degrees apart: at 0.8 one vote in four is right and there are too few, at 0.95 one in thirty.
 _RATIO = 0.9
@@ -49,7 +49,7 @@ class PhotoFeatures:
     @property
     def tolerance_px(self) -> float:
         """Largest distance at which a point may be seen from its predicted position."""
-        return max(_TOLERANCE_SHARE * max(self.camera.width, self.camera.height), _LEAST_TOLERANCE_PX)
+        return max(_TOLERANCE_FRACTION * max(self.camera.width, self.camera.height), _LEAST_TOLERANCE_PX)
 
 
 def known_points(model: pycolmap.Reconstruction, database: pycolmap.Database) -> KnownPoints:

@@ -42,7 +42,7 @@ class VerifiedPair:
 class Agreement:
     """Agreement of a pair's matches with the poses of a model.
 
-    matches: how many can be judged. share: the fraction of them within `TOLERANCE_PX` of the epipolar line and in front
+    matches: how many can be judged. fraction: of them within `TOLERANCE_PX` of the epipolar line and in front
     of both cameras, or with rays that are parallel within the tolerance, as for a far point whatever the baseline.
     angle_deg: the median angle between the rays of a match.
     """
@@ -50,13 +50,13 @@ class Agreement:
     one: int
     other: int
     matches: int
-    share: float
+    fraction: float
     angle_deg: float
 
     @property
     def contradicts(self) -> bool:
         """True if most of the pair's matches are inconsistent with the model."""
-        return self.share < 0.5
+        return self.fraction < 0.5
 
 
 def read_verified_pairs(database: pycolmap.Database, *, min_matches: int) -> list[VerifiedPair]:

@@ -19,17 +19,17 @@ _ROUND_PX = 1.0
 def truncation(sample: Sample) -> Finding:
     """Measure the fraction of views in which the object reaches the border of the detector."""
     reached = np.asarray(sample.border > sample.air_level)
-    share = float(reached.any(axis=(1, 2)).mean())
+    fraction = float(reached.any(axis=(1, 2)).mean())
     sides = reached[..., 0].any(), reached[..., 1].any()
     which = {(True, False): " on the left", (False, True): " on the right", (True, True): " on both sides"}.get(
         (bool(sides[0]), bool(sides[1])), ""
     )
-    verdict = verdict_above(share, look=TRUNCATED_LOOK, bad=TRUNCATED_BAD)
+    verdict = verdict_above(fraction, look=TRUNCATED_LOOK, bad=TRUNCATED_BAD)
     return Finding(
         "truncation",
         verdict,
-        f"the object reaches the border{which} in {100 * share:.3g} % of the views",
-        share,
+        f"the object reaches the border{which} in {100 * fraction:.3g} % of the views",
+        fraction,
         f"look from {100 * TRUNCATED_LOOK:g} %, bad from {100 * TRUNCATED_BAD:g} %; line integrals above "
         f"{sample.air_level:.2g} count as object",
         ""

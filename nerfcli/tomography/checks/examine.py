@@ -44,7 +44,9 @@ class ScanDiagnosis:
         return worst(finding.verdict for finding in self.findings)
 
 
-def examine_scan(scan: Scan, *, progress: Callable[[float, str], None] = lambda share, detail: None) -> ScanDiagnosis:
+def examine_scan(
+    scan: Scan, *, progress: Callable[[float, str], None] = lambda fraction, detail: None
+) -> ScanDiagnosis:
     """Run all checks of a scan. Deterministic."""
     progress(0.0, "reading")
     sample = sample_of(scan)

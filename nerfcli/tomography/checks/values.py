@@ -84,15 +84,16 @@ def rings(sample: Sample) -> Finding | str:
     steep = np.median(np.abs(p[..., 4:] - p[..., :-4]), axis=0) > STEEP * sample.object_level
     limit = max(RING_FLOOR, RING_NOISE * sample.noise)
     bad = (np.abs(inner) > limit) & (agree >= RING_VIEWS) & ~steep
-    share = float(bad.mean())
-    verdict = verdict_above(share, look=RINGS_LOOK, bad=RINGS_BAD)
+    fraction = float(bad.mean())
+    verdict = verdict_above(fraction, look=RINGS_LOOK, bad=RINGS_BAD)
     worst_column = int(np.argmax((np.abs(inner) * bad).max(0))) + 2
     return Finding(
         "rings",
         verdict,
-        f"{100 * share:.2g} % of the detector's pixels are off their neighbours in all views by more than {limit:.2g}"
-        + (f"; the worst is column {worst_column}" if share > 0 else ""),
-        share,
+        f"{100 * fraction:.2g} % of the detector's pixels are off their neighbours in all views by more than "
+        + f"{limit:.2g}"
+        + (f"; the worst is column {worst_column}" if fraction > 0 else ""),
+        fraction,
         f"look from {100 * RINGS_LOOK:g} %, bad from {100 * RINGS_BAD:g} %",
         "" if verdict == "good" else "they cause rings around the axis: take new flats, or mark these pixels unusable",
     )
@@ -127,14 +128,14 @@ def counts(sample: Sample) -> Finding | str:
 def unusable(sample: Sample) -> Finding:
     """Count the values that are left out."""
     usable = sample.scan.usable
-    share = 0.0 if usable is None else 1 - float(usable.mean())
+    fraction = 0.0 if usable is None else 1 - float(usable.mean())
     views = 0 if usable is None or len(usable) == 1 else int((~usable.any(axis=(1, 2))).sum())
-    verdict = verdict_above(share, look=UNUSABLE_LOOK, bad=UNUSABLE_BAD)
+    verdict = verdict_above(fraction, look=UNUSABLE_LOOK, bad=UNUSABLE_BAD)
     return Finding(
         "dead pixels",
         verdict,
-        f"{100 * share:.2g} % of the values are left out" + (f", {several(views, 'whole view')}" if views else ""),
-        share,
+        f"{100 * fraction:.2g} % of the values are left out" + (f", {several(views, 'whole view')}" if views else ""),
+        fraction,
         f"look from {100 * UNUSABLE_LOOK:g} %, bad from {100 * UNUSABLE_BAD:g} %",
         "" if verdict == "good" else "check the flats, and export damaged frames again",
     )

@@ -117,10 +117,11 @@ def _checked(found: Found) -> np.ndarray:
     if len(values) < 2:
         raise UserError(f"{found.path} has one projection", "a reconstruction needs views from several angles")
     finite = np.isfinite(values)
-    share = float(finite.mean())
-    if share < LEAST_FINITE:
+    fraction = float(finite.mean())
+    if fraction < LEAST_FINITE:
         raise UserError(
-            f"{found.path}: only {100 * share:.0f} % of the values are finite", "the file is damaged: export it again"
+            f"{found.path}: only {100 * fraction:.0f} % of the values are finite",
+            "the file is damaged: export it again",
         )
     high = float(np.quantile(values[finite][:: max(1, int(finite.sum()) // 1_000_000)], 0.999))
     if found.kind == "transmission" and high > MOST_TRANSMISSION:
