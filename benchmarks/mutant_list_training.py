@@ -176,7 +176,7 @@ TRAINING: tuple[Group, ...] = (
             Mutant("row * width + column", "column * width + row"),
             Mutant("axis=1) * training_from_scene.scale", "axis=1)"),
             Mutant("(surface.misses_px[kept] / HALF_ERROR_PX) ** 2", "surface.misses_px[kept] / HALF_ERROR_PX"),
-            Mutant("1.0 - fraction / LAST_FRACTION", "1.0 - fraction"),
+            Mutant("max(0.0, 1.0 - fraction)", "1.0 - fraction"),
             Mutant("// PIXELS_PER_POINT // len(self.sets)", "// PIXELS_PER_POINT"),
         ),
     ),

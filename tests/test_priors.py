@@ -16,7 +16,7 @@ from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.fit.losses import opacity_entropy
-from nerfcli.fit.point_depth import LAST_FRACTION, PointRays, fading, point_depths
+from nerfcli.fit.point_depth import PointRays, fading, point_depths
 from nerfcli.kernels import reference
 from nerfcli.multiview.camera_check import CameraCheck
 from nerfcli.multiview.correspondences import Shared
@@ -173,7 +173,7 @@ def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
 
 
 def test_points_fade_out():
-    assert [fading(fraction) for fraction in (0.0, LAST_FRACTION / 2, LAST_FRACTION, 1.0)] == [1.0, 0.5, 0.0, 0.0]
+    assert [fading(fraction) for fraction in (0.0, 0.25, 1.0, 1.5)] == [1.0, 0.75, 0.0, 0.0]
 
 
 def test_undecided_rays_have_the_largest_entropy_and_decided_ones_no_infinite_slope():

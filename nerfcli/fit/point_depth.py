@@ -14,8 +14,6 @@ from nerfcli.multiview.tracks import Tracks, indices_by_value
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.pool import Drawn, PixelPool
 
-# Fraction of the budget at which the weight of the points reaches 0: once there are surfaces, photos tell more.
-LAST_FRACTION = 0.5
 # One pixel at a known distance is drawn per this many other pixels.
 PIXELS_PER_POINT = 8
 # Reprojection error at which a point has half the weight, in pixels of the training photo.
@@ -135,5 +133,8 @@ def stereo_depths(dense: Sequence[DenseDepth], pool: PixelPool, training_from_sc
 
 
 def fading(fraction: float) -> float:
-    """Return the weight of the points at a fraction of the budget: linear from 1 to 0 at `LAST_FRACTION`, then 0."""
-    return max(0.0, 1.0 - fraction / LAST_FRACTION)
+    """Return the weight of the points at a fraction of the budget, linear from 1 to 0.
+
+    Once there are surfaces, photos tell more; but without points, haze before them comes back where few photos look.
+    """
+    return max(0.0, 1.0 - fraction)
