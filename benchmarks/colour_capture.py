@@ -75,12 +75,12 @@ def write(source: Path, out: Path, *, effects: tuple[str, ...], reduction: int) 
         effects: some of `EFFECTS`.
         reduction: factor by which the photos' sides are reduced.
     """
-    known = json.loads((source / "truth" / "cameras.json").read_text())
-    (focal, x, y, k1, k2), names = known["camera"]["params"], sorted(image["name"] for image in known["images"])
-    poses = {image["name"]: np.array(image["world_from_cam"]) for image in known["images"]}
+    recorded = json.loads((source / "truth" / "cameras.json").read_text())
+    (focal, x, y, k1, k2), names = recorded["camera"]["params"], sorted(image["name"] for image in recorded["images"])
+    poses = {image["name"]: np.array(image["world_from_cam"]) for image in recorded["images"]}
     (out / "images").mkdir(parents=True, exist_ok=True)
     effects_by_photo = dict(zip(names, truths(len(names), effects=effects), strict=True))
-    width, height = known["camera"]["width"] // reduction, known["camera"]["height"] // reduction
+    width, height = recorded["camera"]["width"] // reduction, recorded["camera"]["height"] // reduction
     for name in names:
         photo = Image.open(source / "images" / name).resize((width, height), Image.Resampling.BOX)
         light = developed(linear_light(np.asarray(photo) / 255.0), effects_by_photo[name])

@@ -77,10 +77,10 @@ def to_8_bit(levels: np.ndarray) -> np.ndarray:
 
 def desk_views() -> list[View]:
     """Return the photos of the desk at half size, with their true cameras."""
-    known = json.loads((SAMPLES / "desk" / "truth" / "cameras.json").read_text(encoding="utf-8"))
-    whole = Camera.from_json(known["camera"])
+    recorded = json.loads((SAMPLES / "desk" / "truth" / "cameras.json").read_text(encoding="utf-8"))
+    whole = Camera.from_json(recorded["camera"])
     camera = whole.resized(whole.width // DESK_DOWNSCALE, whole.height // DESK_DOWNSCALE)
-    test = scenes.default_split(view["name"] for view in known["images"])
+    test = scenes.default_split(view["name"] for view in recorded["images"])
     return [
         View(
             view["name"],
@@ -89,7 +89,7 @@ def desk_views() -> list[View]:
             downscale(read_image(SAMPLES / "desk" / "images" / view["name"]), DESK_DOWNSCALE),
             view["name"] in test,
         )
-        for view in known["images"]
+        for view in recorded["images"]
     ]
 
 

@@ -156,17 +156,17 @@ def depths(model: Model, frame: Frame, *, min_opacity: float) -> dict[str, np.nd
 def measure(maps: list[dict[str, np.ndarray]], truths: list[np.ndarray]) -> list[Errors]:
     """Return the errors of every depth over all pixels of the views with known truth."""
     rows = []
-    known = np.isfinite(np.stack(truths))
+    defined = np.isfinite(np.stack(truths))
     truth = np.stack(truths)
     for name in DEPTHS:
         depth = np.stack([one[name] for one in maps])
-        both = known & np.isfinite(depth)
+        both = defined & np.isfinite(depth)
         error, where = depth[both] - truth[both], truth[both]
         off = np.abs(error)
         rows.append(
             Errors(
                 depth=name,
-                coverage=float(both.sum() / known.sum()),
+                coverage=float(both.sum() / defined.sum()),
                 median=float(np.median(off)),
                 rmse=float(np.sqrt((error**2).mean())),
                 within_1_percent=float((off < 0.01 * where).mean()),

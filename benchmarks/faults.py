@@ -194,15 +194,15 @@ def serve() -> None:
     channel = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     for line in sys.stdin:
-        asked = json.loads(line)
-        os.chdir(asked["folder"])
-        result = CliRunner().invoke(program, asked["command"])
+        request = json.loads(line)
+        os.chdir(request["folder"])
+        result = CliRunner().invoke(program, request["command"])
         raised = result.exception is not None and not isinstance(result.exception, SystemExit)
-        folder = Path(asked["folder"])
+        folder = Path(request["folder"])
         said = ""
         if result.exit_code == 0:
             try:
-                said = outcome(folder, tuple(asked["command"]), result.stdout)
+                said = outcome(folder, tuple(request["command"]), result.stdout)
             except Exception as error:  # a result that cannot be read
                 said = f"unreadable: {error!r}"
         text = f"{type(result.exception).__name__}: {result.exception}" if raised else result.stderr.strip()

@@ -46,7 +46,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 @dataclass(frozen=True)
-class Given:
+class TimedCommand:
     """A command without its output folder, and the inputs that it must not change."""
 
     name: str
@@ -54,7 +54,7 @@ class Given:
     inputs: tuple[Path, ...]
 
 
-def commands(place: Path, run: Path | None) -> list[Given]:
+def commands(place: Path, run: Path | None) -> list[TimedCommand]:
     """Write the captures and return the commands.
 
     These are: poses of 12 small photos of the desk; 200 steps on spheres; 60 small pictures of a run on spheres, or of
@@ -73,13 +73,13 @@ def commands(place: Path, run: Path | None) -> list[Given]:
         )
     views = ("--cameras", "orbit", "--count", "60", "--max-size", "48")
     return [
-        Given("poses", ("poses", photos, "--quality", "fast", "--seed", "1"), (photos,)),
-        Given("train", ("train", capture / "scene", "--steps", "200"), (capture / "scene", capture / "photos")),
-        Given("render", ("render", shown, *views), (shown,)),
+        TimedCommand("poses", ("poses", photos, "--quality", "fast", "--seed", "1"), (photos,)),
+        TimedCommand("train", ("train", capture / "scene", "--steps", "200"), (capture / "scene", capture / "photos")),
+        TimedCommand("render", ("render", shown, *views), (shown,)),
     ]
 
 
-def started(given: Given, output: Path) -> subprocess.Popen[str]:
+def started(given: TimedCommand, output: Path) -> subprocess.Popen[str]:
     """Start the command in a separate process; a training resumes if there is a state."""
     words = [*given.words, "-o", output, "--threads", "1", "--quiet"]
     if given.name == "train" and (output / "state.safetensors").exists():
@@ -97,7 +97,7 @@ def files_around(output: Path) -> set[str]:
     return found
 
 
-def undisturbed(given: Given, output: Path) -> tuple[float, float]:
+def undisturbed(given: TimedCommand, output: Path) -> tuple[float, float]:
     """Run a command to its end; return the seconds until it began to write, and in total.
 
     Raises:

@@ -144,10 +144,10 @@ GROUPS: tuple[Group, ...] = (
         "",
         (),
         (
-            Mutant("known=samples.encoded, widths=widths", "known=samples.encoded, widths=None"),
+            Mutant("computed=samples.encoded, widths=widths", "computed=samples.encoded, widths=None"),
             Mutant("spherical_harmonics(directions, grid.view_degree)", "spherical_harmonics(directions, 0)"),
-            Mutant("resolutions, sink, known, widths)", "resolutions, None, known, widths)"),
-            Mutant("known=None, widths=None, sink=sink", "known=None, widths=None, sink=None"),
+            Mutant("resolutions, sink, computed, widths)", "resolutions, None, computed, widths)"),
+            Mutant("computed=None, widths=None, sink=sink", "computed=None, widths=None, sink=None"),
         ),
     ),
     Group(

@@ -219,7 +219,7 @@ TRAINING: tuple[Group, ...] = (
         (
             Mutant("min(proportional, both) < min(between, mean)", "proportional < min(between, mean)"),
             Mutant("by_exif[:, None] + offsets", "by_exif[:, None]"),
-            Mutant("log_gains[known] - predicted[:, None]", "log_gains[known]"),
+            Mutant("log_gains[has_exif] - predicted[:, None]", "log_gains[has_exif]"),
             Mutant("if by_place >= _left_out", "if by_place < _left_out"),
         ),
     ),

@@ -50,8 +50,8 @@ from scipy.spatial.transform import Rotation
 from nerfcli import scene as scenes
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.convert.conversion import Doubt, load
-from nerfcli.convert.formats import Given
+from nerfcli.convert.conversion import ConventionOverrides, load
+from nerfcli.convert.formats import UserInputs
 from nerfcli.errors import UserError
 from nerfcli.media.images import image_size, list_images
 
@@ -127,7 +127,7 @@ def read_truth(path: Path, photos: Mapping[str, tuple[int, int]]) -> dict[str, V
     elif path.name.endswith("_par.txt"):
         views = _middlebury(path, photos)
     else:
-        _, _, capture = load(path, Given(), Doubt())
+        _, _, capture = load(path, UserInputs(), ConventionOverrides())
         views = {Path(frame.name).name: View(frame.camera, frame.world_from_cam) for frame in capture.frames}
     return {name: _resized(views[name], size) for name, size in photos.items() if name in views}
 
@@ -279,8 +279,8 @@ def judge(capture: Capture, folder: Path, *, exit_code: int, seconds: float, cpu
         missing=len(truth) - len(both),
     )
     lenses = np.array([_lens_numbers(truth[name].camera, found[name].camera) for name in both])
-    known = lenses[~np.isnan(lenses).all(axis=1)]
-    focal, centre, rms, worst = np.nanmedian(known, axis=0).tolist() if len(known) else [NAN] * 4
+    estimated = lenses[~np.isnan(lenses).all(axis=1)]
+    focal, centre, rms, worst = np.nanmedian(estimated, axis=0).tolist() if len(estimated) else [NAN] * 4
     return replace(
         row,
         compared=len(both),

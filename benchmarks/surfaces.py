@@ -43,11 +43,11 @@ SENSOR_EVERY = 10
 
 def desk_views() -> tuple[Camera, list[tuple[np.ndarray, np.ndarray]]]:
     """Return the camera of the desk, and pose and true z of six photos."""
-    known = json.loads((DESK / "cameras.json").read_text(encoding="utf-8"))
-    depths = {image["name"]: DESK / "depth" / f"{Path(image['name']).stem}.tiff" for image in known["images"]}
-    images = [image for image in known["images"] if depths[image["name"]].exists()]
+    recorded = json.loads((DESK / "cameras.json").read_text(encoding="utf-8"))
+    depths = {image["name"]: DESK / "depth" / f"{Path(image['name']).stem}.tiff" for image in recorded["images"]}
+    images = [image for image in recorded["images"] if depths[image["name"]].exists()]
     views = [(np.array(image["world_from_cam"]), read_any_tiff(depths[image["name"]])[0]) for image in images]
-    return Camera.from_json(known["camera"]), views
+    return Camera.from_json(recorded["camera"]), views
 
 
 def sensor_views(capture: Path) -> tuple[Camera, list[tuple[np.ndarray, np.ndarray]]]:

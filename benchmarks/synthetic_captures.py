@@ -313,9 +313,9 @@ def _appearance(looks: NDArray[np.int64], *, seed: int) -> NDArray[np.uint8]:
     Scaled to norm 1, those of the same look are 0.35 apart, others 0.85.
     """
     rng = np.random.default_rng([seed, 1])
-    known = np.abs(np.random.default_rng(0).normal(size=(looks.max(initial=-1) + 1, 128)))
+    descriptors = np.abs(np.random.default_rng(0).normal(size=(looks.max(initial=-1) + 1, 128)))
     found = np.abs(rng.normal(size=(len(looks), 128)))
-    found[looks >= 0] = known[looks[looks >= 0]]
+    found[looks >= 0] = descriptors[looks[looks >= 0]]
     found *= np.exp(rng.normal(scale=0.25, size=found.shape))
     return np.minimum(np.rint(512 * found / np.linalg.norm(found, axis=1, keepdims=True)), 255).astype(np.uint8)
 

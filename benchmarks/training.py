@@ -148,12 +148,12 @@ def main(
         path.write_text(",".join(names) + "\n", encoding="utf-8")
     with path.open(newline="", encoding="utf-8") as file:
         done = [typed(line) for line in csv.DictReader(file)]
-    known = {(t.scene, t.budget_s, t.model, t.seed) for t in done}
+    finished = {(t.scene, t.budget_s, t.model, t.seed) for t in done}
     for seed in (int(text) for text in seeds.split(",")):
         for scene in scenes:
             for budget in (float(text) for text in budgets.split(",")):
                 for model in models.split(","):
-                    if (scene.name, budget, model, seed) in known:
+                    if (scene.name, budget, model, seed) in finished:
                         continue
                     done.append(measure(scene, budget, model, seed, threads=threads))
                     with path.open("a", newline="", encoding="utf-8") as file:

@@ -125,13 +125,13 @@ def write_capture(name: str, folder: Path) -> None:
     """Write the photos of a scene with their true cameras, as transforms.json."""
     folder.mkdir(parents=True, exist_ok=True)
     if name == "desk":
-        known = json.loads((DESK / "truth" / "cameras.json").read_text(encoding="utf-8"))
-        f, cx, cy, k1, k2 = known["camera"]["params"]
+        recorded = json.loads((DESK / "truth" / "cameras.json").read_text(encoding="utf-8"))
+        f, cx, cy, k1, k2 = recorded["camera"]["params"]
         lens = {"fl_x": f, "fl_y": f, "cx": cx, "cy": cy, "k1": k1, "k2": k2, "p1": 0.0, "p2": 0.0}
         lens |= {"camera_model": "OPENCV", "w": 800, "h": 600}
         files = {
             str((DESK / "images" / image["name"]).resolve()): np.array(image["world_from_cam"]) @ OPENGL
-            for image in known["images"]
+            for image in recorded["images"]
         }
     else:
         truth = truth_of(name)

@@ -17,7 +17,7 @@ import tifffile
 ROWS, COLUMNS, VIEWS = 6, 10, 9
 ANGLES_DEG = np.linspace(10, 250, VIEWS)
 # (view, point) -> column, row.
-Seen = Callable[[int, np.ndarray], tuple[float, float]]
+Projection = Callable[[int, np.ndarray], tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Written:
     """
 
     path: Path
-    seen: Seen
+    seen: Projection
     values: np.ndarray
 
 
@@ -73,7 +73,7 @@ def nxtomo(folder: Path) -> Written:
     return Written(path, _parallel(0.002), values * 1000)
 
 
-def _parallel(pixel: float) -> Seen:
+def _parallel(pixel: float) -> Projection:
     def seen(view: int, point: np.ndarray) -> tuple[float, float]:
         # The object turns clockwise in front of a camera whose columns run along +y.
         at = turned(-np.radians(ANGLES_DEG[view]), point)
@@ -131,7 +131,7 @@ def r2_gaussian(folder: Path) -> Written:
     return Written(folder, _pinhole(5, 7, (0.2, 0.3), (0.1, -0.3)), values)
 
 
-def _pinhole(origin: float, detector: float, pixel: tuple[float, float], offset: tuple[float, float]) -> Seen:
+def _pinhole(origin: float, detector: float, pixel: tuple[float, float], offset: tuple[float, float]) -> Projection:
     """Return NAF's projection: uu = (i + 0.5 - W / 2) d + off, for a camera with x right, y down, z forward."""
 
     def seen(view: int, point: np.ndarray) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import from_parts, rotation_from_vector
-from nerfcli.evaluate.billboards import COMPARED_PIXELS, Billboards, Shape, ShapeEvidence, random_pixels
+from nerfcli.evaluate.billboards import COMPARED_PIXELS, Billboards, GeometryComparison, GeometryEvidence, random_pixels
 from nerfcli.evaluate.metrics import to_8_bit
 from nerfcli.evaluate.protocol import Extras, HeldOutPhoto, evaluate_model, over_white
 from nerfcli.photos.loading import load_photos
@@ -69,7 +69,7 @@ def test_photos_of_a_camera_that_only_turned_are_explained():
 def test_a_field_of_a_camera_that_only_turned_shows_no_shape():
     views = turned(9)
     training = views[::2]
-    evidence = ShapeEvidence(Billboards(training, [far_photo(view) for view in training]))
+    evidence = GeometryComparison(Billboards(training, [far_photo(view) for view in training]))
     for view in map(narrower, views[1::2]):
         photo = far_photo(view)
         # A good field: 35 dB.
@@ -86,7 +86,7 @@ def test_a_field_of_a_camera_that_only_turned_shows_no_shape():
     [(0.77, 0.2, "1.0 dB"), (0.77, 0.58, "1.2 dB"), (0.77, None, "1.0 dB"), (-1.0, 0.2, "")],
 )
 def test_a_gain_that_is_too_small_is_named_with_what_it_takes(gain: float, error: float | None, needed: str):
-    words = Shape(14.83, 14.83 + gain, gain, error, shown=False, seconds=0.0).in_words()
+    words = GeometryEvidence(14.83, 14.83 + gain, gain, error, shown=False, seconds=0.0).in_words()
     assert words.startswith("no evidence of geometry")
     assert ("to be sure" in words) == bool(needed)
     assert needed in words

@@ -27,7 +27,7 @@ from nerfcli.render.depth import CONVENTIONS, DepthRequest
 from nerfcli.render.model import Marching, Model, load_model, save_model
 from nerfcli.render.pictures import Quality, render_picture
 from nerfcli.render.tracing import deepest, render_rays, uniform_cuts
-from nerfcli.runs.blocks import LEAST_FRACTION, MARGIN, PERCENTILES, Cell, Division, divide, joined
+from nerfcli.runs.blocks import LEAST_FRACTION, MARGIN, PERCENTILES, BlockDivision, Cell, divide, joined
 from nerfcli.runs.run import Run
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -60,8 +60,8 @@ def cloudy(similarity: Similarity, *, kind: str = "hash", seed: int = 0) -> Mode
     )
 
 
-def division(cells: tuple[Cell, ...] = CELLS) -> Division:
-    return Division(GROUND, cells, ())
+def division(cells: tuple[Cell, ...] = CELLS) -> BlockDivision:
+    return BlockDivision(GROUND, cells, ())
 
 
 def random_rays(count: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
@@ -169,7 +169,7 @@ def test_light_passes_from_block_to_block_by_the_law_of_absorption():
         fogs.append(replace(model, occupied=torch.ones(16, 16, 16, dtype=torch.bool), marching=march))
     border = 0.4
     cells = (Cell(high=(border, np.inf)), Cell(low=(border, -np.inf)))
-    model = joined(fogs, Division(np.eye(3)[:2], cells, ()))
+    model = joined(fogs, BlockDivision(np.eye(3)[:2], cells, ()))
     first, second = 0.25, 0.8 * np.exp(0.7)  # densities in 1 / scene unit
     scale = model.training_from_scene.scale
     origin = torch.tensor(model.training_from_scene.apply(np.array([[-1.0, 0.2, 0.1]])), dtype=torch.float32)

@@ -20,14 +20,14 @@ def nerfcli(*arguments: str | Path, stdin: str | None = None) -> Result:
 @pytest.fixture
 def estimated(monkeypatch) -> list[tuple[str, str, int]]:
     """The calls of structure from motion: folder, scene, number of photos in the folder. Each makes an empty scene."""
-    asked = []
+    calls = []
 
     def estimate(folder: Path, scene: Path, settings: Any, **more: Any) -> None:
-        asked.append((str(folder), str(scene), len(list(folder.glob("*.jpg")))))
+        calls.append((str(folder), str(scene), len(list(folder.glob("*.jpg")))))
         scene.mkdir(parents=True, exist_ok=True)
 
     monkeypatch.setattr(poses_workflow, "estimate_poses", estimate)
-    return asked
+    return calls
 
 
 @pytest.fixture(scope="module")
@@ -113,11 +113,11 @@ def test_frames_and_scene_are_kept(clip, estimated):
 
 
 def test_masks_go_to_the_settings(tmp_path, monkeypatch):
-    asked: list[Any] = []
+    calls: list[Any] = []
     monkeypatch.setattr(
-        poses_workflow, "estimate_poses", lambda photos, scene, settings, **more: asked.append(settings)
+        poses_workflow, "estimate_poses", lambda photos, scene, settings, **more: calls.append(settings)
     )
     monkeypatch.chdir(tmp_path)
     Path("photos").mkdir()
     assert nerfcli("poses", "photos", "--masks", "masks").exit_code == 0
-    assert [settings.masks for settings in asked] == [str(tmp_path.resolve() / "masks")]
+    assert [settings.masks for settings in calls] == [str(tmp_path.resolve() / "masks")]

@@ -25,8 +25,8 @@ from nerfcli.cameras.frame import Capture, Observations
 from nerfcli.cli.convert import FORMATS_WRITTEN
 from nerfcli.convert import opencv_lenses
 from nerfcli.convert.axes import Convention, all_axes, expressed, opencv_from_axes, reinterpreted
-from nerfcli.convert.conversion import Doubt, TargetOptions, convert, load
-from nerfcli.convert.formats import FORMATS, Given, format_named, recognise
+from nerfcli.convert.conversion import ConventionOverrides, TargetOptions, convert, load
+from nerfcli.convert.formats import FORMATS, UserInputs, format_named, recognise
 from nerfcli.convert.verify import _ROUNDINGS
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
 
@@ -156,7 +156,7 @@ def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
         more = ["--images", tmp_path / "images"]
     back = nerfcli("convert", report["path"], tmp_path / "back", "--to", "colmap", "--allow-loss", *more)
     assert back.exit_code == 0, back.stderr
-    _, _, again = load(tmp_path / "back", Given(), Doubt())
+    _, _, again = load(tmp_path / "back", UserInputs(), ConventionOverrides())
     assert farthest_px(capture, again) < LIMIT_PX
 
 
@@ -169,7 +169,7 @@ def test_points_and_observations_survive(form, tmp_path):
     )
     done = convert(capture, tmp_path / "out", source_format="made", wanted=TargetOptions(format_named(form)))
     assert done.losses == ()
-    _, _, again = load(done.path, Given(), Doubt())
+    _, _, again = load(done.path, UserInputs(), ConventionOverrides())
     np.testing.assert_array_equal(again.points, capture.points)
     assert again.observations is not None
     assert capture.observations is not None
@@ -194,7 +194,7 @@ def test_axes_and_pixel_centre_of_the_written_file(form, tmp_path):
     assert cx == PINHOLE.params[2] - 0.5
     options = ("--from-axes", "opencv", "--from-pixel-center", "0")
     assert nerfcli("convert", out, tmp_path / "back", "--to", "colmap", *options).exit_code == 0
-    assert farthest_px(capture, load(tmp_path / "back", Given(), Doubt())[2]) < LIMIT_PX
+    assert farthest_px(capture, load(tmp_path / "back", UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
 
 
 @pytest.mark.parametrize(
@@ -222,7 +222,7 @@ def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
     options = ("--from-axes", "opencv", "--from-inverted")
     result = nerfcli("convert", tmp_path / "wrong.json", tmp_path / "out", "--to", "colmap", *options)
     assert result.exit_code == 0, result.stderr
-    assert farthest_px(capture, load(tmp_path / "out", Given(), Doubt())[2]) < LIMIT_PX
+    assert farthest_px(capture, load(tmp_path / "out", UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
 
 
 def test_intrinsics_for_another_size(tmp_path):
@@ -230,7 +230,7 @@ def test_intrinsics_for_another_size(tmp_path):
     double = Camera("PINHOLE", 640, 480, (1000.0, 1010.0, 642.5, 477.0))
     source = npz_of(tmp_path, capture_of([double]))
     assert nerfcli("convert", source, tmp_path / "out", "--to", "colmap", "--from-size", "2").exit_code == 0
-    assert load(tmp_path / "out", Given(), Doubt())[2].frames[0].camera == PINHOLE
+    assert load(tmp_path / "out", UserInputs(), ConventionOverrides())[2].frames[0].camera == PINHOLE
 
 
 def test_the_world_frame_and_its_scale(tmp_path):
@@ -238,11 +238,11 @@ def test_the_world_frame_and_its_scale(tmp_path):
     first, second = capture.frames[:2]
     metres = 2.5 * float(np.linalg.norm(first.centre - second.centre))
     out = tmp_path / "out.npz"
-    known = f"{','.join(map(str, first.centre))} {','.join(map(str, second.centre))} {metres}"
-    options = ("--origin", "centre-of-cameras", "--world-up", "-y", "--distance", known, "--json")
+    distance = f"{','.join(map(str, first.centre))} {','.join(map(str, second.centre))} {metres}"
+    options = ("--origin", "centre-of-cameras", "--world-up", "-y", "--distance", distance, "--json")
     result = nerfcli("convert", npz_of(tmp_path, capture), out, "--to", "npz", *options)
     assert result.exit_code == 0, result.stderr
-    again = load(out, Given(), Doubt())[2]
+    again = load(out, UserInputs(), ConventionOverrides())[2]
     centres = np.array([frame.centre for frame in again.frames])
     np.testing.assert_allclose(centres.mean(axis=0), 0, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(centres[0] - centres[1]), metres, rtol=1e-12)
@@ -260,7 +260,7 @@ def test_markers_in_the_photos_give_metres(tmp_path):
     assert result.exit_code == 0, result.stderr
     assert "from ArUco markers (DICT_4X4_50, 0.05 m), 8 sides" in result.stderr
     assert json.loads(result.stdout)["new_from_old"]["scale"] == pytest.approx(0.05 / 0.7, rel=1e-4)
-    assert load(tmp_path / "out.npz", Given(), Doubt())[2].unit == "metre"
+    assert load(tmp_path / "out.npz", UserInputs(), ConventionOverrides())[2].unit == "metre"
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,8 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture
-from nerfcli.convert.conversion import Doubt, TargetOptions, convert, load
-from nerfcli.convert.formats import Given, format_named
+from nerfcli.convert.conversion import ConventionOverrides, TargetOptions, convert, load
+from nerfcli.convert.formats import UserInputs, format_named
 from nerfcli.convert.scene_folder import write_scene
 from nerfcli.convert.stored_pixels import in_pixels
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
@@ -83,9 +83,9 @@ def test_a_known_distance_reaches_training_as_metres(tmp_path):
     capture = photographed(capture_of([PINHOLE]), tmp_path / "photos")
     first, second = capture.frames[:2]
     source = npz_of(tmp_path, capture)
-    known = f'"{first.name}" "{second.name}" 2.5'
+    distance = f'"{first.name}" "{second.name}" 2.5'
     before = listing(tmp_path)
-    result = nerfcli("convert", source, tmp_path / "my scene", "--to", "nerfcli", "--distance", known, "--json")
+    result = nerfcli("convert", source, tmp_path / "my scene", "--to", "nerfcli", "--distance", distance, "--json")
     assert result.exit_code == 0, result.stderr
     assert {name: data for name, data in listing(tmp_path).items() if "my scene" not in name} == before
     scene = scenes.load(tmp_path / "my scene")
@@ -101,7 +101,7 @@ def test_a_known_distance_reaches_training_as_metres(tmp_path):
     assert json.loads(nerfcli("info", tmp_path / "my scene", "--json").stdout)["unit"] == "metre"
     # From there the unit and its source also survive in a format that records units.
     assert nerfcli("convert", tmp_path / "my scene", tmp_path / "again.npz", "--to", "npz").exit_code == 0
-    again = load(tmp_path / "again.npz", Given(), Doubt())[2]
+    again = load(tmp_path / "again.npz", UserInputs(), ConventionOverrides())[2]
     assert (again.unit, again.unit_source, again.pixels) == ("metre", "1 known distance", "upright")
 
 
@@ -115,7 +115,7 @@ def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
     assert result.exit_code == 0, result.stderr
     assert "3 photos have an EXIF orientation: their cameras refer to pixels upright" in result.stderr
     scene = scenes.load(tmp_path / "scene")
-    _, _, parsed = load(tmp_path / "scene", Given(), Doubt())
+    _, _, parsed = load(tmp_path / "scene", UserInputs(), ConventionOverrides())
     assert parsed.observations is not None
     for index, frame in enumerate(scene.frames):
         assert frame.image is not None
@@ -149,7 +149,7 @@ def test_other_programs_get_cameras_for_the_pixels_as_they_are_stored(form, plac
     result = nerfcli("convert", tmp_path / "scene", tmp_path / place, "--to", form, *options)
     assert result.exit_code == 0, result.stderr
     assert "3 photos have an EXIF orientation: their cameras refer to pixels as stored" in result.stderr
-    assert farthest_px(capture, load(tmp_path / place, Given(), Doubt())[2]) < LIMIT_PX
+    assert farthest_px(capture, load(tmp_path / place, UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
     if form in ("colmap", "colmap-text", "transforms"):
         trained = scenes.load(tmp_path)
         assert trained.kind == form.removesuffix("-text")
@@ -161,10 +161,10 @@ def test_which_pixels_can_be_chosen(tmp_path):
     write_scene(in_pixels(capture, "upright").capture, tmp_path / "scene")
     out = tmp_path / "out.npz"
     assert nerfcli("convert", tmp_path / "scene", out, "--to", "npz").exit_code == 0
-    assert load(out, Given(), Doubt())[2].pixels == "upright"  # npz records it
+    assert load(out, UserInputs(), ConventionOverrides())[2].pixels == "upright"  # npz records it
     options = ("--to", "colmap", "--pixels", "upright", "--allow-loss")
     assert nerfcli("convert", tmp_path / "scene", tmp_path / "out", *options).exit_code == 0
-    assert load(tmp_path / "out", Given(), Doubt())[2].frames[0].camera.width == PINHOLE.height
+    assert load(tmp_path / "out", UserInputs(), ConventionOverrides())[2].frames[0].camera.width == PINHOLE.height
     assert nerfcli("convert", out, tmp_path / "2", "--to", "nerfcli", "--pixels", "stored").exit_code == USAGE
     assert nerfcli("convert", out, tmp_path / "2", "--to", "nerfcli", "--pixels", "lying").exit_code == USAGE
 
@@ -206,7 +206,7 @@ def test_a_split_is_kept_and_else_every_eighth_photo_is_held_out(splits, test, t
     names = [frame.name for frame in capture.frames]
     assert [frame.name for frame in scene.test_frames] == [names[i] for i in test]
     assert [frame.name for frame in scene.train_frames] == [names[i] for i in train]
-    _, _, again = load(tmp_path / "scene", Given(), Doubt())
+    _, _, again = load(tmp_path / "scene", UserInputs(), ConventionOverrides())
     expected = splits if any(splits) else tuple("test" if i in test else "train" for i in range(6))
     assert tuple(frame.split for frame in again.frames) == expected
 
@@ -289,9 +289,9 @@ def test_a_scene_is_replaced_only_when_asked_and_after_a_fault_stands_again(tmp_
     assert not (tmp_path / "other").exists()
     monkeypatch.undo()
     # A scene can be given its scale in place.
-    known = ("--distance", '"photo 00.png" "photo 01.png" 1.5')
+    distance = ("--distance", '"photo 00.png" "photo 01.png" 1.5')
     place = tmp_path / "scene"
-    assert nerfcli("convert", place, place, "--to", "nerfcli", "--overwrite", *known).exit_code == 0
+    assert nerfcli("convert", place, place, "--to", "nerfcli", "--overwrite", *distance).exit_code == 0
     assert scenes.load(place).unit == "metre"
 
 

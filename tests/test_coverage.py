@@ -26,7 +26,7 @@ def pool_of(*places: float) -> PixelPool:
     return PixelPool(photos, Similarity(1.0, np.eye(3), np.zeros(3)), torch.device("cpu"))
 
 
-def known(pool: PixelPool, *distances: float) -> PointDepths:
+def at_distances(pool: PixelPool, *distances: float) -> PointDepths:
     """Return the known distance of one pixel of each photo."""
     return PointDepths(pool.first_pixel + 210, torch.tensor(distances), torch.ones(len(distances)))
 
@@ -46,7 +46,7 @@ def middles() -> torch.Tensor:
 
 def test_space_near_a_camera_that_no_other_one_sees_is_not_covered():
     pool = pool_of(-0.4, 0.4)
-    covered = covered_cells(pool, SIDE, "l2", known(pool, 1.5, 2.5))
+    covered = covered_cells(pool, SIDE, "l2", at_distances(pool, 1.5, 2.5))
     first, far_from_first = views_of(-0.4, middles())
     second, far_from_second = views_of(0.4, middles())
     expected = (first & second) | (first & (far_from_first >= 1.5)) | (second & (far_from_second >= 2.5))
@@ -56,7 +56,7 @@ def test_space_near_a_camera_that_no_other_one_sees_is_not_covered():
 
 def test_photos_without_depths_take_the_median_of_the_others_and_all_without_any_need_a_second_photo():
     pool = pool_of(-0.4, 0.4)
-    one = known(pool, 1.5, 1.5)
+    one = at_distances(pool, 1.5, 1.5)
     of_first = PointDepths(one.numbers[:1], one.distances[:1], one.trust[:1])
     assert torch.equal(covered_cells(pool, SIDE, "l2", of_first), covered_cells(pool, SIDE, "l2", one))
     both = views_of(-0.4, middles())[0] & views_of(0.4, middles())[0]
@@ -66,4 +66,4 @@ def test_photos_without_depths_take_the_median_of_the_others_and_all_without_any
 def test_a_single_photo_may_fill_what_lies_behind_its_median_depth():
     pool = pool_of(0.0)
     seen, distance = views_of(0.0, middles())
-    assert torch.equal(covered_cells(pool, SIDE, "l2", known(pool, 1.2)), seen & (distance >= 1.2))
+    assert torch.equal(covered_cells(pool, SIDE, "l2", at_distances(pool, 1.2)), seen & (distance >= 1.2))

@@ -38,7 +38,7 @@ FEATURES = 500
 
 
 @dataclass(frozen=True)
-class Examined:
+class Examination:
     """A capture that was read and compared, so that one photo can be spoilt without repeating this for the others."""
 
     folder: Path
@@ -65,16 +65,16 @@ class Examined:
         return replace(self, facts=tuple(facts), pairs=tuple(pairs.values())).diagnosis()
 
 
-def examined(folder: Path, photos: list[np.ndarray]) -> Examined:
+def examined(folder: Path, photos: list[np.ndarray]) -> Examination:
     write(folder, photos)
     facts = [read_photo(Source(path.name, path), FEATURES) for path in sorted(folder.iterdir())]
     places = connectivity.choose_pairs(facts)
     pairs = compare_all(facts, places, [FOCAL_PX] * len(facts), threads=2, progress=lambda done: None)
-    return Examined(folder, tuple(photos), tuple(facts), tuple(pairs))
+    return Examination(folder, tuple(photos), tuple(facts), tuple(pairs))
 
 
 @pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Examined:
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Examination:
     return examined(tmp_path_factory.mktemp("doctor") / "clean", walk())
 
 
@@ -221,8 +221,10 @@ def test_intrinsics_that_are_known_tell_how_far_things_are(tmp_path):
     folder = write(tmp_path / "photos", [view((step, 0, 0)) for step in (0.0, 0.5)])
 
     def baseline_over_depth(focal_px: float) -> float:
-        known = Calibration(Path("c"), (Camera.pinhole(2 * WIDTH, 2 * HEIGHT, 2 * focal_px),), {})
-        (pair,) = examine(find_subject(folder), threads=1, progress=lambda *reported: None, calibration=known).pairs
+        calibrated = Calibration(Path("c"), (Camera.pinhole(2 * WIDTH, 2 * HEIGHT, 2 * focal_px),), {})
+        (pair,) = examine(
+            find_subject(folder), threads=1, progress=lambda *reported: None, calibration=calibrated
+        ).pairs
         assert pair.views is not None
         return pair.views.baseline_over_depth
 

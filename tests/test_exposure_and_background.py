@@ -19,7 +19,7 @@ from nerfcli.field.exposure import Exposure, exposed, linear_from_srgb, srgb_fro
 from nerfcli.fit.appearance import Appearance
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.photos.pool import Drawn, PixelPool
+from nerfcli.photos.pool import PixelBatch, PixelPool
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import render_picture
 from nerfcli.runs.components import Components
@@ -157,7 +157,7 @@ def test_a_sphere_interpolates_its_grid_and_one_vertex_is_one_colour():
     )
 
 
-def parts_of(components: Components, colours: torch.Tensor, gains: list[float]) -> tuple[Appearance, Drawn]:
+def parts_of(components: Components, colours: torch.Tensor, gains: list[float]) -> tuple[Appearance, PixelBatch]:
     """Parts over photos of one pixel each."""
     photos = [
         LoadedPhoto(Frame(f"{i}", Camera("SIMPLE_PINHOLE", 1, 1, (1.0, 0.5, 0.5)), np.eye(4)), level.numpy(), None)

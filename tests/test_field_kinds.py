@@ -158,8 +158,8 @@ class _Radiance(torch.nn.Module):
         super().__init__()
         self.field = field
 
-    def forward(self, *asked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return radiance_of(self.field, *asked)
+    def forward(self, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return radiance_of(self.field, *inputs)
 
 
 @pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)

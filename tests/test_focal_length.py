@@ -141,12 +141,12 @@ def test_mapping_starts_from_the_estimate_and_no_match_is_lost(job: Job):
 def test_what_is_known_of_a_lens_is_left_alone(job: Job):
     """By definition: intrinsics from a file, reliable EXIF, a fisheye."""
     (group,) = job.groups
-    for known in (
+    for camera_group in (
         replace(group, params=WIDE.params),
         replace(group, focal_px=1000.0, focal_is_prior=True),
         replace(group, model=FISHEYE.model),
     ):
-        alone = replace(job, groups=(known,))
+        alone = replace(job, groups=(camera_group,))
         assert with_focal_lengths(alone, lambda note: None) is alone
     doubted = replace(job, groups=(replace(group, focal_px=2000.0),))
     assert with_focal_lengths(doubted, lambda note: None).groups[0].estimated_focal_px is not None

@@ -68,9 +68,9 @@ def settings(model: str, components: Components) -> TrainSettings:
     )
 
 
-def fit(scene: Scene, run: Path, asked: TrainSettings) -> list[str]:
+def fit(scene: Scene, run: Path, chosen: TrainSettings) -> list[str]:
     reported: list[str] = []
-    train(scene, run, asked, resume=False, notify=reported.append, on_progress=lambda progress: None)
+    train(scene, run, chosen, resume=False, notify=reported.append, on_progress=lambda progress: None)
     return reported
 
 
@@ -131,12 +131,12 @@ def test_the_field_does_not_depend_on_what_is_in_held_out_photos(case, capture, 
     monkeypatch.setattr(selection, "FEWEST_STEPS", 1)
     monkeypatch.setattr(preparation, "SEARCH_FRACTION", 1.0)
     # A budget in steps gives trials of equal length; seconds would differ.
-    asked = settings(*CASES[case])
-    fit(scenes.load(capture), tmp_path / "run", asked)
+    chosen = settings(*CASES[case])
+    fit(scenes.load(capture), tmp_path / "run", chosen)
     noise = np.random.default_rng(0).integers(0, 256, (72, 96, 4), dtype=np.uint8)
     for photo in (capture / HELD_OUT).glob("*.png"):
         write_png(photo, noise)
-    fit(scenes.load(capture), tmp_path / "other", asked)
+    fit(scenes.load(capture), tmp_path / "other", chosen)
     before, after = (load_tensors(tmp_path / name / FIELD, "cpu")[0] for name in ("run", "other"))
     assert {name: tensor.numpy().tobytes() for name, tensor in before.items()} == {
         name: tensor.numpy().tobytes() for name, tensor in after.items()

@@ -13,7 +13,7 @@ from nerfcli.errors import UserError
 from nerfcli.media.images import read_image, write_png
 from nerfcli.media.masks import find_mask, read_mask
 from nerfcli.poses.engine.features import extract, feature_keys
-from nerfcli.poses.input.job import CameraGroup, Job, LaidOutMask, read_job, write_job
+from nerfcli.poses.input.job import CameraGroup, Job, WorkMask, read_job, write_job
 from nerfcli.poses.input.masks import lay_out_masks
 from nerfcli.poses.input.photos import Photo, Photos, find_photos
 
@@ -43,7 +43,7 @@ def masks(tmp_path) -> Path:
     return tmp_path / "masks"
 
 
-def laid_out(photos: Photos, masks: Path, folder: Path) -> tuple[tuple[LaidOutMask, ...], list[str]]:
+def laid_out(photos: Photos, masks: Path, folder: Path) -> tuple[tuple[WorkMask, ...], list[str]]:
     notes: list[str] = []
     files = [f"{number:05d}.png" for number in range(len(photos.names))]
     return lay_out_masks(photos, files, masks, folder=folder, notify=notes.append), notes
@@ -131,7 +131,7 @@ def test_a_folder_without_masks_is_told(photos, masks, tmp_path):
         laid_out(photos, photos.folder, tmp_path / "work")
 
 
-def job_for(photos: Photos, masks: tuple[LaidOutMask, ...], folder: Path) -> Job:
+def job_for(photos: Photos, masks: tuple[WorkMask, ...], folder: Path) -> Job:
     files = tuple(f"{number:05d}.png" for number in range(len(photos.names)))
     (folder / "photos").mkdir(parents=True)
     for name, file in zip(photos.names, files, strict=True):

@@ -114,12 +114,12 @@ def test_hash_encode_takes_a_sink_and_known_values(generator):
     plain = numba_cpu.hash_encode(points, table, (3, 30), None, None)
     plain.sum().backward()
     sink = torch.ones_like(table)
-    known = numba_cpu.hash_encode(points, table, (3, 30), sink, plain.detach())
-    assert torch.equal(known, plain)
+    computed = numba_cpu.hash_encode(points, table, (3, 30), sink, plain.detach())
+    assert torch.equal(computed, plain)
     assert table.grad is not None
     expected = 1 + table.grad
     table.grad = None
-    known.sum().backward()
+    computed.sum().backward()
     assert table.grad is None
     assert_close(sink, expected, "sink")
 
@@ -216,10 +216,12 @@ def test_sample_coordinates(samples, contraction, reach, generator):
 @once
 def test_sample_coordinates_that_are_known_are_taken(generator):
     ray = torch.randn(1, 3, generator=generator)
-    known, offsets = torch.rand(2, 3, generator=generator), torch.tensor([0, 2])
+    computed, offsets = torch.rand(2, 3, generator=generator), torch.tensor([0, 2])
     starts = torch.tensor([0.0, 1.0])
-    taken = numba_cpu.sample_coordinates(ray, ray, starts, starts + 1, offsets=offsets, contraction="l2", known=known)
-    assert torch.equal(taken, known)
+    taken = numba_cpu.sample_coordinates(
+        ray, ray, starts, starts + 1, offsets=offsets, contraction="l2", computed=computed
+    )
+    assert torch.equal(taken, computed)
 
 
 @pytest.mark.parametrize("samples", SIZES)

@@ -41,10 +41,10 @@ class Ramp(Fake):
 
     def __init__(self, contraction: str = "none"):
         super().__init__(contraction)
-        self.asked = torch.zeros(0, 3)
+        self.queried = torch.zeros(0, 3)
 
     def density(self, coordinates: Tensor) -> Tensor:
-        self.asked = torch.cat([self.asked, coordinates])
+        self.queried = torch.cat([self.queried, coordinates])
         return coordinates @ torch.tensor([1.0, 10.0, 100.0])
 
 
@@ -75,12 +75,12 @@ def test_a_cell_is_asked_at_a_random_point_of_its_own(grid):
     """Cells are indexed [z, y, x]; each point is inside its cell, and not in a corner of it."""
     field = Ramp()
     refreshed(grid, field)
-    x, y, z = (field.asked * SIDE).floor().to(torch.int64).T
+    x, y, z = (field.queried * SIDE).floor().to(torch.int64).T
     assert torch.equal((z * SIDE + y) * SIDE + x, torch.arange(SIDE**3))
-    inside = field.asked * SIDE % 1
+    inside = field.queried * SIDE % 1
     assert 0.4 < inside.mean() < 0.6
     assert inside.std() > 0.2  # 0.29 for a uniform distribution
-    expected = field.asked @ torch.tensor([1.0, 10.0, 100.0]) * 0.5
+    expected = field.queried @ torch.tensor([1.0, 10.0, 100.0]) * 0.5
     torch.testing.assert_close(grid.optical_depth.view(-1), expected)
 
 
@@ -88,11 +88,11 @@ def test_the_length_of_a_step_grows_with_the_distance_from_the_origin(grid):
     """Closed form: growth r max(1, r), at least the shortest step; r from the origin of the training frame."""
     field = Ramp("l2")
     refreshed(grid, field, step=0.3, growth=0.25)
-    radius = training_points(field.asked, "l2").norm(dim=-1)
+    radius = training_points(field.queried, "l2").norm(dim=-1)
     length = torch.where(radius > 1, 0.25 * radius**2, 0.25 * radius).clamp_min(0.3)
     assert (radius < 1).any()
     assert (length == 0.3).any()
-    density = field.asked @ torch.tensor([1.0, 10.0, 100.0])
+    density = field.queried @ torch.tensor([1.0, 10.0, 100.0])
     torch.testing.assert_close(grid.optical_depth.view(-1), density * length)
 
 
@@ -106,10 +106,10 @@ def test_cells_are_a_maximum_that_decays(grid):
 
 def test_only_the_chosen_cells_are_looked_at(grid):
     refreshed(grid, Even(2.0), cells=slice(1, None, 8))
-    known = grid.optical_depth.view(-1).isfinite()
-    assert torch.equal(known.nonzero()[:, 0], torch.arange(1, SIDE**3, 8))
+    measured = grid.optical_depth.view(-1).isfinite()
+    assert torch.equal(measured.nonzero()[:, 0], torch.arange(1, SIDE**3, 8))
     # Cells that were never evaluated count as full, and cells exactly at the threshold as empty.
-    assert torch.equal(grid.above(1.0).view(-1), ~known)
+    assert torch.equal(grid.above(1.0).view(-1), ~measured)
     assert grid.above(1 - 1e-6).all()
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerfcli import kernels
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.fit.open_cells import FINE_SIDE, LOOK_AROUND_EVERY, OCCUPANCY_SIDE, REFRESH_EVERY, OpenCells
-from nerfcli.fit.ranks import ALONE, Alone
+from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.kernels import March, Rays, numba_cpu, reference
 from nerfcli.render.model import Marching
 
@@ -46,7 +46,7 @@ def cells_of(field: Any, covered: Tensor | None = None) -> OpenCells:
     return OpenCells(field, CPU, covered=covered)
 
 
-def refresh(cells: OpenCells, step: int, ranks: Alone = ALONE) -> None:
+def refresh(cells: OpenCells, step: int, ranks: SingleProcess = ALONE) -> None:
     generator = torch.Generator().manual_seed(step)
     cells.refresh(step, fraction=1.0, detail=1.0, marching=MARCHING, generator=generator, ranks=ranks)
 
@@ -188,7 +188,7 @@ def test_cells_that_may_not_be_filled_stay_closed():
 
 
 def test_the_samples_of_every_rank_count():
-    class Two(Alone):
+    class Two(SingleProcess):
         def keep_largest(self, tensor: Tensor) -> None:
             tensor[0, 0, 0] = max(float(tensor[0, 0, 0]), 0.0)  # the other rank found this cell empty
 

@@ -13,7 +13,7 @@ from nerfcli.poses.engine.retrieval import alike, likeness, promising
 from nerfcli.poses.input.pairs import EXHAUSTIVE_UP_TO, Pairing, capture_order, choose_pairs, sequential_pairs
 from nerfcli.poses.input.pairs_file import read_pairs
 from nerfcli.poses.input.photos import Photo, Photos
-from nerfcli.poses.input.plan import Outlook, Plan, make_plan
+from nerfcli.poses.input.plan import Plan, TimeEstimate, make_plan
 from nerfcli.poses.input.settings import PoseSettings
 
 
@@ -181,12 +181,12 @@ def test_likeness_counts_the_features_that_two_photos_share():
 
 def test_look_alikes_are_the_neighbours_that_are_not_known():
     _, truth = shared_descriptors(30)
-    assert alike(truth, 2, known=()) == sorted(
+    assert alike(truth, 2, paired=()) == sorted(
         {(min(i, j), max(i, j)) for i in range(30) for j in np.argsort(-truth[i], kind="stable")[:2].tolist()}
     )
-    known = [(i, i + 1) for i in range(29)]
-    found = alike(truth, 2, known=known)
-    assert not set(found) & set(known)
+    paired = [(i, i + 1) for i in range(29)]
+    found = alike(truth, 2, paired=paired)
+    assert not set(found) & set(paired)
     assert {(i, i + 2) for i in range(28)} <= set(found)
 
 
@@ -243,7 +243,7 @@ def test_the_outlook_measures_and_stretches_what_is_to_come():
     """If the first stage takes twice its planned time, so will the rest, until a later stage proves faster."""
     seconds = {"extract": 10.0, "match": 30.0, "map": 10.0}
     now = 0.0
-    outlook = Outlook(Plan(10, 1600, 4096, "exhaustive", 45, seconds), clock=lambda: now)
+    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, seconds), clock=lambda: now)
     assert outlook.update("extract", 0, 10) == (0.0, 50.0)
     now = 10.0
     assert outlook.update("extract", 5, 10) == (pytest.approx(0.1), pytest.approx(90.0))
@@ -264,7 +264,7 @@ def test_a_stage_that_takes_long_does_not_stretch_the_others():
     """A stage planned for 1 s takes 20 s; the other 100 s are not predicted to become 2000 s."""
     now = 0.0
     seconds = {"extract": 50.0, "pair": 1.0, "match": 100.0}
-    outlook = Outlook(Plan(10, 1600, 4096, "sequential", 45, seconds), clock=lambda: now)
+    outlook = TimeEstimate(Plan(10, 1600, 4096, "sequential", 45, seconds), clock=lambda: now)
     outlook.update("extract", 0, 10)
     now = 50.0
     outlook.update("extract", 10, 10)
@@ -278,7 +278,7 @@ def test_a_stage_that_takes_long_does_not_stretch_the_others():
 def test_the_mapper_takes_longer_for_later_photos(seconds_per_photo: float):
     """Closed form: seconds grow as the number of photos to the power of 1.3, and the remaining time is exact."""
     now = 0.0
-    outlook = Outlook(Plan(300, 1600, 4096, "sequential", 9000, {"map": 100.0}), clock=lambda: now)
+    outlook = TimeEstimate(Plan(300, 1600, 4096, "sequential", 9000, {"map": 100.0}), clock=lambda: now)
     whole = seconds_per_photo * 300**1.3
     outlook.update("map", 0, 300)
     for done in range(30, 300, 30):
@@ -289,7 +289,7 @@ def test_the_mapper_takes_longer_for_later_photos(seconds_per_photo: float):
 def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_from_the_share():
     """Half of the photos are searched again, at three times the cost: 10 s of searching become 25 s."""
     now = 0.0
-    outlook = Outlook(
+    outlook = TimeEstimate(
         Plan(10, 1600, 4096, "exhaustive", 45, {"extract": 10.0, "match": 8.0, "map": 2.0}), clock=lambda: now
     )
     outlook.update("extract", 0, 10)
@@ -308,7 +308,7 @@ def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_fro
 def test_merging_and_locating_add_to_what_is_left_and_take_nothing_from_the_share():
     """Merging takes a fifth of the planned mapping time on a machine as fast as planned, and precedes the checks."""
     now = 0.0
-    outlook = Outlook(Plan(10, 1600, 4096, "exhaustive", 45, {"map": 100.0, "check": 20.0}), clock=lambda: now)
+    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, {"map": 100.0, "check": 20.0}), clock=lambda: now)
     outlook.update("map", 0, 10)
     now = 100.0
     assert outlook.update("map", 10, 10) == (pytest.approx(100.0 / 120.0), pytest.approx(20.0))
@@ -347,7 +347,7 @@ def test_what_is_left_is_right_within_a_half_from_a_quarter_on(
     stages = ("extract", "match", "map", "check")
     now = 0.0
     plan = Plan(50, 1600, 4096, "exhaustive", 1225, {s: float(p) for s, p in zip(stages, planned, strict=True)})
-    outlook = Outlook(plan, clock=lambda: now)
+    outlook = TimeEstimate(plan, clock=lambda: now)
     began, whole = 0.0, sum(taken)
     for stage, seconds in zip(stages, taken, strict=True):
         steps = 4 if stage == "check" else 50
@@ -364,7 +364,7 @@ def test_matching_is_planned_by_the_features_that_were_found():
     """Closed form: a quarter of the features that the plan counts on take a quarter of its time."""
     now = 0.0
     seconds = {"extract": 10.0, "match": 100.0, "map": 20.0}
-    outlook = Outlook(Plan(10, 1600, 4096, "exhaustive", 45, seconds, features=4000), clock=lambda: now)
+    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, seconds, features=4000), clock=lambda: now)
     outlook.update("extract", 0, 10)
     now = 10.0
     assert outlook.update("extract", 10, 10)[1] == pytest.approx(120.0)
@@ -374,7 +374,7 @@ def test_matching_is_planned_by_the_features_that_were_found():
 def test_another_attempt_is_measured_from_its_own_start():
     """The mapper took 100 s to get stuck at 60 of 100 photos, and starts anew from two photos, as it did then."""
     now = 0.0
-    outlook = Outlook(Plan(100, 1600, 4096, "exhaustive", 45, {"map": 120.0}), clock=lambda: now)
+    outlook = TimeEstimate(Plan(100, 1600, 4096, "exhaustive", 45, {"map": 120.0}), clock=lambda: now)
     outlook.update("map", 2, 100)
     now = 100.0
     outlook.update("map", 60, 100)
@@ -387,7 +387,7 @@ def test_another_attempt_lowers_the_share():
     """Mapping begins again after the checks: the work is not at its end."""
     now = 0.0
     seconds = {"extract": 10.0, "map": 10.0, "check": 2.0}
-    outlook = Outlook(Plan(10, 1600, 4096, "exhaustive", 45, seconds), clock=lambda: now)
+    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, seconds), clock=lambda: now)
     now = 20.0
     outlook.update("map", 10, 10)
     now = 22.0

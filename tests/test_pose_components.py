@@ -14,10 +14,10 @@ import synthetic_captures as synthetic
 from synthetic_captures import WIDE, Noise, View
 
 from nerfcli.poses.engine import chosen, second_chance
-from nerfcli.poses.engine.chosen import Chosen, choose_component
+from nerfcli.poses.engine.chosen import ChosenModel, choose_component
 from nerfcli.poses.engine.ladder import climb
-from nerfcli.poses.engine.mapped import Mapped
-from nerfcli.poses.engine.second_chance import Chance
+from nerfcli.poses.engine.mapped import MappedModels
+from nerfcli.poses.engine.second_chance import AlternativeMapping
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.examine import examine
 
@@ -27,7 +27,7 @@ SECOND = list(range(11, 20))
 
 
 @pytest.fixture(scope="module")
-def apart(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], Mapped]:
+def apart(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], MappedModels]:
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     folder = tmp_path_factory.mktemp("apart")
     ring = synthetic.ring
@@ -44,15 +44,15 @@ def apart(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], Mapped]
 
 
 @pytest.fixture
-def misled(apart: tuple[list[View], Mapped], tmp_path: Path) -> Mapped:
+def misled(apart: tuple[list[View], MappedModels], tmp_path: Path) -> MappedModels:
     _, right = apart
     shutil.copytree(right.job.database.parent, tmp_path / "again")
     job = replace(right.job, folder=str(tmp_path / "again" / "work"))
     wrong = [synthetic.bent(right.models[0], 8), synthetic.bent(right.models[1], 17)]
-    return Mapped(wrong, job, [{"what": "default thresholds", "models": [10, 9]}], seconds=1000.0)
+    return MappedModels(wrong, job, [{"what": "default thresholds", "models": [10, 9]}], seconds=1000.0)
 
 
-def choose(mapped: Mapped, component: int) -> tuple[Chosen, list[str]]:
+def choose(mapped: MappedModels, component: int) -> tuple[ChosenModel, list[str]]:
     notes: list[str] = []
     found = choose_component(mapped, lambda *progress: None, notes.append, component=component, checks=Checks)
     return found, notes
@@ -71,7 +71,10 @@ def worst_rotation_deg(model: pycolmap.Reconstruction, views: list[View]) -> flo
 
 @pytest.mark.parametrize("failing", [(), ("_regrown", "_all_at_once")])
 def test_a_smaller_component_gets_a_second_chance_of_its_own(
-    apart: tuple[list[View], Mapped], misled: Mapped, monkeypatch: pytest.MonkeyPatch, failing: tuple[str, ...]
+    apart: tuple[list[View], MappedModels],
+    misled: MappedModels,
+    monkeypatch: pytest.MonkeyPatch,
+    failing: tuple[str, ...],
 ):
     """Its three photos that were off by 40 degrees come out within 0.4 degrees; the largest, which is right, stays."""
     for name in failing:
@@ -89,13 +92,15 @@ def test_a_smaller_component_gets_a_second_chance_of_its_own(
     assert found.mapped.job == misled.job  # with all pairs of photos
 
 
-def test_a_model_is_not_grown_over_photos_that_match_none_of_its_own(apart: tuple[list[View], Mapped], misled: Mapped):
+def test_a_model_is_not_grown_over_photos_that_match_none_of_its_own(
+    apart: tuple[list[View], MappedModels], misled: MappedModels
+):
     found, notes = choose(replace(misled, models=apart[1].models), 1)
     assert [sorted(model.reg_image_ids()) for model in found.mapped.models] == [FIRST, SECOND]
     assert notes == []
 
 
-def test_components_keep_the_numbers_that_were_reported(misled: Mapped):
+def test_components_keep_the_numbers_that_were_reported(misled: MappedModels):
     listed, _ = choose(misled, 1)
     assert [sorted(model.reg_image_ids()) for model in listed.mapped.models] == [FIRST, SECOND]
     again, notes = choose(misled, 2)
@@ -106,7 +111,11 @@ def test_components_keep_the_numbers_that_were_reported(misled: Mapped):
 
 @pytest.mark.parametrize(("taken", "components"), [(16, [16]), (14, [14, 9])])
 def test_a_component_has_most_of_its_photos_for_itself(
-    apart: tuple[list[View], Mapped], misled: Mapped, monkeypatch: pytest.MonkeyPatch, taken: int, components: list[int]
+    apart: tuple[list[View], MappedModels],
+    misled: MappedModels,
+    monkeypatch: pytest.MonkeyPatch,
+    taken: int,
+    components: list[int],
 ):
     """The second chance of the largest component takes in six or four of the other's nine photos."""
     views, right = apart
@@ -115,8 +124,8 @@ def test_a_component_has_most_of_its_photos_for_itself(
         grown.deregister_frame(grown.image(image_id).frame_id)
     accepted = examine(right.models[:1], right.job, lambda *progress: None)
 
-    def chance(mapped: Mapped, *arguments: object, **options: object) -> Chance:
-        return Chance(replace(mapped, models=[grown]), accepted)
+    def chance(mapped: MappedModels, *arguments: object, **options: object) -> AlternativeMapping:
+        return AlternativeMapping(replace(mapped, models=[grown]), accepted)
 
     monkeypatch.setattr(chosen, "second_chance", chance)
     found, _ = choose(misled, 1)

@@ -131,9 +131,9 @@ def test_only_a_photo_that_resembles_a_placed_one_is_tried_again(tmp_path: Path,
     tried: list[int] = []
     votes = localising.votes
 
-    def counted(photo: PhotoFeatures, known: KnownPoints) -> tuple[np.ndarray, np.ndarray]:
+    def counted(photo: PhotoFeatures, model_points: KnownPoints) -> tuple[np.ndarray, np.ndarray]:
         tried.append(photo.image_id)
-        return votes(photo, known)
+        return votes(photo, model_points)
 
     monkeypatch.setattr(localising, "votes", counted)
     _, attempts = localise(model, job, image_ids=[LAST, LAST + 1, LAST + 2])

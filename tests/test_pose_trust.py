@@ -23,14 +23,14 @@ from nerfcli.poses.engine.chosen import choose_component
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.engine.features import match
 from nerfcli.poses.engine.ladder import climb
-from nerfcli.poses.engine.mapped import Mapped
+from nerfcli.poses.engine.mapped import MappedModels
 from nerfcli.poses.engine.mapping import MapperOptions, map_photos
 from nerfcli.poses.engine.second_chance import grow, is_contradicted, second_chance
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge.acceptance import Failure, Verdict, judge
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
-from nerfcli.poses.judge.examine import Examined, examine
+from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model import merging
 from nerfcli.poses.model.intrinsics import converted
@@ -50,8 +50,8 @@ def _quiet() -> None:
 class Solved:
     views: Sequence[View]
     job: Job
-    climbed: Mapped
-    examined: Examined
+    climbed: MappedModels
+    examined: ExaminedModel
 
     @property
     def model(self) -> pycolmap.Reconstruction:
@@ -129,11 +129,11 @@ def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
     assert "verified matches between" in verdict.failures[0].evidence
 
 
-def wrongly_mapped(solved: Solved, folder: Path) -> Mapped:
+def wrongly_mapped(solved: Solved, folder: Path) -> MappedModels:
     """The whole capture with photos 8, 9 and 10 in a wrong place, as a misled mapper leaves it."""
     shutil.copytree(solved.job.database.parent, folder)
     job = replace(solved.job, folder=str(folder / "work"))
-    return Mapped(
+    return MappedModels(
         [synthetic.bent(solved.model, 8)], job, [{"what": "default thresholds", "models": [10]}], seconds=1000.0
     )
 
@@ -168,12 +168,12 @@ def without(model: pycolmap.Reconstruction, photos: range) -> pycolmap.Reconstru
     return rest
 
 
-def in_two_parts(solved: Solved, tmp_path: Path) -> Mapped:
+def in_two_parts(solved: Solved, tmp_path: Path) -> MappedModels:
     """Return a right model in two parts, of seven and four photos, in a folder of its own."""
     shutil.copytree(solved.job.database.parent, tmp_path / "again")
     parts = [without(solved.model, range(8, 11)), without(solved.model, range(1, 7))]
     job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
-    return Mapped(parts, job, [{"what": "default thresholds", "models": [7, 4]}], seconds=1000.0)
+    return MappedModels(parts, job, [{"what": "default thresholds", "models": [7, 4]}], seconds=1000.0)
 
 
 def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(solved: Solved, tmp_path: Path):

@@ -85,17 +85,17 @@ def test_the_plan_names_the_files_that_are_skipped(tmp_path: Path):
 
 @pytest.mark.parametrize("command", ["poses", "run"])
 def test_the_quality_goes_to_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str):
-    asked: list[tuple[int, int]] = []
+    calls: list[tuple[int, int]] = []
 
     def estimate(folder: Path, scene: Path, settings: PoseSettings, **more: object) -> None:
-        asked.append((settings.max_image_size, settings.max_features))
+        calls.append((settings.max_image_size, settings.max_features))
         raise UserError("enough", "that was all")
 
     monkeypatch.setattr(poses_workflow, "estimate_poses", estimate)
     photos = write_photos(tmp_path / "photos", 5)
     for quality in ("fast", "best"):
         assert nerfcli(command, photos, "--quality", quality).exit_code == BAD_INPUT
-    assert asked == [QUALITIES["fast"], QUALITIES["best"]]
+    assert calls == [QUALITIES["fast"], QUALITIES["best"]]
     assert nerfcli(command, photos, "--quality", "superb").exit_code == USAGE
 
 

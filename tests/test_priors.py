@@ -19,7 +19,7 @@ from nerfcli.fit.losses import opacity_entropy
 from nerfcli.fit.point_depth import PointRays, fading, point_depths
 from nerfcli.kernels import reference
 from nerfcli.multiview.camera_check import CameraCheck
-from nerfcli.multiview.correspondences import Shared
+from nerfcli.multiview.correspondences import SharedFeatures
 from nerfcli.multiview.tracks import Tracks, tracks_of_model
 from nerfcli.multiview.training_matches import chosen_pairs
 from nerfcli.multiview.triangulation import triangulate
@@ -83,28 +83,28 @@ def tracks_in(scene: Scene) -> Tracks:
 def test_points_are_found_at_their_pixels_with_their_distances_and_trust(capture):
     similarity = Similarity(0.5, np.eye(3), np.array([1.0, 2.0, 3.0]))
     pool = pool_of(capture, "empty", similarity=similarity)
-    known = point_depths(tracks_in(capture), pool, similarity)
-    rays = pool.rays_of(known.numbers)
-    reached = rays.origins + rays.directions * known.distances[:, None]
+    of_points = point_depths(tracks_in(capture), pool, similarity)
+    rays = pool.rays_of(of_points.numbers)
+    reached = rays.origins + rays.directions * of_points.distances[:, None]
     expected = torch.from_numpy(similarity.apply(np.concatenate([POINTS, POINTS]))).float()
     # A ray goes through the middle of its pixel: half a pixel's diagonal off at most, at these distances.
-    off = (reached - expected).norm(dim=-1) / known.distances
+    off = (reached - expected).norm(dim=-1) / of_points.distances
     assert (off[[1, 2, 4, 5]] <= math.sqrt(0.5) / 12 + 1e-6).all()
     # The rays to the first point are e = 0.5 px apart in height where they meet at the angle a: the point nearest to
     # both is at a^2 / (a^2 + e^2) of the way.
     fraction = (0.2 / 3) ** 2 / ((0.2 / 3) ** 2 + (0.5 / 12) ** 2)
-    assert known.distances[[0, 3]].tolist() == pytest.approx([0.5 * 3 * fraction] * 2, rel=0.01)
-    assert pool.photo_of(known.numbers).tolist() == [0, 0, 0, 1, 1, 1]
+    assert of_points.distances[[0, 3]].tolist() == pytest.approx([0.5 * 3 * fraction] * 2, rel=0.01)
+    assert pool.photo_of(of_points.numbers).tolist() == [0, 0, 0, 1, 1, 1]
     misses = triangulate(pool.frames, tracks_in(capture)).misses_px
     assert misses[[0, 3]].min() > 0.2
-    assert known.trust.tolist() == pytest.approx((1 / (1 + misses**2)).tolist(), abs=1e-6)
+    assert of_points.trust.tolist() == pytest.approx((1 / (1 + misses**2)).tolist(), abs=1e-6)
 
 
 def test_points_behind_a_mask_are_not_looked_at(capture):
     one = Similarity(1.0, np.eye(3), np.zeros(3))
     pool = pool_of(capture, "ignore", similarity=one)
-    known = point_depths(tracks_in(capture), pool, one)
-    columns = [pool.place(number)[1] for number in known.numbers.tolist()]
+    of_points = point_depths(tracks_in(capture), pool, one)
+    columns = [pool.place(number)[1] for number in of_points.numbers.tolist()]
     assert len(columns) == 3
     assert min(columns) >= 6
 
@@ -163,13 +163,13 @@ def test_the_gradient_of_light_off_its_target_is_right():
 def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
     one = Similarity(1.0, np.eye(3), np.zeros(3))
     pool = pool_of(capture, "empty", similarity=one)
-    known = point_depths(tracks_in(capture), pool, one)
+    of_points = point_depths(tracks_in(capture), pool, one)
     generator = torch.Generator().manual_seed(0)
-    both = PointRays([known], pool).added_to(pool.draw(80, generator), generator)
+    both = PointRays([of_points], pool).added_to(pool.draw(80, generator), generator)
     assert (len(both.numbers), len(both.distances), len(both.trust)) == (90, 10, 10)
-    of_pixel = dict(zip(known.numbers.tolist(), known.distances.tolist(), strict=True))
+    of_pixel = dict(zip(of_points.numbers.tolist(), of_points.distances.tolist(), strict=True))
     assert both.distances.tolist() == [of_pixel[number] for number in both.numbers[-10:].tolist()]
-    assert len(PointRays([known], pool).added_to(pool.draw(3, generator), generator).distances) == 1
+    assert len(PointRays([of_points], pool).added_to(pool.draw(3, generator), generator).distances) == 1
 
 
 def test_points_fade_out():
@@ -242,7 +242,7 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
     """With requested components and no search; refining poses alone leaves lenses as they are."""
     check = CameraCheck(-0.019, 0.0006, (0.26, 0.14), 900)
     facts = Facts("hash", has_alpha=False, has_exif=False, cameras=check, fixed=("cameras",))
-    monkeypatch.setattr("nerfcli.train.preparation._facts", lambda *asked, **known: facts)
+    monkeypatch.setattr("nerfcli.train.preparation._facts", lambda *positional, **of_points: facts)
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(cameras=cameras), model="default")
     reported: list[str] = []
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=reported.append)
@@ -259,7 +259,7 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
 def test_comparing_photos_has_a_price_once(spheres):
     """0.7 us for each pixel of the compared photos, divided by two threads; 0 once it is done."""
     photos = load_photos(spheres.train_frames, factor=4, threads=1)
-    shared = Shared(spheres, photos, threads=2)
+    shared = SharedFeatures(spheres, photos, threads=2)
     wanted = {index for pair in chosen_pairs(photos) for index in pair}
     pixels = sum(photos[index].pixels.shape[0] * photos[index].pixels.shape[1] for index in wanted)
     assert shared.matching_seconds == pytest.approx(0.7e-6 * pixels / 2)

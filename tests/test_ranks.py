@@ -19,8 +19,8 @@ from commands import error_of, nerfcli
 
 from nerfcli.errors import LOST_RANK, TERMINATED
 from nerfcli.field.checkpoint import load_tensors
-from nerfcli.fit.ranks import Alone
-from nerfcli.photos.pool import Drawn
+from nerfcli.fit.ranks import SingleProcess
+from nerfcli.photos.pool import PixelBatch
 from nerfcli.runs.components import Components, choose
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
@@ -219,16 +219,16 @@ def test_torchrun_trains_by_time_with_selected_components_and_reports_once(tmp_p
 def test_every_pixel_of_a_step_is_one_rank_s_and_points_stay_last(count):
     numbers, points = torch.arange(23), 5
     origins, directions, colours = torch.rand(3, 23, 3)
-    known = numbers[-points:]
-    whole = Drawn(origins, directions, colours, numbers, known / 10, known / 20, torch.rand(23))
+    point_pixels = numbers[-points:]
+    whole = PixelBatch(origins, directions, colours, numbers, point_pixels / 10, point_pixels / 20, torch.rand(23))
     parts = [whole.every(rank, count) for rank in range(count)]
     assert sorted(torch.cat([part.numbers for part in parts]).tolist()) == list(range(23))
     for part in parts:
         assert torch.equal(part.colours, whole.colours[part.numbers])
         assert torch.equal(part.weights, whole.weights[part.numbers])
-        known = part.numbers[len(part.numbers) - len(part.distances) :]
-        assert torch.equal(part.distances, known / 10)
-        assert torch.equal(part.trust, known / 20)
+        point_pixels = part.numbers[len(part.numbers) - len(part.distances) :]
+        assert torch.equal(part.distances, point_pixels / 10)
+        assert torch.equal(part.trust, point_pixels / 20)
     assert sum(len(part.distances) for part in parts) == points
 
 
@@ -242,7 +242,7 @@ def test_rows_of_tables_follow_the_threads_of_all_ranks(spheres, tmp_path, monke
         raise PreparedError(settings.log2_rows)
 
     monkeypatch.setattr(loop, "prepare", prepared)
-    monkeypatch.setattr(Alone, "count", count)
+    monkeypatch.setattr(SingleProcess, "count", count)
     by_steps = replace(SMALL, log2_rows=None)
     for settings, expected in ((TrainSettings(budget_seconds=26.0), rows), (by_steps, 16)):
         with pytest.raises(PreparedError) as found:

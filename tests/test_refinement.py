@@ -355,23 +355,23 @@ NO_RAYS = (
 
 def steps_of(monkeypatch: pytest.MonkeyPatch, twist: float) -> list[dict[str, float]]:
     """Replace Newton steps by a constant twist of the poses, and return the list that records their settings."""
-    asked: list[dict[str, float]] = []
+    calls: list[dict[str, float]] = []
 
     def change(self: NewtonSteps, slope: torch.Tensor, so_far: torch.Tensor, **settings: float) -> torch.Tensor:
-        asked.append(settings)
+        calls.append(settings)
         return torch.tensor([[twist, 0, 0, 0, -twist, 0], [0, twist, 0, 0, 0, twist]], dtype=torch.float64).repeat(2, 1)
 
     monkeypatch.setattr(NewtonSteps, "change", change)
-    return asked
+    return calls
 
 
 def test_poses_are_damped_less_and_less_and_held_once_it_is_known_what_was_wrong(monkeypatch):
-    asked = steps_of(monkeypatch, 1e-9)
+    calls = steps_of(monkeypatch, 1e-9)
     refinement = PoseRefinement(random_poses(np.random.default_rng(0), 4), [Camera.pinhole(40, 30, 40.0)] * 4)
     fractions = (0.11, 0.2, 0.21, 0.35, 0.5, 0.8, 0.97)
     for fraction in fractions:
         refinement.step(*NO_RAYS, fraction, rate=1.0)
-    damping, holding = ([one[name] for one in asked] for name in ("damping", "holding"))
+    damping, holding = ([one[name] for one in calls] for name in ("damping", "holding"))
     assert damping[:2] == pytest.approx([1.0, 1.0])
     assert damping[-2:] == pytest.approx([0.1, 0.1])
     assert damping == sorted(damping, reverse=True)

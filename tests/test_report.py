@@ -24,7 +24,7 @@ from nerfcli.render.visibility import depth_maps
 from nerfcli.report.drawings import Curve, curves, from_above
 from nerfcli.report.page import page_html
 from nerfcli.report.run_facts import RunFacts, captures_of, labels_of, mismatches_of, warnings_of
-from nerfcli.report.views import ERROR_RANGE, Seen, common_names, depth_range, error_map, spread_evenly
+from nerfcli.report.views import ERROR_RANGE, HeldOutRenderings, common_names, depth_range, error_map, spread_evenly
 from nerfcli.report.views import look_at as look_through
 from nerfcli.runs.components import Components
 from nerfcli.runs.config import RunConfig
@@ -77,7 +77,7 @@ def facts(label: str = "a run", **changes: Any) -> RunFacts:
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[list[Seen], np.ndarray]:
+def seen() -> tuple[list[HeldOutRenderings], np.ndarray]:
     """Return views of a cube of fog from the poses of held-out grey photos, and the photo."""
     cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     model = fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
@@ -164,7 +164,7 @@ def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
     assert all(layer["uri"].startswith("data:image/jpeg;base64,") for view in layers for layer in view)
 
 
-def two_captures(seen: tuple[list[Seen], np.ndarray]) -> str:
+def two_captures(seen: tuple[list[HeldOutRenderings], np.ndarray]) -> str:
     """A page about two runs of one capture and one of another, whose photo has the same name."""
     look, _ = seen
 

@@ -64,8 +64,8 @@ def test_a_capture_is_scaled_to_metres():
 
 def test_distances_by_hand():
     """1, 2 and 4 units for 2, 4.04 and 8 m: the mean of the logarithms gives 2 * 1.01^(1/3)."""
-    known = [KnownDistance("a", 1.0, 2.0), KnownDistance("b", 2.0, 4.04), KnownDistance("c", 4.0, 8.0)]
-    estimate = scale_from_distances(known)
+    measured = [KnownDistance("a", 1.0, 2.0), KnownDistance("b", 2.0, 4.04), KnownDistance("c", 4.0, 8.0)]
+    estimate = scale_from_distances(measured)
     scale = 2 * 1.01 ** (1 / 3)
     assert estimate.metres_per_unit == pytest.approx(scale, rel=1e-14)
     scatter = np.std(np.log([2, 2.02, 2]), ddof=1) / np.sqrt(3)
@@ -73,7 +73,7 @@ def test_distances_by_hand():
     expected = [100 * (scale / 2 - 1), 100 * (scale / 2.02 - 1), 100 * (scale / 2 - 1)]
     assert [name for name, _ in estimate.residuals] == ["a", "b", "c"]
     np.testing.assert_allclose([value for _, value in estimate.residuals], expected, rtol=1e-10)
-    single = scale_from_distances(known[:1])
+    single = scale_from_distances(measured[:1])
     assert (single.metres_per_unit, single.standard_error, single.source) == (2.0, None, "1 known distance")
 
 

@@ -10,7 +10,7 @@ from scan_files import WRITERS, Written, naf, nikon, stack
 
 from nerfcli.tomography.circle import Circle, circle_from_json, circle_of, differences
 from nerfcli.tomography.formats.assemble import axis_column
-from nerfcli.tomography.formats.given import Given
+from nerfcli.tomography.formats.given import ScanOptions
 from nerfcli.tomography.formats.read import read_scan, recognise
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.scan import load_scan
@@ -92,7 +92,9 @@ def test_the_true_volume_is_found_in_its_unit(form: str, per_value: float | None
 def test_options_say_more_than_the_file(tmp_path: Path) -> None:
     written = stack(tmp_path)
     plain = read_scan(written.path)
-    scan = read_scan(written.path, Given(photons=4e4, unit="mm", centre_column=3.25, holdout="every:4", mirrored=True))
+    scan = read_scan(
+        written.path, ScanOptions(photons=4e4, unit="mm", centre_column=3.25, holdout="every:4", mirrored=True)
+    )
     assert axis_column(plain.geometry) == pytest.approx(5.5)
     assert axis_column(scan.geometry) == pytest.approx(3.25)
     assert scan.photons_per_value == pytest.approx(4e4 / 50000)

@@ -213,7 +213,7 @@ class Scripted:
 
     def __init__(self, gain: Callable[[Components], float], *, spread: float = 0.1, far: float = 0.05):
         self.gain, self.spread, self.far = gain, spread, far
-        self.asked: list[tuple[Components, int, int]] = []
+        self.requested: list[tuple[Components, int, int]] = []
         self.begun: list[Components] = []
         self.from_psnr: set[float] = set()
 
@@ -228,7 +228,7 @@ class Scripted:
         )
 
     def go_on(self, start: TrialStart, components: Components, *, seed: int, steps: int) -> Trial:
-        self.asked.append((components, seed, steps))
+        self.requested.append((components, seed, steps))
         self.from_psnr.add(start.trial.psnr)
         return trial(20.0 + seed + self.gain(components))
 
@@ -247,8 +247,8 @@ def test_what_gains_is_in_the_model_what_does_not_is_not_and_seeds_are_paired():
         "background": True,
         "cameras": False,
     }
-    assert {seed for _, seed, _ in scripted.asked} == {0, 1}
-    assert {steps for _, _, steps in scripted.asked} == {125}  # half of the longest start
+    assert {seed for _, seed, _ in scripted.requested} == {0, 1}
+    assert {steps for _, _, steps in scripted.requested} == {125}  # half of the longest start
     assert Selection.from_json(chosen.to_json(), wanted=Components()).decisions == chosen.decisions
 
 
@@ -262,7 +262,7 @@ def test_points_that_photos_share_are_in_the_model_from_the_start_unless_they_lo
     chosen = chosen_by(scripted, facts=POINTED)
     assert [model.points for model in scripted.begun] == [0.1, 0.0]
     assert chosen.components.points == (0.1 if kept else 0.0)
-    assert {model.points for model, _, _ in scripted.asked} == {chosen.components.points}
+    assert {model.points for model, _, _ in scripted.requested} == {chosen.components.points}
     assert list(scripted.from_psnr) == pytest.approx([20.0 + (gain if kept else 0.0)])
     (decision,) = (decision for decision in chosen.decisions if decision.component == "points")
     assert (decision.kept, decision.gain_db) == (kept, pytest.approx(reported(gain), abs=1e-9))
@@ -273,7 +273,7 @@ def test_points_are_taken_untried_where_there_is_no_time_for_a_start():
     chosen = chosen_by(scripted, steps=100, facts=POINTED)
     assert chosen.components == Components(points=0.1)
     assert [d.in_words() for d in chosen.decisions] == ["points=0.1: kept, 7 pixels see a 3D point at a known distance"]
-    assert scripted.asked == []
+    assert scripted.requested == []
 
 
 @pytest.mark.parametrize("facts", [replace(POINTED, fixed=("points",)), replace(POINTED, has_alpha=True), FITTED])
@@ -344,7 +344,7 @@ def test_what_there_was_no_time_for_stays_as_it_is():
     """A fifth of the steps is for the start, a tenth for each of eight trials: none is left for view."""
     scripted = Scripted(lambda c: 0.6 * (c.exposure == "learned") + 0.4 * (c.background == "sphere"))
     chosen = chosen_by(scripted, steps=1000)
-    assert len(scripted.asked) <= 8
+    assert len(scripted.requested) <= 8
     assert chosen.components == Components(exposure="learned", background="sphere")
     assert {d.component: d.why for d in chosen.decisions}["view"] == NO_TIME
 
@@ -352,7 +352,7 @@ def test_what_there_was_no_time_for_stays_as_it_is():
 def test_too_few_steps_are_not_spent():
     scripted = Scripted(lambda c: 1.0)
     chosen = chosen_by(scripted, steps=100)
-    assert (chosen.components, chosen.decisions, scripted.asked) == (Components(), (), [])
+    assert (chosen.components, chosen.decisions, scripted.requested) == (Components(), (), [])
 
 
 def test_short_trainings_are_not_searched_for():
@@ -408,11 +408,11 @@ def test_a_focal_length_that_matched_features_are_sure_of_is_taken(check, kept):
     assert reported in decision.in_words()
     assert with_known_cameras(Components(), replace(facts, fixed=("cameras",))) == (Components(), 0.0, [])
     assert with_known_cameras(Components(), FITTED) == (Components(), 0.0, [])
-    for asked in (Components(cameras="focal"), Components(cameras="all")):
-        components, log_focal, decisions = with_known_cameras(asked, replace(facts, fixed=("cameras",)))
-        assert components == asked  # the request is kept, and starts where features say
+    for requested in (Components(cameras="focal"), Components(cameras="all")):
+        components, log_focal, decisions = with_known_cameras(requested, replace(facts, fixed=("cameras",)))
+        assert components == requested  # the request is kept, and starts where features say
         assert log_focal == (check.log_focal if kept else 0.0)
-        assert [one.in_words().startswith(f"cameras={asked.cameras}: kept, ") for one in decisions] == [True] * kept
+        assert [one.in_words().startswith(f"cameras={requested.cameras}: kept, ") for one in decisions] == [True] * kept
 
 
 @pytest.mark.parametrize("error", [0.007, math.inf])
@@ -435,7 +435,7 @@ def test_poses_that_are_decided_on_learn_in_no_trial():
     facts = replace(FITTED, cameras_known=None, cameras=CameraCheck(0.0, math.inf, (2.3, 2.3), 900))
     chosen = select(scripted, Components(cameras="poses"), facts, seconds=None, steps=4000)  # type: ignore[arg-type]
     assert chosen.components == Components(cameras="poses", exposure="learned", view=0)
-    assert {model.cameras for model in (*scripted.begun, *(model for model, _, _ in scripted.asked))} == {"fixed"}
+    assert {model.cameras for model in (*scripted.begun, *(model for model, _, _ in scripted.requested))} == {"fixed"}
 
 
 def test_what_is_clear_is_not_tried_again_and_what_is_surely_missed_neither():
@@ -443,7 +443,7 @@ def test_what_is_clear_is_not_tried_again_and_what_is_surely_missed_neither():
     scripted = Scripted(lambda c: 2.0 * (c.background == "sphere") - 0.5 * (c.view == 0), spread=0.0)
     chosen = chosen_by(scripted)
     assert chosen.components == Components(background="sphere")
-    assert [seed for _, seed, _ in scripted.asked] == [0, 0, 0]
+    assert [seed for _, seed, _ in scripted.requested] == [0, 0, 0]
 
 
 def test_what_gains_once_is_not_kept_where_no_time_is_left_to_try_it_again():
@@ -452,7 +452,7 @@ def test_what_gains_once_is_not_kept_where_no_time_is_left_to_try_it_again():
     facts = replace(FITTED, has_exif=True, cameras_known=None)
     scripted = Scripted(lambda c: 0.35 * (c.exposure == "exif") + 0.3 * (c.cameras == "poses"))
     chosen = chosen_by(scripted, steps=1000, facts=facts)
-    assert len(scripted.asked) == 8
+    assert len(scripted.requested) == 8
     assert chosen.components == Components(exposure="exif")
     assert {d.value: d.why for d in chosen.decisions if d.component == "cameras"}["poses"] == ONCE
     assert {d.component: d.why for d in chosen.decisions}["view"] == NO_TIME
@@ -464,7 +464,7 @@ def test_what_gains_once_is_tried_again_before_there_is_no_time_for_that():
     facts = replace(POINTED, has_exif=True, cameras_known=None)
     scripted = Scripted(lambda c: 0.35 * (c.exposure == "exif") + 0.5 * (c.background == "sphere"))
     chosen = chosen_by(scripted, steps=1000, facts=facts)
-    assert len(scripted.asked) == 6
+    assert len(scripted.requested) == 6
     assert chosen.components == Components(points=0.1, exposure="exif")
     assert {d.component: d.why for d in chosen.decisions}["background"] == NO_TIME
 
@@ -475,7 +475,7 @@ def test_exposures_that_signs_speak_for_are_clear_with_one_seed(spread, seeds):
     scripted = Scripted(lambda c: 0.4 * (c.exposure == "learned"), spread=spread, far=0.0)
     chosen = chosen_by(scripted, facts=replace(FITTED, fixed=("view",)))
     assert chosen.components == Components(exposure="learned")
-    assert len(scripted.asked) == 2 * seeds
+    assert len(scripted.requested) == 2 * seeds
 
 
 @pytest.mark.parametrize(("steps", "tried"), [(4000, True), (2000, False)])
@@ -484,7 +484,7 @@ def test_leaving_something_out_is_tried_where_that_costs_little(steps, tried):
     scripted = Scripted(lambda c: 0.0, spread=0.0, far=0.0)
     chosen = chosen_by(scripted, steps=steps)
     assert chosen.components.view == (0 if tried else 3)
-    assert bool(scripted.asked) is tried
+    assert bool(scripted.requested) is tried
     (view,) = (decision for decision in chosen.decisions if decision.component == "view")
     assert (view.why == COSTS_MORE) is not tried
 
@@ -492,7 +492,7 @@ def test_leaving_something_out_is_tried_where_that_costs_little(steps, tried):
 def test_a_long_search_does_not_make_a_long_start():
     scripted = Scripted(lambda c: 0.0)
     chosen_by(scripted, steps=100_000)
-    assert {steps for _, _, steps in scripted.asked} == {MOST_START_STEPS // 2}
+    assert {steps for _, _, steps in scripted.requested} == {MOST_START_STEPS // 2}
 
 
 def test_of_values_that_gain_as_much_the_plainest_is_kept():

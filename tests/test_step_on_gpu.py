@@ -141,10 +141,10 @@ def test_a_step_waits_once_for_the_device(components, most, waits, spheres: Scen
     opaque = [photo.__class__(photo.frame, photo.pixels[..., :3].copy(), photo.used) for photo in photos]
     pool = PixelPool(opaque, Similarity(1.0, np.eye(3), np.zeros(3)), GPU)
     settings = TrainSettings(budget_seconds=None, steps=40, components=components, device="cuda", samples_per_step=2**9)
-    known = [PointDepths(*(torch.zeros(9, device=GPU).to(t) for t in (torch.int64, torch.float32, torch.float32)))]
+    depths = [PointDepths(*(torch.zeros(9, device=GPU).to(t) for t in (torch.int64, torch.float32, torch.float32)))]
     fitting = Fitting(
         pool, Marching(0.1, 4.0, 0.05, 0.0), contraction="l2", settings=settings,
-        points=PointRays(known, pool) if components.points else None,
+        points=PointRays(depths, pool) if components.points else None,
         error_map=ErrorMap(pool) if components.pixels == "error" else None,
     )  # fmt: skip
     fitting.field.backend = TritonBackend(GPU)

@@ -144,12 +144,14 @@ def test_depths_are_pixels_of_the_pool_in_its_frame():
     photos = [photo(x) for x in OFFSETS]
     pool = PixelPool(photos, similarity, torch.device("cpu"))
     depths = found(photos)
-    known = stereo_depths(depths, pool, similarity)
-    rays = pool.rays_of(known.numbers)
-    points = similarity.inverse().apply((rays.origins + rays.directions * known.distances[:, None]).double().numpy())
+    of_stereo = stereo_depths(depths, pool, similarity)
+    rays = pool.rays_of(of_stereo.numbers)
+    points = similarity.inverse().apply(
+        (rays.origins + rays.directions * of_stereo.distances[:, None]).double().numpy()
+    )
     assert np.median(np.abs((points @ NORMALS.T).max(-1) - 3.0)) < 0.02
     errors = np.concatenate([depth.errors for depth in depths])
-    assert known.trust.numpy() == pytest.approx(1 / (1 + (errors / 0.05) ** 2), rel=1e-5)
+    assert of_stereo.trust.numpy() == pytest.approx(1 / (1 + (errors / 0.05) ** 2), rel=1e-5)
 
 
 def test_pictures_are_as_large_as_there_is_time_for():

@@ -28,7 +28,7 @@ from nerfcli.surface import extent
 from nerfcli.surface.colmap_dense import read_map, write_map, write_photo, write_sparse, write_stereo
 from nerfcli.surface.colours import point_colours, surface_colours
 from nerfcli.surface.extent import scene_box
-from nerfcli.surface.fusion import Fused, fuse
+from nerfcli.surface.fusion import FusedVolume, fuse
 from nerfcli.surface.grid import Grid
 from nerfcli.surface.marching import mesh_of, surface_of, without_small_pieces
 from nerfcli.surface.points import agreed_points
@@ -77,7 +77,7 @@ def ball_views() -> list[DepthView]:
 
 
 @pytest.fixture(scope="module")
-def fused(ball_views) -> Fused:
+def fused(ball_views) -> FusedVolume:
     low, high = CENTRE - 0.7, CENTRE + 0.7
     return fuse(ball_views, Grid.over((*low, *high), 0.025))
 

@@ -24,14 +24,14 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.run_cameras import read_cameras, write_cameras
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity, apply, rotation_from_quaternion
-from nerfcli.convert.formats import Given, recognise
+from nerfcli.convert.formats import UserInputs, recognise
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model, over_white
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image, write_png
 from nerfcli.photos.loading import load_photos
-from nerfcli.photos.pool import Drawn, PixelPool
+from nerfcli.photos.pool import PixelBatch, PixelPool
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import DepthRequest, render_picture
 from nerfcli.runs.components import Components
@@ -106,11 +106,11 @@ def test_photos_of_a_desk_are_learned_too(with_points, tmp_path):
     # Photos without alpha, of an unbounded scene, with the cameras that rendered them, and points as structure from
     # motion would give them, from the true depth of the held-out views.
     desk = SPHERES.with_name("desk")
-    known = json.loads((desk / "truth" / "cameras.json").read_text())
-    camera = Camera.from_json(known["camera"])
+    recorded = json.loads((desk / "truth" / "cameras.json").read_text())
+    camera = Camera.from_json(recorded["camera"])
     frames = tuple(
         Frame(view["name"], camera, np.array(view["world_from_cam"]), desk / "images" / view["name"])
-        for view in known["images"]
+        for view in recorded["images"]
     )
     names = scenes.default_split(frame.name for frame in frames)
     points = []
@@ -365,7 +365,7 @@ def test_ctrl_c_waits_for_the_end_of_the_step(views, tmp_path, monkeypatch):
     draw = PixelPool.draw
     calls = 0
 
-    def interrupt(self: PixelPool, count: int, generator: torch.Generator) -> Drawn:
+    def interrupt(self: PixelPool, count: int, generator: torch.Generator) -> PixelBatch:
         nonlocal calls
         calls += 1
         if calls == 5:  # in the middle of the fifth step
@@ -539,7 +539,7 @@ def as_convert_reads(run: Path) -> Capture:
     """Read the cameras of a run as `nerfcli convert` does."""
     form, found = recognise(run)
     assert form.parse is not None
-    return form.parse(found, Given())
+    return form.parse(found, UserInputs())
 
 
 def says_the_same(text: str, other: str) -> bool:

@@ -27,7 +27,7 @@ from nerfcli.media.images import downscale, write_png
 from nerfcli.memory import default_memory_limit, resident_bytes
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
 from nerfcli.photos.pool import Album, PixelPool, load_album
-from nerfcli.photos.storage import IN_MEMORY, InFiles, Needs, PhotoStorage, check_device_memory, storage_for
+from nerfcli.photos.storage import IN_MEMORY, InFiles, MemoryNeeds, PhotoStorage, check_device_memory, storage_for
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train import preparation
@@ -413,7 +413,7 @@ def test_pages_are_given_back_beyond_the_limit(tmp_path):
 
 
 def test_what_does_not_fit_is_refused_up_front(tmp_path):
-    needs = Needs(photos=3 * 10**9, step=10**9, rest=10**9)
+    needs = MemoryNeeds(photos=3 * 10**9, step=10**9, rest=10**9)
     assert storage_for(needs, None, folder=tmp_path)[0] is IN_MEMORY
     assert storage_for(needs, 4 * 10**9, folder=tmp_path)[0] is IN_MEMORY
     room, reported = storage_for(needs, 2 * 10**9, folder=tmp_path)
@@ -427,7 +427,7 @@ def test_what_does_not_fit_is_refused_up_front(tmp_path):
 
 
 def test_a_gpu_without_room_is_refused_up_front(monkeypatch):
-    needs = Needs(photos=3 * 10**9, step=10**9, rest=9 * 10**9)  # decoding is on the host and does not count
+    needs = MemoryNeeds(photos=3 * 10**9, step=10**9, rest=9 * 10**9)  # decoding is on the host and does not count
     device = torch.device("cuda:1")
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (4 * 10**9, 8 * 10**9))
     assert check_device_memory(needs, device, None) == "memory on cuda:1: about 4.00 GB of 4.00 GB that are free"
@@ -440,19 +440,19 @@ def test_a_gpu_without_room_is_refused_up_front(monkeypatch):
 
 def test_a_limit_of_memory_is_that_of_the_gpu(monkeypatch, tmp_path):
     """The limit is passed to torch; the host's memory then has its default limit."""
-    needs, device = Needs(photos=3 * 10**9, step=10**9, rest=0), torch.device("cuda:1")
+    needs, device = MemoryNeeds(photos=3 * 10**9, step=10**9, rest=0), torch.device("cuda:1")
     kept: list[tuple[float, torch.device]] = []
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (6 * 10**9, 10 * 10**9))
     monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda *given: kept.append(given))
     with pytest.raises(UserError, match=r"4\.00 GB of memory on cuda:1, where the limit is 3\.90 GB"):
         check_device_memory(needs, device, 39 * 10**8)
     with pytest.raises(UserError, match=r"8\.00 GB of memory on cuda:1, where 6\.00 GB are free"):
-        check_device_memory(Needs(7 * 10**9, 10**9, 0), device, 9 * 10**9)
+        check_device_memory(MemoryNeeds(7 * 10**9, 10**9, 0), device, 9 * 10**9)
     assert kept == []
     check_device_memory(needs, device, 5 * 10**9)
     assert kept == [(0.5, device)]
     assert default_memory_limit("cuda:1") is None
-    needed = Needs(photos=0, step=0, rest=2 * (default_memory_limit() or 0))
+    needed = MemoryNeeds(photos=0, step=0, rest=2 * (default_memory_limit() or 0))
     monkeypatch.setattr(preparation, "needs_of", lambda *given, **named: needed)
     settings = TrainSettings(steps=1, device="cuda:1")
     with pytest.raises(UserError, match="in addition to the photos, but the limit is"):

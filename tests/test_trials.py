@@ -162,7 +162,7 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
     trials = Trials(album.photos, everywhere, settings=SETTINGS, exif=exif, colours=album.colours)
     fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
     fitting.edges = torch.linspace(0.1, 1.4, 14)
-    fitting.step, fitting.furthest = DETAILED_STEPS, 1.0  # no steps are skipped
+    fitting.step, fitting.largest_fraction = DETAILED_STEPS, 1.0  # no steps are skipped
     sigma = 0.1
 
     class Fog:
@@ -209,8 +209,8 @@ def test_the_brightness_of_photos_is_found_among_highlights_and_noise():
     gains = gains - gains.mean(0)
     rendered = 0.2 + 0.3 * torch.rand(len(photos), 3, generator=generator)
     measured = exposed(rendered, gains[photos])
-    lit = torch.rand(len(photos), generator=generator) < 0.2
-    measured[lit] = exposed(measured[lit], torch.tensor(math.log(3.0)))
+    brightened = torch.rand(len(photos), generator=generator) < 0.2
+    measured[brightened] = exposed(measured[brightened], torch.tensor(math.log(3.0)))
     measured = (measured + 2 / 255 * torch.randn(measured.shape, generator=generator)).clamp(0.0, 1.0)
     signs = diagnose(rendered, measured, photos, directions=rendered, from_beyond=torch.zeros(len(photos)), count=9)
     assert (signs.log_gains - gains).abs().max() < 0.03

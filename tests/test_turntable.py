@@ -191,10 +191,10 @@ class TestMasks:
     def test_light_that_changes_from_photo_to_photo_changes_little(self, capture: Turntable) -> None:
         rng = np.random.default_rng(0)
         gains = rng.uniform(0.8, 1.1, size=len(capture.photos))
-        lit = [
+        brighter = [
             np.clip(photo * gain, 0, 255).astype(np.uint8) for photo, gain in zip(capture.photos, gains, strict=True)
         ]
-        self.check(capture, [still.small(photo) for photo in lit], cut=0.05, extra=0.06)
+        self.check(capture, [still.small(photo) for photo in brighter], cut=0.05, extra=0.06)
 
     def test_photos_of_another_place_do_not_agree(self, capture: Turntable) -> None:
         behind = still.background([still.small(photo) for photo in capture.photos], self.around(capture))

@@ -370,8 +370,8 @@ def test_what_no_ray_meets_has_the_deviation_of_the_prior():
     expected = opacity * -0.5 * math.log10(prior) + (1 - opacity) * laplace.LEAST
     assert float(laplace.logarithms(model, origins, directions, variance, side)) == pytest.approx(expected, rel=1e-4)
     seen = laplace.squared_jacobians(model, origins, directions, side)
-    known = 1.0 / (seen + prior)
-    assert float(laplace.logarithms(model, origins, directions, known, side)) < expected
+    expected_deviations = 1.0 / (seen + prior)
+    assert float(laplace.logarithms(model, origins, directions, expected_deviations, side)) < expected
 
 
 def test_predictors_are_combined_as_in_the_other_scenes():

@@ -35,7 +35,7 @@ from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Marching, Model, save_model
 from nerfcli.render.pictures import RenderedPicture, render_picture
-from nerfcli.runs.blocks import Cell, Division, joined
+from nerfcli.runs.blocks import BlockDivision, Cell, joined
 from nerfcli.runs.files import FIELD, LIVE
 from nerfcli.runs.live import Pulse, Request, read_status, write_request
 from nerfcli.runs.run import Run
@@ -47,7 +47,7 @@ from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.painter import Painter, Tile, View, render_tile, strides_of, tiles_of, view_from_json
 from nerfcli.viewer.pictures import view_of
 from nerfcli.viewer.server import PageServer
-from nerfcli.workflows.view import RunShow
+from nerfcli.workflows.view import RunData
 
 FEW = TrainSettings(
     budget_seconds=None, steps=12, samples_per_step=2**10, log2_rows=10, threads=2, downscale=8, model="default"
@@ -58,7 +58,7 @@ class Served:
     """A run that is served, and a client of it."""
 
     def __init__(self, run: Path):
-        self.show = RunShow(run, threads=2)
+        self.show = RunData(run, threads=2)
         self.server = PageServer(self.show, host="127.0.0.1", port=0)
         self.url = self.server.url("127.0.0.1")
         threading.Thread(target=self.server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
@@ -102,7 +102,7 @@ def frame_of(run: Path, *, width: int = 90, height: int = 66) -> Frame:
     return replace(frame, camera=Camera.pinhole(width, height, camera.focal_px * width / camera.width))
 
 
-def asked(frame: Frame, *, client: str = "a") -> dict[str, Any]:
+def view_request(frame: Frame, *, client: str = "a") -> dict[str, Any]:
     return {"client": client, "view": {**view_of(frame), "share": 0.25}}
 
 
@@ -137,7 +137,7 @@ def rendered(model: Model, frame: Frame, depth: str) -> RenderedPicture:
 
 def test_a_picture_is_that_of_nerfcli_render_bit_for_bit(trained):
     frame, model = frame_of(trained.show._path), Run(trained.show._path).model()
-    picture = assembled(trained.get("picture", asked(frame)), frame)
+    picture = assembled(trained.get("picture", view_request(frame)), frame)
     by_render = {
         name: rendered(model, frame, name) for name in ("conditional", "median", "max-weight", "quantile:0.25")
     }
@@ -254,7 +254,7 @@ def test_two_clients_get_their_pictures_in_turn(monkeypatch, spheres_run):
     ],
 )
 def test_what_is_no_view_is_refused(damage, finished):
-    sound = asked(frame_of(finished))["view"]
+    sound = view_request(frame_of(finished))["view"]
     view_from_json(sound)
     with pytest.raises(ValueError, match="view"):
         view_from_json(sound | damage)
@@ -322,7 +322,7 @@ def network_without_a_table(model: Model) -> Model:
 
 def two_blocks(model: Model) -> Model:
     cells = (Cell(high=(0.1, np.inf)), Cell(low=(0.1, -np.inf)))
-    return joined([model, deepcopy(model)], Division(np.eye(3)[:2], cells, ()))
+    return joined([model, deepcopy(model)], BlockDivision(np.eye(3)[:2], cells, ()))
 
 
 @pytest.mark.parametrize(
@@ -335,7 +335,7 @@ def test_what_the_page_cannot_render_is_drawn_by_the_server(finished, made, refu
         assert f'"refusal":"the page cannot render {refusal}' in served.get().decode()
         assert served.refusal("field")[0] == 503
         frame = frame_of(finished, width=30, height=20)
-        picture = assembled(served.get("picture", asked(frame)), frame)
+        picture = assembled(served.get("picture", view_request(frame)), frame)
     np.testing.assert_array_equal(picture[..., :3], rendered(model, frame, "conditional").rgb)
 
 
@@ -369,7 +369,7 @@ def test_a_port_that_is_taken_is_told_or_passed_over(finished):
         error, hint = error_of(nerfcli("view", finished, "--port", str(port), "--no-browser"))
         assert error == f"Error: port {port} of 127.0.0.1 is in use"
         assert "--port" in hint
-    show = RunShow(finished, threads=1)
+    show = RunData(finished, threads=1)
     with PageServer(show, host="127.0.0.1", port=None) as one, PageServer(show, host="127.0.0.1", port=None) as two:
         assert one.port < two.port
 
@@ -431,7 +431,7 @@ class Watched:
     """A run with a viewer from its first step on."""
 
     def __init__(self, run: Path):
-        self.run, self.show = run, RunShow(run, threads=1)
+        self.run, self.show = run, RunData(run, threads=1)
         self.server = SimpleNamespace(clients=1, announce=lambda: None)
         self.states: list[str] = []
 

@@ -91,9 +91,11 @@ def test_up_points_along_the_axis_and_nothing_else_changes_size(seed, axis):
     assert turn.scale == 1
     np.testing.assert_array_equal(turn.translation, 0)
     np.testing.assert_allclose(up_direction(transformed(capture, turn).frames), WORLD_AXES[axis], rtol=0, atol=1e-9)
-    known = rng.normal(size=3)
-    turn = up_aligned([], axis, up=known)
-    np.testing.assert_allclose(turn.rotation @ known, np.linalg.norm(known) * WORLD_AXES[axis], rtol=0, atol=1e-14)
+    direction = rng.normal(size=3)
+    turn = up_aligned([], axis, up=direction)
+    np.testing.assert_allclose(
+        turn.rotation @ direction, np.linalg.norm(direction) * WORLD_AXES[axis], rtol=0, atol=1e-14
+    )
 
 
 def test_axes_by_hand():

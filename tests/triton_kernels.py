@@ -252,14 +252,14 @@ def test_sample_coordinates(samples, contraction, reach, generator):
     ends = starts + 0.1 * reach
     gradient = torch.randn(samples, 3, generator=generator)
     exact = [x.double().requires_grad_() for x in (origins, directions)]
-    known = reference.sample_coordinates(
+    computed = reference.sample_coordinates(
         *exact, starts.double(), ends.double(), offsets=offsets, contraction=contraction
     )
-    known.backward(gradient.double())
+    computed.backward(gradient.double())
     fast = [x.to(DEVICE).requires_grad_() for x in (origins, directions)]
     found = coordinates.sample_coordinates(
         *fast, *on_device(starts, ends), offsets=offsets.to(DEVICE), contraction=contraction,
-        known=known.detach().float().to(DEVICE),
+        computed=computed.detach().float().to(DEVICE),
     )  # fmt: skip
     found.backward(gradient.to(DEVICE))
     for name, a, b in zip(("origins", "directions"), fast, exact, strict=True):

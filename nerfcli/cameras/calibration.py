@@ -50,7 +50,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class PhotoCalibration:
     """Camera of an upright photo, the index of the camera in the file, and whether the photo was found by name."""
 
     camera: Camera
@@ -58,7 +58,7 @@ class Calibrated:
     by_name: bool
 
 
-def calibrated(calibration: Calibration, pictures: Sequence[Picture]) -> tuple[Calibrated, ...]:
+def calibrated(calibration: Calibration, pictures: Sequence[Picture]) -> tuple[PhotoCalibration, ...]:
     """Return the camera of each photo, turned and rescaled to its upright picture.
 
     Photos are matched to the file's images by name, without folders. A photo that is not listed gets the only camera
@@ -73,7 +73,7 @@ def calibrated(calibration: Calibration, pictures: Sequence[Picture]) -> tuple[C
     return tuple(_of_picture(calibration, picture, numbers) for picture in pictures)
 
 
-def _of_picture(calibration: Calibration, picture: Picture, numbers: Mapping[str, set[int]]) -> Calibrated:
+def _of_picture(calibration: Calibration, picture: Picture, numbers: Mapping[str, set[int]]) -> PhotoCalibration:
     listed = numbers.get(picture.path.name, set())
     if len(listed) > 1:
         raise UserError(
@@ -82,14 +82,14 @@ def _of_picture(calibration: Calibration, picture: Picture, numbers: Mapping[str
         )
     if listed:
         number = next(iter(listed))
-        return Calibrated(_fitted(calibration, number, picture), number, by_name=True)
+        return PhotoCalibration(_fitted(calibration, number, picture), number, by_name=True)
     size = {picture.width, picture.height}
     sizes = [{camera.width, camera.height} for camera in calibration.cameras]
     fitting = [n for n in range(len(sizes)) if sizes[n] == size and _fits(calibration, n, picture)]
     if not fitting:
         fitting = [n for n in range(len(sizes)) if _fits(calibration, n, picture)]
     if len(fitting) == 1:
-        return Calibrated(_fitted(calibration, fitting[0], picture), fitting[0], by_name=False)
+        return PhotoCalibration(_fitted(calibration, fitting[0], picture), fitting[0], by_name=False)
     what = f"photo {picture.path.name} of {picture.width}x{picture.height}"
     if fitting:
         raise UserError(

@@ -13,7 +13,7 @@ from nerfcli.cli.options import Holdout, Json, Overwrite, Quiet, one_of
 
 if TYPE_CHECKING:
     from nerfcli.convert.conversion import Conversion
-    from nerfcli.convert.detect import Answer, Detection, Question
+    from nerfcli.convert.detect import Detection, HypothesisScore, Question
 
 FORMATS_WRITTEN = (
     "nerfcli",
@@ -170,8 +170,8 @@ def convert(
     """
     values = dict(locals())
     from nerfcli.convert.camera_files import read_intrinsics
-    from nerfcli.convert.conversion import Doubt, TargetOptions
-    from nerfcli.convert.formats import Given, format_named
+    from nerfcli.convert.conversion import ConventionOverrides, TargetOptions
+    from nerfcli.convert.formats import UserInputs, format_named
     from nerfcli.convert.world_frame import WorldFrame
     from nerfcli.workflows.convert import convert_capture, detect_convention, detection_record
 
@@ -181,10 +181,12 @@ def convert(
     if source != STDIN and convert_scan(Path(source), False):
         return
     from_centre = _pixel_centre(from_pixel_center, "--from-pixel-center")
-    doubt = Doubt(axes=from_axes, inverted=from_inverted, pixel_centre=from_centre, intrinsics_scale=from_size)
+    overrides = ConventionOverrides(
+        axes=from_axes, inverted=from_inverted, pixel_centre=from_centre, intrinsics_scale=from_size
+    )
 
-    def given() -> Given:
-        return Given(images=images, camera=None if intrinsics is None else read_intrinsics(intrinsics))
+    def given() -> UserInputs:
+        return UserInputs(images=images, camera=None if intrinsics is None else read_intrinsics(intrinsics))
 
     if detect:
         if to is not None or target is not None:
@@ -192,7 +194,9 @@ def convert(
 
         def work(path: Path, one_of_many: bool) -> None:
             with console.progress(f"detect {path.name}") as update:
-                form, found = detect_convention(path, given=given(), doubt=doubt, notify=console.note, progress=update)
+                form, found = detect_convention(
+                    path, given=given(), overrides=overrides, notify=console.note, progress=update
+                )
             if json:
                 console.result(path, detection_record(found, form.name))
             else:
@@ -224,7 +228,7 @@ def convert(
                 place,
                 wanted,
                 given=given(),
-                doubt=doubt,
+                overrides=overrides,
                 world=world,
                 notify=console.note,
                 warn=console.warn,
@@ -281,7 +285,7 @@ def _table(found: "Detection") -> list[str]:
     return lines
 
 
-def _hypothesis(question: "Question", answer: "Answer") -> str:
+def _hypothesis(question: "Question", answer: "HypothesisScore") -> str:
     convention = answer.convention
     text = {
         "axes and direction": f"{convention.axes}, {'cam_from_world' if convention.inverted else 'world_from_cam'}",

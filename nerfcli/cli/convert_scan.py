@@ -48,13 +48,13 @@ def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console
         if recognise(path) is None:
             _refuse(path, [name for name in given if name in OF_SCANS], of="X-ray scans, and this is not one")
             return False
-        from nerfcli.tomography.formats.given import Given
+        from nerfcli.tomography.formats.given import ScanOptions
         from nerfcli.workflows.scans import ASTRA, OWN, convert_scan, detect_scan, judgement_record
 
         _refuse(
             path, [name for name in given if name not in (*OF_SCANS, *OF_BOTH)], of="photos, and this is an X-ray scan"
         )
-        said = Given(
+        said = ScanOptions(
             photons=values["photons"],
             unit=values["unit"],
             centre_column=values["centre_of_rotation"],

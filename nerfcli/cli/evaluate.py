@@ -228,7 +228,7 @@ def requirements_of(text: str | None) -> "tuple[Requirement, ...]":
 
 def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None:
     """Print new metrics in a few lines and a table; print nothing about metrics kept from an earlier call."""
-    from nerfcli.evaluate.billboards import Shape
+    from nerfcli.evaluate.billboards import GeometryEvidence
     from nerfcli.evaluate.ledger import Entry, summary_line
 
     if evaluation.is_kept:
@@ -248,7 +248,7 @@ def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None
     ]
     console.table(("", "PSNR", "SSIM", "LPIPS"), rows, styles={})
     if metrics["shape"] is not None:
-        console.note(Shape(**metrics["shape"]).in_words())
+        console.note(GeometryEvidence(**metrics["shape"]).in_words())
     if kinds:
         where = {"interpolation": "between", "extrapolation": "beyond"}
         parts = [

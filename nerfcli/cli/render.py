@@ -253,8 +253,8 @@ def render(
         return
     chosen = some_of(outputs or "rgb,depth,opacity", OUTPUTS, "--outputs")
     if not is_convention(depth):
-        known = f"{', '.join(CONVENTIONS)} or quantile:Q with 0 < Q < 1"
-        raise typer.BadParameter(f"{depth!r}; choose {known}", param_hint="--depth")
+        choices = f"{', '.join(CONVENTIONS)} or quantile:Q with 0 < Q < 1"
+        raise typer.BadParameter(f"{depth!r}; choose {choices}", param_hint="--depth")
     one_of(depth_axis, ("ray", "z"), "--depth-axis")
     formats = depth_formats(depth_format, outputs=chosen, convention=depth)
     scale = level_scale(depth_scale, formats=formats)

@@ -11,7 +11,7 @@ from nerfcli.cli.options import one_of, some_of
 
 if TYPE_CHECKING:
     from nerfcli.export.settings import VideoSettings
-    from nerfcli.workflows.views import Look
+    from nerfcli.workflows.views import PictureOptions
 
 MOST_SAMPLES = 256
 
@@ -197,14 +197,14 @@ def frame_range(text: str) -> slice:
 
 def look_of(
     width: int | None, height: int | None, *, lens: str | None, fov_deg: float | None, crop: str | None
-) -> "Look":
+) -> "PictureOptions":
     """Return the picture geometry selected by --width, --height, --lens, --fov and --crop.
 
     Raises:
         typer.BadParameter: the lens is unknown, --fov is given without --lens, or --crop cannot be parsed.
     """
     from nerfcli.cameras.framing import LENSES
-    from nerfcli.workflows.views import Look
+    from nerfcli.workflows.views import PictureOptions
 
     one_of(lens, LENSES, "--lens")
     if fov_deg is not None and lens is None:
@@ -216,4 +216,4 @@ def look_of(
             raise typer.BadParameter(f"{crop!r}; write X,Y,WIDTH,HEIGHT in pixels", param_hint="--crop")
         x, y, crop_width, crop_height = (int(part) for part in match.groups())
         window = (x, y, crop_width, crop_height)
-    return Look(width, height, lens, fov_deg, window)
+    return PictureOptions(width, height, lens, fov_deg, window)

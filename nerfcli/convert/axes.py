@@ -72,21 +72,21 @@ class Convention:
     intrinsics_scale: float = 1.0
 
 
-def reinterpreted(capture: Capture, meant: Convention, *, parsed_axes: str) -> Capture:
+def reinterpreted(capture: Capture, true_convention: Convention, *, parsed_axes: str) -> Capture:
     """Return the capture that a file describes if its numbers are in another convention than its format's.
 
     Args:
         capture: as it was parsed, by the format's own convention.
-        meant: the true convention.
+        true_convention: the one that its numbers are in.
         parsed_axes: the camera axes that the format prescribes.
 
     Raises:
         UserError: the axes are unknown.
     """
-    poses = reinterpreted_poses(poses_of(capture), meant, parsed_axes=parsed_axes)
-    shift = 0.5 - meant.pixel_centre
+    poses = reinterpreted_poses(poses_of(capture), true_convention, parsed_axes=parsed_axes)
+    shift = 0.5 - true_convention.pixel_centre
     cameras = {
-        camera: for_picture(shifted(camera, shift), meant.intrinsics_scale)
+        camera: for_picture(shifted(camera, shift), true_convention.intrinsics_scale)
         for camera in {frame.camera for frame in capture.frames}
     }
     return _with_views(capture, poses, cameras, shift)
@@ -103,12 +103,12 @@ def expressed(capture: Capture, wanted: Convention, *, written_axes: str) -> Cap
     return _with_views(capture, poses_of(capture) @ turn, cameras, shift)
 
 
-def reinterpreted_poses(world_from_cam: np.ndarray, meant: Convention, *, parsed_axes: str) -> np.ndarray:
+def reinterpreted_poses(world_from_cam: np.ndarray, true_convention: Convention, *, parsed_axes: str) -> np.ndarray:
     """Return the poses (frames, 4, 4), OpenCV axes, of a file in another convention than the one it was parsed in."""
     in_file = world_from_cam @ opencv_from_axes(parsed_axes)
-    if meant.inverted:
+    if true_convention.inverted:
         in_file = rigid.inverse(in_file)
-    return in_file @ rigid.inverse(opencv_from_axes(meant.axes))
+    return in_file @ rigid.inverse(opencv_from_axes(true_convention.axes))
 
 
 def poses_of(capture: Capture) -> np.ndarray:

@@ -6,7 +6,7 @@ from nerfcli.cameras.calibration import Calibration
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.colmap import read_cameras
 from nerfcli.cameras.formats.fields import read_json_object
-from nerfcli.convert.formats import Given, recognise
+from nerfcli.convert.formats import UserInputs, recognise
 from nerfcli.convert.stored_pixels import UPRIGHT
 from nerfcli.errors import UserError
 from nerfcli.scene import MODEL_FOLDER, SCENE_FILE
@@ -58,7 +58,7 @@ def read_calibration(path: Path, *, images: Path | None = None) -> Calibration:
         if form.parse is None or form.name in _WITHOUT_CAMERAS:
             raise _no_cameras(path)
         # In scenes of nerfcli poses and in arrays the cameras may be for upright pictures; the capture then says so.
-        capture = form.parse(found, Given(images=images))
+        capture = form.parse(found, UserInputs(images=images))
         cameras = {index: frame.camera for index, frame in enumerate(capture.frames)}
         of_image = {frame.name: index for index, frame in enumerate(capture.frames)}
         upright = capture.pixels == UPRIGHT

@@ -11,17 +11,17 @@ import numpy as np
 
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import NAMED_AXES, Convention, expressed, opencv_from_axes, reinterpreted
-from nerfcli.convert.formats import Format, Given, recognise, with_photos
+from nerfcli.convert.formats import Format, UserInputs, recognise, with_photos
 from nerfcli.convert.probes import probes_of, projected
-from nerfcli.convert.readback import READERS, Meant, read_ply
+from nerfcli.convert.readback import READERS, UnstatedFacts, read_ply
 from nerfcli.convert.reduction import reduced
-from nerfcli.convert.stored_pixels import STORED, Turned, in_pixels
+from nerfcli.convert.stored_pixels import STORED, ReorientedCapture, in_pixels
 from nerfcli.convert.verify import TOLERANCE_PX, Verification, listed_order, unreadable, verify, verify_points
 from nerfcli.errors import GATE_NOT_MET, UserError
 
 
 @dataclass(frozen=True)
-class Doubt:
+class ConventionOverrides:
     """The user's corrections of the convention; None or the default where the format is right.
 
     Args: see `Convention`.
@@ -80,7 +80,7 @@ class Conversion:
     notes: tuple[str, ...] = ()
 
 
-def load(source: Path, given: Given, doubt: Doubt) -> tuple[Format, Path, Capture]:
+def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tuple[Format, Path, Capture]:
     """Read the capture in a file or folder, in the convention given by the user.
 
     Returns:
@@ -94,14 +94,14 @@ def load(source: Path, given: Given, doubt: Doubt) -> tuple[Format, Path, Captur
     capture = form.parse(found, given)
     if given.images is not None:
         capture = with_photos(capture, given.images)
-    meant = Convention(
-        axes=form.axes if doubt.axes is None else doubt.axes,
-        inverted=doubt.inverted,
-        pixel_centre=0.5 if doubt.pixel_centre is None else doubt.pixel_centre,
-        intrinsics_scale=doubt.intrinsics_scale,
+    true_convention = Convention(
+        axes=form.axes if overrides.axes is None else overrides.axes,
+        inverted=overrides.inverted,
+        pixel_centre=0.5 if overrides.pixel_centre is None else overrides.pixel_centre,
+        intrinsics_scale=overrides.intrinsics_scale,
     )
-    if meant != Convention(form.axes):
-        capture = reinterpreted(capture, meant, parsed_axes=form.axes)
+    if true_convention != Convention(form.axes):
+        capture = reinterpreted(capture, true_convention, parsed_axes=form.axes)
     return form, found, capture
 
 
@@ -165,7 +165,7 @@ def _pixels(form: Format, wanted: TargetOptions, capture: Capture) -> str:
     return wanted.pixels or form.pixels or capture.pixels
 
 
-def _orientation_notes(turned: Turned) -> tuple[str, ...]:
+def _orientation_notes(turned: ReorientedCapture) -> tuple[str, ...]:
     notes = []
     if turned.num_turned:
         stored = "as stored, as most programs expect" if turned.capture.pixels == STORED else "upright"
@@ -205,7 +205,7 @@ def _verification(left: Capture, path: Path, form: Format, convention: Conventio
     sizes = tuple((left.frames[index].camera.width, left.frames[index].camera.height) for index in listed)
     letters = NAMED_AXES.get(convention.axes, convention.axes)
     try:
-        back = READERS[form.name](path, Meant(letters, convention.pixel_centre, sizes))
+        back = READERS[form.name](path, UnstatedFacts(letters, convention.pixel_centre, sizes))
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError, OSError) as error:
         return unreadable(left, f"it cannot be read back ({type(error).__name__}: {error})", tolerance_px=tolerance_px)
     return verify(left, back, listed=listed, tolerance_px=tolerance_px)

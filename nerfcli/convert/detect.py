@@ -30,7 +30,7 @@ Evidence = ObservationEvidence | MatchEvidence | FrustumEvidence
 
 
 @dataclass(frozen=True)
-class Answer:
+class HypothesisScore:
     """One hypothesis and the evidence for it.
 
     Args:
@@ -59,7 +59,7 @@ class Question:
     """
 
     name: str
-    answers: tuple[Answer, ...]
+    answers: tuple[HypothesisScore, ...]
     verdict: str
     ratio: float
     reason: str
@@ -194,7 +194,7 @@ def _question(
 ) -> Question:
     ranked = sorted(tried, key=lambda pair: _rank(pair[1], evidence.threshold_px))
     answers = tuple(
-        Answer(
+        HypothesisScore(
             convention,
             _same(name, convention, declared),
             float(np.median(errors)),

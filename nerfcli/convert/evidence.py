@@ -149,7 +149,7 @@ def _directions(
     directions, valid = np.zeros((len(pixels), 3)), np.zeros(len(pixels), dtype=bool)
     focal_px = np.zeros(len(pixels))
     for camera, rows in zip(each, rows_of_each(camera_of_frame[frame_index], len(each)), strict=True):
-        meant = for_picture(shifted(camera, 0.5 - intrinsics.pixel_centre), intrinsics.scale)
-        directions[rows], valid[rows] = meant.bearings(pixels[rows])
-        focal_px[rows] = meant.focal_px
+        corrected = for_picture(shifted(camera, 0.5 - intrinsics.pixel_centre), intrinsics.scale)
+        directions[rows], valid[rows] = corrected.bearings(pixels[rows])
+        focal_px[rows] = corrected.focal_px
     return directions, valid, focal_px

@@ -57,7 +57,7 @@ from nerfcli.media.masks import find_mask
 
 
 @dataclass(frozen=True)
-class Given:
+class UserInputs:
     """Additional input of the user besides the capture's own files.
 
     Args:
@@ -92,7 +92,7 @@ class Format:
     title: str
     looked_for: str
     find: Callable[[Path], Path | None]
-    parse: Callable[[Path, Given], Capture] | None
+    parse: Callable[[Path, UserInputs], Capture] | None
     axes: str = "opencv"
     open_axes: bool = False
     open_centre: bool = False
@@ -151,7 +151,7 @@ def with_photos(capture: Capture, folder: Path) -> Capture:
     return replace(capture, frames=tuple(frames))
 
 
-def _parse_scene(path: Path, given: Given) -> Capture:
+def _parse_scene(path: Path, given: UserInputs) -> Capture:
     described = read_description(path)
     capture = parse_colmap(described.model_dir, given.images or described.image_folder)
     frames = described.described(capture.frames, find_mask)
@@ -165,7 +165,7 @@ def _parse_scene(path: Path, given: Given) -> Capture:
     )
 
 
-def _parse_model(path: Path, given: Given) -> Capture:
+def _parse_model(path: Path, given: UserInputs) -> Capture:
     """Read a COLMAP model, with its photos in the first folder in which its names lead to one.
 
     The folders tried are the given one; or images/ and the like in the model's folder or up to three folders above it,

@@ -25,7 +25,7 @@ class UnreadableError(Exception):
 
 
 @dataclass(frozen=True)
-class Beside:
+class OptionalContent:
     """Optional content of a file besides cameras, poses and points; None where its format has no place for it.
 
     Args:
@@ -65,11 +65,11 @@ class ReadBack:
     points: np.ndarray | None
     colours: np.ndarray | None = None
     features: Callable[[int], tuple[np.ndarray, np.ndarray]] | None = None
-    beside: Beside = Beside()
+    beside: OptionalContent = OptionalContent()
 
 
 @dataclass(frozen=True)
-class Meant:
+class UnstatedFacts:
     """Facts that a file does not state: its camera axes as three letters, the coordinate of the first pixel's centre,
     and the widths and heights of its views' pictures in the file's order."""
 
@@ -78,7 +78,7 @@ class Meant:
     sizes: tuple[tuple[int, int], ...]
 
 
-def read_colmap(path: Path, meant: Meant) -> ReadBack:
+def read_colmap(path: Path, unstated: UnstatedFacts) -> ReadBack:
     """Read a COLMAP model, by pycolmap."""
     model = pycolmap.Reconstruction(str(path))
     lenses = {
@@ -101,15 +101,15 @@ def read_colmap(path: Path, meant: Meant) -> ReadBack:
     )
 
 
-def read_scene(path: Path, meant: Meant) -> ReadBack:
+def read_scene(path: Path, unstated: UnstatedFacts) -> ReadBack:
     """Read a scene of nerfcli: its model by pycolmap, scene.json by the json module."""
     content = json.loads((path / "scene.json").read_text(encoding="utf-8"))
-    back = read_colmap(path / content["model"], meant)
+    back = read_colmap(path / content["model"], unstated)
     names = back.labels or ()
     masks, bounds, root = content["masks"] or {}, content.get("depth_bounds"), os.path.realpath(path)
     parts = {name: part for part in ("test", "val", "unused") for name in content["split"].get(part, [])}
     splits = tuple(parts.get(name, "train").replace("unused", "") for name in names)
-    beside = Beside(
+    beside = OptionalContent(
         images=tuple(os.path.join(root, content["image_folder"], name) for name in names),
         masks=tuple(os.path.join(root, masks[name]) if name in masks else "" for name in names),
         splits=splits,
@@ -126,24 +126,24 @@ def _features(image: Any, places: dict[int, int]) -> tuple[np.ndarray, np.ndarra
     return np.array([feature.xy for feature in features]).reshape(-1, 2), np.array(points, dtype=np.int64)
 
 
-def read_transforms(path: Path, meant: Meant) -> ReadBack:
+def read_transforms(path: Path, unstated: UnstatedFacts) -> ReadBack:
     """Read transforms.json, by the json module, and the PLY file of points that it names."""
     content = json.loads(path.read_text(encoding="utf-8"))
     cloud = content.get("ply_file_path")
     points, colours = (np.zeros((0, 3)), None) if cloud is None else read_ply(path.parent / cloud)
     parts = {name: part for part in ("train", "val", "test") for name in content.get(f"{part}_filenames", [])}
     records = content["frames"]
-    beside = Beside(
+    beside = OptionalContent(
         images=tuple(os.path.join(path.parent, record["file_path"]) for record in records),
         masks=tuple(
             os.path.join(path.parent, record["mask_path"]) if "mask_path" in record else "" for record in records
         ),
         splits=tuple(parts.get(record["file_path"], "") for record in records),
     )
-    return replace(_from_transforms([content], meant), points=points, colours=colours, beside=beside)
+    return replace(_from_transforms([content], unstated), points=points, colours=colours, beside=beside)
 
 
-def read_blender(path: Path, meant: Meant) -> ReadBack:
+def read_blender(path: Path, unstated: UnstatedFacts) -> ReadBack:
     """Read transforms_{train,val,test}.json of a folder, whose only intrinsic is the angle of view."""
     files = [path / f"transforms_{split}.json" for split in ("train", "val", "test")]
     contents = [json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()]
@@ -151,35 +151,35 @@ def read_blender(path: Path, meant: Meant) -> ReadBack:
     splits = [split for split, content in zip(named, contents, strict=True) for _ in content["frames"]]
     for content in contents:
         content["frames"] = [{**record, "angle": content["camera_angle_x"]} for record in content["frames"]]
-    return replace(_from_transforms(contents, meant), beside=Beside(splits=tuple(splits)))
+    return replace(_from_transforms(contents, unstated), beside=OptionalContent(splits=tuple(splits)))
 
 
-def read_llff(path: Path, meant: Meant) -> ReadBack:
+def read_llff(path: Path, unstated: UnstatedFacts) -> ReadBack:
     """Read poses_bounds.npy, by NumPy: 17 numbers per view; the fifth column of its 3 x 5 is height, width, focal."""
     rows = np.load(path / "poses_bounds.npy")
     matrices = rows[:, :15].reshape(-1, 3, 5)
-    rotations, centres = _views_from_world_from_cam(matrices[:, :, :4], meant.axes)
+    rotations, centres = _views_from_world_from_cam(matrices[:, :, :4], unstated.axes)
     lenses = []
     for height, width, focal in matrices[:, :, 4]:
         lenses.append(FileLens("SIMPLE_PINHOLE", int(width), int(height), (focal, width / 2, height / 2)))
-    return ReadBack(None, rotations, centres, tuple(lenses), None, beside=Beside(depth_bounds=rows[:, 15:]))
+    return ReadBack(None, rotations, centres, tuple(lenses), None, beside=OptionalContent(depth_bounds=rows[:, 15:]))
 
 
-def read_tum(path: Path, meant: Meant) -> ReadBack:
+def read_tum(path: Path, unstated: UnstatedFacts) -> ReadBack:
     """Read a TUM trajectory: time, position, quaternion with its real part last, by NumPy and SciPy."""
     rows = np.loadtxt(path, ndmin=2)
     matrices = np.concatenate([Rotation.from_quat(rows[:, 4:8]).as_matrix(), rows[:, 1:4, None]], axis=2)
-    rotations, centres = _views_from_world_from_cam(matrices, meant.axes)
+    rotations, centres = _views_from_world_from_cam(matrices, unstated.axes)
     return ReadBack(None, rotations, centres, None, None)
 
 
-def read_kitti(path: Path, meant: Meant) -> ReadBack:
+def read_kitti(path: Path, unstated: UnstatedFacts) -> ReadBack:
     """Read a KITTI odometry file: 3 x 4 numbers a line, by NumPy."""
-    rotations, centres = _views_from_world_from_cam(np.loadtxt(path, ndmin=2).reshape(-1, 3, 4), meant.axes)
+    rotations, centres = _views_from_world_from_cam(np.loadtxt(path, ndmin=2).reshape(-1, 3, 4), unstated.axes)
     return ReadBack(None, rotations, centres, None, None)
 
 
-def read_opensfm(path: Path, meant: Meant) -> ReadBack:
+def read_opensfm(path: Path, unstated: UnstatedFacts) -> ReadBack:
     """Read reconstruction.json, by the json module and SciPy: angle-axis and translation of cam_from_world."""
     (content,) = json.loads(path.read_text(encoding="utf-8"))
     shots = content["shots"]
@@ -196,17 +196,17 @@ def read_opensfm(path: Path, meant: Meant) -> ReadBack:
     )
 
 
-def read_npz(path: Path, meant: Meant) -> ReadBack:
+def read_npz(path: Path, unstated: UnstatedFacts) -> ReadBack:
     """Read the arrays of an .npz file, by NumPy."""
     with np.load(path) as arrays:
-        rotations, centres = _views_from_world_from_cam(arrays["world_from_cam"], meant.axes)
+        rotations, centres = _views_from_world_from_cam(arrays["world_from_cam"], unstated.axes)
         lenses = []
         for model, (width, height), params in zip(
             arrays["camera_models"].tolist(), arrays["camera_sizes"].tolist(), arrays["camera_params"], strict=True
         ):
             camera = pycolmap.Camera(model=model, width=width, height=height, params=params[~np.isnan(params)])
             shifted = np.array(camera.params)
-            shifted[list(camera.principal_point_idxs())] += 0.5 - meant.pixel_centre
+            shifted[list(camera.principal_point_idxs())] += 0.5 - unstated.pixel_centre
             lenses.append(FileLens(model, width, height, tuple(shifted.tolist())))
         return ReadBack(
             labels=tuple(arrays["names"].tolist()),
@@ -215,8 +215,8 @@ def read_npz(path: Path, meant: Meant) -> ReadBack:
             lenses=tuple(lenses[index] for index in arrays["camera_index"]),
             points=arrays["points"],
             colours=arrays.get("colours"),
-            features=_features_of_arrays(arrays, 0.5 - meant.pixel_centre),
-            beside=Beside(
+            features=_features_of_arrays(arrays, 0.5 - unstated.pixel_centre),
+            beside=OptionalContent(
                 images=tuple(os.path.join(path.parent, text) if text else "" for text in arrays["images"].tolist()),
                 masks=tuple(os.path.join(path.parent, text) if text else "" for text in arrays["masks"].tolist()),
                 splits=tuple(arrays["splits"].tolist()),
@@ -271,16 +271,16 @@ def _opensfm_lens(record: dict[str, Any]) -> FileLens:
     return FileLens("FULL_OPENCV", width, height, (*head, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
 
 
-def _from_transforms(contents: list[dict[str, Any]], meant: Meant) -> ReadBack:
+def _from_transforms(contents: list[dict[str, Any]], unstated: UnstatedFacts) -> ReadBack:
     records = [{**content, **record} for content in contents for record in content["frames"]]
-    rotations, centres = _views_from_world_from_cam([record["transform_matrix"] for record in records], meant.axes)
+    rotations, centres = _views_from_world_from_cam([record["transform_matrix"] for record in records], unstated.axes)
     return ReadBack(
         labels=tuple(record["file_path"] for record in records),
         cam_from_world=rotations,
         centres=centres,
         lenses=tuple(
-            _transforms_lens(record, 0.5 - meant.pixel_centre, size)
-            for record, size in zip(records, meant.sizes, strict=True)
+            _transforms_lens(record, 0.5 - unstated.pixel_centre, size)
+            for record, size in zip(records, unstated.sizes, strict=True)
         ),
         points=None,
     )

@@ -31,7 +31,7 @@ _MOST_MEASURED = 200
 
 
 @dataclass(frozen=True)
-class Turned:
+class ReorientedCapture:
     """Capture whose cameras refer to the requested pixels.
 
     Args:
@@ -63,7 +63,7 @@ def measure_of(capture: Capture) -> Measure:
     return measure_upright if capture.pixels == UPRIGHT else measure
 
 
-def in_pixels(capture: Capture, pixels: str) -> Turned:
+def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
     """Return the capture with cameras, poses and observations for stored or upright pixels, at the cameras' own size.
 
     Frames without a photo on disk are left as they are, and reported.
@@ -72,7 +72,7 @@ def in_pixels(capture: Capture, pixels: str) -> Turned:
         UserError: a photo cannot be read, is mirrored by its orientation, or has another shape than its camera.
     """
     if capture.pixels == pixels:
-        return Turned(capture)
+        return ReorientedCapture(capture)
     frames, masks_left_out, num_unknown = list(capture.frames), [], 0
     turns = np.ones(len(frames), dtype=np.int64)
     for index, frame in enumerate(capture.frames):
@@ -92,7 +92,7 @@ def in_pixels(capture: Capture, pixels: str) -> Turned:
     turned_capture = replace(
         capture, frames=tuple(frames), observations=_turned_observations(capture, turns), pixels=pixels
     )
-    return Turned(turned_capture, int((turns != 1).sum()), num_unknown, tuple(masks_left_out))
+    return ReorientedCapture(turned_capture, int((turns != 1).sum()), num_unknown, tuple(masks_left_out))
 
 
 def upright(frame: Frame, measure: Measure) -> Frame:

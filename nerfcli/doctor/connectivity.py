@@ -35,7 +35,7 @@ def choose_pairs(photos: Sequence[PhotoFacts]) -> list[tuple[int, int]]:
         photo.features.descriptors[np.argsort(-photo.features.scales, kind="stable")[:_COARSEST]] for photo in photos
     ]
     shared = likeness(coarsest, lambda stage, done, total: None)
-    return sorted(near | set(alike(shared, LOOK_ALIKES, known=near)))
+    return sorted(near | set(alike(shared, LOOK_ALIKES, paired=near)))
 
 
 def pair_count(count: int) -> int:

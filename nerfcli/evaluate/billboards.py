@@ -41,7 +41,7 @@ SEED = 7
 
 
 @dataclass(frozen=True)
-class Shape:
+class GeometryEvidence:
     """Evidence for geometry, over all held-out photos.
 
     Args:
@@ -182,7 +182,7 @@ def reduction(frame: Frame) -> float:
     return max(1.0, max(frame.camera.width, frame.camera.height) / LONGER_SIDE_PX)
 
 
-class ShapeEvidence:
+class GeometryComparison:
     """Compares a field with billboards, photo by photo.
 
     A comparison that fails does not stop the evaluation: `failure` then gives the reason, and there is no shape.
@@ -230,7 +230,7 @@ class ShapeEvidence:
         self._pairs.append((psnr_of(float(of_field)), psnr_of(float(of_billboards))))
         self._seconds += time.perf_counter() - began
 
-    def shape(self) -> Shape | None:
+    def shape(self) -> GeometryEvidence | None:
         """Return the evidence for geometry; None if no photo could be compared or a comparison failed."""
         if not self._pairs or self.failure is not None:
             return None
@@ -240,4 +240,4 @@ class ShapeEvidence:
         error = float(gains.std(ddof=1) / math.sqrt(len(gains))) if len(gains) > 1 else None
         shown = gain > LEAST_GAIN_DB and gain > STANDARD_ERRORS * (error or 0.0)
         field_psnr, psnr = (float(column.mean()) for column in pairs.T)
-        return Shape(psnr, field_psnr, gain, error, shown, self._seconds)
+        return GeometryEvidence(psnr, field_psnr, gain, error, shown, self._seconds)

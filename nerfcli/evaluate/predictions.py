@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.evaluate.metrics import to_8_bit
-from nerfcli.evaluate.protocol import Compared
+from nerfcli.evaluate.protocol import ComparedImages
 from nerfcli.media.images import write_png
 
 PREDICTIONS = "predictions"
@@ -21,7 +21,7 @@ INFO = "info.json"
 KINDS = ("png", "float")
 
 
-def save_compared(folder: Path, stem: str, compared: Compared) -> None:
+def save_compared(folder: Path, stem: str, compared: ComparedImages) -> None:
     """Write the 8-bit picture, the photo and, where pixels are left out, the mask.
 
     Args:
@@ -34,7 +34,7 @@ def save_compared(folder: Path, stem: str, compared: Compared) -> None:
         write_png(folder / "mask" / f"{stem}.png", compared.used.astype(np.uint8) * 255)
 
 
-def save_unrounded(folder: Path, stem: str, compared: Compared) -> None:
+def save_unrounded(folder: Path, stem: str, compared: ComparedImages) -> None:
     """Write the rendered picture before rounding."""
     path = folder / "color-float" / f"{stem}.npy"
     path.parent.mkdir(parents=True, exist_ok=True)

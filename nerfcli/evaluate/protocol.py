@@ -12,7 +12,7 @@ import torch
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
-from nerfcli.evaluate.billboards import Billboards, Shape, ShapeEvidence
+from nerfcli.evaluate.billboards import Billboards, GeometryComparison, GeometryEvidence
 from nerfcli.evaluate.colour import colour_aligned
 from nerfcli.evaluate.colour_alignment import align_gains
 from nerfcli.evaluate.metrics import as_float, psnr, ssim, to_8_bit, whole_windows
@@ -51,7 +51,7 @@ class HeldOutPhoto:
 
 
 @dataclass(frozen=True)
-class Compared:
+class ComparedImages:
     """A compared pair: rendered (H, W, 3) float sRGB, the photo (H, W, 3) uint8, and the mask of counted pixels (H, W).
 
     on_white: whether the photo has alpha and is composited on white. There is then no colour correction: it ignores
@@ -83,7 +83,7 @@ class Extras:
     billboards: Billboards | None = None
     align_poses: bool = False
     align_colours: bool = False
-    keep: Callable[[Compared], None] = lambda compared: None
+    keep: Callable[[ComparedImages], None] = lambda compared: None
 
 
 def evaluate_model(
@@ -127,7 +127,7 @@ def evaluate_model(
         on_image(done, total)
 
     views = novelty([photo.frame for photo in held_out], extras.training) if extras.training else None
-    evidence = ShapeEvidence(extras.billboards) if extras.billboards is not None else None
+    evidence = GeometryComparison(extras.billboards) if extras.billboards is not None else None
     images, seconds = [], []
     for index, photo in enumerate(held_out):
         background = WHITE if photo.pixels.shape[-1] == 4 else model.background
@@ -169,7 +169,7 @@ def evaluate_model(
     }
 
 
-def _warnings(shape: Shape | None, evidence: ShapeEvidence | None) -> list[str]:
+def _warnings(shape: GeometryEvidence | None, evidence: GeometryComparison | None) -> list[str]:
     if evidence is not None and evidence.failure is not None:
         return [f"the comparison with a model without geometry failed: {evidence.failure}"]
     return [shape.in_words()] if shape is not None and not shape.shown else []
@@ -192,7 +192,7 @@ def over_white(pixels: np.ndarray) -> np.ndarray:
     return to_8_bit(pixels[..., :3] / 255.0 * alpha + 1.0 - alpha)
 
 
-def compare(photo: HeldOutPhoto, picture: RenderedPicture) -> Compared:
+def compare(photo: HeldOutPhoto, picture: RenderedPicture) -> ComparedImages:
     """Return a held-out photo with its rendered picture, to which the photo's gains are applied.
 
     Raises:
@@ -204,7 +204,7 @@ def compare(photo: HeldOutPhoto, picture: RenderedPicture) -> Compared:
             f"no pixels of {photo.frame.name} are left to compare",
             "check its mask: white pixels are used, black ones are ignored",
         )
-    return Compared(
+    return ComparedImages(
         photo.frame,
         as_exposed(picture.rgb, photo.log_gains),
         over_white(photo.pixels),
@@ -220,7 +220,7 @@ def as_exposed(rgb: np.ndarray, log_gains: tuple[float, ...]) -> np.ndarray:
     return exposed(torch.from_numpy(rgb), torch.tensor(log_gains)).clamp(0.0, 1.0).numpy()
 
 
-def measured(compared: Compared, perceptual: Perceptual | None) -> dict[str, float | None]:
+def measured(compared: ComparedImages, perceptual: Perceptual | None) -> dict[str, float | None]:
     """Return the metrics of a compared pair, see `evaluate_model`."""
     truth, used = compared.photo, compared.used
     rounded = to_8_bit(compared.rendered)
@@ -253,7 +253,7 @@ def _lpips(picture: np.ndarray, truth: np.ndarray, *, used: np.ndarray, perceptu
     return perceptual(as_float(np.where(used[..., None], picture, truth)), as_float(truth))
 
 
-def _counted(photo: HeldOutPhoto, picture: RenderedPicture, compared: Compared) -> dict[str, int]:
+def _counted(photo: HeldOutPhoto, picture: RenderedPicture, compared: ComparedImages) -> dict[str, int]:
     return {
         "pixels": int(compared.used.sum()),
         "masked_pixels": 0 if photo.used is None else int((~photo.used).sum()),
@@ -264,7 +264,7 @@ def _counted(photo: HeldOutPhoto, picture: RenderedPicture, compared: Compared) 
 
 def _pose_aligned(
     model: Model,
-    compared: Compared,
+    compared: ComparedImages,
     log_gains: tuple[float, ...],
     *,
     background: Background,
@@ -282,7 +282,7 @@ def _pose_aligned(
     }
 
 
-def _gains_aligned(rgb: np.ndarray, compared: Compared, log_gains: tuple[float, ...]) -> dict[str, Any]:
+def _gains_aligned(rgb: np.ndarray, compared: ComparedImages, log_gains: tuple[float, ...]) -> dict[str, Any]:
     """Measure the model's own colours (H, W, 3) with gains fitted to the left half of the photo."""
     if compared.on_white:
         return dict.fromkeys(("psnr_gains_aligned", "ssim_gains_aligned", "gain_alignment"))
@@ -294,7 +294,7 @@ def _gains_aligned(rgb: np.ndarray, compared: Compared, log_gains: tuple[float, 
     }
 
 
-def _right_half(compared: Compared, rendered: np.ndarray, *, suffix: str) -> dict[str, float | None]:
+def _right_half(compared: ComparedImages, rendered: np.ndarray, *, suffix: str) -> dict[str, float | None]:
     """Measure a picture on the right half of the photo; None if no pixel of it counts."""
     _, right = halves(compared.used)
     if not right.any():

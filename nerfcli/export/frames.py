@@ -13,7 +13,7 @@ from nerfcli.export.presentation import write_previews, write_videos
 from nerfcli.export.processes import render_in_processes
 from nerfcli.export.settings import depth_meta
 from nerfcli.export.threads import render_in_threads
-from nerfcli.export.unfinished import Unfinished, take_over, unfinished_of
+from nerfcli.export.unfinished import UnfinishedFrames, take_over, unfinished_of
 from nerfcli.export.visibility import removed_in_words
 from nerfcli.media.levels import scale_in_words
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
@@ -155,7 +155,7 @@ def _render_missing(
     order: Order,
     part: range,
     *,
-    unfinished: Unfinished,
+    unfinished: UnfinishedFrames,
     on_rays: Callable[[int], None],
     notify: Callable[[str], None],
     workers: Workers,

@@ -8,7 +8,7 @@ from nerfcli.export.members import with_deviations
 from nerfcli.export.order import Order
 from nerfcli.export.picture_files import write_picture
 from nerfcli.export.settings import BLACK, depth_meta
-from nerfcli.export.unfinished import Unfinished
+from nerfcli.export.unfinished import UnfinishedFrames
 from nerfcli.export.visibility import with_measured_errors, with_visibility, without_unseen_depth
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.accuracy import measure_error, truncation_bounds
@@ -17,7 +17,7 @@ from nerfcli.render.pictures import render_picture, straight_rgba
 
 
 def render_frame(
-    model: Model, order: Order, index: int, *, unfinished: Unfinished, on_rays: Callable[[int], None]
+    model: Model, order: Order, index: int, *, unfinished: UnfinishedFrames, on_rays: Callable[[int], None]
 ) -> None:
     """Render a frame and write its files to the unfinished folder.
 

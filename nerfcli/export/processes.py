@@ -17,7 +17,7 @@ import torch
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import Order
-from nerfcli.export.unfinished import Unfinished
+from nerfcli.export.unfinished import UnfinishedFrames
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.render.model import Model
 
@@ -41,7 +41,7 @@ def render_in_processes(
     order: Order,
     indices: Sequence[int],
     *,
-    unfinished: Unfinished,
+    unfinished: UnfinishedFrames,
     jobs: int,
     threads: int,
     on_rays: Callable[[int], None],
@@ -129,7 +129,7 @@ class _Failure:
         return UserError(self.text, self.hint, self.exit_code)
 
 
-def _serve(connection: Any, model: Model, order: Order, unfinished: Unfinished, threads: int) -> None:
+def _serve(connection: Any, model: Model, order: Order, unfinished: UnfinishedFrames, threads: int) -> None:
     """Render the frames whose indices are received, until the connection is closed."""
     torch.set_num_threads(threads)
     signal.signal(signal.SIGTERM, _leave)

@@ -8,7 +8,7 @@ import torch
 
 from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import Order
-from nerfcli.export.unfinished import Unfinished
+from nerfcli.export.unfinished import UnfinishedFrames
 from nerfcli.render.model import Model
 
 
@@ -17,7 +17,7 @@ def render_in_threads(
     order: Order,
     indices: Sequence[int],
     *,
-    unfinished: Unfinished,
+    unfinished: UnfinishedFrames,
     at_a_time: int,
     threads: int,
     on_rays: Callable[[int], None],

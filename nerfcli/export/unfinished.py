@@ -26,7 +26,7 @@ _NOTES = ".frames"
 
 
 @dataclass(frozen=True)
-class Unfinished:
+class UnfinishedFrames:
     """The folder that collects the frames of an order."""
 
     folder: Path
@@ -88,7 +88,7 @@ def _digest_of_note(files: dict[str, str], facts: dict[str, Any]) -> str:
     return _digest(json.dumps([files, facts], sort_keys=True).encode())
 
 
-def take_over(unfinished: Unfinished, order: Order, finished: Path) -> None:
+def take_over(unfinished: UnfinishedFrames, order: Order, finished: Path) -> None:
     """Link the frames of a finished folder, for which `Order.shares_pictures_with` is True, into an unfinished one.
 
     Frames with a missing or changed file are left out, as are previews and videos. Files are hard-linked, or copied if
@@ -116,7 +116,7 @@ def _has_digest(path: Path, digest: str) -> bool:
     return path.is_file() and _digest(path.read_bytes()) == digest
 
 
-def unfinished_of(order: Order, folder: Path) -> Unfinished:
+def unfinished_of(order: Order, folder: Path) -> UnfinishedFrames:
     """Return the unfinished folder of an order that will become `folder`; it is created if needed.
 
     Raises:
@@ -128,4 +128,4 @@ def unfinished_of(order: Order, folder: Path) -> Unfinished:
     except OSError as error:
         raise cannot_write(folder, error) from error
     write_json(unfinished / _NOTES / "order.json", order.of_pictures())
-    return Unfinished(unfinished)
+    return UnfinishedFrames(unfinished)

@@ -9,9 +9,9 @@ from nerfcli.errors import UserError
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.exposure import Exposure
 from nerfcli.fit.losses import over_background
-from nerfcli.fit.ranks import Alone
+from nerfcli.fit.ranks import SingleProcess
 from nerfcli.fit.refinement import Refinement, rate_at
-from nerfcli.photos.pool import Drawn, Pool
+from nerfcli.photos.pool import PixelBatch, Pool
 from nerfcli.runs.components import LEARNED_BACKGROUNDS, Components
 
 # Learning rates as multiples of the field's. After 300 steps at 0.3, the photos' gains have come a tenth of the way to
@@ -94,11 +94,11 @@ class Appearance(nn.Module):
         """Return by name the gradients of the parameters that have one."""
         return {name: tensor.grad for name, tensor in self.named_parameters() if tensor.grad is not None}
 
-    def refined(self, drawn: Drawn) -> Drawn:
+    def refined(self, drawn: PixelBatch) -> PixelBatch:
         """Return the same pixels, with the rays of the current cameras."""
         return drawn if self.cameras is None else self.cameras.refined(drawn)
 
-    def with_learning_rays(self, drawn: Drawn, fraction: float) -> Drawn:
+    def with_learning_rays(self, drawn: PixelBatch, fraction: float) -> PixelBatch:
         """Return the same as `refined`, with rays that collect gradients while cameras learn."""
         refined = self.refined(drawn)
         if self.cameras is None or rate_at(fraction) == 0.0:
@@ -107,7 +107,9 @@ class Appearance(nn.Module):
             origins=refined.origins.clone().requires_grad_(), directions=refined.directions.clone().requires_grad_()
         )
 
-    def step_cameras(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float, ranks: Alone) -> None:
+    def step_cameras(
+        self, drawn: PixelBatch, losses: Tensor, fraction: float, *, factor: float, ranks: SingleProcess
+    ) -> None:
         """Take one step of the cameras against the gradients of rays of `with_learning_rays`.
 
         Args:
@@ -137,7 +139,7 @@ class Appearance(nn.Module):
         return torch.zeros(count, 3, device=device)
 
     def compared(
-        self, rendered: Tensor, transmittance: Tensor, drawn: Drawn, *, behind: Tensor
+        self, rendered: Tensor, transmittance: Tensor, drawn: PixelBatch, *, behind: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the predicted and the measured colours of pixels, both (R, 3) sRGB.
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from nerfcli.photos.pool import Drawn, PixelPool
+from nerfcli.photos.pool import PixelBatch, PixelPool
 
 BLOCK_PX = 16
 # This fraction of a step's pixels is drawn in proportion to the error of their block, the others uniformly.
@@ -38,7 +38,7 @@ class ErrorMap:
         self._corner = torch.stack([place // columns, place % columns], dim=-1) * BLOCK_PX  # (blocks, 2) row, column
         self._extent = (pool.sizes[self._photo] - self._corner).clamp_max(BLOCK_PX)
 
-    def draw(self, count: int, generator: torch.Generator) -> Drawn:
+    def draw(self, count: int, generator: torch.Generator) -> PixelBatch:
         """Draw `count` pixels, with the weight of each in the loss."""
         pool, device = self._pool, self.errors.device
         guided = round(GUIDED_FRACTION * count)

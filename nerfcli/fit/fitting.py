@@ -19,11 +19,11 @@ from nerfcli.fit.movers import Movers
 from nerfcli.fit.open_cells import OpenCells
 from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.fit.point_depth import PointRays, fading
-from nerfcli.fit.ranks import ALONE, Alone
+from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.fit.strides import stride_at
 from nerfcli.fit.watch import UNWATCHED, NonFiniteError, Watch
 from nerfcli.kernels import March, Rays, Targets
-from nerfcli.photos.pool import Drawn, Pool
+from nerfcli.photos.pool import PixelBatch, Pool
 from nerfcli.render.model import Marching
 from nerfcli.runs.settings import TrainSettings
 
@@ -89,7 +89,7 @@ class Fitting:
         covered: Tensor | None = None,
         sky: Tensor | None = None,
         size: FieldSettings | None = None,
-        ranks: Alone = ALONE,
+        ranks: SingleProcess = ALONE,
     ):
         device = pool.colours.device
         torch.manual_seed(settings.seed)
@@ -99,7 +99,7 @@ class Fitting:
         self.ranks = ranks
         self.step = 0
         # The largest fraction of any budget so far: a training resumed with a larger budget begins at a smaller one.
-        self.furthest = 0.0
+        self.largest_fraction = 0.0
         self.components = settings.components
         if size is None:
             size = chosen_size(
@@ -150,7 +150,7 @@ class Fitting:
         """
         self.in_step = True
         watch.state(self.state)
-        self.furthest = max(self.furthest, fraction)
+        self.largest_fraction = max(self.largest_fraction, fraction)
         of_cameras = max(0.0, fraction - self._cameras_from) / (1.0 - self._cameras_from)
         ranks, whole = self.ranks, self.draw(fraction)
         drawn = self.parts.with_learning_rays(whole.every(ranks.rank, ranks.count), of_cameras)
@@ -173,19 +173,19 @@ class Fitting:
         self.in_step = False
         return StepResult(loss=value, samples=samples, rays=rays)
 
-    def draw(self, fraction: float) -> Drawn:
+    def draw(self, fraction: float) -> PixelBatch:
         """Return the pixels of the next step; refresh the open cells first if it is time."""
         settings = self.settings
         self.cells.refresh(
             self.step,
-            fraction=self.furthest,
+            fraction=self.largest_fraction,
             detail=self._detail,
             marching=self.marching,
             generator=self.generator,
             ranks=self.ranks,
         )
         rays = min(self._most_rays, max(64, round(settings.samples_at(self.step) / max(1.0, self.samples_per_ray))))
-        source = self.pool if self.error_map is None or self.furthest < BEGINS else self.error_map
+        source = self.pool if self.error_map is None or self.largest_fraction < BEGINS else self.error_map
         drawn = source.draw(rays, self.generator)
         if self.points is None or fading(fraction) == 0.0:
             return drawn
@@ -205,7 +205,7 @@ class Fitting:
         return self.rate_factor * warmup * rate
 
     def _loss(
-        self, drawn: Drawn, *, whole: Drawn, edges: Tensor, fraction: float, watch: Watch
+        self, drawn: PixelBatch, *, whole: PixelBatch, edges: Tensor, fraction: float, watch: Watch
     ) -> tuple[Tensor, Tensor, int]:
         """Return the loss contributed by this rank's rays of the whole step, the colour loss of each ray, and the
         number of samples.
@@ -227,7 +227,7 @@ class Fitting:
         losses = colour_losses(rendered, measured)
         if self.movers is not None:
             residuals = self.ranks.joined((rendered - measured).detach(), count)
-            self.movers.learn(whole.numbers, residuals, fraction=self.furthest, step=self.step)
+            self.movers.learn(whole.numbers, residuals, fraction=self.largest_fraction, step=self.step)
             losses = losses * self.movers.weights(drawn.numbers)
         if self.error_map is not None:
             self.error_map.learn(whole.numbers, self.ranks.joined(losses.detach(), count))
@@ -249,23 +249,23 @@ class Fitting:
         return loss, losses.detach(), int(seen.samples)
 
     @torch.no_grad()
-    def compare(self, drawn: Drawn) -> tuple[Tensor, Tensor]:
+    def compare(self, drawn: PixelBatch) -> tuple[Tensor, Tensor]:
         """Return the model's and the photos' colours of pixels, both (N, 3) sRGB, alpha on white."""
         drawn = self.parts.refined(drawn)
         behind = torch.full_like(drawn.origins, 1.0 if self.pool.has_alpha else 0.0)
-        edges = self.edges[:: stride_at(self.furthest, self.step)].contiguous()
+        edges = self.edges[:: stride_at(self.largest_fraction, self.step)].contiguous()
         rendered, transmittance = self._seen(drawn, edges=edges, behind=behind)
         return self.parts.compared(rendered, transmittance, drawn, behind=behind)
 
     @torch.no_grad()
-    def light_from_beyond(self, drawn: Drawn, *, distance: float) -> Tensor:
+    def light_from_beyond(self, drawn: PixelBatch, *, distance: float) -> Tensor:
         """Return the fraction of each pixel's light, (N,), that comes from beyond a distance in the current field."""
         drawn = self.parts.refined(drawn)
-        edges = self.edges[:: stride_at(self.furthest, self.step)].contiguous()
+        edges = self.edges[:: stride_at(self.largest_fraction, self.step)].contiguous()
         near = edges[: max(2, int(torch.searchsorted(edges, distance, right=True)))]
         return self._seen(drawn, edges=near, behind=torch.zeros_like(drawn.origins))[1]
 
-    def _seen(self, drawn: Drawn, *, edges: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
+    def _seen(self, drawn: PixelBatch, *, edges: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
         """Return the colours (N, 3) of rays stepping from edge to edge, over `behind`, and their transmittance (N,)."""
         jitter = torch.full_like(drawn.origins[:, 0], 0.5)
         seen = self.field.backend.render_rays(
@@ -280,19 +280,19 @@ class Fitting:
     def _detail(self) -> float:
         """Fraction of the budget whose detail the field has; cameras that learn late do not delay it."""
         if self._cameras_from > 0.0:
-            return self.furthest
+            return self.largest_fraction
         if self.parts.cameras is None and self.field.settings.detailed:
-            return min(1.0, max(self.furthest, self.step / LARGE_TABLE_STEPS))
-        return self.parts.fraction_of_detail(self.furthest)
+            return min(1.0, max(self.largest_fraction, self.step / LARGE_TABLE_STEPS))
+        return self.parts.fraction_of_detail(self.largest_fraction)
 
     def _march(self, edges: Tensor, occupied: Tensor) -> March:
         return March(edges, occupied, self.field.settings.contraction, DEEPEST)
 
-    def _cones(self, drawn: Drawn) -> Tensor | None:
+    def _cones(self, drawn: PixelBatch) -> Tensor | None:
         """Return the pixel widths per unit of distance if the field is antialiased, else None."""
         return self.pool.cones[self.pool.photo_of(drawn.numbers)] if self.components.antialias else None
 
-    def _add_up_gradients(self, drawn: Drawn, samples: int) -> int:
+    def _add_up_gradients(self, drawn: PixelBatch, samples: int) -> int:
         """Add up the gradients and the samples of all ranks, and return the number of samples."""
         if self.ranks.count == 1:
             return samples
@@ -317,7 +317,7 @@ class Fitting:
                 raise NonFiniteError
             self.loss = value
 
-    def _finite_loss(self, loss: Tensor, drawn: Drawn, watch: Watch) -> float:
+    def _finite_loss(self, loss: Tensor, drawn: PixelBatch, watch: Watch) -> float:
         """Return the loss if it and all gradients are finite; on a GPU usually that of the previous step."""
         total = loss.detach()
         rays = {"origins of rays": drawn.origins.grad, "directions of rays": drawn.directions.grad}
@@ -355,7 +355,7 @@ class Fitting:
             "samples_per_ray": self.samples_per_ray,
             "rate_factor": self.rate_factor,
             "rollbacks": self.rollbacks,
-            "furthest": self.furthest,
+            "furthest": self.largest_fraction,
         }
 
     def restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
@@ -377,5 +377,5 @@ class Fitting:
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]
         self.rate_factor, self.rollbacks = description["rate_factor"], description["rollbacks"]
-        self.furthest = description.get("furthest", 1.0)  # earlier versions learned all detail from the start
+        self.largest_fraction = description.get("furthest", 1.0)  # earlier versions learned all detail from the start
         self.in_step = False

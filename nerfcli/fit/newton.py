@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from nerfcli.fit.ranks import ALONE, Alone
+from nerfcli.fit.ranks import ALONE, SingleProcess
 
 # Decay of the running mean of the curvature per step: a photo has few rays in one step.
 MEMORY = 0.95
@@ -33,7 +33,7 @@ class NewtonSteps(nn.Module):
         self.register_buffer("curvature", torch.zeros(count, 6, 6, dtype=torch.float64))
         self.register_buffer("weight", torch.zeros((), dtype=torch.float64))
 
-    def learn(self, gradients: Tensor, losses: Tensor, photos: Tensor, ranks: Alone = ALONE) -> Tensor:
+    def learn(self, gradients: Tensor, losses: Tensor, photos: Tensor, ranks: SingleProcess = ALONE) -> Tensor:
         """Update the curvature from some rays, and return the sum (P, 6) of their gradients.
 
         Args:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.field.interface import Field
-from nerfcli.fit.ranks import Alone
+from nerfcli.fit.ranks import SingleProcess
 from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import Occupancy
 
@@ -59,7 +59,7 @@ class OpenCells:
         detail: float,
         marching: Marching,
         generator: torch.Generator,
-        ranks: Alone,
+        ranks: SingleProcess,
     ) -> None:
         """Update the open cells from the field, every few steps.
 

@@ -12,7 +12,7 @@ from nerfcli.cameras.rigid import Similarity, apply, inverse
 from nerfcli.multiview.stereo import DenseDepth
 from nerfcli.multiview.tracks import Tracks, indices_by_value
 from nerfcli.multiview.triangulation import triangulate
-from nerfcli.photos.pool import Drawn, PixelPool
+from nerfcli.photos.pool import PixelBatch, PixelPool
 
 # One pixel at a known distance is drawn per this many other pixels.
 PIXELS_PER_POINT = 8
@@ -64,7 +64,7 @@ class PointRays:
         self.sets = [depths for depths in sets if len(depths.numbers)]
         self._pool = pool
 
-    def added_to(self, drawn: Drawn, generator: torch.Generator) -> Drawn:
+    def added_to(self, drawn: PixelBatch, generator: torch.Generator) -> PixelBatch:
         """Append pixels at known distances to those in `drawn`. Their colours count like all others."""
         count = max(1, len(drawn.numbers) // PIXELS_PER_POINT // len(self.sets))
         chosen = reduce(PointDepths.joined, [depths.draw(count, generator) for depths in self.sets])

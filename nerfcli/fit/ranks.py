@@ -16,7 +16,7 @@ from torch import Tensor
 from nerfcli.errors import LOST_RANK, UserError
 
 
-class Alone:
+class SingleProcess:
     """A single process: sums are its own values, and nothing is sent."""
 
     rank, count = 0, 1
@@ -59,10 +59,10 @@ class Alone:
         """Overwrite tensors with those of rank 0."""
 
 
-ALONE = Alone()
+ALONE = SingleProcess()
 
 
-class Ranks(Alone):
+class Ranks(SingleProcess):
     """Several processes, of which this is one.
 
     Args:

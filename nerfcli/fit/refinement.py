@@ -18,9 +18,9 @@ from nerfcli.cameras.rigid import from_parts, transform_from_twist, vector_from_
 from nerfcli.fit.delayed import Delayed, on_device_of
 from nerfcli.fit.gauge import relative_motions, without_mean
 from nerfcli.fit.newton import NewtonSteps
-from nerfcli.fit.ranks import ALONE, Alone
+from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.fit.whitening import WhitenedAdam, whitening
-from nerfcli.photos.pool import Drawn, Pool
+from nerfcli.photos.pool import PixelBatch, Pool
 
 # Points that represent what a camera sees: this many pixels along each side, at these multiples of the camera's
 # distance from the origin of the training frame.
@@ -109,7 +109,14 @@ class PoseRefinement(nn.Module):
         return (cam_from_world @ torch.stack([by_origin, torque], dim=-1)).transpose(-1, -2).flatten(-2)
 
     def step(
-        self, gradients: Tensor, losses: Tensor, photos: Tensor, fraction: float, *, rate: float, ranks: Alone = ALONE
+        self,
+        gradients: Tensor,
+        losses: Tensor,
+        photos: Tensor,
+        fraction: float,
+        *,
+        rate: float,
+        ranks: SingleProcess = ALONE,
     ) -> None:
         """Take a step against gradients (R, 6) of losses (R,) of rays, and remove the mean similarity of all moves.
 
@@ -171,7 +178,7 @@ class LensRefinement(nn.Module):
         own = [self._names.index(name) for name in self._own[index]]
         return changed(camera, self._own[index], self.values[index, own].numpy())
 
-    def directions(self, drawn: Drawn, photos: Tensor) -> Tensor:
+    def directions(self, drawn: PixelBatch, photos: Tensor) -> Tensor:
         """Return ray directions (R, 3) for the given poses and the current lenses."""
         numbers, photos = torch.stack([drawn.numbers, photos]).cpu()  # with a GPU, the host waits for this
         changed = torch.full(drawn.directions.shape, torch.nan, dtype=drawn.directions.dtype)
@@ -244,7 +251,7 @@ class Refinement(nn.Module):
         self.sent = Delayed()
 
     @torch.no_grad()
-    def refined(self, drawn: Drawn) -> Drawn:
+    def refined(self, drawn: PixelBatch) -> PixelBatch:
         """Return the same pixels, with the rays of the current cameras."""
         photos = self._pool.photo_of(drawn.numbers)
         origins, directions = drawn.origins, drawn.directions
@@ -255,7 +262,9 @@ class Refinement(nn.Module):
         return drawn._replace(origins=origins, directions=directions)
 
     @torch.no_grad()
-    def step(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float, ranks: Alone = ALONE) -> None:
+    def step(
+        self, drawn: PixelBatch, losses: Tensor, fraction: float, *, factor: float, ranks: SingleProcess = ALONE
+    ) -> None:
         """Take one step against the gradients of the mean loss over the rays of all ranks.
 
         On a GPU, the gradients are those of the previous step.

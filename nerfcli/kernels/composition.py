@@ -29,7 +29,7 @@ from nerfcli.kernels.reference.compositing import contracted_distance, off_targe
 CHUNK = 2**16
 
 
-class Parts(Protocol):
+class SampleOperations(Protocol):
     """Single operations on packed samples, as `reference` defines them."""
 
     def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]: ...
@@ -64,7 +64,7 @@ class ComposedBackend(abc.ABC):
 
     name: str
     deterministic: bool
-    parts: ClassVar[Parts]
+    parts: ClassVar[SampleOperations]
 
     def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
         return self.parts.pixel_rays(chosen, pixels)
@@ -227,11 +227,11 @@ class ComposedBackend(abc.ABC):
         with torch.no_grad():  # samples behind surfaces are computed, then left out
             starts, ends, coordinates, offsets = self.parts.occupied_samples(rays, march)
             density = torch.cat([medium.density(chunk) for chunk in coordinates.split(CHUNK)])
-            lit = self.parts.optical_depth_before(density, ends - starts, offsets) < march.max_optical_depth
-            kept = torch.nn.functional.pad(lit.cumsum(0), (1, 0))[offsets]
+            reached = self.parts.optical_depth_before(density, ends - starts, offsets) < march.max_optical_depth
+            kept = torch.nn.functional.pad(reached.cumsum(0), (1, 0))[offsets]
             if visits is not None:
-                self.parts.keep_largest(visits, coordinates[lit], (density * (ends - starts))[lit])
-            return Samples(starts[lit], ends[lit], density[lit], None, coordinates[lit], kept)
+                self.parts.keep_largest(visits, coordinates[reached], (density * (ends - starts))[reached])
+            return Samples(starts[reached], ends[reached], density[reached], None, coordinates[reached], kept)
 
 
 def _widths(rays: Rays, samples: Samples, index: Tensor, grid: HashGrid, *, contraction: str) -> Tensor | None:

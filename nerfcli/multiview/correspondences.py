@@ -14,7 +14,7 @@ from nerfcli.scene import Scene
 SECONDS_PER_PIXEL = 0.7e-6
 
 
-class Shared:
+class SharedFeatures:
     """Features and 3D points shared by training photos.
 
     Args:

@@ -217,16 +217,16 @@ def _depth(photo: LoadedPhoto, view: _View, own: _Map, others: Sequence[tuple[_V
     rows, columns = np.nonzero(np.isfinite(own.rho))
     rho, errors = own.rho[rows, columns], own.errors[rows, columns]
     confirmed = np.zeros(len(rho), dtype=bool)
-    for other, known in others:
+    for other, other_depth in others:
         turn = (other.matrix @ other.turn @ view.turn.T @ np.linalg.inv(view.matrix)).astype(np.float32)
         move = (other.matrix @ other.turn @ (view.centre - other.centre)).astype(np.float32)
         x, y, z = (a * columns + b * rows + (c + move * rho) for (a, b, c), move in zip(turn, move, strict=True))
-        height, width = known.rho.shape
+        height, width = other_depth.rho.shape
         with np.errstate(divide="ignore", invalid="ignore"):
             column, row = np.rint(x / z), np.rint(y / z)
             inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
             place = np.where(inside, row * width + column, 0).astype(np.int64)
-            confirmed |= inside & (np.abs(known.rho.ravel()[place] * z / rho - 1.0) < CONSISTENT)
+            confirmed |= inside & (np.abs(other_depth.rho.ravel()[place] * z / rho - 1.0) < CONSISTENT)
     rows, columns, rho, errors = rows[confirmed], columns[confirmed], rho[confirmed], errors[confirmed]
     bearings, _ = view.pinhole.bearings(np.stack([columns, rows], axis=-1) + 0.5)
     camera = photo.frame.camera

@@ -21,8 +21,8 @@ def log_exposures(frames: Sequence[Frame]) -> np.ndarray:
 
 def mean_log_exposure(frames: Sequence[Frame]) -> float | None:
     """Return the mean of `log_exposures` over photos with a known exposure; None without any."""
-    known = [value for value in log_exposures(frames) if math.isfinite(value)]
-    return math.fsum(known) / len(known) if known else None
+    exposures = [value for value in log_exposures(frames) if math.isfinite(value)]
+    return math.fsum(exposures) / len(exposures) if exposures else None
 
 
 def relative_log_exposures(frames: Sequence[Frame], reference: float | None) -> np.ndarray:

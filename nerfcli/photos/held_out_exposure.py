@@ -44,8 +44,8 @@ def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> f
         places, log_gains: see `gains_between`.
         exif: (P,) logarithms of exposures; photos without a known one are ignored.
     """
-    known = np.isfinite(exif)
-    places, log_gains, exif = places[known], log_gains[known], exif[known]
+    has_exif = np.isfinite(exif)
+    places, log_gains, exif = places[has_exif], log_gains[has_exif], exif[has_exif]
     if len(places) < 3:
         return 1.0
 
@@ -73,11 +73,11 @@ def gains_beyond_exif(
         exif: (P,) logarithms of exposures; photos without a known one are ignored.
         slope: see `exif_slope`.
     """
-    known = np.isfinite(exif)
-    if not known.any():
+    has_exif = np.isfinite(exif)
+    if not has_exif.any():
         return np.zeros((len(wanted), 3))
-    predicted = slope * (exif[known] - exif[known].mean())
-    return gains_between(places[known], log_gains[known] - predicted[:, None], wanted)
+    predicted = slope * (exif[has_exif] - exif[has_exif].mean())
+    return gains_between(places[has_exif], log_gains[has_exif] - predicted[:, None], wanted)
 
 
 def _slope(exif: np.ndarray, log_gains: np.ndarray) -> float:
@@ -108,10 +108,10 @@ def gain_sources(frames: Sequence[Frame], model: Model) -> list[str]:
     none, exif, both, around, mean = SOURCES
     if model.log_exposure is None and not model.exposures:
         return [none] * len(frames)
-    known = np.isfinite(_by_exif(frames, model))
+    has_exif = np.isfinite(_by_exif(frames, model))
     has_offset = _by_name(frames, model.beyond_exif).any(1)
     has_neighbours = _by_name(frames, model.exposures).any(1)
-    return np.where(known, np.where(has_offset, both, exif), np.where(has_neighbours, around, mean)).tolist()
+    return np.where(has_exif, np.where(has_offset, both, exif), np.where(has_neighbours, around, mean)).tolist()
 
 
 def _by_name(frames: Sequence[Frame], log_gains: Mapping[str, tuple[float, ...]]) -> np.ndarray:

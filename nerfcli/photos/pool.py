@@ -75,7 +75,7 @@ def load_album(
     raise AssertionError("four channels hold every photo")
 
 
-class Drawn(NamedTuple):
+class PixelBatch(NamedTuple):
     """Random pixels with their rays.
 
     Args:
@@ -94,7 +94,7 @@ class Drawn(NamedTuple):
     trust: Tensor
     weights: Tensor
 
-    def every(self, first: int, step: int) -> "Drawn":
+    def every(self, first: int, step: int) -> "PixelBatch":
         """Return the pixels `first`, `first + step`, ...; those with known surface depth remain the last ones."""
         if step == 1:
             return self
@@ -103,7 +103,7 @@ class Drawn(NamedTuple):
             name: tensor[(first - begins.get(name, 0)) % step :: step].contiguous()
             for name, tensor in self._asdict().items()
         }
-        return Drawn(**parts)
+        return PixelBatch(**parts)
 
 
 class Pool(Protocol):
@@ -121,7 +121,7 @@ class Pool(Protocol):
         """True if the colours have four channels."""
         ...
 
-    def draw(self, count: int, generator: torch.Generator) -> Drawn:
+    def draw(self, count: int, generator: torch.Generator) -> PixelBatch:
         """Draw `count` random pixels, with replacement."""
         ...
 
@@ -204,7 +204,7 @@ class PixelPool:
     def has_alpha(self) -> bool:
         return self.colours.shape[-1] == 4
 
-    def draw(self, count: int, generator: torch.Generator) -> Drawn:
+    def draw(self, count: int, generator: torch.Generator) -> PixelBatch:
         """Draw `count` random pixels, with replacement."""
         return self.rays_of(self.numbers(count, generator))
 
@@ -220,12 +220,12 @@ class PixelPool:
         places = torch.searchsorted(self.usable, numbers).clamp_max(self.usable_count - 1)
         return self.usable[places] == numbers
 
-    def rays_of(self, numbers: Tensor) -> Drawn:
+    def rays_of(self, numbers: Tensor) -> PixelBatch:
         """Return the rays and colours of pixels (N,), counted through all photos."""
         pixels = PixelTable(self.first_pixel, self.first_bearing, self.bearings, self.poses, self.colours)
         rays = self._backend.pixel_rays(numbers, pixels)
         none = torch.zeros(0, device=numbers.device)
-        return Drawn(*rays, numbers, distances=none, trust=none, weights=none)
+        return PixelBatch(*rays, numbers, distances=none, trust=none, weights=none)
 
     def photo_of(self, numbers: Tensor) -> Tensor:
         """Return the photo index of each pixel (N,)."""

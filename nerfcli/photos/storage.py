@@ -32,7 +32,7 @@ _BYTES_PER_DECODED_PIXEL = 12
 
 
 @dataclass(frozen=True)
-class Needs:
+class MemoryNeeds:
     """Memory that a training run needs, in bytes.
 
     Args:
@@ -46,7 +46,7 @@ class Needs:
     rest: int
 
 
-def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -> Needs:
+def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -> MemoryNeeds:
     """Estimate the memory of photos and field from their sizes; `rest` includes what is resident now."""
     sizes = [(frame.camera.width // factor) * (frame.camera.height // factor) for frame in frames]
     of_cameras = {frame.camera: size for frame, size in zip(frames, sizes, strict=True)}
@@ -61,7 +61,7 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     largest = max(frame.camera.width * frame.camera.height for frame in frames)
     step = _COPIES_OF_FIELD * field_bytes(settings) + _BYTES_PER_SAMPLE * settings.samples_per_step
     rest = _BYTES_PER_DECODED_PIXEL * largest * min(settings.threads, len(frames)) + step
-    return Needs(photos, step, rest + resident_bytes(os.getpid()))
+    return MemoryNeeds(photos, step, rest + resident_bytes(os.getpid()))
 
 
 def field_bytes(settings: TrainSettings) -> int:
@@ -127,7 +127,7 @@ PhotoStorage = InMemory | InFiles
 IN_MEMORY = InMemory()
 
 
-def check_device_memory(needs: Needs, device: torch.device, limit: int | None) -> str:
+def check_device_memory(needs: MemoryNeeds, device: torch.device, limit: int | None) -> str:
     """Limit the memory that torch uses on a CUDA device, and return a message for the user.
 
     Args:
@@ -152,7 +152,7 @@ def check_device_memory(needs: Needs, device: torch.device, limit: int | None) -
     return f"memory on {device}: about {_gigabytes(needed)} of {_gigabytes(free)} that are free"
 
 
-def storage_for(needs: Needs, limit: int | None, *, folder: Path) -> tuple[PhotoStorage, str]:
+def storage_for(needs: MemoryNeeds, limit: int | None, *, folder: Path) -> tuple[PhotoStorage, str]:
     """Choose the storage of the photos, and a message for the user.
 
     Args:

@@ -41,9 +41,10 @@ class PosesReport:
     seconds: per stage, for the call that wrote the report; time spent in earlier calls is not included. models: the
     sizes of all models found, the kept one first. attempts: the result of each rung of the ladder. matching: the rule
     for pairs, and their number. points: number of points of the kept model. intrinsics: the given intrinsics, see
-    `cameras.Grouped`. strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components: each
-    model's photos and why it is not joined to the largest, ordered by size, as `--component` counts them. not_computed:
-    checks that could not be computed, and why. not_finite: where the report has null for a number that was not finite.
+    `cameras.PhotoGroups`. strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components:
+    each model's photos and why it is not joined to the largest, ordered by size, as `--component` counts them.
+    not_computed: checks that could not be computed, and why. not_finite: where the report has null for a number that
+    was not finite.
     cut_short: what was stopped because it took far longer than planned.
     moving_foreground: facts about an object that turns in front of a static background, and its masks; see `turntable`.
     """
@@ -95,8 +96,8 @@ def make_report(
             images[name] = ImageReport(name, True, None, orientation, blur.get(str(number)))
         else:
             elsewhere = max((len(model) for model in models[1:] if number in model), default=0)
-            known = Evidence(**result["evidence"][number], other_model_size=elsewhere)
-            why = result["left_out"].get(str(number)) or reason(known)
+            evidence = Evidence(**result["evidence"][number], other_model_size=elsewhere)
+            why = result["left_out"].get(str(number)) or reason(evidence)
             images[name] = ImageReport(name, False, why, orientation)
     return PosesReport(
         registered=len(models[0]) if models else 0,

@@ -31,7 +31,7 @@ from nerfcli.poses.input.settings import Limits, PoseSettings, check_settings
 from nerfcli.poses.input.stages import file_key
 from nerfcli.poses.input.work_photos import lay_out
 from nerfcli.poses.judge.checks import UNDERWAY
-from nerfcli.poses.model.cameras import GivenIntrinsics, Grouped, group_by_given, group_photos
+from nerfcli.poses.model.cameras import GivenIntrinsics, PhotoGroups, group_by_given, group_photos
 from nerfcli.poses.report import PosesReport, closing_notes, make_report, refusal
 from nerfcli.poses.workspace import POINTS_FILE, is_under_construction, keep_refused, publish, workspace
 
@@ -123,7 +123,7 @@ def plan_poses(
     settings: PoseSettings,
     progress: Callable[[str, int, int], None],
     given: GivenIntrinsics | None = None,
-) -> tuple[Photos, Grouped, Pairing, Plan]:
+) -> tuple[Photos, PhotoGroups, Pairing, Plan]:
     """Read the photos, choose cameras and pairs, and estimate how long the work will take; nothing is written.
 
     Raises:
@@ -141,7 +141,7 @@ def plan_poses(
     return photos, grouped, pairing, make_plan(photos, pairing, settings, threads=threads)
 
 
-def photo_notes(photos: Photos, grouped: Grouped) -> list[str]:
+def photo_notes(photos: Photos, grouped: PhotoGroups) -> list[str]:
     """List the skipped files with reasons, and notes on the cameras of the other photos."""
     return [*(f"{name} is skipped: {why}" for name, why in photos.unreadable.items()), *grouped.notes]
 
@@ -165,11 +165,11 @@ def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given
     names = [path.name for path in list_images(photos_dir)]
     pairs_key = None if settings.pairs_file is None else file_key(Path(settings.pairs_file))
     holdout_key = file_key(Path(settings.holdout)) if Path(settings.holdout).is_file() else None
-    known = report.get("intrinsics")
+    earlier = report.get("intrinsics")
     wanted_settings = asdict(settings)
     for name in ("threads", "accept_refused"):
         del wanted_settings[name]
-    if (known and (known["use"], known["key"])) != (given and (given.use, given.calibration.key)):
+    if (earlier and (earlier["use"], earlier["key"])) != (given and (given.use, given.calibration.key)):
         return False
     made_with = asdict(PoseSettings()) | report["settings"]  # settings newer than the report had their defaults
     return (
@@ -217,7 +217,7 @@ def _prepare(
     photos: Photos,
     settings: PoseSettings,
     *,
-    grouped: Grouped,
+    grouped: PhotoGroups,
     pairing: Pairing,
     work: Path,
     notify: Callable[[str], None],

@@ -8,7 +8,7 @@ import numpy as np
 from nerfcli.pages.embedded_pictures import data_uri, fitted, jpeg_bytes
 from nerfcli.report.run_facts import RunFacts, warnings_of
 from nerfcli.report.tables import last_logged, metric, registered, render_time
-from nerfcli.report.views import Seen
+from nerfcli.report.views import HeldOutRenderings
 
 _THUMBNAIL_PX = 120
 _COLUMNS = (
@@ -22,7 +22,7 @@ _COLUMNS = (
 )
 
 
-def overview_html(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]]) -> str:
+def overview_html(runs: Sequence[RunFacts], looks: Sequence[Sequence[HeldOutRenderings]]) -> str:
     """Format a table with a row for each run; its thumbnail is the photo with the median PSNR beside its rendering."""
     headings = "".join(f"<th{_aligned(name)}><button>{name}</button></th>" for name in ("run", *dict(_COLUMNS)))
     rows = "".join(
@@ -39,7 +39,7 @@ def _aligned(name: str) -> str:
     return "" if name == "run" else " class=number"
 
 
-def _thumbnails(look: Sequence[Seen]) -> str:
+def _thumbnails(look: Sequence[HeldOutRenderings]) -> str:
     if not look:
         return ""
     view = sorted(look, key=lambda view: view.psnr)[len(look) // 2]

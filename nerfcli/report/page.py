@@ -31,7 +31,7 @@ from nerfcli.report.views import (
     COVERAGE_RANGE,
     ERROR_COLOURS,
     ERROR_RANGE,
-    Seen,
+    HeldOutRenderings,
     coverage_picture,
     depth_range,
 )
@@ -62,7 +62,11 @@ def origin_of(runs: Sequence[RunFacts], hashes: Sequence[str], *, views: int, de
 
 
 def page_html(
-    runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], *, depths: Sequence[DepthMeta], origin: str | None = None
+    runs: Sequence[RunFacts],
+    looks: Sequence[Sequence[HeldOutRenderings]],
+    *,
+    depths: Sequence[DepthMeta],
+    origin: str | None = None,
 ) -> str:
     """Return the page's text.
 
@@ -105,11 +109,11 @@ def _warnings_html(runs: Sequence[RunFacts]) -> str:
     return f'<ul class="warned">{items}</ul>' if rows else "<p>No warnings.</p>"
 
 
-def _structure(view: Seen) -> str:
+def _structure(view: HeldOutRenderings) -> str:
     return "not known" if view.ssim is None else f"{view.ssim:.3f}"
 
 
-def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]]) -> list[tuple[float, float]]:
+def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[HeldOutRenderings]]) -> list[tuple[float, float]]:
     """Return the depth range of each run's colour scale, which all runs of a scene share."""
     scenes = scenes_of(runs)
     return [
@@ -119,7 +123,7 @@ def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]]) -> 
 
 
 def _views_html(
-    runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], ranges: Sequence[tuple[float, float]]
+    runs: Sequence[RunFacts], looks: Sequence[Sequence[HeldOutRenderings]], ranges: Sequence[tuple[float, float]]
 ) -> str:
     layers, figures = [], []
     shown = [
@@ -151,7 +155,7 @@ def _views_html(
 
 
 def _layers(
-    first: Seen, seen: Sequence[tuple[RunFacts, Seen, tuple[float, float]]], *, alone: bool
+    first: HeldOutRenderings, seen: Sequence[tuple[RunFacts, HeldOutRenderings, tuple[float, float]]], *, alone: bool
 ) -> list[dict[str, str]]:
     """Return the layers of a photo: itself, then the renderings, errors, depths and coverage of all runs."""
 

@@ -29,7 +29,7 @@ _RANGE_PERCENT = (1, 99)
 
 
 @dataclass(frozen=True)
-class Seen:
+class HeldOutRenderings:
     """Renderings of a held-out photo by a run.
 
     Args:
@@ -73,7 +73,7 @@ def look_at(
     depth: DepthRequest,
     photo_depths: Sequence[DepthMap],
     on_progress: Callable[[float], None],
-) -> list[Seen]:
+) -> list[HeldOutRenderings]:
     """Render held-out photos of a run.
 
     Args:
@@ -91,7 +91,7 @@ def look_at(
         compared = compare(photo, picture)
         rendered, used = to_8_bit(compared.rendered), compared.used
         views.append(
-            Seen(
+            HeldOutRenderings(
                 name=photo.frame.name,
                 photo=compared.photo,
                 picture=rendered,
@@ -107,7 +107,7 @@ def look_at(
 
 
 def coverage_map(model: Model, frame: Frame, photo_depths: Sequence[DepthMap]) -> np.ndarray:
-    """Count the training photos that see the surface in each pixel of a small picture (h, w), see `Seen`."""
+    """Count the training photos that see the surface in each pixel of a small picture (h, w)."""
     small = small_frame(frame, COVERAGE_PX)
     picture = render_picture(model, small, background=model.background, depth=_COVERAGE)
     seen = with_visibility(picture, small, axis=_COVERAGE.axis, photo_depths=photo_depths)
@@ -120,7 +120,7 @@ def coverage_picture(coverage: np.ndarray) -> np.ndarray:
     return coloured(coverage, lo=0.0, hi=float(COVERAGE_RANGE), colour_map=COVERAGE_COLOURS)
 
 
-def depth_range(views: Sequence[Seen]) -> tuple[float, float]:
+def depth_range(views: Sequence[HeldOutRenderings]) -> tuple[float, float]:
     """Return the 1st and 99th percentile of all defined depths; (0, 1) if there are none."""
     valid = np.concatenate([np.empty(0), *(view.depth[np.isfinite(view.depth)] for view in views)])
     if not len(valid):

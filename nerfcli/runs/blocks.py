@@ -48,7 +48,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Division:
+class BlockDivision:
     """A scene divided into blocks.
 
     Args:
@@ -67,7 +67,7 @@ def block_path(run: Path, number: int) -> Path:
     return run / BLOCKS / str(number)
 
 
-def divide(scene: Scene, count: int) -> Division:
+def divide(scene: Scene, count: int) -> BlockDivision:
     """Divide a scene into blocks with about equally many points.
 
     Raises:
@@ -104,10 +104,10 @@ def divide(scene: Scene, count: int) -> Division:
             only = len(of_block.train_frames)
             raise UserError(f"block {number} of {count} is seen by {only} training photos of {scene.root}", fewer)
         scenes.append(replace(of_block, points=capture.points[own]))
-    return Division(ground, cells, tuple(scenes))
+    return BlockDivision(ground, cells, tuple(scenes))
 
 
-def joined(models: Sequence[Model], division: Division) -> Model:
+def joined(models: Sequence[Model], division: BlockDivision) -> Model:
     """Join the models of all blocks into one.
 
     Its unit ball contains those of the blocks, its steps along rays are the shortest of the blocks, and its background

@@ -41,8 +41,8 @@ class Decision:
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Decision":
         """Read the content that `to_json` returned; numbers that earlier versions did not write are None."""
-        known: dict[str, Any] = {entry.name: content.get(entry.name) for entry in fields(cls)}
-        return cls(**known)
+        entries: dict[str, Any] = {entry.name: content.get(entry.name) for entry in fields(cls)}
+        return cls(**entries)
 
     def in_words(self) -> str:
         """Return a line for people: "exposure=learned: +1.20 dB (± 0.08), 3 % more time: kept, gains ..."."""

@@ -169,10 +169,10 @@ class TrainSettings:
     def from_json(cls, content: dict[str, Any]) -> "TrainSettings":
         """Read the content that `to_json` returned; missing entries have their defaults."""
         names = {entry.name for entry in dataclasses.fields(cls)}
-        known: dict[str, Any] = {name: value for name, value in content.items() if name in names}
-        known["components"] = Components(**content.get("components", {}))
-        known["fixed"] = tuple(content.get("fixed", ()))
-        return cls(**known)
+        entries: dict[str, Any] = {name: value for name, value in content.items() if name in names}
+        entries["components"] = Components(**content.get("components", {}))
+        entries["fixed"] = tuple(content.get("fixed", ()))
+        return cls(**entries)
 
 
 def sizes_for(device: str) -> dict[str, Any]:

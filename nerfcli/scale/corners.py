@@ -65,22 +65,22 @@ def scale_from_corners(
             reasons.append(point)
         else:
             points[corner] = point
-    known = [side for side in sides if side.first in points and side.second in points]
-    lengths = np.array([np.linalg.norm(points[side.first] - points[side.second]) for side in known])
+    measured_sides = [side for side in sides if side.first in points and side.second in points]
+    lengths = np.array([np.linalg.norm(points[side.first] - points[side.second]) for side in measured_sides])
     if not len(lengths) or not lengths.min() > 0:
         raise _no_scale(pattern, sightings, reasons)
-    metres = np.array([side.metres for side in known])
+    metres = np.array([side.metres for side in measured_sides])
     scale = float(np.median(metres / lengths))
     deviation = _SIGMA_PER_MAD * float(np.median(np.abs(metres / lengths - scale)))
     named: dict[str, list[float]] = {}
-    for side, ratio in zip(known, scale * lengths / metres, strict=True):
+    for side, ratio in zip(measured_sides, scale * lengths / metres, strict=True):
         named.setdefault(side.name, []).append(100 * (float(ratio) - 1))
     return ScaleEstimate(
         metres_per_unit=scale,
-        standard_error=_MEDIAN_PER_MEAN * deviation / math.sqrt(len(known)),
+        standard_error=_MEDIAN_PER_MEAN * deviation / math.sqrt(len(measured_sides)),
         residuals=tuple((name, float(np.mean(values))) for name, values in named.items()),
         residual_unit="percent",
-        source=f"{pattern}, {len(known)} sides",
+        source=f"{pattern}, {len(measured_sides)} sides",
     )
 
 

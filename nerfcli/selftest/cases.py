@@ -119,7 +119,7 @@ def groups() -> tuple[Group, ...]:
     )
 
 
-def lit(rays: list[Segments], precision: Precision) -> tuple[int, float]:
+def deepest_ray(rays: list[Segments], precision: Precision) -> tuple[int, float]:
     """Return the largest number of intervals on a ray that light reaches, and the largest optical depth it passes."""
     counts, depths = [0], [0.0]
     for ray in rays:

@@ -16,7 +16,7 @@ from torch import Tensor
 from nerfcli.kernels import HashGrid, March, PixelTable, Rays, reference
 from nerfcli.kernels.activations import density_from_log
 from nerfcli.selftest import cases, textbook
-from nerfcli.selftest.cases import MEANINGLESS, Ray, Segments, lit
+from nerfcli.selftest.cases import MEANINGLESS, Ray, Segments, deepest_ray
 from nerfcli.selftest.measure import Errors, Precision, largest_error
 
 BACKGROUND = COLOUR_GRADIENT = (1.0, 0.5, 0.25)
@@ -112,7 +112,7 @@ def light_bound(rays: Sequence[Segments], precision: Precision) -> Errors:
         rays = [ray for ray in rays if len(ray.density) <= 16]
     if not rays:
         return Errors(math.inf)
-    samples, depth = lit(list(rays), precision)
+    samples, depth = deepest_ray(list(rays), precision)
     bound = precision.unit * (8 + (samples + 2) * (1 + depth))
     return Errors(bound, 2 * bound)
 
@@ -205,7 +205,7 @@ def depth_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Err
         return Errors(16 * factor * precision.unit)
     lengths = (tuple(end - start for start, end in zip(ray.starts, ray.ends, strict=True)) for ray in rays)
     intervals = [Segments(tuple(ray.density), length) for ray, length in zip(rays, lengths, strict=True)]
-    samples, depth = lit(intervals, precision)
+    samples, depth = deepest_ray(intervals, precision)
     bound = factor * precision.unit * (16 + (samples + 2) * (1 + depth))
     return Errors(bound, 16 * bound)
 

@@ -36,7 +36,7 @@ _FAR = 1e9
 
 
 @dataclass(frozen=True)
-class Fused:
+class FusedVolume:
     """Signed distances in the blocks of a grid.
 
     Args:
@@ -74,7 +74,7 @@ class Fused:
 
 def fuse(
     views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda fraction: None
-) -> Fused:
+) -> FusedVolume:
     """Fuse depth maps.
 
     Args:
@@ -91,7 +91,7 @@ def fuse(
         _add(view, grid, corners, inside=inside, distance=distance, weight=weight)
         on_progress((count + 1) / len(views))
     shape = (-1, SIDE, SIDE, SIDE)
-    return Fused(grid, index, distance.numpy().reshape(shape), weight.numpy().reshape(shape))
+    return FusedVolume(grid, index, distance.numpy().reshape(shape), weight.numpy().reshape(shape))
 
 
 def pixel_weights(view: DepthView, voxel_size: float) -> np.ndarray:

@@ -8,7 +8,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
-from nerfcli.surface.fusion import SIDE, Fused
+from nerfcli.surface.fusion import SIDE, FusedVolume
 
 # Voxels along a side of a brick, the unit of marching.
 _BRICK = 8 * SIDE
@@ -35,7 +35,7 @@ class Mesh:
     colours: np.ndarray | None = None
 
 
-def surface_of(fused: Fused, *, on_progress: Callable[[float], None] = lambda fraction: None) -> Mesh:
+def surface_of(fused: FusedVolume, *, on_progress: Callable[[float], None] = lambda fraction: None) -> Mesh:
     """Return the mesh on which the signed distance is 0, between seen voxels.
 
     Args:
@@ -102,18 +102,18 @@ def _any_block(index: np.ndarray) -> np.ndarray:
     return np.asarray(padded.reshape(x, size, y, size, z, size).any(axis=(1, 3, 5)))
 
 
-def _march(fused: Fused, first: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def _march(fused: FusedVolume, first: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the vertices of a brick, in voxels from `first`, and its triangles; None if it has no surface."""
     shape = tuple(int(min(_BRICK + 1, total - at)) for at, total in zip(first, fused.grid.shape, strict=True))
     if min(shape) < 2:
         return None
     distance, weight = fused.dense((int(first[0]), int(first[1]), int(first[2])), (shape[0], shape[1], shape[2]))
-    known = weight >= SEEN
-    cubes = known[:-1, :-1, :-1].copy()
+    seen = weight >= SEEN
+    cubes = seen[:-1, :-1, :-1].copy()
     negative = np.zeros(cubes.shape, np.int8)
     for corner in np.ndindex(2, 2, 2):
         part = tuple(slice(at, at + length) for at, length in zip(corner, cubes.shape, strict=True))
-        cubes &= known[part]
+        cubes &= seen[part]
         negative += distance[part] < 0
     if not (cubes & (negative > 0) & (negative < 8)).any():
         return None

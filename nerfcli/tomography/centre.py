@@ -57,12 +57,12 @@ def centre_of(row: Row, *, mirrored: bool = False) -> Centre:
     between = (columns // coarse.geometry.columns) / factor
     best = float(shifts[int(np.argmin(means))]) * between
     step = between / 2
-    known: dict[float, np.ndarray] = {}
+    misfits: dict[float, np.ndarray] = {}
 
     def errors(shift: float) -> np.ndarray:
-        if shift not in known:
-            known[shift] = misfit(fine, shift=shift, mirrored=mirrored)
-        return known[shift]
+        if shift not in misfits:
+            misfits[shift] = misfit(fine, shift=shift, mirrored=mirrored)
+        return misfits[shift]
 
     while step * factor > _PRECISE_PX * 4:
         around = [best - step, best, best + step]

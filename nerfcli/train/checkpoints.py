@@ -24,7 +24,7 @@ from nerfcli.runs.config import read_config
 from nerfcli.runs.files import FIELD, STATE
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train.preparation import Begun, Prepared
+from nerfcli.train.preparation import EarlierDecisions, Prepared
 
 STATE_FORMAT = "nerfcli training 2"
 # Photos without alpha fill the frame; behind the field is black, and little of it shows through.
@@ -151,7 +151,7 @@ class Checkpoints:
             self.write_cameras()
 
 
-def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]) -> Begun:
+def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]) -> EarlierDecisions:
     """Return the decisions of an earlier call, from its last checkpoint and its settings.
 
     Raises:
@@ -165,7 +165,7 @@ def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]
             f"{run} was trained with --contraction {extent.contraction}, not {settings.contraction}",
             "train into a new folder with -o, or again with --overwrite",
         )
-    return Begun(extent, read_config(run).components)
+    return EarlierDecisions(extent, read_config(run).components)
 
 
 def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> Totals:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerfcli.fit.extent import Extent
 from nerfcli.fit.point_depth import PointDepths, point_depths, stereo_depths
-from nerfcli.multiview.correspondences import Shared
+from nerfcli.multiview.correspondences import SharedFeatures
 from nerfcli.multiview.exposures import matched_log_gains
 from nerfcli.multiview.sky import sky_masks
 from nerfcli.multiview.stereo import LEAST_SIDE_PX, DenseDepth, affordable_side_px, dense_depths
@@ -42,7 +42,7 @@ class Evidence:
 
     def __init__(
         self,
-        shared: Shared,
+        shared: SharedFeatures,
         album: Album,
         pool: PixelPool,
         extent: Extent,
@@ -85,22 +85,22 @@ class Evidence:
         began = time.perf_counter()
         found = matched_log_gains(self._album.photos, dense)
         exif = log_exposures([photo.frame for photo in self._album.photos])
-        known = np.isfinite(found).all(1) & np.isfinite(exif)
-        if known.sum() < FEWEST_EXIF or exif_slope(np.flatnonzero(known), found[known], exif[known]) == 0.0:
+        measured = np.isfinite(found).all(1) & np.isfinite(exif)
+        if measured.sum() < FEWEST_EXIF or exif_slope(np.flatnonzero(measured), found[measured], exif[measured]) == 0.0:
             found = np.full_like(found, np.nan)
         self.stereo_seconds += time.perf_counter() - began
         return found
 
     def gains_or(self, others: Tensor) -> Tensor:
         """Return `log_gains` (photos, 3), with the values of `others` where unknown."""
-        known = torch.from_numpy(self.log_gains).to(others)
-        return torch.where(known.isfinite(), known, others)
+        measured = torch.from_numpy(self.log_gains).to(others)
+        return torch.where(measured.isfinite(), measured, others)
 
     @property
     def exposure_spread(self) -> float:
         """Standard deviation of the photos' log brightness in matched pixels; 0 if nothing is known."""
-        known = self.log_gains[np.isfinite(self.log_gains).all(1)]
-        return float(known.mean(1).std()) if len(known) else 0.0
+        measured = self.log_gains[np.isfinite(self.log_gains).all(1)]
+        return float(measured.mean(1).std()) if len(measured) else 0.0
 
     @cached_property
     def _plain(self) -> Tensor:

@@ -13,7 +13,7 @@ from nerfcli.errors import UserError
 from nerfcli.fit.extent import Extent
 from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.point_depth import PointDepths, PointRays
-from nerfcli.fit.ranks import ALONE, Alone
+from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.photos.pool import PixelPool
 from nerfcli.runs.settings import TrainSettings
@@ -30,7 +30,7 @@ TIMED_STEPS = 20
 
 
 @dataclass(frozen=True)
-class Decided:
+class SharedPreparation:
     """Results of rank 0's preparation that the other ranks need, on the CPU; see `Prepared`."""
 
     settings: TrainSettings
@@ -50,7 +50,7 @@ def start_others(fitting: Fitting, prepared: Prepared) -> None:
     ranks, points = fitting.ranks, prepared.points
     if ranks.count == 1:
         return
-    decided = Decided(
+    decided = SharedPreparation(
         prepared.settings,
         prepared.extent,
         prepared.log_gains.cpu(),
@@ -62,7 +62,7 @@ def start_others(fitting: Fitting, prepared: Prepared) -> None:
     _copy_state(fitting)
 
 
-def follow(scene: Scene, run: Path, settings: TrainSettings, ranks: Alone, *, memory_bytes: int | None) -> None:
+def follow(scene: Scene, run: Path, settings: TrainSettings, ranks: SingleProcess, *, memory_bytes: int | None) -> None:
     """Take part in the training of rank 0 until it ends.
 
     Args:
@@ -79,7 +79,7 @@ def follow(scene: Scene, run: Path, settings: TrainSettings, ranks: Alone, *, me
     torch.set_num_threads(settings.threads)
     kernels.prepare(_silent, settings.device)
     factor, storage, album = load_training_photos(scene, settings, run=run, memory_bytes=memory_bytes, notify=_silent)
-    decided: Decided | None = ranks.from_first(None)
+    decided: SharedPreparation | None = ranks.from_first(None)
     if decided is None:  # the run is complete already
         return
     settings = replace(decided.settings, device=settings.device, threads=settings.threads)

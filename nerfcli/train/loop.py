@@ -16,7 +16,7 @@ from nerfcli.errors import LOST_RANK, UserError
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.cost import field_bytes
 from nerfcli.fit.fitting import Fitting
-from nerfcli.fit.ranks import ALONE, Alone
+from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.runs.config import RunConfig, read_config, write_config
 from nerfcli.runs.files import FIELD, LOG, STATE
@@ -54,7 +54,7 @@ def train(
     *,
     resume: bool,
     memory_bytes: int | None = None,
-    ranks: Alone = ALONE,
+    ranks: SingleProcess = ALONE,
     notify: Callable[[str], None],
     on_progress: Callable[[Progress], None],
 ) -> None:

@@ -21,10 +21,10 @@ from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.movers import Movers
 from nerfcli.fit.open_cells import OCCUPANCY_SIDE
 from nerfcli.fit.point_depth import PointDepths, PointRays
-from nerfcli.fit.ranks import ALONE, Alone
+from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.memory import default_memory_limit
 from nerfcli.multiview.camera_check import CameraCheck, check_cameras
-from nerfcli.multiview.correspondences import Shared
+from nerfcli.multiview.correspondences import SharedFeatures
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.pool import Album, PixelPool, load_album
@@ -54,7 +54,7 @@ MATCHING_FRACTION = 0.5
 
 
 @dataclass(frozen=True)
-class Begun:
+class EarlierDecisions:
     """Decisions of an interrupted training."""
 
     extent: Extent
@@ -94,7 +94,7 @@ class Prepared:
     seconds: float
     sky: Tensor | None
 
-    def fitting(self, ranks: Alone = ALONE) -> Fitting:
+    def fitting(self, ranks: SingleProcess = ALONE) -> Fitting:
         """Return the training before its first step, for this one of the ranks."""
         return Fitting(
             self.pool,
@@ -152,7 +152,7 @@ def prepare(
     *,
     run: Path,
     memory_bytes: int | None,
-    begun: Begun | None,
+    begun: EarlierDecisions | None,
     notify: Callable[[str], None],
 ) -> Prepared:
     """Load the training photos and choose extent, components and initial exposures.
@@ -170,7 +170,7 @@ def prepare(
     """
     factor, storage, album = load_training_photos(scene, settings, run=run, memory_bytes=memory_bytes, notify=notify)
     device = torch.device(settings.device)
-    shared = Shared(scene, album.photos, threads=settings.threads)
+    shared = SharedFeatures(scene, album.photos, threads=settings.threads)
     if begun is not None:
         extent = begun.extent
     else:
@@ -240,7 +240,7 @@ def _facts(
     album: Album,
     settings: TrainSettings,
     *,
-    shared: Shared,
+    shared: SharedFeatures,
     evidence: Evidence,
     notify: Callable[[str], None],
 ) -> Facts:
@@ -268,7 +268,7 @@ def _facts(
     return facts
 
 
-def _camera_check(album: Album, shared: Shared, *, notify: Callable[[str], None]) -> CameraCheck | None:
+def _camera_check(album: Album, shared: SharedFeatures, *, notify: Callable[[str], None]) -> CameraCheck | None:
     """Check the cameras against matched features; None, with a note, if the check cannot be computed."""
     try:
         return check_cameras(album.photos, shared.matched)

@@ -7,7 +7,7 @@ from datetime import timedelta
 import torch
 import torch.distributed as dist
 
-from nerfcli.fit.ranks import ALONE, Alone, Ranks, lost_ranks_reported
+from nerfcli.fit.ranks import ALONE, Ranks, SingleProcess, lost_ranks_reported
 from nerfcli.torchrun import is_one_of_several
 
 # Timeouts: long while photos are loaded and components selected, short for joining and for steps. A process that ends
@@ -16,7 +16,7 @@ PREPARATION, STEP = timedelta(hours=12), timedelta(minutes=5)
 
 
 @functools.cache  # they meet once, and stay together as long as they live
-def joined_ranks(device: str) -> Alone:
+def joined_ranks(device: str) -> SingleProcess:
     """Join the processes that torchrun has started; return `ALONE` if it has started one, or none.
 
     Args:

@@ -24,7 +24,7 @@ from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.kinds import settings_from_json
 from nerfcli.fit.fitting import Fitting, StepResult
 from nerfcli.fit.watch import BadTensor, FirstBad, NonFiniteError, is_finite, that_must_be_finite
-from nerfcli.photos.pool import Drawn, PixelPool
+from nerfcli.photos.pool import PixelBatch, PixelPool
 from nerfcli.render.model import Marching
 from nerfcli.runs.settings import TrainSettings
 
@@ -187,7 +187,7 @@ class _SavedBatch:
         self.cones = tensors["batch.cones"]
         self.poses = tensors.get("batch.poses", torch.zeros(0, 4, 4))  # earlier versions refined no cameras
         self.cameras = tuple(Camera.from_json(camera) for camera in cameras)
-        self._drawn = Drawn(**{name: tensors[f"batch.{name}"] for name in Drawn._fields})
+        self._drawn = PixelBatch(**{name: tensors[f"batch.{name}"] for name in PixelBatch._fields})
         self._after_draw = tensors["batch.after_draw"]
         self.footprint = math.nan  # the field's size is known
 
@@ -195,7 +195,7 @@ class _SavedBatch:
     def has_alpha(self) -> bool:
         return self.colours.shape[-1] == 4
 
-    def draw(self, count: int, generator: torch.Generator) -> Drawn:
+    def draw(self, count: int, generator: torch.Generator) -> PixelBatch:
         generator.set_state(self._after_draw)
         return self._drawn
 

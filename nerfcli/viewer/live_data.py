@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.viewer.packing import Packed
+from nerfcli.viewer.packing import PackedField
 from nerfcli.viewer.proof import Proof
 
 
-def field_bytes(packed: Packed, version: int) -> bytes:
+def field_bytes(packed: PackedField, version: int) -> bytes:
     """Encode the parameters of a field; `version` is the field version in the server's status."""
     return _bytes({"version": version, "field": packed.field, "march": packed.march}, packed.arrays)
 

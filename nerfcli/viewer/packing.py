@@ -33,7 +33,7 @@ MOST_BLOCKS = 256
 
 
 @dataclass(frozen=True)
-class Packed:
+class PackedField:
     """A field ready for the page.
 
     Args:
@@ -46,7 +46,7 @@ class Packed:
     arrays: dict[str, np.ndarray]
 
 
-def pack_model(model: Model) -> Packed:
+def pack_model(model: Model) -> PackedField:
     """Pack the field of a model with everything that rendering needs.
 
     Raises:
@@ -85,7 +85,7 @@ def pack_model(model: Model) -> Packed:
         "occupied": np.packbits(occupied.numpy().ravel(), bitorder="little"),
         **({} if sky is None else {"sky": sky[0]}),
     }
-    return Packed(field, march, arrays)
+    return PackedField(field, march, arrays)
 
 
 def quantised(values: np.ndarray) -> tuple[np.ndarray, float]:

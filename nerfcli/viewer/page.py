@@ -18,7 +18,7 @@ from nerfcli.media.colour_maps import levels_of
 from nerfcli.pages import page
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import TOLERANCE
-from nerfcli.viewer.packing import Packed
+from nerfcli.viewer.packing import PackedField
 from nerfcli.viewer.pictures import PagePhotos, frustum_depth, view_of
 from nerfcli.viewer.proof import Proof
 
@@ -40,7 +40,7 @@ class PageNumbers:
     elements: str
 
     @classmethod
-    def of(cls, packed: Packed, proof: Proof, seen: np.ndarray) -> "PageNumbers":
+    def of(cls, packed: PackedField, proof: Proof, seen: np.ndarray) -> "PageNumbers":
         """Encode a packed field with its proof and its `seen_cells`."""
         description = {"field": packed.field, "march": packed.march, "proof": proof.description, "seen": len(seen)}
         arrays = {**packed.arrays, "expected": proof.expected, "seen": seen}
@@ -85,7 +85,7 @@ def live_page_html(
     Args:
         model, run, frames, box: as for `page_html`.
         photos: see `pictures.fetched_photos`.
-        version: version of the field, see `server.Show.status`.
+        version: version of the field, see `server.PageData.status`.
         refusal: reason why the page cannot draw this field itself; None if it can.
     """
     scene = _scene(model, run=run, frames=frames, photos=photos, box=box)

@@ -24,7 +24,7 @@ ACTIONS = ("pause", "continue", "stop")
 _HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
 
 
-class Show(Protocol):
+class PageData(Protocol):
     """Data source of the page, called from several threads. A UserError becomes a message on the page."""
 
     def page(self) -> str:
@@ -72,7 +72,7 @@ class PageServer(ThreadingHTTPServer):
     # On Windows this option would let a second server take the port of the first.
     allow_reuse_address = sys.platform != "win32"
 
-    def __init__(self, show: Show, *, host: str, port: int | None):
+    def __init__(self, show: PageData, *, host: str, port: int | None):
         self.show = show
         self.token = secrets.token_urlsafe(16)
         self.clients = 0

@@ -7,8 +7,8 @@ from typing import Any
 from nerfcli.cameras.frame import Capture
 from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.convert import detect
-from nerfcli.convert.conversion import Conversion, Doubt, TargetOptions, convert, load
-from nerfcli.convert.formats import Format, Given, recording
+from nerfcli.convert.conversion import ConventionOverrides, Conversion, TargetOptions, convert, load
+from nerfcli.convert.formats import Format, UserInputs, recording
 from nerfcli.convert.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.convert.world_frame import WorldFrame, in_world_frame
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
@@ -27,8 +27,8 @@ def convert_capture(
     target: Path,
     wanted: TargetOptions,
     *,
-    given: Given = Given(),
-    doubt: Doubt = Doubt(),
+    given: UserInputs = UserInputs(),
+    overrides: ConventionOverrides = ConventionOverrides(),
     world: WorldFrame = WorldFrame(),
     notify: Notify = silent,
     warn: Notify = warn_python,
@@ -40,7 +40,7 @@ def convert_capture(
         target: the file or folder to write.
         wanted: format and conventions of the target.
         given: photos and cameras that the source does not name.
-        doubt: conventions of the source that differ from those of its format.
+        overrides: conventions of the source that differ from those of its format.
         world: the world frame of the target.
         notify, warn: called with lines for the user.
 
@@ -48,7 +48,7 @@ def convert_capture(
         UserError: the capture cannot be read or written, the format cannot hold it, or the verification fails.
     """
     to = wanted.form.name
-    form, found, capture = load(source, given, doubt)
+    form, found, capture = load(source, given, overrides)
     notify(f"{found}: {form.name}, {contents(capture)}")
     for text in describe_rescaling(other_sizes(capture)):
         notify(f"{text.removesuffix(': rescaled')}; written to {to} unchanged")
@@ -75,8 +75,8 @@ def convert_capture(
 def detect_convention(
     source: Path,
     *,
-    given: Given = Given(),
-    doubt: Doubt = Doubt(),
+    given: UserInputs = UserInputs(),
+    overrides: ConventionOverrides = ConventionOverrides(),
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> tuple[Format, detect.Detection]:
@@ -85,7 +85,7 @@ def detect_convention(
     Raises:
         UserError: the capture cannot be read, or there is too little evidence.
     """
-    form, found, capture = load(source, given, doubt)
+    form, found, capture = load(source, given, overrides)
     notify(f"{found}: {form.name}, {contents(capture)}")
     return form, detect.detect(in_pixels(capture, STORED).capture, axes=form.axes, progress=progress)
 

@@ -21,7 +21,7 @@ from nerfcli.evaluate.predictions import (
     save_compared,
     save_unrounded,
 )
-from nerfcli.evaluate.protocol import PROTOCOL, Compared, Extras, evaluate_model
+from nerfcli.evaluate.protocol import PROTOCOL, ComparedImages, Extras, evaluate_model
 from nerfcli.evaluate.requirements import WHY_ABSENT, Requirement, known_numbers, unmet
 from nerfcli.evaluate.run_photos import held_out_photos_of, training_billboards
 from nerfcli.export.file_names import file_names
@@ -152,7 +152,7 @@ def check_requirements(run: Run, metrics: dict[str, Any], requirements: Sequence
 @contextmanager
 def saved_predictions(
     run: Path, frames: Sequence[Frame], kind: str | None, *, checkpoint: str
-) -> Iterator[Callable[[Compared], None]]:
+) -> Iterator[Callable[[ComparedImages], None]]:
     """Yield a function that saves one comparison in RUN/predictions; the folder appears when all are saved.
 
     Args:
@@ -167,7 +167,7 @@ def saved_predictions(
     stems = dict(zip((frame.name for frame in frames), file_names(frames), strict=True))
     with atomic_folder(run / PREDICTIONS) as folder:
 
-        def keep(compared: Compared) -> None:
+        def keep(compared: ComparedImages) -> None:
             save_compared(folder, stems[compared.frame.name], compared)
             if kind == "float":
                 save_unrounded(folder, stems[compared.frame.name], compared)

@@ -5,7 +5,7 @@ from pathlib import Path
 from nerfcli.convert.camera_files import read_calibration
 from nerfcli.errors import UserError
 from nerfcli.poses import structure_from_motion
-from nerfcli.poses.input.plan import Outlook, Plan, duration
+from nerfcli.poses.input.plan import Plan, TimeEstimate, duration
 from nerfcli.poses.input.settings import Limits, PoseSettings
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 from nerfcli.poses.model.cameras import USES, GivenIntrinsics
@@ -72,15 +72,15 @@ def estimate_poses(
             )
             return target
         raise UserError(f"{target} exists", "add --overwrite to replace it, or choose another folder with -o")
-    outlook: Outlook | None = None
+    time_estimate: TimeEstimate | None = None
 
     def planned(plan: Plan) -> None:
-        nonlocal outlook
+        nonlocal time_estimate
         notify(plan.describe())
-        outlook = Outlook(plan)
+        time_estimate = TimeEstimate(plan)
 
     def on_stage(stage: str, done: int, total: int) -> None:
-        fraction, left = (0.0, None) if outlook is None else outlook.update(stage, done, total)
+        fraction, left = (0.0, None) if time_estimate is None else time_estimate.update(stage, done, total)
         about = "" if left is None else f", about {duration(left)} left"
         progress(fraction, f"({done} of {total} {_STAGES[stage]}{about})")
 

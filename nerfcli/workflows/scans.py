@@ -13,7 +13,7 @@ from nerfcli.tomography.checks.examine import ScanDiagnosis, examine_scan
 from nerfcli.tomography.checks.page import refuse_foreign, write_scan_page
 from nerfcli.tomography.circle import circle_from_json, circle_of, differences
 from nerfcli.tomography.formats.assemble import axis_column
-from nerfcli.tomography.formats.given import Given
+from nerfcli.tomography.formats.given import ScanOptions
 from nerfcli.tomography.formats.read import read_scan
 from nerfcli.tomography.hypotheses import Judgement, judge
 from nerfcli.tomography.scan import Scan, is_scan, load_scan, save_scan
@@ -62,7 +62,7 @@ def convert_scan(
     target: Path,
     *,
     to: str = OWN,
-    given: Given = Given(),
+    given: ScanOptions = ScanOptions(),
     overwrite: bool = False,
     notify: Notify = silent,
 ) -> ConvertedScan:
@@ -111,7 +111,7 @@ def convert_scan(
 
 
 def detect_scan(
-    source: Path, *, given: Given = Given(), notify: Notify = silent, progress: Progress = no_progress
+    source: Path, *, given: ScanOptions = ScanOptions(), notify: Notify = silent, progress: Progress = no_progress
 ) -> Judgement:
     """Judge direction of rotation, mirroring and centre of rotation by how well they predict the data.
 

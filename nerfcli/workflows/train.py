@@ -18,7 +18,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train import loop
 from nerfcli.train.following import follow
-from nerfcli.train.ranks import Alone, joined_ranks
+from nerfcli.train.ranks import SingleProcess, joined_ranks
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.workflows.view_worker import viewer_beside
 
@@ -313,7 +313,7 @@ def _fit(
     settings: TrainSettings,
     *,
     memory_bytes: int | None,
-    ranks: Alone,
+    ranks: SingleProcess,
     resume: bool,
     on_begin: Callable[[], None],
     notify: Notify,

@@ -60,7 +60,7 @@ def view_run(
         KeyboardInterrupt: Ctrl-C; the server has stopped.
     """
     path = Path(run)
-    show = RunShow(path, threads=threads)
+    show = RunData(path, threads=threads)
     show.check()
     server = PageServer(show, host=host, port=port)
     local = host in (LOCAL, "0.0.0.0", "::", "::1", "localhost")
@@ -85,8 +85,8 @@ def _from_elsewhere(port: int) -> str:
     return f"ssh -L {port}:{LOCAL}:{port} {getpass.getuser()}@{socket.gethostname()}"
 
 
-class RunShow:
-    """Data of a run for the server, see `viewer.server.Show`.
+class RunData:
+    """Data of a run for the server, see `viewer.server.PageData`.
 
     Args:
         path: of the run.

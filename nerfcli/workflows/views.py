@@ -17,7 +17,7 @@ from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.frame_names import frames_named
 from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
 from nerfcli.convert.finding import find_camera_path
-from nerfcli.convert.formats import Given, recognise
+from nerfcli.convert.formats import UserInputs, recognise
 from nerfcli.errors import UserError
 from nerfcli.photos.loading import downscaled_camera
 from nerfcli.runs.run import Run
@@ -33,7 +33,7 @@ SCENES = ("nerfcli", "colmap", "transforms", "blender", "llff")
 
 
 @dataclass(frozen=True)
-class Look:
+class PictureOptions:
     """Size, lens and crop of the pictures, where they differ from training or from the file of cameras.
 
     Args:
@@ -91,7 +91,7 @@ class Views:
     through: str | None = None
     nerfstudio_frame: Path | None = None
     max_size: int | None = None
-    look: Look = Look()
+    look: PictureOptions = PictureOptions()
 
     @property
     def name(self) -> str:
@@ -123,18 +123,18 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
             exit_code=2,
         )
     sets, factor = run.cameras, run.config.downscale
-    known = sets.train
+    keyframes = sets.train
     if through is not None:
-        known = frames_named([*sets.train, *sets.test], through.split(","))
+        keyframes = frames_named([*sets.train, *sets.test], through.split(","))
     if cameras in ("test", "train"):
         chosen = sets.test if cameras == "test" else sets.train
         if not chosen:
             raise UserError(f"{run.path} has no {cameras} cameras", f"use --cameras train, {', '.join(PATHS)}")
     elif cameras == "interpolate":
-        chosen = paths.interpolate(known, count=views.count)
+        chosen = paths.interpolate(keyframes, count=views.count)
     elif cameras in PATHS:
         path = {"orbit": paths.orbit, "ellipse": paths.ellipse, "spiral": paths.spiral}[cameras]
-        chosen = path(known, count=views.count, depth_hint=depth_hint)
+        chosen = path(keyframes, count=views.count, depth_hint=depth_hint)
     else:
         chosen = _frames_of(Path(cameras), views.nerfstudio_frame)
         factor = 1
@@ -214,7 +214,7 @@ def _frames_of(path: Path, nerfstudio_frame: Path | None) -> tuple[Frame, ...]:
     if path.is_dir() and form.name in SCENES:
         frames = scenes.load(path).frames
     else:
-        frames = form.parse(found, Given()).frames
+        frames = form.parse(found, UserInputs()).frames
     if nerfstudio_frame is None:
         return frames
     world_from_nerfstudio = read_normalisation(nerfstudio_frame).inverse()

@@ -14,7 +14,16 @@ from hard_cases.exact_depths import FRACTIONS, quantile_name
 from nerfcli.kernels import LightEnds
 from nerfcli.kernels.reference.depth import BISECTIONS
 from nerfcli.selftest import textbook
-from nerfcli.selftest.cases import MEANINGLESS, PIXEL_FRACTIONS, PIXELS, Ray, Segments, depth_rays, lit, thick_and_thin
+from nerfcli.selftest.cases import (
+    MEANINGLESS,
+    PIXEL_FRACTIONS,
+    PIXELS,
+    Ray,
+    Segments,
+    deepest_ray,
+    depth_rays,
+    thick_and_thin,
+)
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
 # Rays with at most this many intervals form the coarse group; all others form the fine one.
@@ -159,7 +168,7 @@ def _bound(ray: Ray, precision: Precision) -> float:
     if precision.compiled:
         return 16 * precision.unit
     lengths = tuple(end - start for start, end in zip(ray.starts, ray.ends, strict=True))
-    samples, depth = lit([Segments(tuple(ray.density), lengths)], precision)
+    samples, depth = deepest_ray([Segments(tuple(ray.density), lengths)], precision)
     return precision.unit * (16 + (samples + 2) * (1 + depth))
 
 

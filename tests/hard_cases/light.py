@@ -12,7 +12,7 @@ from torch import Tensor
 from hard_cases import exact
 from hard_cases.exact import Composited
 from nerfcli.selftest import textbook
-from nerfcli.selftest.cases import FAR_SURFACE, MEANINGLESS, Group, Segments, groups, lit
+from nerfcli.selftest.cases import FAR_SURFACE, MEANINGLESS, Group, Segments, deepest_ray, groups
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
 # A bfloat16 sum of more terms than this has no correct digits.
@@ -95,7 +95,7 @@ def _packed(rays: list[Segments], precision: Precision) -> _Packed:
 def _bounds(rays: list[Segments], precision: Precision) -> tuple[Errors, str]:
     if precision.compiled:
         return Errors(8 * precision.unit, 16 * precision.unit), COMPILED_BOUND
-    samples, depth = lit(rays, precision)
+    samples, depth = deepest_ray(rays, precision)
     bound = precision.unit * (8 + (samples + 2) * (1 + depth))
     return Errors(bound, 2 * bound), REFERENCE_BOUND
 

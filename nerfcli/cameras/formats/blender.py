@@ -19,7 +19,7 @@ from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.transforms import (
     SPLITS,
-    Found,
+    FoundFrames,
     capture_on_disk,
     check_unique_names,
     frames_on_disk,
@@ -49,7 +49,7 @@ def read_blender(folder: Path, measure: Measure) -> Capture:
         frames += [replace(frame, split=split) for frame in found.frames]
         missing += found.missing
         rescaled.update(found.rescaled)
-    return capture_on_disk(_file(folder, "train"), Found(frames, missing, dict(rescaled)), kind="blender")
+    return capture_on_disk(_file(folder, "train"), FoundFrames(frames, missing, dict(rescaled)), kind="blender")
 
 
 def parse_blender(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:

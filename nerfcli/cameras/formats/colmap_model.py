@@ -194,12 +194,12 @@ def tracks(model: ColmapModel) -> tuple[np.ndarray, np.ndarray]:
     return elements, np.bincount(point_index[order], minlength=len(model.point_ids))
 
 
-def _point_index(ids: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the index of each id (M,) in `known` (N,); -1 for `NO_POINT`, and for all ids if `known` is empty."""
-    if not len(known):
+def _point_index(ids: np.ndarray, known_ids: np.ndarray) -> np.ndarray:
+    """Return the index of each id (M,) in `known_ids` (N,); -1 for `NO_POINT`, and for all if `known_ids` is empty."""
+    if not len(known_ids):
         return np.full(len(ids), -1, dtype=np.int64)
-    order = np.argsort(known, kind="stable")
-    ordered = known[order]
+    order = np.argsort(known_ids, kind="stable")
+    ordered = known_ids[order]
     if (ordered[1:] == ordered[:-1]).any():
         raise ValueError(f"two points have the id {ordered[1:][ordered[1:] == ordered[:-1]][0]}")
     place = np.minimum(np.searchsorted(ordered, ids), len(ordered) - 1)

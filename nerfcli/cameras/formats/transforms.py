@@ -138,7 +138,7 @@ def records_of(path: Path, content: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundFrames:
     """The frames of a file whose image is on disk, fitted to it, and the names of those whose image is missing.
 
     `rescaled` is as in `Capture`.
@@ -149,7 +149,7 @@ class Found:
     rescaled: dict[tuple[Size, Size], int]
 
 
-def frames_on_disk(path: Path, content: dict[str, Any], measure: Measure) -> Found:
+def frames_on_disk(path: Path, content: dict[str, Any], measure: Measure) -> FoundFrames:
     """Return the frames of a file whose image is on disk."""
     frames, missing, rescaled = [], [], []
     records = records_of(path, content)
@@ -168,10 +168,10 @@ def frames_on_disk(path: Path, content: dict[str, Any], measure: Measure) -> Fou
         mask = _find_mask(path.parent, record.get("mask_path"), where)
         name = _name_of(listed, where, suffix=image.suffix)
         frames.append(Frame(name, camera, world_from_cam, image=image, mask=mask))
-    return Found(frames, missing, counted(rescaled))
+    return FoundFrames(frames, missing, counted(rescaled))
 
 
-def capture_on_disk(path: Path, found: Found, *, kind: str) -> Capture:
+def capture_on_disk(path: Path, found: FoundFrames, *, kind: str) -> Capture:
     """Return the capture of `frames_on_disk`; raise a UserError if it has no frames or two with the same name."""
     if not found.frames:
         raise UserError(

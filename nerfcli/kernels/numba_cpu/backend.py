@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels import numba_cpu, reference
-from nerfcli.kernels.composition import ComposedBackend, Parts
+from nerfcli.kernels.composition import ComposedBackend, SampleOperations
 from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import HashGrid, March, Medium, Rays, RaysSeen, Samples
 from nerfcli.kernels.numba_cpu.row_adam import FEATURES
@@ -21,7 +21,7 @@ class NumbaBackend(ComposedBackend):
     """Backend composed of `numba_cpu`. The same seed and number of threads give the same bits."""
 
     name = "numba_cpu"
-    parts: ClassVar[Parts] = numba_cpu
+    parts: ClassVar[SampleOperations] = numba_cpu
     deterministic = True
 
     def refuses(self, device: torch.device, dtype: torch.dtype) -> str | None:
@@ -58,7 +58,7 @@ class NumbaBackend(ComposedBackend):
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
     ) -> Tensor:
-        return _encode(points, table, resolutions, known=None, widths=None, sink=sink)
+        return _encode(points, table, resolutions, computed=None, widths=None, sink=sink)
 
     def adam_rows(
         self,
@@ -108,12 +108,12 @@ class NumbaBackend(ComposedBackend):
             samples.ends,
             offsets=samples.offsets,
             contraction=contraction,
-            known=samples.coordinates,
+            computed=samples.coordinates,
         )
 
     def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, sink: Tensor | None) -> Tensor:
         return _encode(
-            samples.coordinates, grid.table, grid.resolutions, known=samples.encoded, widths=widths, sink=sink
+            samples.coordinates, grid.table, grid.resolutions, computed=samples.encoded, widths=widths, sink=sink
         )
 
     def _density_of(self, encoded: Tensor, grid: HashGrid) -> Tensor:
@@ -130,12 +130,12 @@ def _encode(
     table: Tensor,
     resolutions: tuple[int, ...],
     *,
-    known: Tensor | None,
+    computed: Tensor | None,
     widths: Tensor | None,
     sink: Tensor | None,
 ) -> Tensor:
     if numba_cpu.can_hash_encode(points, table, resolutions):
-        return numba_cpu.hash_encode(points, table, resolutions, sink, known, widths)
+        return numba_cpu.hash_encode(points, table, resolutions, sink, computed, widths)
     return encode_into(points, table, resolutions, widths=widths, sink=sink)
 
 

@@ -90,13 +90,13 @@ class _SampleCoordinates(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor,
-        contraction: int, known: Tensor | None,
+        contraction: int, computed: Tensor | None,
     ) -> Tensor:  # fmt: skip
         rays = [t.detach().contiguous() for t in (origins, directions, starts, ends, offsets)]
         ctx.save_for_backward(*rays)
         ctx.contraction = contraction
-        if known is not None:
-            return known.view_as(known)
+        if computed is not None:
+            return computed.view_as(computed)
         use_threads()
         out = torch.empty(len(starts), 3)
         o, d, s, e, at = (t.numpy() for t in rays)
@@ -121,12 +121,12 @@ def sample_coordinates(
     *,
     offsets: Tensor,
     contraction: str,
-    known: Tensor | None = None,
+    computed: Tensor | None = None,
 ) -> Tensor:
     """See `reference.sample_coordinates`; float32 on the CPU, differentiable in origins and directions.
 
     Args:
-        known: (N, 3), the result, if it has already been computed without gradients.
+        computed: (N, 3), the result, if it has already been computed without gradients.
     """
     number = CONTRACTIONS.index(contraction)
-    return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, known)  # type: ignore[return-value]
+    return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, computed)  # type: ignore[return-value]

@@ -132,8 +132,8 @@ def _passed(density: Any, starts: Any, ends: Any, offsets: Any, first: Any, coun
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _mixture_quantile(density: Any, starts: Any, ends: Any, offsets: Any, out: Any, asked: Any) -> None:
-    count, wanted = np.int64(asked[0]), asked[1]
+def _mixture_quantile(density: Any, starts: Any, ends: Any, offsets: Any, out: Any, parameters: Any) -> None:
+    count, wanted = np.int64(parameters[0]), parameters[1]
     for pixel in numba.prange(out.shape[0]):
         first, low, high = pixel * count, 0.0, 0.0
         for ray in range(first, first + count):

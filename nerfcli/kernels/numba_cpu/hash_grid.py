@@ -187,21 +187,21 @@ class _HashEncode(torch.autograd.Function):
         table: Tensor,
         resolutions: tuple[int, ...],
         sink: Tensor | None,
-        known: Tensor | None,
+        computed: Tensor | None,
         widths: Tensor | None,
     ) -> Tensor:
         points, table = points.detach().contiguous(), table.detach().contiguous()
         widths = points.new_empty(0) if widths is None else widths.detach().contiguous()
         levels, rows, features = table.shape
         sides = np.array(resolutions, dtype=np.int32)
-        if known is None:
+        if computed is None:
             out = torch.empty(len(points), levels * features)
             _encode_forward(
                 by_axis(points), widths.numpy(), table.view(-1).numpy(), rows, sides, out.view(-1).numpy(),
                 use_threads(),
             )  # fmt: skip
         else:
-            out = known.view_as(known)
+            out = computed.view_as(computed)
         ctx.save_for_backward(points, widths, table if ctx.needs_input_grad[0] else table[:0])
         ctx.table_shape, ctx.sides, ctx.sink = table.shape, sides, sink
         return out
@@ -241,13 +241,13 @@ def hash_encode(
     table: Tensor,
     resolutions: tuple[int, ...],
     sink: Tensor | None = None,
-    known: Tensor | None = None,
+    computed: Tensor | None = None,
     widths: Tensor | None = None,
 ) -> Tensor:
     """See `reference.hash_encode`; float32 on the CPU, rows of 4 features, differentiable in points and table.
 
     Args:
         sink: see `Backend.hash_encode`.
-        known: (N, L * F), the result, if it has already been computed without gradients.
+        computed: (N, L * F), the result, if it has already been computed without gradients.
     """
-    return _HashEncode.apply(points, table, resolutions, sink, known, widths)  # type: ignore[return-value]
+    return _HashEncode.apply(points, table, resolutions, sink, computed, widths)  # type: ignore[return-value]

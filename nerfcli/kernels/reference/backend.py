@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels import reference
-from nerfcli.kernels.composition import ComposedBackend, Parts
+from nerfcli.kernels.composition import ComposedBackend, SampleOperations
 from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
 
@@ -19,7 +19,7 @@ class ReferenceBackend(ComposedBackend):
     """
 
     name = "reference"
-    parts: ClassVar[Parts] = reference
+    parts: ClassVar[SampleOperations] = reference
 
     def __init__(self, device: torch.device):
         self.deterministic = device.type == "cpu"

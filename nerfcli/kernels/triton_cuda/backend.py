@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels import reference
-from nerfcli.kernels.composition import Parts
+from nerfcli.kernels.composition import SampleOperations
 from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
 from nerfcli.kernels.reference.backend import ReferenceBackend
 from nerfcli.kernels.triton_cuda import compositing, hash_grid, marching, networks, operations, rays
@@ -39,7 +39,7 @@ class TritonBackend(ReferenceBackend):
     """Backend composed of `triton_cuda`. Sums are atomic: results of the same seed differ in their last digits."""
 
     name = "triton_cuda"
-    parts: ClassVar[Parts] = operations
+    parts: ClassVar[SampleOperations] = operations
 
     def __init__(self, device: torch.device):
         super().__init__(device)
@@ -104,7 +104,7 @@ class TritonBackend(ReferenceBackend):
             samples.ends,
             offsets=samples.offsets,
             contraction=contraction,
-            known=samples.coordinates,
+            computed=samples.coordinates,
         )
 
     def _radiance(

@@ -86,11 +86,11 @@ class _SampleCoordinates(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor, contraction: int,
-        known: Tensor,
+        computed: Tensor,
     ) -> Tensor:  # fmt: skip
         ctx.save_for_backward(*(t.detach().contiguous() for t in (origins, directions, starts, ends, offsets)))
         ctx.contraction = contraction
-        return known.view_as(known)
+        return computed.view_as(computed)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
@@ -111,12 +111,12 @@ def sample_coordinates(
     *,
     offsets: Tensor,
     contraction: str,
-    known: Tensor,
+    computed: Tensor,
 ) -> Tensor:
     """See `reference.sample_coordinates`; float32, differentiable in origins and directions.
 
     Args:
-        known: (N, 3), the result, already computed without gradients.
+        computed: (N, 3), the result, already computed without gradients.
     """
     number = CONTRACTIONS.index(contraction)
-    return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, known)  # type: ignore[return-value]
+    return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, computed)  # type: ignore[return-value]

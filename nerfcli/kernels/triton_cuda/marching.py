@@ -97,7 +97,7 @@ def _lit(
     last = tl.minimum(last, room)
     longest = tl.max(last - first, 0).to(tl.int32)
     depth = tl.zeros([RAYS], tl.float32)
-    lit = tl.zeros([RAYS], tl.int64)
+    reached = tl.zeros([RAYS], tl.int64)
     for step in range(0, longest, STEPS):
         i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
         valid = i < last[:, None]
@@ -106,9 +106,9 @@ def _lit(
         length = tl.load(ends + i - 1, mask=ahead, other=0.0) - tl.load(starts + i - 1, mask=ahead, other=0.0)
         own = tl.load(density + i - 1, mask=ahead, other=0.0) * length
         before = depth[:, None] + tl.cumsum(own, 1)
-        lit += tl.sum((valid & (before < deepest)).to(tl.int32), 1)
+        reached += tl.sum((valid & (before < deepest)).to(tl.int32), 1)
         depth += tl.sum(own, 1)
-    tl.store(counts + ray, lit, mask=ray < rays)
+    tl.store(counts + ray, reached, mask=ray < rays)
 
 
 @jit
@@ -171,14 +171,14 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, *, table: Tensor, 
             break
     index = ray_indices(kept, samples)
     device = starts.device
-    lit = [torch.empty(samples, device=device) for _ in range(3)]
+    reached = [torch.empty(samples, device=device) for _ in range(3)]
     places = torch.empty(samples, 3, device=device)
     codes = torch.empty(samples, WIDTH, dtype=torch.float16, device=device)
     launch(
         _compact, (blocks(samples, COMPACTED),), index, offsets, kept, starts, ends, density, coordinates, code,
-        *lit, places, codes, samples, BLOCK=COMPACTED,
+        *reached, places, codes, samples, BLOCK=COMPACTED,
     )  # fmt: skip
-    return Samples(lit[0], lit[1], lit[2], codes, places, kept, index)
+    return Samples(reached[0], reached[1], reached[2], codes, places, kept, index)
 
 
 def _counted(rays: Rays, along: March) -> Tensor:

@@ -10,28 +10,28 @@ from pathlib import Path
 
 import pycolmap
 
-from nerfcli.poses.engine.mapped import COMPONENTS, FIRST, Mapped, mapping_key, read_mapped, write_mapped
-from nerfcli.poses.engine.second_chance import Chance, grow, is_contradicted, second_chance
+from nerfcli.poses.engine.mapped import COMPONENTS, FIRST, MappedModels, mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.second_chance import AlternativeMapping, grow, is_contradicted, second_chance
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.stages import read_stage, write_stage
 from nerfcli.poses.judge.checks import Checks
-from nerfcli.poses.judge.examine import Examined, examine
+from nerfcli.poses.judge.examine import ExaminedModel, examine
 
 # A component has at least this many photos of its own.
 _LEAST_PHOTOS = 3
 
 
 @dataclass(frozen=True)
-class Chosen:
+class ChosenModel:
     """The examined component, and all models in the order of their numbers, including the examined one."""
 
-    mapped: Mapped
-    examined: Examined
+    mapped: MappedModels
+    examined: ExaminedModel
 
 
 def choose_component(
-    mapped: Mapped, report: Report, tell: Tell, *, component: int, checks: Callable[[], Checks]
-) -> Chosen:
+    mapped: MappedModels, report: Report, tell: Tell, *, component: int, checks: Callable[[], Checks]
+) -> ChosenModel:
     """Examine one component, and give it a second chance if pairs of photos contradict it.
 
     Args:
@@ -51,32 +51,34 @@ def choose_component(
     wanted, others = numbered.models[index : index + 1], [*numbered.models[:index], *numbered.models[index + 1 :]]
     examined = examine(wanted, numbered.job, report, checks=checks())
     if not is_contradicted(examined.verdict):
-        return Chosen(numbered, examined)
+        return ChosenModel(numbered, examined)
     size, placed = wanted[0].num_reg_images(), sum(model.num_reg_images() for model in numbered.models)
     alone = replace(numbered, models=[*wanted, *others], seconds=numbered.seconds * size / placed, localised=())
     chance = second_chance(alone, examined, report, tell, checks=checks, component=component)
     models = [*numbered.models[:index], chance.mapped.models[0], *numbered.models[index + 1 :]]
-    return Chosen(replace(numbered, models=models, attempts=chance.mapped.attempts), chance.examined)
+    return ChosenModel(replace(numbered, models=models, attempts=chance.mapped.attempts), chance.examined)
 
 
-def _largest(mapped: Mapped, report: Report, tell: Tell, *, checks: Callable[[], Checks]) -> Chosen:
-    known = _numbered(mapped) or mapped
-    examined = examine(known.models[:1], known.job, report, localised=known.localised, checks=checks())
+def _largest(mapped: MappedModels, report: Report, tell: Tell, *, checks: Callable[[], Checks]) -> ChosenModel:
+    largest_first = _numbered(mapped) or mapped
+    examined = examine(
+        largest_first.models[:1], largest_first.job, report, localised=largest_first.localised, checks=checks()
+    )
     if is_contradicted(examined.verdict):
         chance = second_chance(mapped, examined, report, tell, checks=checks)
-    elif examined.verdict.accepted and known is mapped:
+    elif examined.verdict.accepted and largest_first is mapped:
         chance = grow(mapped, examined, report, tell, checks=checks)
     else:
-        chance = Chance(known, examined)
+        chance = AlternativeMapping(largest_first, examined)
     if chance.examined is examined or not chance.examined.verdict.accepted:
-        if known is mapped or chance.mapped is not known:
+        if largest_first is mapped or chance.mapped is not largest_first:
             _keep_numbers(mapped.job, FIRST)
-        return Chosen(chance.mapped, chance.examined)
+        return ChosenModel(chance.mapped, chance.examined)
     first, *found = chance.mapped.models
     numbered = replace(chance.mapped, models=[first, *_with_photos_of_their_own(first, [*found, *mapped.models[1:]])])
     write_mapped(numbered, mapping_key(mapped.job), name=COMPONENTS)
     _keep_numbers(mapped.job, COMPONENTS)
-    return Chosen(numbered, chance.examined)
+    return ChosenModel(numbered, chance.examined)
 
 
 def _with_photos_of_their_own(
@@ -93,7 +95,7 @@ def _with_photos_of_their_own(
     return kept
 
 
-def _numbered(mapped: Mapped) -> Mapped | None:
+def _numbered(mapped: MappedModels) -> MappedModels | None:
     """Return the models in the order listed by an earlier call; None if there was none, or the models are gone."""
     name = read_stage(_stage(mapped.job), mapping_key(mapped.job))
     if name is None or name == FIRST:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pycolmap
 
 from nerfcli.poses.engine.database import clear_matches, forget_features, keep_geometries, register_photos
-from nerfcli.poses.input.job import Job, LaidOutMask, Report
+from nerfcli.poses.input.job import Job, Report, WorkMask
 from nerfcli.poses.input.plan import duration, limit_seconds, matching_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
@@ -32,7 +32,7 @@ _MATCHES_VERSION = "ratio 0.8, cross-checked"
 def feature_keys(job: Job) -> dict[str, str]:
     """Return, per photo (by image id, as text for JSON), a hash of everything that its features depend on."""
     settings = (_FEATURES_VERSION, job.max_image_size, job.max_features, pycolmap.__version__)
-    contents = [(key, mask.key) for key, mask in zip(job.keys, job.masks or repeat(LaidOutMask()), strict=False)]
+    contents = [(key, mask.key) for key, mask in zip(job.keys, job.masks or repeat(WorkMask()), strict=False)]
     return {str(i): stage_key(*content, *settings) for i, content in zip(job.image_ids, contents, strict=True)}
 
 
@@ -43,11 +43,11 @@ def extract(job: Job, report: Report) -> None:
     many features gain nothing, since pycolmap keeps the coarsest; so only those with few are searched in a second pass.
     """
     register_photos(job)
-    keys, known = feature_keys(job), _stage_file(job, "features")
-    there = read_stage(known, _FEATURES_VERSION) or {}
+    keys, stage_path = feature_keys(job), _stage_file(job, "features")
+    there = read_stage(stage_path, _FEATURES_VERSION) or {}
     forget_features(job, [int(image_id) for image_id, key in keys.items() if there.get(image_id) != key])
     # From here on, all features in the database are those of `keys`.
-    write_stage(known, _FEATURES_VERSION, keys)
+    write_stage(stage_path, _FEATURES_VERSION, keys)
     passes = _stage_file(job, "enlarged")
     enlarged = {i: key for i, key in (read_stage(passes, _FEATURES_VERSION) or {}).items() if keys.get(i) == key}
     first = [number for number, image_id in enumerate(job.image_ids) if str(image_id) not in enlarged]

@@ -18,7 +18,7 @@ from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.initial_focal import with_focal_lengths
-from nerfcli.poses.engine.mapped import Mapped
+from nerfcli.poses.engine.mapped import MappedModels
 from nerfcli.poses.engine.mapping import MapperOptions, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
@@ -63,7 +63,7 @@ LOW_ANGLES = MapperOptions(
 
 class _Ladder:
     def __init__(self, job: Job, report: Report, tell: Tell) -> None:
-        self.best = Mapped([], job, [])
+        self.best = MappedModels([], job, [])
         self.rungs: list[dict[str, Any]] = []
         self._report = report
         self._tell = tell
@@ -126,7 +126,7 @@ class _Ladder:
     def attempt_instead(self, what: str, job: Job, start: MapperOptions) -> None:
         """Map once; the result replaces the best so far, from another initial lens, if it places as many photos."""
         best = self.best
-        self.best = Mapped([], job, [])
+        self.best = MappedModels([], job, [])
         self.attempt(what, job, start)
         if _placed(self.best.models) < _placed(best.models):
             self.best = best
@@ -174,7 +174,7 @@ class _Ladder:
         if unmatched is not None:
             self._cut(unmatched)
 
-    def result(self) -> Mapped:
+    def result(self) -> MappedModels:
         """Return the best models with the record of all attempts."""
         return replace(self.best, attempts=self.rungs, cut_short=tuple(self._cut_short))
 
@@ -194,14 +194,14 @@ class _Ladder:
     def _take(self, what: str, models: list[pycolmap.Reconstruction], job: Job) -> None:
         self.rungs.append({"what": what, "models": [model.num_reg_images() for model in models]})
         if _placed(models) > _placed(self.best.models):
-            self.best = Mapped(models, job, self.rungs)
+            self.best = MappedModels(models, job, self.rungs)
 
     def fraction(self, candidates: int) -> float:
         """Return the best model's number of photos as a fraction of `candidates`, the number that could register."""
         return _placed(self.best.models) / max(candidates, 1)
 
 
-def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
+def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> MappedModels:
     """Map a job's photos, with as many attempts as it takes.
 
     The first attempt has pycolmap's own thresholds, and starts from focal lengths estimated from pairs of photos where
@@ -241,7 +241,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     return ladder.result()
 
 
-def _tell_of_exif(given: Job, best: Mapped, tell: Tell) -> None:
+def _tell_of_exif(given: Job, best: MappedModels, tell: Tell) -> None:
     """Tell the user where the resulting focal length differs from EXIF's, which was not used.
 
     Photos of a camera that moves straight ahead determine the focal length poorly.

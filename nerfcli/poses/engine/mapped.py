@@ -26,7 +26,7 @@ COMPONENTS = "components"
 
 
 @dataclass(frozen=True)
-class Mapped:
+class MappedModels:
     """The mapped models, largest first, and the job whose features and matches they use.
 
     attempts: in order, {"what", "models": sizes, largest first}; the one that locates single photos also has "photos":
@@ -42,14 +42,14 @@ class Mapped:
     cut_short: tuple[str, ...] = ()
 
 
-def write_mapped(mapped: Mapped, key: str, *, name: str = FIRST) -> None:
+def write_mapped(mapped: MappedModels, key: str, *, name: str = FIRST) -> None:
     """Write models and stage into the work folder, replacing earlier ones of this name."""
     content = {"job": asdict(mapped.job), "attempts": mapped.attempts, "localised": list(mapped.localised)}
     content |= {"seconds": mapped.seconds, "cut_short": list(mapped.cut_short)}
     write_models(Path(mapped.job.folder) / name, mapped.models, key, also=content)
 
 
-def read_mapped(job: Job, key: str, *, name: str = FIRST) -> Mapped | None:
+def read_mapped(job: Job, key: str, *, name: str = FIRST) -> MappedModels | None:
     """Read what `write_mapped` wrote for this key; None if it is damaged or missing, or its database is missing.
 
     Args:
@@ -72,7 +72,7 @@ def read_mapped(job: Job, key: str, *, name: str = FIRST) -> Mapped | None:
     )
     if not there.database.exists():
         return None
-    return Mapped(
+    return MappedModels(
         models,
         there,
         content["attempts"],

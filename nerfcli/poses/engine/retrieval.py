@@ -45,7 +45,7 @@ def with_neighbours(job: Job, report: Report) -> Job:
     found = read_stage(path, key)
     if found is None:
         common = likeness(_coarsest(job), report)
-        found = [*promising(common, job.pairs), *alike(common, job.neighbours, known=job.pairs)]
+        found = [*promising(common, job.pairs), *alike(common, job.neighbours, paired=job.pairs)]
         write_stage(path, key, found)
     return replace(job, pairs=in_blocks((i, j) for i, j in found), neighbours=0)
 
@@ -80,11 +80,11 @@ def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
     return shared
 
 
-def alike(likeness: np.ndarray, count: int, *, known: Collection[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the sorted pairs (i, j), i < j, of each photo and its `count` most similar ones, without `known` pairs."""
+def alike(likeness: np.ndarray, count: int, *, paired: Collection[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the sorted pairs (i, j), i < j, of each photo and its `count` most similar ones that are not `paired`."""
     likeness = likeness.astype(np.float64)
     np.fill_diagonal(likeness, -np.inf)
-    for i, j in known:
+    for i, j in paired:
         likeness[i, j] = likeness[j, i] = -np.inf
     pairs: set[tuple[int, int]] = set()
     for i, row in enumerate(likeness):

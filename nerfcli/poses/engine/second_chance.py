@@ -15,7 +15,7 @@ import pycolmap
 
 from nerfcli.poses.engine.database import keep_geometries
 from nerfcli.poses.engine.ladder import SMALLER_BASELINE
-from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.mapped import MappedModels, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.mapping import (
     MapperOptions,
     map_globally,
@@ -29,7 +29,7 @@ from nerfcli.poses.input.plan import at_once_seconds, duration, mapping_seconds
 from nerfcli.poses.input.stages import stage_key
 from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict
 from nerfcli.poses.judge.checks import Checks
-from nerfcli.poses.judge.examine import Examined, examine
+from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import NO_PARALLAX_PX
 from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.two_views import agreements, read_verified_pairs
@@ -51,22 +51,22 @@ _LEAST_APART = 0.05
 
 
 @dataclass(frozen=True)
-class Chance:
+class AlternativeMapping:
     """Result of an alternative mapping."""
 
-    mapped: Mapped
-    examined: Examined
+    mapped: MappedModels
+    examined: ExaminedModel
 
 
 def second_chance(
-    mapped: Mapped,
-    first: Examined,
+    mapped: MappedModels,
+    first: ExaminedModel,
     report: Report,
     tell: Tell,
     *,
     checks: Callable[[], Checks],
     component: int = 1,
-) -> Chance:
+) -> AlternativeMapping:
     """Map again under one hypothesis after the other until the checks accept a model.
 
     Args:
@@ -94,16 +94,16 @@ def second_chance(
     names = "second-chance" if component == 1 else f"component-{component}-second-chance"
     attempts = list(mapped.attempts)
     core = _core(mapped.models[0], mapped.job)
-    at_once: list[Mapped] = []  # result of the global mapper, to extend later
+    at_once: list[MappedModels] = []  # result of the global mapper, to extend later
 
-    def grown_from_all() -> Mapped | None:
+    def grown_from_all() -> MappedModels | None:
         return _regrown(mapped, _core(at_once[0].models[0], mapped.job), report) if at_once else None
 
     rest = 1 - core.model.num_reg_images() / mapped.models[0].num_reg_images()
     photos = len(mapped.job.files)
     all_at_once = scratch * at_once_seconds(photos) / mapping_seconds(photos)
     # The time of each is estimated from the number of photos that it has to place again.
-    hypotheses: list[tuple[str, float, Callable[[], Mapped | None]]] = [
+    hypotheses: list[tuple[str, float, Callable[[], MappedModels | None]]] = [
         ("from the largest consistent part", rest * scratch, lambda: _regrown(mapped, core, report)),
         (_ALL_AT_ONCE, all_at_once, lambda: _all_at_once(mapped, core)),
         ("from the largest consistent part of that", rest * scratch, grown_from_all),
@@ -135,18 +135,18 @@ def second_chance(
         verdict = "accepted" if examined.verdict.accepted else examined.verdict.failures[0].kind
         tell(f"{what}: {size} of {len(mapped.job.files)} photos registered, {verdict}")
         if examined.verdict.accepted:
-            return Chance(replace(found, attempts=attempts), examined)
-    return Chance(replace(mapped, attempts=attempts), first)
+            return AlternativeMapping(replace(found, attempts=attempts), examined)
+    return AlternativeMapping(replace(mapped, attempts=attempts), first)
 
 
 def grow(
-    mapped: Mapped,
-    first: Examined,
+    mapped: MappedModels,
+    first: ExaminedModel,
     report: Report,
     tell: Tell,
     *,
     checks: Callable[[], Checks],
-) -> Chance:
+) -> AlternativeMapping:
     """Extend an accepted model to the photos of smaller models, if these are many and match its photos.
 
     Where a few photos fail in a row, the mapper gives up and begins another model; starting from the adjusted model,
@@ -159,7 +159,7 @@ def grow(
     Returns:
         A larger accepted model, or the given one.
     """
-    given = Chance(mapped, first)
+    given = AlternativeMapping(mapped, first)
     model = first.model
     if model is None:  # no photo was placed at all
         return given
@@ -171,7 +171,7 @@ def grow(
     takes = mapped.seconds * len(apart) / (len(placed) + len(apart))
     tell(f"{len(apart)} photos are in smaller models, next: {what} (about {duration(takes)})")
 
-    def make() -> Mapped:
+    def make() -> MappedModels:
         base = _Core(pycolmap.Reconstruction(model), frozenset())
         return _mapped_without(mapped, base, report, attempt=_FIRST_ATTEMPT, base=base.model)
 
@@ -190,8 +190,8 @@ def grow(
     tell(f"{what}: {size} of {len(mapped.job.files)} photos registered, {verdict}")
     attempts = [*mapped.attempts, {"what": what, "models": [size, *(m.num_reg_images() for m in found.models[1:])]}]
     if not examined.verdict.accepted or size <= len(placed):
-        return Chance(replace(mapped, attempts=attempts), first)
-    return Chance(replace(found, attempts=attempts), examined)
+        return AlternativeMapping(replace(mapped, attempts=attempts), first)
+    return AlternativeMapping(replace(found, attempts=attempts), examined)
 
 
 def _mapping_limit_seconds(job: Job) -> float:
@@ -265,7 +265,7 @@ def _neighbours_in_order(job: Job, pairs: Iterable[tuple[int, int]]) -> set[tupl
     return {(one, other) for one, other in pairs if abs(place[one] - place[other]) <= _NEAR_IN_ORDER}
 
 
-def _regrown(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
+def _regrown(mapped: MappedModels, core: _Core, report: Report) -> MappedModels | None:
     """Adjust the core and extend it to the other photos without the suspects; return None if the core is too small."""
     if core.model.num_reg_images() < _LEAST_CORE * mapped.models[0].num_reg_images():
         return None
@@ -274,24 +274,24 @@ def _regrown(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
     return _mapped_without(mapped, core, report, attempt=_FIRST_ATTEMPT, base=base)
 
 
-def _from_nothing(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
+def _from_nothing(mapped: MappedModels, core: _Core, report: Report) -> MappedModels | None:
     """Map from scratch without the suspects, with another seed and a smaller initial baseline."""
     return _mapped_without(mapped, core, report, attempt=_FIRST_ATTEMPT + 1, base=None)
 
 
 def _mapped_without(
-    mapped: Mapped, core: _Core, report: Report, *, attempt: int, base: pycolmap.Reconstruction | None
-) -> Mapped:
+    mapped: MappedModels, core: _Core, report: Report, *, attempt: int, base: pycolmap.Reconstruction | None
+) -> MappedModels:
     job = _with_own_database(mapped.job, without=core.suspects)
     if base is not None:
         _set_cameras(job, base)
     start = MapperOptions() if base is not None else SMALLER_BASELINE
     models = map_photos(job, report, attempt=attempt, start=start, base=base)
     job.database.unlink()
-    return Mapped(models, mapped.job, mapped.attempts)
+    return MappedModels(models, mapped.job, mapped.attempts)
 
 
-def _all_at_once(mapped: Mapped, core: _Core) -> Mapped | None:
+def _all_at_once(mapped: MappedModels, core: _Core) -> MappedModels | None:
     """Estimate the rotations, then the positions, of all photos together, with the intrinsics of the core."""
     job = _with_own_database(mapped.job, without=frozenset())
     for camera in core.model.cameras.values():
@@ -299,7 +299,7 @@ def _all_at_once(mapped: Mapped, core: _Core) -> Mapped | None:
     _set_cameras(job, core.model)
     models = map_globally(job)
     job.database.unlink()
-    return Mapped(models, mapped.job, mapped.attempts)
+    return MappedModels(models, mapped.job, mapped.attempts)
 
 
 def _set_cameras(job: Job, model: pycolmap.Reconstruction) -> None:
@@ -318,7 +318,7 @@ def _with_own_database(job: Job, *, without: frozenset[tuple[int, int]]) -> Job:
     return copy
 
 
-def _kept(job: Job, name: str, make: Callable[[], Mapped | None]) -> Mapped | None:
+def _kept(job: Job, name: str, make: Callable[[], MappedModels | None]) -> MappedModels | None:
     """Return the models that an earlier call wrote under this name, or make and write them."""
     key = stage_key(mapping_key(job), name)
     if (there := read_mapped(job, key, name=name)) is not None:

@@ -193,7 +193,7 @@ def _seen_points(
 def _renumbered(job: Job, training: Job, result: Mapping[str, Any]) -> dict[str, Any]:
     """Return a result of the training photos, renumbered to the photo numbers of the whole job."""
     number = {index: job.files.index(file) for index, file in enumerate(training.files)}
-    by_number = {number[index]: known for index, known in enumerate(result["evidence"])}
+    by_number = {number[index]: of_photo for index, of_photo in enumerate(result["evidence"])}
     nothing = {"features": 0, "best_matches": 0, "best_partner": None}
     return {
         **result,

@@ -26,7 +26,7 @@ from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.stationary import Motions, Stationary, motions, together
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.input import still_background as still
-from nerfcli.poses.input.job import Job, LaidOutMask, Tell
+from nerfcli.poses.input.job import Job, Tell, WorkMask
 from nerfcli.poses.input.masks import write_mask, write_no_mask
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
@@ -292,7 +292,7 @@ def _judged(
     return facts
 
 
-def _written(job: Job, masks: Sequence[np.ndarray | None]) -> tuple[LaidOutMask, ...]:
+def _written(job: Job, masks: Sequence[np.ndarray | None]) -> tuple[WorkMask, ...]:
     """Write a mask of each photo for pycolmap, and the object masks that were found for the user."""
     job.mask_folder.mkdir(exist_ok=True)
     scene_masks(job).mkdir(exist_ok=True)

@@ -27,7 +27,7 @@ from nerfcli.poses.engine.chosen import choose_component
 from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.ladder import climb
-from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.mapped import MappedModels, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
 from nerfcli.poses.engine.retrieval import with_neighbours
 from nerfcli.poses.engine.separate_models import describe_components
@@ -59,14 +59,14 @@ def main(job_path: str) -> None:
 
 def solve(job: Job, report: Report, tell: Tell) -> None:
     """Extract, match, map and check, each continuing from the results of earlier calls."""
-    known = recalled(job)
-    result, key = Path(job.folder) / RESULT, result_key(job if known is None else known[0])
+    stored = recalled(job)
+    result, key = Path(job.folder) / RESULT, result_key(job if stored is None else stored[0])
     if _is_complete(job, key):
         _name_images(job)
         return
     result.unlink(missing_ok=True)
     seconds: dict[str, float] = {}
-    job, moving = _looked_at(job, report, tell, seconds=seconds) if known is None else known
+    job, moving = _looked_at(job, report, tell, seconds=seconds) if stored is None else stored
     key = result_key(job)
     found = _solve_strictly(job, report, tell) if job.held_out else _estimate(job, report, tell)
     for stage, value in seconds.items():
@@ -151,7 +151,7 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     return result
 
 
-def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> Mapped:
+def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> MappedModels:
     """Return the models of an earlier call if they are intact, else map the photos; either way they are on disk."""
     discard_if_damaged(job.database)
     key = mapping_key(job)

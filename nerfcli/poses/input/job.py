@@ -45,7 +45,7 @@ def usual_focal_px(width: int, height: int) -> float:
 
 
 @dataclass(frozen=True)
-class LaidOutMask:
+class WorkMask:
     """Mask of one photo: a hash of the used pixels, "" without a mask, and their fraction."""
 
     key: str = ""
@@ -78,7 +78,7 @@ class Job:
     max_features: int
     seed: int
     threads: int
-    masks: tuple[LaidOutMask, ...] = ()
+    masks: tuple[WorkMask, ...] = ()
     rung: str = ""
     held_out: tuple[int, ...] = ()
     component: int = 1
@@ -138,7 +138,7 @@ def job_from_json(content: dict[str, Any]) -> Job:
     content["skipped_checks"] = tuple((check, why) for check, why in content["skipped_checks"])
     for name in ("files", "names", "keys", "held_out"):
         content[name] = tuple(content[name])
-    content["masks"] = tuple(LaidOutMask(**mask) for mask in content["masks"])
+    content["masks"] = tuple(WorkMask(**mask) for mask in content["masks"])
     return Job(**content)
 
 

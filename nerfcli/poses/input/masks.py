@@ -9,7 +9,7 @@ from PIL import Image
 
 from nerfcli.errors import UserError
 from nerfcli.media.masks import find_mask, read_mask
-from nerfcli.poses.input.job import LaidOutMask
+from nerfcli.poses.input.job import WorkMask
 from nerfcli.poses.input.photos import Photos
 from nerfcli.poses.input.stages import stage_key
 
@@ -19,7 +19,7 @@ _READERS = 4
 
 def lay_out_masks(
     photos: Photos, files: Sequence[str], masks: Path, *, folder: Path, notify: Callable[[str], None]
-) -> tuple[LaidOutMask, ...]:
+) -> tuple[WorkMask, ...]:
     """Write a mask for each photo, upright, for pycolmap: 00000.jpg.png for the photo 00000.jpg, black where not used.
 
     Args:
@@ -40,7 +40,7 @@ def lay_out_masks(
         )
     folder.mkdir(parents=True, exist_ok=True)
 
-    def one(index: int) -> LaidOutMask | str:
+    def one(index: int) -> WorkMask | str:
         path, photo = found[index], photos.photos[index]
         if path is None:
             return write_no_mask(folder / f"{files[index]}.png", (photo.width, photo.height))
@@ -59,23 +59,23 @@ def lay_out_masks(
     without = [name for name, mask in zip(photos.names, found, strict=True) if mask is None]
     if without:
         notify(f"{len(without)} of {len(photos.names)} photos have no mask and are used completely: {_some(without)}")
-    done = tuple(mask for mask in laid_out if isinstance(mask, LaidOutMask))
+    done = tuple(mask for mask in laid_out if isinstance(mask, WorkMask))
     hidden = [name for name, mask in zip(photos.names, done, strict=True) if mask.used_fraction == 0]
     if hidden:
         notify(f"{len(hidden)} masks are completely black, so their photos are not used: {_some(hidden)}")
     return done
 
 
-def write_mask(path: Path, used: np.ndarray) -> LaidOutMask:
+def write_mask(path: Path, used: np.ndarray) -> WorkMask:
     """Write a mask for pycolmap from the used pixels of the upright photo, bool (height, width)."""
     Image.fromarray(used).save(path)
-    return LaidOutMask(stage_key(used.shape, np.packbits(used).tobytes().hex()), float(used.mean()))
+    return WorkMask(stage_key(used.shape, np.packbits(used).tobytes().hex()), float(used.mean()))
 
 
-def write_no_mask(path: Path, size: tuple[int, int]) -> LaidOutMask:
+def write_no_mask(path: Path, size: tuple[int, int]) -> WorkMask:
     """Write a white mask for a photo of (width, height), since pycolmap leaves out a photo whose mask is missing."""
     Image.new("1", size, 1).save(path)
-    return LaidOutMask()
+    return WorkMask()
 
 
 def _check_folder(photos: Photos, masks: Path) -> None:

@@ -25,12 +25,12 @@ def read_pairs(path: Path, photos: Photos) -> Pairing:
             f"cannot read the pairs in {path}: {why}", "give a text file with two names per line"
         ) from error
     numbers = {name: number for number, name in enumerate(photos.names)}
-    known = {*numbers, *photos.unreadable}
+    photo_names = {*numbers, *photos.unreadable}
     pairs: set[tuple[int, int]] = set()
     for line_number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        one, other = _names(line.strip(), known, f"{path}, line {line_number}", photos.folder)
+        one, other = _names(line.strip(), photo_names, f"{path}, line {line_number}", photos.folder)
         if one in numbers and other in numbers:
             i, j = numbers[one], numbers[other]
             pairs.add((min(i, j), max(i, j)))
@@ -39,13 +39,13 @@ def read_pairs(path: Path, photos: Photos) -> Pairing:
     return Pairing("file", in_blocks(pairs), 0)
 
 
-def _names(line: str, known: Container[str], place: str, folder: Path) -> tuple[str, str]:
+def _names(line: str, photo_names: Container[str], place: str, folder: Path) -> tuple[str, str]:
     """Return the two names of a line."""
-    found = [(one, other) for one, other in _cuts(line) if one in known and other in known]
+    found = [(one, other) for one, other in _cuts(line) if one in photo_names and other in photo_names]
     if len(set(found)) > 1:
         raise UserError(f"{place}: {line!r} can be split into two names in more than one way", "put a tab between them")
     if not found:
-        unknown = _unknown(line, known)
+        unknown = _unknown(line, photo_names)
         raise UserError(f"{place}: {unknown}", f"write two names of photos in {folder}, separated by a space")
     if found[0][0] == found[0][1]:
         raise UserError(f"{place}: {found[0][0]} is paired with itself", "write two different names")
@@ -67,12 +67,12 @@ def _bare(text: str) -> str:
     return text[1:-1] if quoted else text
 
 
-def _unknown(line: str, known: Container[str]) -> str:
+def _unknown(line: str, photo_names: Container[str]) -> str:
     """Describe the error in a line that does not contain two names of photos."""
     cuts = list(_cuts(line))
     for one, other in cuts:
-        if one in known:
+        if one in photo_names:
             return f"there is no photo {other!r}"
-        if other in known:
+        if other in photo_names:
             return f"there is no photo {one!r}"
     return f"there is no photo {cuts[0][0]!r}" if len(cuts) == 1 else f"{line!r} does not contain two names of photos"

@@ -145,7 +145,7 @@ def checking_seconds(photos: int) -> float:
     return _CHECK_SECONDS + photos * _CHECK_SECONDS_PER_PHOTO
 
 
-class Outlook:
+class TimeEstimate:
     """Estimate of the remaining time: measured for the current stage, from the plan for later ones.
 
     The planned seconds of the current stage are scaled by the time it has taken so far, after its beginning; those of

@@ -21,14 +21,14 @@ _VERSION = "JPEG 97"
 
 
 @dataclass(frozen=True)
-class LaidOut:
+class WorkPhoto:
     """A photo's file below work/photos, whose stem is its number, and a hash of the original's content."""
 
     file: str
     key: str
 
 
-def lay_out(photos: Photos, work: Path) -> tuple[LaidOut, ...]:
+def lay_out(photos: Photos, work: Path) -> tuple[WorkPhoto, ...]:
     """Give the worker each photo, upright, under its number: a link if the file can be used directly, else a copy.
 
     A photo keeps the number that it got when it was first laid out, and numbers are not reused, so that stored results
@@ -37,17 +37,17 @@ def lay_out(photos: Photos, work: Path) -> tuple[LaidOut, ...]:
     folder, stage = work / "photos", work / "photos.json"
     folder.mkdir(parents=True, exist_ok=True)
     content = read_stage(stage, _VERSION) or {"next": 0, "photos": {}}
-    known = {name: LaidOut(**laid_out) for name, laid_out in content["photos"].items()}
+    earlier = {name: WorkPhoto(**laid_out) for name, laid_out in content["photos"].items()}
     following = content["next"]
     numbers: dict[str, int] = {}
     for photo in photos.photos:
-        if photo.name in known:
-            numbers[photo.name] = int(Path(known[photo.name].file).stem)
+        if photo.name in earlier:
+            numbers[photo.name] = int(Path(earlier[photo.name].file).stem)
         else:
             numbers[photo.name], following = following, following + 1
 
-    def lay_out_one(photo: Photo) -> LaidOut:
-        return _laid_out(photos.folder, photo, folder, number=numbers[photo.name], known=known.get(photo.name))
+    def lay_out_one(photo: Photo) -> WorkPhoto:
+        return _laid_out(photos.folder, photo, folder, number=numbers[photo.name], earlier=earlier.get(photo.name))
 
     with ThreadPoolExecutor(_COPIERS) as copiers:
         laid_out = tuple(copiers.map(lay_out_one, photos.photos))
@@ -56,13 +56,13 @@ def lay_out(photos: Photos, work: Path) -> tuple[LaidOut, ...]:
     return laid_out
 
 
-def _laid_out(photos: Path, photo: Photo, folder: Path, *, number: int, known: LaidOut | None) -> LaidOut:
+def _laid_out(photos: Path, photo: Photo, folder: Path, *, number: int, earlier: WorkPhoto | None) -> WorkPhoto:
     original = (photos / photo.name).absolute()
     key = file_key(original)
     plain = _is_plain(original, photo)
-    laid_out = LaidOut(f"{number:05d}{original.suffix.lower() if plain else '.jpg'}", key)
+    laid_out = WorkPhoto(f"{number:05d}{original.suffix.lower() if plain else '.jpg'}", key)
     target = folder / laid_out.file
-    if known == laid_out and target.exists() and not (target.is_symlink() and target.readlink() != original):
+    if earlier == laid_out and target.exists() and not (target.is_symlink() and target.readlink() != original):
         return laid_out
     partial = folder / f".{laid_out.file}"
     partial.unlink(missing_ok=True)
@@ -79,5 +79,5 @@ def _laid_out(photos: Path, photo: Photo, folder: Path, *, number: int, known: L
 
 def _is_plain(path: Path, photo: Photo) -> bool:
     with Image.open(path) as image:
-        known = (image.format, path.suffix.lower()) in _PLAIN and image.mode in ("L", "RGB")
-    return known and photo.exif.orientation == 1
+        as_stored = (image.format, path.suffix.lower()) in _PLAIN and image.mode in ("L", "RGB")
+    return as_stored and photo.exif.orientation == 1

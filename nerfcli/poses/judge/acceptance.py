@@ -13,7 +13,7 @@ import pycolmap
 
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import Contradiction, strong_contradictions
-from nerfcli.poses.judge.parallax import Turn
+from nerfcli.poses.judge.parallax import RotationFit
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.determined import is_centred
 from nerfcli.poses.model.two_views import Agreement, RotationError, VerifiedPair, agreements, rotation_errors
@@ -79,7 +79,7 @@ def judge(
     model: pycolmap.Reconstruction,
     pairs: Sequence[VerifiedPair],
     *,
-    turn: Turn | None,
+    turn: RotationFit | None,
     names: Mapping[str, str],
     seed: int,
     threads: int,
@@ -142,7 +142,7 @@ def judge(
     return Verdict(measures, tuple(failures))
 
 
-def nothing_placed(turn: Turn | None) -> Verdict:
+def nothing_placed(turn: RotationFit | None) -> Verdict:
     """Return the verdict on a capture without a model: only whether the camera moved."""
     measures = {"parallax_px": None if turn is None else turn.parallax_px}
     return Verdict(measures, tuple(_no_baseline(turn, {"camera_spread_over_distance": None})))
@@ -228,7 +228,7 @@ def _observation_measure(model: pycolmap.Reconstruction) -> dict[str, Any]:
     return {"median": float(np.median(counts)), "least": int(min(counts))} if counts else {"median": 0.0, "least": 0}
 
 
-def _no_baseline(turn: Turn | None, geometry: Mapping[str, Any]) -> list[Failure]:
+def _no_baseline(turn: RotationFit | None, geometry: Mapping[str, Any]) -> list[Failure]:
     advice = "take the photos while walking around the scene or sideways; turning on the spot gives no depth"
     if turn is not None and turn.explains_all:
         evidence = f"a rotation of the camera without translation explains all matches to {turn.parallax_px:.1f} px"

@@ -66,7 +66,7 @@ def leave_out_contradicting(
     for photo in (photo for side in sides for photo in side if photo not in far):
         pair = next((c for c in contradicting if model.image(photo).name in (c.one, c.other)), None)
         if pair is None:
-            reasons[photo] = "contradicts the rest: connected only through a photo that does"
+            reasons[photo] = "connected to the rest only through a photo that contradicts it"
         else:
             other = pair.other if pair.one == model.image(photo).name else pair.one
             reasons[photo] = (

@@ -15,7 +15,7 @@ from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.judge.uncertainty import pose_blur_px
-from nerfcli.poses.model.intrinsics import Lenses, choose_lenses
+from nerfcli.poses.model.intrinsics import ModelLenses, choose_lenses
 from nerfcli.poses.model.localise import shared_pairs
 from nerfcli.poses.model.reasons import FEW_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, read_verified_pairs
@@ -25,7 +25,7 @@ _MOST_PHOTOS_FOR_BLUR = 500
 
 
 @dataclass(frozen=True)
-class Examined:
+class ExaminedModel:
     """A model after examination, with the results for the report.
 
     left_out: why photos were left out, by number. blur_px: of each photo's pose, by number. details: for the report.
@@ -47,7 +47,7 @@ def examine(
     *,
     localised: Sequence[int] = (),
     checks: Checks | None = None,
-) -> Examined:
+) -> ExaminedModel:
     """Leave out contradicting photos of the first model, choose lenses, adjust, judge, and measure the uncertainty.
 
     A check that cannot be computed is left out and listed in `details["not_computed"]`; the others go on.
@@ -68,7 +68,7 @@ def examine(
     joined = connected_groups(job.image_ids, [(pair.one, pair.other) for pair in strong])
     details: dict[str, Any] = {"parts": [len(part) for part in joined if len(part) > 1]}
     if not models:
-        return Examined(None, nothing_placed(turn), {}, {}, details | {"not_computed": checks.not_computed})
+        return ExaminedModel(None, nothing_placed(turn), {}, {}, details | {"not_computed": checks.not_computed})
     numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
     report("check", 0, 4)
     mapped = with_pose_only(models[0])
@@ -82,7 +82,7 @@ def examine(
         "contradicting photos", lambda: leave_out_contradicting(mapped, [*pairs, *held]), otherwise=(mapped, {})
     )
     report("check", 1, 4)
-    lenses = checks.run("lens models", lambda: _with_lenses(model, job), otherwise=Lenses(model, [], {}))
+    lenses = checks.run("lens models", lambda: _with_lenses(model, job), otherwise=ModelLenses(model, [], {}))
     model = lenses.model
     details["lenses"] = [asdict(candidate) for candidate in lenses.candidates]
     report("check", 2, 4)
@@ -110,7 +110,7 @@ def examine(
     reasons = {numbers[image_id]: _with_names(reason, job) for image_id, reason in left_out.items()}
     details["not_computed"] = checks.not_computed
     uncertainty = {str(camera_id): certain for camera_id, certain in lenses.uncertainty.items()}
-    return Examined(
+    return ExaminedModel(
         model, verdict, reasons, {numbers[image_id]: px for image_id, px in blur.items()}, details, uncertainty
     )
 
@@ -122,7 +122,7 @@ def with_pose_only(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return copy
 
 
-def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> Lenses:
+def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> ModelLenses:
     """Choose lens models by evidence, unless the user or a file has named them."""
     named = [number for number, group in enumerate(job.groups, start=1) if not group.choose]
     exif_focal_px = {

@@ -30,7 +30,7 @@ _STEPS = 40
 
 
 @dataclass(frozen=True)
-class Turn:
+class RotationFit:
     """The best explanation of all matches by rotations of the camera alone.
 
     parallax_px: the remaining error that three pairs in four do not exceed (median over the matches of each). focal_px:
@@ -46,7 +46,7 @@ class Turn:
         return self.parallax_px < NO_PARALLAX_PX
 
 
-def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]]) -> Turn | None:
+def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]]) -> RotationFit | None:
     """Find how well rotations of one camera explain the matches; None without a pair.
 
     Args:
@@ -73,7 +73,7 @@ def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[i
     simplex = np.array([[start, 0.0], [start + 0.15, 0.0], [start, 0.05]])
     options = {"maxiter": _STEPS, "initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2}
     found = minimize(left_over, simplex[0], method="Nelder-Mead", options=options)
-    return Turn(float(found.fun), float(np.exp(found.x[0]) * longest))
+    return RotationFit(float(found.fun), float(np.exp(found.x[0]) * longest))
 
 
 def _from_middle(photos: Sequence[tuple[Array, tuple[int, int]]], counts: NDArray[np.int64]) -> Array:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from nerfcli.cameras.calibration import Calibrated, Calibration, Picture, calibrated
+from nerfcli.cameras.calibration import Calibration, PhotoCalibration, Picture, calibrated
 from nerfcli.cameras.orientation import counted, describe_rescaling, rescaling
 from nerfcli.errors import UserError
 from nerfcli.media.focal_evidence import focal_evidence
@@ -33,7 +33,7 @@ class GivenIntrinsics:
 
 
 @dataclass(frozen=True)
-class Grouped:
+class PhotoGroups:
     """Photos by camera, notes on them for the user, and the given intrinsics for the report (None without any)."""
 
     groups: tuple[CameraGroup, ...]
@@ -41,7 +41,7 @@ class Grouped:
     given: dict[str, Any] | None = None
 
 
-def group_photos(photos: Photos, *, model: str) -> Grouped:
+def group_photos(photos: Photos, *, model: str) -> PhotoGroups:
     """Group photos by EXIF and upright size; model: COLMAP's name, or "auto" to start from the one that EXIF suggests.
 
     If EXIF describes another picture than the file, its focal length is only the start of the adjustment, not a prior.
@@ -67,11 +67,11 @@ def group_photos(photos: Photos, *, model: str) -> Grouped:
         )
     notes = _doubts(doubted)
     if len(groups) == 1:
-        return Grouped(tuple(groups), notes)
-    return Grouped(tuple(groups), (f"{len(groups)} cameras, by EXIF and size: {_summary(groups)}", *notes))
+        return PhotoGroups(tuple(groups), notes)
+    return PhotoGroups(tuple(groups), (f"{len(groups)} cameras, by EXIF and size: {_summary(groups)}", *notes))
 
 
-def group_by_given(photos: Photos, given: GivenIntrinsics) -> Grouped:
+def group_by_given(photos: Photos, given: GivenIntrinsics) -> PhotoGroups:
     """Group photos by the cameras of a file. Photos that it does not list share a camera only if their EXIF agrees.
 
     Raises:
@@ -108,7 +108,7 @@ def group_by_given(photos: Photos, given: GivenIntrinsics) -> Grouped:
         {"photos": len(numbers), "matched_by": "name" if by_name else "size", **camera.to_json()}
         for (_, camera, by_name, _), numbers in members.items()
     ]
-    return Grouped(groups, _notes(given, found), given.to_json() | {"cameras": described})
+    return PhotoGroups(groups, _notes(given, found), given.to_json() | {"cameras": described})
 
 
 def start_model(exif: Exif) -> str:
@@ -147,7 +147,7 @@ def _photos(count: int, more: str = "") -> str:
     return f"{count} {more}photo{'' if count == 1 else 's'}"
 
 
-def _notes(given: GivenIntrinsics, found: Sequence[Calibrated]) -> tuple[str, ...]:
+def _notes(given: GivenIntrinsics, found: Sequence[PhotoCalibration]) -> tuple[str, ...]:
     calibration = given.calibration
     named = sum(one.by_name for one in found)
     ways = [f"{count} by {how}" for count, how in ((named, "name"), (len(found) - named, "size")) if count]

@@ -65,7 +65,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Determined:
+class DeterminedLens:
     """Lens parameters that a capture determines.
 
     Args:
@@ -90,7 +90,7 @@ def determine(
     fixed: Sequence[int] = (),
     named: bool = False,
     exif_focal_px: float | None = None,
-) -> Determined:
+) -> DeterminedLens:
     """Find which lens parameters of a perspective camera a converged model determines.
 
     Args:
@@ -121,10 +121,10 @@ def determine(
     fraction = found.deviation("f") / camera.mean_focal_length()
     if not named and not fraction <= (_OPEN_DEVIATION if exif_focal_px is None else _EXIF_DEVIATION):
         focal_px = exif_focal_px or _between_px(mapped, camera_id, seed=seed, fixed=fixed)
-        return Determined(_held(mapped.cameras[camera_id], focal_px), False, True, tuple(steps))
+        return DeterminedLens(_held(mapped.cameras[camera_id], focal_px), False, True, tuple(steps))
     if not named and "k2" not in free and fraction <= _EXIF_DEVIATION:
         free, found = _with_or_without_distortion(evidence, free, found, camera, steps)
-    return Determined(_camera(camera, found, named=named), "cx" in free, False, tuple(steps))
+    return DeterminedLens(_camera(camera, found, named=named), "cx" in free, False, tuple(steps))
 
 
 def uncertainty(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from nerfcli.poses.model import held_out
-from nerfcli.poses.model.determined import Determined, determine, has_open_distortion, is_centred, uncertainty
+from nerfcli.poses.model.determined import DeterminedLens, determine, has_open_distortion, is_centred, uncertainty
 from nerfcli.poses.model.lens_evidence import UndeterminedError, parameters_of
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ class _Trial:
 
 
 @dataclass(frozen=True)
-class Lenses:
+class ModelLenses:
     """A model with the chosen lenses, the decisions, and each lens's uncertainty by camera id, for the report."""
 
     model: pycolmap.Reconstruction
@@ -92,7 +92,7 @@ def choose_lenses(
     fixed: Sequence[int] = (),
     named: Sequence[int] = (),
     exif_focal_px: Mapping[int, float] | None = None,
-) -> Lenses:
+) -> ModelLenses:
     """Return the model with the lens models that its observations support, adjusted again.
 
     Args:
@@ -107,7 +107,7 @@ def choose_lenses(
     cameras = sorted((c for c in photos if c not in fixed and photos[c] >= _LEAST_PHOTOS), key=lambda c: -photos[c])
     candidates: list[Candidate] = []
     freed: list[int] = []
-    held: dict[int, Determined] = {}
+    held: dict[int, DeterminedLens] = {}
     result = pycolmap.Reconstruction(model)
     held_out.adjust(result, threads=threads, fixed=fixed)
     for camera_id in cameras[:_MOST_CAMERAS]:
@@ -162,19 +162,19 @@ def choose_lenses(
         )
         for camera_id in sorted(photos)[:_MOST_DESCRIBED]
     }
-    return Lenses(result, candidates, certain)
+    return ModelLenses(result, candidates, certain)
 
 
 def _with_held(
     model: pycolmap.Reconstruction,
-    held: Mapping[int, Determined],
+    held: Mapping[int, DeterminedLens],
     *,
     seed: int,
     threads: int,
     fixed: Sequence[int],
     named: Sequence[int],
     exif_focal_px: Mapping[int, float] | None,
-) -> Lenses:
+) -> ModelLenses:
     """Choose the lenses again, with the undetermined focal lengths held at their assumed values.
 
     Only the distortion of these cameras is adjusted, and then fixed; or removed, if it is undetermined too.
@@ -199,10 +199,10 @@ def _with_held(
         for camera_id in held
         if camera_id in chosen.uncertainty
     }
-    return Lenses(chosen.model, [*decided, *chosen.candidates], chosen.uncertainty | certain)
+    return ModelLenses(chosen.model, [*decided, *chosen.candidates], chosen.uncertainty | certain)
 
 
-def _decisions(camera_id: int, found: Determined) -> list[Candidate]:
+def _decisions(camera_id: int, found: DeterminedLens) -> list[Candidate]:
     return [
         Candidate(
             camera_id,

@@ -110,8 +110,8 @@ def localise(
         total = _ROUNDS * len(left)
         placed_before: list[int] = []
         for turn in range(_ROUNDS):
-            known = known_points(grown, database)
-            fresh = np.isin(known.photos, placed_before)
+            model_points = known_points(grown, database)
+            fresh = np.isin(model_points.photos, placed_before)
             placed_now = []
             for number, image_id in enumerate(left):
                 report("locate", turn * len(image_ids) + number, total)
@@ -119,11 +119,11 @@ def localise(
                 if photo is None:
                     attempts[image_id] = Attempt(image_id, refused="its camera is unknown")
                     continue
-                if turn > 0 and resembling(photo, known.descriptors[fresh]) < _LEAST_VOTES:
+                if turn > 0 and resembling(photo, model_points.descriptors[fresh]) < _LEAST_VOTES:
                     continue
-                placed, attempts[image_id] = _place(photo, known, seed=job.seed)
+                placed, attempts[image_id] = _place(photo, model_points, seed=job.seed)
                 if placed is not None:
-                    _add(grown, photo, placed, known=known, name=files[image_id])
+                    _add(grown, photo, placed, model_points=model_points, name=files[image_id])
                     placed_now.append(image_id)
             left = [image_id for image_id in left if image_id not in placed_now]
             if not left or not placed_now:
@@ -182,27 +182,33 @@ def _doubt(model: pycolmap.Reconstruction, image_id: int, pairs: Sequence[Verifi
     return f"{against[0].matches} verified matches contradict its pose" if against else ""
 
 
-def _place(photo: PhotoFeatures, known: KnownPoints, *, seed: int) -> tuple[_Placed | None, Attempt]:
+def _place(photo: PhotoFeatures, model_points: KnownPoints, *, seed: int) -> tuple[_Placed | None, Attempt]:
     """Return a photo's pose with the points it sees, or None; and the record of the attempt."""
-    features, points = votes(photo, known)
-    first = _pose(photo, known, features, points, seed=seed)
+    features, points = votes(photo, model_points)
+    first = _pose(photo, model_points, features, points, seed=seed)
     agreeing = 0 if first is None else len(first.features)
     attempt = Attempt(photo.image_id, len(features), agreeing)
     if first is None or agreeing < _LEAST_VOTES:
         return None, replace(attempt, refused=f"only {agreeing} of {len(features)} features agree on a pose")
     others = ~np.isin(features, first.features)
-    second = _pose(photo, known, features[others], points[others], seed=seed)
-    if second is not None and len(second.features) >= _RIVAL_FRACTION * agreeing and not _alike(first, second, known):
+    second = _pose(photo, model_points, features[others], points[others], seed=seed)
+    if (
+        second is not None
+        and len(second.features) >= _RIVAL_FRACTION * agreeing
+        and not _alike(first, second, model_points)
+    ):
         return None, replace(
             attempt, refused=f"{len(second.features)} features agree on a different pose than the {agreeing} others"
         )
     placed = first
     for within in _WITHIN:
-        found = _pose(photo, known, *_expected(photo, known, placed.pose, within=within), seed=seed)
+        found = _pose(photo, model_points, *_expected(photo, model_points, placed.pose, within=within), seed=seed)
         if found is None:
             break
         placed = found
-    count, *beside = (len(_expected(photo, known, placed.pose, beside=step)[0]) for step in (np.zeros(2), *_steps()))
+    count, *beside = (
+        len(_expected(photo, model_points, placed.pose, beside=step)[0]) for step in (np.zeros(2), *_steps())
+    )
     attempt = replace(attempt, found=count, beside=max(beside))
     if count < _LEAST_FOUND or count < _CLEARLY * max(beside):
         said = f"{count} features match the expected positions, but {max(beside)} match wrong ones by chance"
@@ -210,13 +216,15 @@ def _place(photo: PhotoFeatures, known: KnownPoints, *, seed: int) -> tuple[_Pla
     area = _area(photo, placed.features)
     if area < _LEAST_AREA:
         return None, replace(attempt, refused=f"only {100 * area:.0f} % of the picture agrees with the model")
-    turn_deg, shift = _deviations(photo, known, placed)
+    turn_deg, shift = _deviations(photo, model_points, placed)
     if turn_deg > _MOST_TURN_DEG or shift > _MOST_SHIFT:
         return None, replace(attempt, refused=f"its position is uncertain by {100 * shift:.1f} % of the distance")
     return placed, attempt
 
 
-def _pose(photo: PhotoFeatures, known: KnownPoints, features: Indices, points: Indices, *, seed: int) -> _Placed | None:
+def _pose(
+    photo: PhotoFeatures, model_points: KnownPoints, features: Indices, points: Indices, *, seed: int
+) -> _Placed | None:
     """Return the pose that most of the features agree on, with these features."""
     if len(features) < _LEAST_VOTES:
         return None
@@ -226,7 +234,7 @@ def _pose(photo: PhotoFeatures, known: KnownPoints, features: Indices, points: I
     options.ransac.max_num_trials = _TRIALS
     options.ransac.confidence = 0.9999
     found = pycolmap.estimate_and_refine_absolute_pose(
-        photo.pixels[features], known.places[points], photo.camera, estimation_options=options
+        photo.pixels[features], model_points.places[points], photo.camera, estimation_options=options
     )
     if found is None:
         return None
@@ -235,13 +243,18 @@ def _pose(photo: PhotoFeatures, known: KnownPoints, features: Indices, points: I
 
 
 def _expected(
-    photo: PhotoFeatures, known: KnownPoints, pose: pycolmap.Rigid3d, *, within: float = 1.0, beside: Array = _HERE
+    photo: PhotoFeatures,
+    model_points: KnownPoints,
+    pose: pycolmap.Rigid3d,
+    *,
+    within: float = 1.0,
+    beside: Array = _HERE,
 ) -> tuple[Indices, Indices]:
     """Return the features that look like the points that a pose predicts there, and these points.
 
     within: search radius. beside: offset of the search from the predicted positions. Both are in tolerances.
     """
-    local = known.places @ pose.rotation.matrix().T + pose.translation
+    local = model_points.places @ pose.rotation.matrix().T + pose.translation
     pixels = np.full((len(local), 2), np.nan)
     before = local[:, 2] > 0
     pixels[before] = np.asarray(photo.camera.img_from_cam(local[before]), dtype=np.float64).reshape(-1, 2)
@@ -250,15 +263,15 @@ def _expected(
         seen = np.flatnonzero(np.all((pixels >= 0) & (pixels < (photo.camera.width, photo.camera.height)), axis=1))
     found = KDTree(photo.pixels).query_ball_point(pixels[seen], within * photo.tolerance_px)
     near = {int(point): features for point, features in zip(seen, found, strict=True) if features}
-    looks = np.flatnonzero(np.isin(known.of, np.array(list(near), dtype=np.int64)))
-    features = np.array([feature for point in known.of[looks] for feature in near[int(point)]], dtype=np.int64)
-    looks = np.repeat(looks, np.array([len(near[int(point)]) for point in known.of[looks]], dtype=np.int64))
+    looks = np.flatnonzero(np.isin(model_points.of, np.array(list(near), dtype=np.int64)))
+    features = np.array([feature for point in model_points.of[looks] for feature in near[int(point)]], dtype=np.int64)
+    looks = np.repeat(looks, np.array([len(near[int(point)]) for point in model_points.of[looks]], dtype=np.int64))
     distances = np.empty(len(features))
     for start in range(0, len(features), BLOCK * 64):
         rows = slice(start, start + BLOCK * 64)
-        cosines = np.einsum("ij,ij->i", photo.descriptors[features[rows]], known.descriptors[looks[rows]])
+        cosines = np.einsum("ij,ij->i", photo.descriptors[features[rows]], model_points.descriptors[looks[rows]])
         distances[rows] = np.sqrt(np.maximum(2 - 2 * cosines, 0))
-    points = known.of[looks]
+    points = model_points.of[looks]
     order = np.argsort(distances, kind="stable")
     order = order[distances[order] < ALIKE]
     for ids in (points, features):  # the most similar feature of each point, and the reverse
@@ -279,20 +292,20 @@ def _area(photo: PhotoFeatures, features: Indices) -> float:
     return float(4 * np.pi * spread / (photo.camera.width * photo.camera.height))
 
 
-def _alike(one: _Placed, other: _Placed, known: KnownPoints) -> bool:
+def _alike(one: _Placed, other: _Placed, model_points: KnownPoints) -> bool:
     """Return whether two poses are the same except for noise."""
     turned = np.degrees((one.pose.rotation * other.pose.rotation.inverse()).angle())
     places = [np.asarray(placed.pose.inverse().translation) for placed in (one, other)]
-    distance = np.median(np.linalg.norm(known.places[one.points] - places[0], axis=1))
+    distance = np.median(np.linalg.norm(model_points.places[one.points] - places[0], axis=1))
     return bool(turned < 5 and np.linalg.norm(places[0] - places[1]) < 0.1 * distance)
 
 
-def _deviations(photo: PhotoFeatures, known: KnownPoints, placed: _Placed) -> tuple[float, float]:
+def _deviations(photo: PhotoFeatures, model_points: KnownPoints, placed: _Placed) -> tuple[float, float]:
     """Return the standard deviations of a pose: angles in degrees, position relative to the distance of its points."""
     refined = pycolmap.refine_absolute_pose(
         placed.pose,
         photo.pixels[placed.features],
-        known.places[placed.points],
+        model_points.places[placed.points],
         np.ones(len(placed.features), dtype=bool),
         photo.camera,
         return_covariance=True,
@@ -300,7 +313,7 @@ def _deviations(photo: PhotoFeatures, known: KnownPoints, placed: _Placed) -> tu
     if refined is None:
         return np.inf, np.inf
     pose = refined["cam_from_world"]
-    local = known.places[placed.points] @ pose.rotation.matrix().T + pose.translation
+    local = model_points.places[placed.points] @ pose.rotation.matrix().T + pose.translation
     pixels = np.asarray(photo.camera.img_from_cam(local), dtype=np.float64).reshape(-1, 2)
     noise_px = np.sqrt(np.mean((pixels - photo.pixels[placed.features]) ** 2))
     spread = np.sqrt(np.maximum(np.diag(refined["covariance"]), 0)) * noise_px  # three of angles, three of translation
@@ -309,7 +322,7 @@ def _deviations(photo: PhotoFeatures, known: KnownPoints, placed: _Placed) -> tu
 
 
 def _add(
-    model: pycolmap.Reconstruction, photo: PhotoFeatures, placed: _Placed, *, known: KnownPoints, name: str
+    model: pycolmap.Reconstruction, photo: PhotoFeatures, placed: _Placed, *, model_points: KnownPoints, name: str
 ) -> None:
     """Add a photo and its observations to a model."""
     if not model.exists_camera(photo.camera.camera_id):
@@ -323,4 +336,4 @@ def _add(
         image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in photo.pixels])
         model.add_image_with_trivial_frame(image, placed.pose)
     for feature, point in zip(placed.features, placed.points, strict=True):
-        model.add_observation(int(known.ids[point]), pycolmap.TrackElement(photo.image_id, int(feature)))
+        model.add_observation(int(model_points.ids[point]), pycolmap.TrackElement(photo.image_id, int(feature)))

@@ -94,16 +94,16 @@ def resembling(photo: PhotoFeatures, descriptors: NDArray[np.float32]) -> int:
     return found
 
 
-def votes(photo: PhotoFeatures, known: KnownPoints) -> tuple[Indices, Indices]:
+def votes(photo: PhotoFeatures, model_points: KnownPoints) -> tuple[Indices, Indices]:
     """Return features and the points that they vote for, each point once."""
     nearest = np.empty(len(photo.pixels), dtype=np.int64)
     ratios, cosines = np.empty(len(nearest)), np.empty(len(nearest))
     for start in range(0, len(nearest), BLOCK):
-        alike = photo.descriptors[start : start + BLOCK] @ known.descriptors.T  # (block, descriptors)
+        alike = photo.descriptors[start : start + BLOCK] @ model_points.descriptors.T  # (block, descriptors)
         rows = np.arange(len(alike))
         best = alike.argmax(axis=1)
-        points, cosine = known.of[best], alike[rows, best]
-        alike[known.of[None, :] == points[:, None]] = -1.0
+        points, cosine = model_points.of[best], alike[rows, best]
+        alike[model_points.of[None, :] == points[:, None]] = -1.0
         second = alike.max(axis=1)
         block = slice(start, start + len(alike))
         nearest[block], cosines[block] = points, cosine

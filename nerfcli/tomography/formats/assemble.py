@@ -11,7 +11,7 @@ from nerfcli.errors import UserError
 from nerfcli.findings import several
 from nerfcli.holdout import names_held_out
 from nerfcli.tomography.circle import Circle
-from nerfcli.tomography.formats.given import MILLIMETRES, Given, check_pixel_size
+from nerfcli.tomography.formats.given import MILLIMETRES, ScanOptions, check_pixel_size
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.open_beam import OpenBeam
 from nerfcli.tomography.scan import Kind, Scan, held_out_views
@@ -25,7 +25,7 @@ _EMPTY = "the projections are empty: export them again"
 
 
 @dataclass(frozen=True)
-class Found:
+class ReaderOutput:
     """Output of a reader.
 
     Args:
@@ -59,7 +59,7 @@ class Found:
     stated_mm: float = 1.0
 
 
-def scan_of(found: Found, given: Given) -> Scan:
+def scan_of(found: ReaderOutput, given: ScanOptions) -> Scan:
     """Build the scan.
 
     Raises:
@@ -107,7 +107,7 @@ def scan_of(found: Found, given: Given) -> Scan:
     )
 
 
-def _checked(found: Found) -> np.ndarray:
+def _checked(found: ReaderOutput) -> np.ndarray:
     """Return the values as float32; raise if they are implausible for their kind."""
     values = np.asarray(found.values, dtype=np.float32)
     if values.ndim != 3 or 0 in values.shape:
@@ -139,7 +139,7 @@ def _checked(found: Found) -> np.ndarray:
     return values
 
 
-def _in_millimetres(found: Found, given: Given) -> tuple[str, Circle | ScanGeometry]:
+def _in_millimetres(found: ReaderOutput, given: ScanOptions) -> tuple[str, Circle | ScanGeometry]:
     """Return the unit of lengths, and the geometry in that unit; it is mm if the user gave a unit."""
     if given.unit is None:
         return found.unit, found.geometry
@@ -182,7 +182,7 @@ def axis_column(geometry: ScanGeometry) -> float:
     return float(np.median([geometry.pixel_of(view, origin)[0, 0] for view in range(geometry.views)]))
 
 
-def _usable(found: Found, values: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
+def _usable(found: ReaderOutput, values: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the values with neutral numbers where they are not finite, and the mask of usable ones."""
     finite = np.isfinite(values)
     usable = None if found.beam is None or found.beam.usable.all() else found.beam.usable
@@ -206,12 +206,12 @@ def _usable(found: Found, values: np.ndarray, notes: list[str]) -> tuple[np.ndar
     return values, usable
 
 
-def _named(found: Found, which: np.ndarray) -> str:
+def _named(found: ReaderOutput, which: np.ndarray) -> str:
     index = int(np.argmax(which))
     return found.names[index] if index < len(found.names) else f"number {index}"
 
 
-def _photons(found: Found, given: Given) -> float | None:
+def _photons(found: ReaderOutput, given: ScanOptions) -> float | None:
     """Return the photons per detector value for counts, else per transmission of 1."""
     if given.photons is not None:
         if not (np.isfinite(given.photons) and given.photons > 0):
@@ -227,7 +227,7 @@ def _photons(found: Found, given: Given) -> float | None:
     return found.photons if found.beam is None else found.beam.photons_per_value
 
 
-def _held_out(found: Found, given: Given, views: int) -> tuple[int, ...]:
+def _held_out(found: ReaderOutput, given: ScanOptions, views: int) -> tuple[int, ...]:
     if given.holdout is not None:
         names = [f"{view:05d}" for view in range(views)]
         return tuple(sorted(int(name) for name in names_held_out(given.holdout, names)))

@@ -23,7 +23,7 @@ _NARROW_DEG, _MANY_VIEWS = 6.5, 30
 
 
 @dataclass(frozen=True)
-class Given:
+class ScanOptions:
     """The user's options.
 
     Args:

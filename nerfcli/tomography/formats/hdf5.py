@@ -12,8 +12,8 @@ import numpy as np
 
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
-from nerfcli.tomography.formats.assemble import UNKNOWN_UNIT, Found, scan_of
-from nerfcli.tomography.formats.given import Given, angles_in_radians, millimetres
+from nerfcli.tomography.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
+from nerfcli.tomography.formats.given import ScanOptions, angles_in_radians, millimetres
 from nerfcli.tomography.open_beam import open_beam_of
 from nerfcli.tomography.scan import Scan
 
@@ -28,7 +28,7 @@ _PIXEL_HEIGHT = tuple(name.replace("_x", "_y").replace("x_", "y_") for name in _
 _PROJECTION, _FLAT, _DARK = 0, 1, 2
 
 
-def read_data_exchange(path: Path, given: Given = Given()) -> Scan:
+def read_data_exchange(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     """Read a DataExchange file: exchange/data, data_white, data_dark and theta.
 
     Raises:
@@ -44,7 +44,7 @@ def read_data_exchange(path: Path, given: Given = Given()) -> Scan:
     return _parallel(path, "data-exchange", data, angles, flats=flats, darks=darks, sides=sides, given=given)
 
 
-def read_nxtomo(path: Path, given: Given = Given()) -> Scan:
+def read_nxtomo(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     """Read a NeXus file with an NXtomo entry: frames with an image_key (0 projections, 1 flats, 2 darks).
 
     Raises:
@@ -104,7 +104,7 @@ def _parallel(
     flats: np.ndarray | None,
     darks: np.ndarray | None,
     sides: tuple[float, float, float] | None,
-    given: Given,
+    given: ScanOptions,
 ) -> Scan:
     for name, frames in (("flats", flats), ("darks", darks)):
         if frames is not None and frames.shape[1:] != data.shape[1:]:
@@ -131,7 +131,7 @@ def _parallel(
     else:
         beam = open_beam_of(flats, darks)
     kind = "transmission" if beam is None else "counts"
-    return scan_of(Found(path, form, data, kind, circle, unit, beam=beam, notes=notes, stated_mm=stated), given)
+    return scan_of(ReaderOutput(path, form, data, kind, circle, unit, beam=beam, notes=notes, stated_mm=stated), given)
 
 
 def _opened(path: Path) -> Any:

@@ -11,14 +11,14 @@ import numpy as np
 
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
-from nerfcli.tomography.formats.assemble import Found, scan_of
-from nerfcli.tomography.formats.given import Given, angles_in_radians, millimetres
+from nerfcli.tomography.formats.assemble import ReaderOutput, scan_of
+from nerfcli.tomography.formats.given import ScanOptions, angles_in_radians, millimetres
 from nerfcli.tomography.scan import Scan
 
 _HINT = "expected a struct CtData with sinogram and parameters, as HelTomo writes it"
 
 
-def read_heltomo(path: Path, given: Given = Given()) -> Scan:
+def read_heltomo(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     """Read a .mat file with a struct of sinogram and parameters.
 
     Raises:
@@ -56,7 +56,7 @@ def read_heltomo(path: Path, given: Given = Given()) -> Scan:
     )
     project = str(getattr(parameters, "projectName", path.stem))
     return scan_of(
-        Found(
+        ReaderOutput(
             path,
             "heltomo",
             sinogram[:, None],

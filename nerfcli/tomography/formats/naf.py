@@ -14,8 +14,8 @@ import numpy as np
 
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
-from nerfcli.tomography.formats.assemble import Found, scan_of
-from nerfcli.tomography.formats.given import Given, angles_in_radians
+from nerfcli.tomography.formats.assemble import ReaderOutput, scan_of
+from nerfcli.tomography.formats.given import ScanOptions, angles_in_radians
 from nerfcli.tomography.scan import Scan
 
 SUFFIXES = (".pickle", ".pkl")
@@ -75,7 +75,7 @@ def load_plain(path: Path) -> Any:
         raise UserError(f"{path} cannot be read as a pickle: {error or 'it ends early'}", _HINT) from error
 
 
-def read_naf(path: Path, given: Given = Given()) -> Scan:
+def read_naf(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     """Read a pickle with train and val projections; val is held out.
 
     Raises:
@@ -118,7 +118,7 @@ def read_naf(path: Path, given: Given = Given()) -> Scan:
         row_shift=offsets[1] / sides[1],
     )
     held_out = range(counts[0], sum(counts)) if len(counts) == 2 else None
-    found = Found(
+    found = ReaderOutput(
         *(path, "naf", np.concatenate(projections), "line_integral", circle, "mm"),
         held_out=held_out,
         history=_truth(data, path),

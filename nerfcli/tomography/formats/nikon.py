@@ -12,8 +12,8 @@ import numpy as np
 
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
-from nerfcli.tomography.formats.assemble import Found, scan_of
-from nerfcli.tomography.formats.given import Given, angles_in_radians
+from nerfcli.tomography.formats.assemble import ReaderOutput, scan_of
+from nerfcli.tomography.formats.given import ScanOptions, angles_in_radians
 from nerfcli.tomography.formats.pictures import numbered, read_stack
 from nerfcli.tomography.formats.statement import Statement, read_lines
 from nerfcli.tomography.scan import Scan
@@ -22,7 +22,7 @@ SUFFIXES = (".xtekct",)
 _HINT = "a .xtekct file has SrcToObject, SrcToDetector, DetectorPixelsX, DetectorPixelSizeX, WhiteLevel and Projections"
 
 
-def read_nikon(path: Path, given: Given = Given()) -> Scan:
+def read_nikon(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     """Read a .xtekct file with its projections.
 
     Raises:
@@ -59,7 +59,7 @@ def read_nikon(path: Path, given: Given = Given()) -> Scan:
         mirrored=True,
     )
     values = read_stack(_projections(path, fields, views))
-    return scan_of(Found(path, "nikon", values / white, "transmission", circle, "mm", notes=notes), given)
+    return scan_of(ReaderOutput(path, "nikon", values / white, "transmission", circle, "mm", notes=notes), given)
 
 
 def _angles(fields: Statement, views: int, recorded: np.ndarray | None, notes: list[str]) -> np.ndarray:

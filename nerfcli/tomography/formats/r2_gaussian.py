@@ -11,8 +11,8 @@ import numpy as np
 
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
-from nerfcli.tomography.formats.assemble import UNKNOWN_UNIT, Found, scan_of
-from nerfcli.tomography.formats.given import Given, angles_in_radians
+from nerfcli.tomography.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
+from nerfcli.tomography.formats.given import ScanOptions, angles_in_radians
 from nerfcli.tomography.formats.statement import Statement, read_object
 from nerfcli.tomography.scan import Scan
 
@@ -20,7 +20,7 @@ NAME = "meta_data.json"
 _HINT = "expected R2-Gaussian's meta_data.json: scanner, proj_train and proj_test"
 
 
-def read_r2_gaussian(path: Path, given: Given = Given()) -> Scan:
+def read_r2_gaussian(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     """Read a folder with a meta_data.json, or the meta_data.json itself; proj_test is held out.
 
     Raises:
@@ -69,7 +69,7 @@ def read_r2_gaussian(path: Path, given: Given = Given()) -> Scan:
         row_shift=-up / height,
     )
     held_out = [view for view, (part, _) in enumerate(frames) if part == "proj_test"]
-    found = Found(
+    found = ReaderOutput(
         *(path, "r2-gaussian", np.stack(values), "line_integral", circle, UNKNOWN_UNIT),
         held_out=held_out or None,
         names=[str(frame.get("file_path")) for _, frame in frames],

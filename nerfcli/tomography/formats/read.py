@@ -15,10 +15,10 @@ from nerfcli.tomography.formats import (
     stated_stack,
     transmission_transforms,
 )
-from nerfcli.tomography.formats.given import Given
+from nerfcli.tomography.formats.given import ScanOptions
 from nerfcli.tomography.scan import SCENE_FILE, Scan, is_scan, load_scan
 
-Reader = Callable[[Path, Given], Scan]
+Reader = Callable[[Path, ScanOptions], Scan]
 READERS: dict[str, Reader] = {
     "data-exchange": hdf5.read_data_exchange,
     "nxtomo": hdf5.read_nxtomo,
@@ -66,7 +66,7 @@ def recognise(path: Path) -> str | None:
     return None
 
 
-def read_scan(path: Path, given: Given = Given()) -> Scan:
+def read_scan(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     """Read a scan in any supported format.
 
     Raises:
@@ -76,7 +76,7 @@ def read_scan(path: Path, given: Given = Given()) -> Scan:
     if form is None:
         raise UserError(f"{path} is not a scan in a supported format", f"supported formats: {', '.join(FORMATS_READ)}")
     if form == OWN:
-        if given != Given():
+        if given != ScanOptions():
             raise UserError(f"{path} is a scan that was converted already", "set options when converting it")
         return load_scan(path if path.is_dir() else path.parent)
     return READERS[form](_file_of(path, form), given)

@@ -11,8 +11,8 @@ import numpy as np
 
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
-from nerfcli.tomography.formats.assemble import Found, scan_of
-from nerfcli.tomography.formats.given import Given, angles_in_radians
+from nerfcli.tomography.formats.assemble import ReaderOutput, scan_of
+from nerfcli.tomography.formats.given import ScanOptions, angles_in_radians
 from nerfcli.tomography.formats.pictures import numbered, read_stack
 from nerfcli.tomography.formats.statement import Statement, read_lines
 from nerfcli.tomography.scan import Scan
@@ -25,7 +25,7 @@ _OTHERS = r"(_rec|_spr|_arc|_TS)\w*\.\w+$"
 _PARALLEL = 1000.0
 
 
-def read_skyscan(path: Path, given: Given = Given()) -> Scan:
+def read_skyscan(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     """Read a .log file with its projections.
 
     Raises:
@@ -72,7 +72,7 @@ def read_skyscan(path: Path, given: Given = Given()) -> Scan:
             "--detect estimates the centre of rotation"
         )
     white = _white(fields, values, notes)
-    return scan_of(Found(path, "skyscan", values / white, "transmission", circle, "mm", notes=notes), given)
+    return scan_of(ReaderOutput(path, "skyscan", values / white, "transmission", circle, "mm", notes=notes), given)
 
 
 def _white(fields: Statement, values: np.ndarray, notes: list[str]) -> float:

@@ -33,8 +33,8 @@ import numpy as np
 
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
-from nerfcli.tomography.formats.assemble import Found, scan_of
-from nerfcli.tomography.formats.given import Given, angles_in_radians, millimetres
+from nerfcli.tomography.formats.assemble import ReaderOutput, scan_of
+from nerfcli.tomography.formats.given import ScanOptions, angles_in_radians, millimetres
 from nerfcli.tomography.formats.pictures import SUFFIXES, numbered, read_stack
 from nerfcli.tomography.formats.statement import Statement, read_object
 from nerfcli.tomography.geometry import Beam, ScanGeometry, from_vectors
@@ -50,7 +50,7 @@ _KEYS = (
 )
 
 
-def read_stated_stack(path: Path, given: Given = Given()) -> Scan:
+def read_stated_stack(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     """Read a folder with a scan.json, or the scan.json itself.
 
     Raises:
@@ -73,7 +73,7 @@ def read_stated_stack(path: Path, given: Given = Given()) -> Scan:
     measured: Kind = next(name for name in KINDS if name == kind)
     beam = _open_beam(file, fields, values.shape) if measured == "counts" else None
     photons = fields.positive("photons") if "photons" in fields else None
-    found = Found(
+    found = ReaderOutput(
         *(path, "stack", values, measured, geometry, "mm"),
         beam=beam,
         photons=photons if beam is None else None,

@@ -13,8 +13,8 @@ import numpy as np
 
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import circle_of
-from nerfcli.tomography.formats.assemble import UNKNOWN_UNIT, Found, scan_of
-from nerfcli.tomography.formats.given import Given
+from nerfcli.tomography.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
+from nerfcli.tomography.formats.given import ScanOptions
 from nerfcli.tomography.formats.pictures import read_stack
 from nerfcli.tomography.formats.statement import Statement, read_object
 from nerfcli.tomography.geometry import ScanGeometry
@@ -26,7 +26,7 @@ WHITE = 65535.0
 _HINT = "expected geometry.json, transforms_train.json and transforms_test.json, with transmissions"
 
 
-def read_transmission_transforms(path: Path, given: Given = Given()) -> Scan:
+def read_transmission_transforms(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     """Read the folder, one of its JSON files, or a .npy in it with the projections in the order of their angles.
 
     Raises:
@@ -57,7 +57,7 @@ def read_transmission_transforms(path: Path, given: Given = Given()) -> Scan:
     geometry = geometry.shifted(columns / 2 - lens.number("cx"), rows / 2 - lens.number("cy"))
     values, kind, photons = _values(path, folder, frames)
     circle, apart = circle_of(geometry)
-    found = Found(
+    found = ReaderOutput(
         *(path, "transmission-transforms", values),
         kind="line_integral" if kind == "line_integral" else "transmission",
         geometry=circle if apart < 1e-6 else geometry,
