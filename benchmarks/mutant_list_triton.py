@@ -68,12 +68,18 @@ TRITON: tuple[Group, ...] = (
     Group(
         "kernels/triton_cuda/marching.py",
         KERNELS,
-        "visible or occupied",
+        "visible or occupied or faint",
         (),
         (
             Mutant("if candidates <= room:", "if True:"),
             Mutant("fits = kept & (place < room)", "fits = kept"),
-            Mutant("(valid & (before < deepest))", "(valid & (before <= 2.0 * deepest))"),
+            Mutant("valid & (before < deepest)", "valid & (before <= 2.0 * deepest)"),
+            Mutant("own * tl.exp(-before) < least", "own < least"),
+            Mutant("            least = 0.0  # all", "            break  # all"),
+            Mutant(
+                "tl.store(thickness + i, own, mask=reached)",
+                "tl.store(thickness + i, own, mask=reached & (own >= least))",
+            ),
             Mutant("middle + shift * (far - middle)", "middle + shift * (middle - near)"),
         ),
     ),

@@ -241,6 +241,30 @@ def test_visible_samples(count, room, faded, generator):
     assert_close(fast.density, exact.density, "density", relative=HALF)
 
 
+@pytest.mark.parametrize(("least", "fraction"), [(0.0, 1.0), (0.02, 0.9), (0.08, 0.6), (2.0, 1.0)])
+def test_faint_samples_are_left_out_but_counted_for_visits_and_never_all(least, fraction, generator):
+    """With 0, none is left out; with 0.02, a tenth or more; with 0.08, 40 %; with 2, all are kept."""
+    rays, march = rays_and_march(60, "l2", generator)
+    table = (0.7 * torch.randn(8, 64, 4, generator=generator)).half().float()
+    layers = tuple(layers_of(32, generator))
+    march = march._replace(max_optical_depth=3.0, least_weight=least)
+    grid = HashGrid(table, (4, 5, 6, 7, 8, 9, 10, 11), layers)
+    doubled = grid._replace(table=table.double(), layers=tuple(x.double() for x in layers))
+    expected_visits, visits = torch.zeros(8, 8, 8, dtype=torch.float64), torch.zeros(8, 8, 8, device=DEVICE)
+    exact = reference.visible_samples(*exactly(rays, march), doubled, expected_visits)
+    fast = marching.visible_samples(
+        rays, march, grid._replace(layers=on_device(*layers)), table=table.half().to(DEVICE),
+        capacity=marching.Capacity(), visits=visits,
+    )  # fmt: skip
+    every = reference.visible_samples(*exactly(rays, march._replace(least_weight=0.0)), doubled)
+    assert len(exact.starts) <= fraction * len(every.starts)
+    assert torch.equal(fast.offsets.cpu(), exact.offsets)  # for this seed both keep the same samples
+    assert_close(fast.starts, exact.starts, "starts")
+    assert_close(fast.density, exact.density, "density", relative=HALF)
+    assert_close(visits, expected_visits, "visits", relative=HALF)
+    assert least != 0.08 or ((visits > 0) & (visits < least)).any()  # cells in which all samples are left out
+
+
 @pytest.mark.parametrize("samples", SIZES)
 @pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
 @pytest.mark.parametrize("reach", [1e-3, 2.0, 1e12])

@@ -91,10 +91,7 @@ class TritonBackend(ReferenceBackend):
             return reference.visible_samples(rays, march, grid, visits)
         with torch.no_grad():
             table = self._half.of(grid.table)
-            samples = marching.visible_samples(rays, march, grid, table=table, capacity=self._capacity)
-            if visits is not None:
-                reference.keep_largest(visits, samples.coordinates, samples.density * (samples.ends - samples.starts))
-            return samples
+            return marching.visible_samples(rays, march, grid, table=table, capacity=self._capacity, visits=visits)
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         return sample_coordinates(

@@ -1,4 +1,4 @@
-"""The samples of rays: those in occupied cells, and those among them that light reaches, packed without gaps.
+"""The samples of rays: those in occupied cells, and those among them that absorb light, packed without gaps.
 
 Same operations as `reference.occupied_samples` and `reference.visible_samples`. Rays are marched twice: first to count,
 then to write. The number of samples stays on the device, as the host would have to wait for it: buffers are as large as
@@ -14,6 +14,7 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
+from nerfcli.kernels import reference
 from nerfcli.kernels.contraction import CONTRACTIONS, sample_widths
 from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
 from nerfcli.kernels.triton_cuda import hash_grid, networks
@@ -87,40 +88,56 @@ def _march(
 
 
 @jit
-def _lit(
-    density, starts, ends, offsets, counts, deepest, room, rays,
-    RAYS: tl.constexpr, STEPS: tl.constexpr,
+def _visible(
+    density, starts, ends, offsets, counts, sources, thickness, deepest, least, room, rays,
+    WRITES: tl.constexpr, MEASURES: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
-    """Count the samples of each ray in front of which the optical depth is below a limit: its first samples."""
+    """Count the samples of each ray that are not faint, and in front of which the optical depth is below a limit.
+
+    With WRITES, `counts` are the offsets of these samples, and their places are written to `sources`. With MEASURES,
+    the optical depth of each sample in front of the limit is written to `thickness`.
+    """
     ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    there = ray < rays
     first, last = span_of(offsets, ray, rays)
     last = tl.minimum(last, room)
     longest = tl.max(last - first, 0).to(tl.int32)
     depth = tl.zeros([RAYS], tl.float32)
-    reached = tl.zeros([RAYS], tl.int64)
+    found = tl.zeros([RAYS], tl.int64)
+    if WRITES:
+        found = tl.load(counts + ray, mask=there, other=0)
     for step in range(0, longest, STEPS):
         i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
         valid = i < last[:, None]
         # In front of each: a sum over the samples shifted by one place, so that nothing is subtracted from a sum.
         ahead = valid & (i > first[:, None])
         length = tl.load(ends + i - 1, mask=ahead, other=0.0) - tl.load(starts + i - 1, mask=ahead, other=0.0)
-        own = tl.load(density + i - 1, mask=ahead, other=0.0) * length
-        before = depth[:, None] + tl.cumsum(own, 1)
-        reached += tl.sum((valid & (before < deepest)).to(tl.int32), 1)
-        depth += tl.sum(own, 1)
-    tl.store(counts + ray, reached, mask=ray < rays)
+        shifted = tl.load(density + i - 1, mask=ahead, other=0.0) * length
+        before = depth[:, None] + tl.cumsum(shifted, 1)
+        length = tl.load(ends + i, mask=valid, other=0.0) - tl.load(starts + i, mask=valid, other=0.0)
+        own = tl.load(density + i, mask=valid, other=0.0) * length
+        reached = valid & (before < deepest)
+        if MEASURES:
+            tl.store(thickness + i, own, mask=reached)
+        faint = own * tl.exp(-before) < least
+        number = tl.where(reached & (faint == 0), 1, 0)
+        if WRITES:
+            tl.store(sources + found[:, None] + tl.cumsum(number, 1) - 1, i, mask=number > 0)
+        found += tl.sum(number, 1)
+        depth += tl.sum(shifted, 1)
+    if not WRITES:
+        tl.store(counts + ray, found, mask=there)
 
 
 @jit
 def _compact(
-    index, wide, narrow, starts, ends, density, coordinates, code,
+    sources, starts, ends, density, coordinates, code,
     starts_out, ends_out, density_out, coordinates_out, code_out, samples,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     to = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = to < samples
-    ray = tl.load(index + to, mask=valid, other=0)
-    at = to + tl.load(wide + ray, mask=valid, other=0) - tl.load(narrow + ray, mask=valid, other=0)
+    at = tl.load(sources + to, mask=valid, other=0)
     tl.store(starts_out + to, tl.load(starts + at, mask=valid), mask=valid)
     tl.store(ends_out + to, tl.load(ends + at, mask=valid), mask=valid)
     tl.store(density_out + to, tl.load(density + at, mask=valid), mask=valid)
@@ -138,7 +155,9 @@ def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, 
     return *_written(rays, along, offsets, room=samples), offsets
 
 
-def visible_samples(rays: Rays, along: March, grid: HashGrid, *, table: Tensor, capacity: Capacity) -> Samples:
+def visible_samples(
+    rays: Rays, along: March, grid: HashGrid, *, table: Tensor, capacity: Capacity, visits: Tensor | None = None
+) -> Samples:
     """See `reference.visible_samples`; codes are float16.
 
     Args:
@@ -146,7 +165,7 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, *, table: Tensor, 
         capacity: kept from call to call; if it is large enough, the host waits only once.
     """
     offsets = _counted(rays, along)
-    count = len(rays.origins)
+    count, least = len(rays.origins), along.least_weight
     if capacity.samples == 0:
         capacity.fit(int(offsets[-1]))
     while True:
@@ -159,23 +178,35 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, *, table: Tensor, 
             widths = _widths(rays, along, starts, ends, offsets)
         code = hash_grid.encode(coordinates, table, grid.resolutions, widths=widths, count=limit, dtype=torch.float16)
         density = networks.density(code, grid.layers, count=limit)
+        spans = density, starts, ends, offsets
         counts = torch.empty(count, dtype=torch.int64, device=offsets.device)
+        thickness = density if visits is None else torch.full_like(density, torch.nan)
+        ends_at = float(along.max_optical_depth)
         launch(
-            _lit, blocks_of(count), density, starts, ends, offsets, counts, float(along.max_optical_depth), room, count,
-            RAYS=RAYS, STEPS=STEPS,
+            _visible, blocks_of(count), *spans, counts, counts, thickness, ends_at, least, room, count,
+            WRITES=False, MEASURES=visits is not None, RAYS=RAYS, STEPS=STEPS,
         )  # fmt: skip
         kept = _offsets(counts)
         candidates, samples = torch.stack([needed, kept[-1]]).tolist()  # the host waits
         capacity.fit(candidates)
         if candidates <= room:
-            break
+            if samples > 0 or candidates == 0 or least == 0.0:
+                break
+            least = 0.0  # all are faint: keep them, see `reference.visible_samples`
+    if visits is not None:
+        reference.keep_largest(visits, coordinates, thickness)  # NaN in unused places, which is ignored
     index = ray_indices(kept, samples)
     device = starts.device
+    sources = torch.empty(samples, dtype=torch.int64, device=device)
+    launch(
+        _visible, blocks_of(count), *spans, kept, sources, thickness, ends_at, least, room, count,
+        WRITES=True, MEASURES=False, RAYS=RAYS, STEPS=STEPS,
+    )  # fmt: skip
     reached = [torch.empty(samples, device=device) for _ in range(3)]
     places = torch.empty(samples, 3, device=device)
     codes = torch.empty(samples, WIDTH, dtype=torch.float16, device=device)
     launch(
-        _compact, (blocks(samples, COMPACTED),), index, offsets, kept, starts, ends, density, coordinates, code,
+        _compact, (blocks(samples, COMPACTED),), sources, starts, ends, density, coordinates, code,
         *reached, places, codes, samples, BLOCK=COMPACTED,
     )  # fmt: skip
     return Samples(reached[0], reached[1], reached[2], codes, places, kept, index)
