@@ -399,8 +399,8 @@ def test_ctrl_c_ends_the_server(finished):
 def test_a_server_that_nobody_looks_at_has_not_imported_what_renders(finished):
     program = (
         "import sys; from pathlib import Path; from types import SimpleNamespace\n"
-        "from nerfcli.workflows import view_worker\nfrom nerfcli.workflows.view import RunShow\n"
-        f"show = RunShow(Path({str(finished)!r}), threads=1); show.check()\n"
+        "from nerfcli.workflows import view_worker\nfrom nerfcli.workflows.view import RunData\n"
+        f"show = RunData(Path({str(finished)!r}), threads=1); show.check()\n"
         "show.tick(SimpleNamespace(clients=0, announce=bool)); print({'torch', 'numba', 'cv2'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
