@@ -173,3 +173,14 @@ start()
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert ended.returncode == INTERRUPTED
     assert ended.stderr.splitlines() == ["Interrupted; nothing was begun."]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_a_full_disk_behind_stdout_is_an_error_of_two_lines(options, capture):
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "nerfcli", "info", capture, *options]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == BAD_INPUT
+    assert [line.split(":")[0] for line in done.stderr.splitlines()] == ["Error", "Hint"]
+    assert "disk is full" in done.stderr

@@ -1,5 +1,6 @@
 """Output of commands: results on stdout, everything else on stderr, errors in two lines with their exit code."""
 
+import errno
 import functools
 import json
 import os
@@ -20,6 +21,8 @@ R = TypeVar("R")
 
 # Without a terminal, progress is a plain line at most this often.
 PLAIN_LINE_SECONDS = 10.0
+# Error numbers of a full disk and of an exhausted quota. Files that commands write have errors of their own for these.
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 # Widths of tables of findings and of numbers in a file or a pipe, which have no width of their own.
 PLAIN_TABLE_WIDTH = 140
 WIDE_TABLE_WIDTH = 200
@@ -165,10 +168,23 @@ def command(function: Callable[P, R]) -> Callable[P, R]:
             raise typer.Exit(INTERRUPTED) from error
         except BrokenPipeError as error:
             # The reader of stdout has gone: end quietly, and keep Python from complaining when it closes stdout.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _discard_stdout()
             raise typer.Exit(0) from error
+        except OSError as error:
+            if error.errno not in _FULL:
+                raise
+            _discard_stdout()
+            hint = "free some space, or send stdout elsewhere; completed files are kept"
+            full = UserError("the disk is full: the output could not be written", hint)
+            report_error(full)
+            raise typer.Exit(full.exit_code) from error
 
     return guarded
+
+
+def _discard_stdout() -> None:
+    """Send what is left to write to nowhere, so that Python does not fail when it closes stdout."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextmanager
