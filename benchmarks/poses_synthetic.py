@@ -154,7 +154,7 @@ def solve(name: str, capture: Capture, *, seed: int) -> Result:
 def pair_errors_deg(model: pycolmap.Reconstruction, views: list[View]) -> np.ndarray:
     """Return the pose error of every pair of views; infinite if one of them was not placed."""
     placed = set(model.reg_image_ids())
-    errors = []
+    errors: list[float] = []
     for i, j in combinations(range(len(views)), 2):
         if i + 1 not in placed or j + 1 not in placed:
             errors.append(np.inf)
@@ -165,7 +165,7 @@ def pair_errors_deg(model: pycolmap.Reconstruction, views: list[View]) -> np.nda
         turned = np.degrees((found.rotation * truth.rotation.inverse()).angle())
         cosine = found.translation @ truth.translation
         cosine /= np.linalg.norm(found.translation) * np.linalg.norm(truth.translation) + 1e-300
-        errors.append(max(turned, np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
+        errors.append(max(turned, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))))
     return np.array(errors)
 
 

@@ -13,7 +13,7 @@ import statistics
 import time
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -60,7 +60,7 @@ def thinned(scan: Scan, views: int) -> Scan:
     training = scan.training_views
     chosen = training[:: max(1, len(training) // views)][:views]
     index = np.sort(np.concatenate([chosen, np.array(scan.held_out, dtype=int)]))
-    arrays = {name: scan.of_views(name, index) for name in ("open_beam", "dark", "usable")}
+    arrays: dict[str, Any] = {name: scan.of_views(name, index) for name in ("open_beam", "dark", "usable")}
     held_out = tuple(int(k) for k in np.flatnonzero(np.isin(index, scan.held_out)))
     return replace(scan, geometry=scan.geometry.select(index), values=scan.values[index], held_out=held_out, **arrays)
 

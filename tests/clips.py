@@ -37,7 +37,7 @@ def wallpaper(*, height: int = 240, width: int = 900, seed: int = 0) -> np.ndarr
 
 
 def pan(
-    offsets: Sequence[float], *, height: int = 120, width: int = 160, blurred: Sequence[int] = ()
+    offsets: Sequence[float | np.integer], *, height: int = 120, width: int = 160, blurred: Sequence[int] = ()
 ) -> list[np.ndarray]:
     """Return views of the wallpaper shifted by `offsets` pixels; those in `blurred` have sideways motion blur."""
     paper = wallpaper()

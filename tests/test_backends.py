@@ -404,7 +404,7 @@ def test_what_marching_has_computed_is_not_computed_again(monkeypatch):
         handed.append(rest[2] is not None)
         return encode(points, table, *rest)
 
-    def placing(*given: Tensor, **named: Tensor) -> Tensor:
+    def placing(*given: Tensor, **named: Any) -> Tensor:
         handed.append(named["computed"] is not None)
         return place(*given, **named)
 

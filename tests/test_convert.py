@@ -419,7 +419,8 @@ def test_poses_count_even_where_no_point_is_seen(moved, tmp_path):
     checked = convert(capture_of([SQUARE]), tmp_path / "out.npz", source_format="made", wanted=wanted).verification
     assert checked is not None
     assert checked.holds
-    assert not replace(checked, **{moved: 1e-6}).holds
+    change: dict[str, Any] = {moved: 1e-6}
+    assert not replace(checked, **change).holds
 
 
 def test_without_points_cameras_are_compared_by_synthetic_ones(tmp_path):

@@ -116,15 +116,10 @@ def matched_pairs(capture: Capture) -> list[Matches]:
     """Return the matches of a perfect matcher: the points that both neighbours see."""
     seen = capture.observations
     assert isinstance(seen, Observations)
-    where = [
-        dict(
-            zip(
-                *(column[seen.frame_index == i] for column in (seen.point_index, np.arange(len(seen.pixels)))),
-                strict=True,
-            )
-        )
-        for i in range(len(capture.frames))
-    ]
+    where: list[dict[int, int]] = []
+    for i in range(len(capture.frames)):
+        rows = np.flatnonzero(seen.frame_index == i)
+        where.append(dict(zip(seen.point_index[rows].tolist(), rows.tolist(), strict=True)))
     pairs = []
     for first in range(len(capture.frames) - 1):
         both = sorted(set(where[first]) & set(where[first + 1]))

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -72,7 +73,8 @@ def seen_upright(capture: Capture, index: int, orientation: int) -> np.ndarray:
         column, row = int(x - 0.5), int(y - 0.5)
         u, v = x - 0.5 - column, y - 0.5 - row
         stored[row : row + 2, column : column + 2] = np.outer([1 - v, v], [1 - u, u])
-        upright = stored if TURNS[orientation] is None else cv2.rotate(stored, TURNS[orientation])
+        turn = TURNS[orientation]
+        upright = stored if turn is None else cv2.rotate(stored, turn)
         rows, columns = np.nonzero(upright)
         weights = upright[rows, columns]
         turned.append(((columns + 0.5) @ weights, (rows + 0.5) @ weights))
@@ -275,11 +277,8 @@ def test_a_scene_is_replaced_only_when_asked_and_after_a_fault_stands_again(tmp_
     assert again.exit_code == BAD_INPUT
     assert "scene.json exists" in error_of(again)[0]
     wrong = scenes.save
-    monkeypatch.setattr(
-        scenes,
-        "save",
-        lambda folder, **options: wrong(folder, **{**options, "unit": "metre", "unit_source": "a guess"}),
-    )
+    guess: dict[str, Any] = {"unit": "metre", "unit_source": "a guess"}
+    monkeypatch.setattr(scenes, "save", lambda folder, **options: wrong(folder, **options | guess))
     fault = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli", "--overwrite")
     assert fault.exit_code == GATE_NOT_MET
     assert "its unit is metre, not arbitrary" in error_of(fault)[0]
@@ -325,7 +324,7 @@ def test_what_stands_beside_the_cameras_is_compared(form, fault, message, tmp_pa
     assert capture.observations is not None
     seen = capture.observations
     other_mask = replace(capture.frames[1], mask=tmp_path / "masks" / "of another.png")
-    wrong = {
+    wrong: dict[str, dict[str, dict[str, Any]]] = {
         "colours": {"other": {"colours": capture.colours[::-1]}},
         "observations": {
             "moved": {"observations": replace(seen, pixels=seen.pixels + 1e-3)},

@@ -43,8 +43,8 @@ def model() -> Model:
 
 
 def order(frames: list[Frame], *, outputs: tuple[str, ...] = ("rgb", "depth", "opacity"), **settings: Any) -> Order:
-    settings = {"depth": DEPTH} | settings
-    return Order(tuple(frames), ExportSettings(outputs=outputs, **settings), {"run": "a run"})
+    wanted: dict[str, Any] = {"depth": DEPTH} | settings
+    return Order(tuple(frames), ExportSettings(outputs=outputs, **wanted), {"run": "a run"})
 
 
 def export(model: Model, frames: list[Frame], folder: Path, **settings: Any) -> list[Path]:

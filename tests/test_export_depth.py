@@ -46,7 +46,7 @@ def frame(name: str, distance: float = 2.0) -> Frame:
 
 
 def ordered(frames: list[Frame], **settings: Any) -> Order:
-    wanted = {"outputs": OUTPUTS, "depth": DEPTH} | settings
+    wanted: dict[str, Any] = {"outputs": OUTPUTS, "depth": DEPTH} | settings
     return Order(tuple(frames), ExportSettings(**wanted), {"run": "a run", "field_sha256": "ab"})
 
 

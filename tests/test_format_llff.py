@@ -100,7 +100,8 @@ def test_what_the_array_cannot_hold_is_listed():
     assert losses_llff(replace(bare, depth_bounds=np.tile([1.0, 2.0], (6, 1)))) == ()
     capture = ring(CAMERAS["RADIAL"], CAMERAS["PINHOLE"])
     moved = (replace(capture.frames[0], name="other/x.jpg", split="test"), *capture.frames[1:])
-    num_observations = len(capture.observations.pixels)  # pyright: ignore[reportOptionalMemberAccess]
+    assert capture.observations is not None
+    num_observations = len(capture.observations.pixels)
     assert losses_llff(replace(capture, frames=moved)) == (
         "k1 of 1 camera",
         "k2 of 1 camera",

@@ -100,7 +100,8 @@ def test_images_masks_splits_and_cameras_per_image(tmp_path):
     frames = [replace(frame, split=split) for frame, split in zip(capture.frames, splits, strict=True)]
     frames[1] = replace(frames[1], mask=tmp_path / "masks/ö.png")
     capture = replace(capture, frames=tuple(frames))
-    assert losses_transforms(capture) == (f"{len(capture.observations.pixels)} observations",)  # pyright: ignore[reportOptionalMemberAccess]
+    assert capture.observations is not None
+    assert losses_transforms(capture) == (f"{len(capture.observations.pixels)} observations",)
     path = tmp_path / "out" / "my transforms.json"
     write_transforms(capture, path)
     content = json.loads(path.read_text(encoding="utf-8"))
@@ -241,6 +242,7 @@ def test_blender_files_are_read_back(tmp_path):
 def test_what_blender_cannot_hold_is_listed(tmp_path):
     cameras = (CAMERAS["OPENCV"], CAMERAS["PINHOLE"], Camera.pinhole(640, 480, 400.0))
     capture = replace(ring(*cameras, CAMERAS["OPENCV_FISHEYE"]), unit="metre")
+    assert capture.observations is not None
     assert losses_blender(capture) == (
         "k1 of 2 cameras",
         "k2 of 2 cameras",
@@ -255,7 +257,7 @@ def test_what_blender_cannot_hold_is_listed(tmp_path):
         "the picture's size of 6 frames",
         "40 points",
         "colours of 40 points",
-        f"{len(capture.observations.pixels)} observations",  # pyright: ignore[reportOptionalMemberAccess]
+        f"{len(capture.observations.pixels)} observations",
         "the unit of length (metre)",
     )
     with pytest.raises(UserError, match="spherical picture"):

@@ -92,7 +92,7 @@ def test_projection_matrices_are_taken_apart(benchmark, tmp_path):
     """K [R | t], of either sign and any scale, in pixels of pictures twice as large."""
     poses = random_poses(3)
     k = np.array([[900.0, 0, 64], [0, 910, 48], [0, 0, 1]])
-    projections = {}
+    projections: dict[str, Any] = {}
     for index, (pose, scale) in enumerate(zip(poses, (1.0, -3.0, 0.1), strict=True)):
         write_png(tmp_path / "images" / f"{index}.png", np.zeros((48, 64, 3), np.uint8))
         projections[f"world_mat_{index}"] = np.vstack([scale * (k @ rigid.inverse(pose)[:3]), [0, 0, 0, 1]])

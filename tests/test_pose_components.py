@@ -35,7 +35,9 @@ def apart(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], MappedM
     scene = synthetic.together(synthetic.boulder(800, seed=0), synthetic.boulder(800, seed=1, centre=FAR))
     synthetic.write_database(folder / "database.db", views, scene, noise=Noise(outliers=0.2), seed=0)
     reports: list[tuple[str, int, int]] = []
-    climbed = climb(synthetic.synthetic_job(folder, views, seed=0), lambda *progress: reports.append(progress))
+    climbed = climb(
+        synthetic.synthetic_job(folder, views, seed=0), lambda stage, done, total: reports.append((stage, done, total))
+    )
     # A second model does not set progress back: it counts 2 to 10 photos of the first, then stays at 10.
     placed = [done for stage, done, _ in reports if stage == "map"]
     assert placed[:17] == [*range(2, 11), *[10] * 8]

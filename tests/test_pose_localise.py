@@ -53,7 +53,9 @@ def capture(folder: Path, last: Shown, *, camera_id: int = 1) -> tuple[pycolmap.
 def refusal(folder: Path, last: Shown) -> str:
     model, job = capture(folder, last)
     reports: list[tuple[str, int, int]] = []
-    grown, (attempt,) = localise(model, job, image_ids=[LAST], report=lambda *report: reports.append(report))
+    grown, (attempt,) = localise(
+        model, job, image_ids=[LAST], report=lambda stage, done, total: reports.append((stage, done, total))
+    )
     assert reports == [("locate", 0, 3), ("locate", 3, 3)]
     assert grown.num_reg_images() == len(VIEWS)
     return attempt.refused

@@ -334,7 +334,13 @@ def test_the_mapper_counts_the_photos_that_it_goes_on_from(solved: Solved, tmp_p
         base.deregister_frame(base.image(photo).frame_id)
     base.tear_down()
     reports: list[tuple[str, int, int]] = []
-    map_photos(job, lambda *report: reports.append(report), attempt=7, start=MapperOptions(), base=base)
+    map_photos(
+        job,
+        lambda stage, done, total: reports.append((stage, done, total)),
+        attempt=7,
+        start=MapperOptions(),
+        base=base,
+    )
     assert reports == [("map", 8, 10), ("map", 9, 10), ("map", 10, 10)]
 
 
@@ -630,7 +636,7 @@ def test_sub_models_are_merged_where_they_overlap(solved: Solved, tmp_path: Path
         output=tmp_path / "merged",
         seed=0,
         threads=1,
-        report=lambda *progress: reports.append(progress),
+        report=lambda stage, done, total: reports.append((stage, done, total)),
     )
     assert reports == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
     assert [model.num_reg_images() for model in merged] == [10]

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -205,7 +206,7 @@ class TestMasks:
 SETTINGS = PoseSettings(max_image_size=480, threads=1)
 
 
-def solved(photos: Path, scene_dir: Path, **options: object) -> tuple[dict, list[str]]:
+def solved(photos: Path, scene_dir: Path, **options: Any) -> tuple[dict, list[str]]:
     notes: list[str] = []
     settings = replace(SETTINGS, **options)
     estimate_poses(photos, scene_dir, settings=settings, notify=notes.append, progress=lambda *reported: None)

@@ -156,7 +156,7 @@ def test_nothing_is_left_after_an_exception(tmp_path, num_frames, problem, kind,
     encoders = []
     start = subprocess.Popen
 
-    def started(*args: Any, **options: Any) -> subprocess.Popen[bytes]:
+    def started(*args: Any, **options: Any) -> subprocess.Popen[Any]:
         encoders.append(start(*args, **options))
         return encoders[-1]
 

@@ -1,6 +1,7 @@
 """The models of an ablation: the chosen one, and those that differ from it in one component."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from nerfcli.runs.components import CHOICES, Components, Value
 
@@ -78,7 +79,7 @@ def _offers(name: str, chosen: Components, capture: CaptureTraits) -> list[Value
 
 
 def _variant(chosen: Components, name: str, value: Value, *, adds: bool) -> Variant:
-    changed = {name: value}
+    changed: dict[str, Any] = {name: value}
     if name == "points" and not value:
         changed["stereo"] = False  # stereo has no effect without points
     return Variant(f"{name}={str(value).lower()}", replace(chosen, **changed), adds)

@@ -49,7 +49,7 @@ def measure_trainings(
         seconds: time limit for all of this.
     """
     ends = session.spent + seconds
-    plan = session.records.last("training plan")
+    plan: dict[str, Any] | None = session.records.last("training plan")
     if plan is None:
         chosen, unit = affordable(settings, seconds, overhead=_FIRST_OVERHEAD_SECONDS)
         plan = {"settings": [setting.name for setting in chosen], "unit_seconds": unit}

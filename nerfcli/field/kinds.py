@@ -48,8 +48,8 @@ def settings_from_json(content: dict[str, Any]) -> FieldSettings:
         case FourierFieldSettings.kind:
             return FourierFieldSettings(**sizes)
         case BlocksFieldSettings.kind:
-            ground, blocks = tuple(map(tuple, sizes["ground"])), tuple(map(_block, sizes["blocks"]))
-            return BlocksFieldSettings(**{**sizes, "ground": ground, "blocks": blocks})
+            sizes["ground"], sizes["blocks"] = tuple(map(tuple, sizes["ground"])), tuple(map(_block, sizes["blocks"]))
+            return BlocksFieldSettings(**sizes)
         case kind:
             raise UserError(f"unknown type of field: {kind!r}", "use the version of nerfcli that trained it")
 

@@ -42,6 +42,7 @@ def file_facts(path: Path) -> dict[str, Any]:
     entries = description_of(path)
     meta = _meta(path, entries)
     suffix = path.suffix.lower()
+    content: dict[str, Any]
     if suffix in VIDEO_SUFFIXES:
         content = _video_facts(path)
     elif suffix == ".png":

@@ -46,8 +46,9 @@ def write_volume_npz(volume: Volume, path: Path) -> None:
     """
     meta = json.dumps(dict(volume.description), allow_nan=False)
     with atomic_path(path) as partial:
+        maps: dict[str, Any] = dict(volume.maps)
         place = {"origin": np.asarray(volume.origin, np.float64), "voxel_size": np.float64(volume.voxel_size)}
-        np.savez_compressed(partial, **volume.maps, **place, meta=np.array(meta))
+        np.savez_compressed(partial, **maps, **place, meta=np.array(meta))
 
 
 def write_nrrd(volume: Volume, name: str, path: Path) -> None:

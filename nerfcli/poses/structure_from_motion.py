@@ -166,7 +166,7 @@ def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given
     pairs_key = None if settings.pairs_file is None else file_key(Path(settings.pairs_file))
     holdout_key = file_key(Path(settings.holdout)) if Path(settings.holdout).is_file() else None
     earlier = report.get("intrinsics")
-    wanted_settings = asdict(settings)
+    wanted_settings: dict[str, Any] = asdict(settings)
     for name in ("threads", "accept_refused"):
         del wanted_settings[name]
     if (earlier and (earlier["use"], earlier["key"])) != (given and (given.use, given.calibration.key)):

@@ -90,7 +90,7 @@ def effective_floor(request: DepthRequest) -> float:
 
 def fractions(request: DepthRequest) -> tuple[float, ...]:
     """Return the quantiles that a picture needs: the median, and the requested one."""
-    return (MEDIAN,) if request.fraction in (None, MEDIAN) else (MEDIAN, request.fraction)
+    return (MEDIAN,) if request.fraction is None or request.fraction == MEDIAN else (MEDIAN, request.fraction)
 
 
 def requested(request: DepthRequest, ends: LightEnds, *, background_distance: Tensor) -> Tensor:

@@ -205,8 +205,10 @@ def _curves_html(runs: Sequence[RunFacts]) -> str:
     def drawn(key: str, *, scale: float = 1.0, dots: bool = False) -> list[Curve]:
         found = []
         for index, run in enumerate(runs):
-            entries = [entry for entry in run.log if isinstance(entry.get(key), int | float)]
-            x, y = [entry["seconds"] for entry in entries], [entry[key] / scale for entry in entries]
+            points = [
+                (entry["seconds"], value) for entry in run.log if isinstance(value := entry.get(key), int | float)
+            ]
+            x, y = [seconds for seconds, _ in points], [value / scale for _, value in points]
             found.append(Curve(index % COLOURS, run.label, x, y, dots))
         return found
 

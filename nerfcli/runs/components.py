@@ -136,7 +136,7 @@ def choose(start: Components, *, included: Sequence[str], excluded: Sequence[str
     Raises:
         UserError: an unknown name or value, or a component that is named twice.
     """
-    values: dict[str, Value] = {}
+    values: dict[str, Any] = {}
     for text, on in [*((text, True) for text in included), *((text, False) for text in excluded)]:
         name, given, value = text.partition("=")
         if name not in CHOICES or (given and not on):

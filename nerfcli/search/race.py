@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
 
 from torch import Tensor
 
@@ -194,7 +195,8 @@ class Race:
 
     def _trial(self, changes: Sequence[Change], *, seed: int) -> Trial:
         before = self._budget.spent
-        components = replace(self._requested, **dict([*self.kept, *changes]))
+        values: dict[str, Any] = dict([*self.kept, *changes])
+        components = replace(self._requested, **values)
         trial = self._trials.go_on(self._start, components, seed=seed, steps=self._length)
         self._budget.charge(self._length)
         self._seconds_each = max(self._seconds_each, self._budget.spent - before)

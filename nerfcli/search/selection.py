@@ -10,6 +10,7 @@ needed.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from nerfcli.multiview.camera_check import CameraCheck
 from nerfcli.runs.components import CHOICES, Change, Components
@@ -157,7 +158,8 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
             reason = f"photos differ in brightness by {per_cent:.0f} % at the same points"
             wanted.append((("exposure", "learned"), reason))
     wanted = [(change, reason) for change, reason in wanted if change[0] not in facts.fixed]
-    model = replace(requested, **dict(change for change, _ in wanted))
+    values: dict[str, Any] = dict(change for change, _ in wanted)
+    model = replace(requested, **values)
     return model, [untried(*change, reason, kept=True) for change, reason in wanted]
 
 
@@ -301,7 +303,8 @@ def select(
     candidates, declined = proposals(model, start.signs, facts)
     race = Race(trials, start, budget, _without_poses(model))
     race.run(candidates, removals(model, facts), rules(candidates, start.signs, facts))
-    chosen = replace(model, **dict(race.kept))
+    values: dict[str, Any] = dict(race.kept)
+    chosen = replace(model, **values)
     is_found = chosen.exposure == "learned" and model.exposure != "learned"
     gains = race.log_gains if is_found else None
     return Selection(chosen, (*decided, *race.decisions.values(), *declined), budget.spent, gains)

@@ -21,7 +21,7 @@ def simplified(mesh: Mesh, faces: int, *, threads: int) -> Mesh:
     middle = mesh.vertices.mean(axis=0)
     with tempfile.TemporaryDirectory() as folder:
         given, made = Path(folder) / "given.ply", Path(folder) / "made.ply"
-        columns = dict(zip("xyz", (mesh.vertices - middle).astype("<f4").T, strict=True))
+        columns: dict[str, np.ndarray] = dict(zip("xyz", (mesh.vertices - middle).astype("<f4").T, strict=True))
         write_ply(given, columns, faces=mesh.faces)
         options = pycolmap.MeshSimplificationOptions()
         options.target_face_ratio = faces / len(mesh.faces)

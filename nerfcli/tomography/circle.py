@@ -85,7 +85,8 @@ class Circle:
 
 def circle_from_json(content: Mapping[str, Any]) -> Circle:
     """Restore a circle from the output of `Circle.to_json`."""
-    return Circle(**{**content, "angles": tuple(content["angles"])})
+    values: dict[str, Any] = {**content, "angles": tuple(content["angles"])}
+    return Circle(**values)
 
 
 def circle_of(geometry: ScanGeometry) -> tuple[Circle, float]:

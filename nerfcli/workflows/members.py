@@ -145,7 +145,9 @@ def evaluate_members(
             background = WHITE if photo.pixels.shape[-1] == 4 else model.background
             pairs.append(compare(photo, render_picture(model, photo.frame, background=background)))
             progress((place + len(pairs) / len(members)) / len(test), f"{place}/{len(test)} photos")
-        mean = replace(pairs[0], rendered=np.mean([pair.rendered for pair in pairs], axis=0, dtype=np.float32))
+        mean = replace(
+            pairs[0], rendered=np.asarray(np.mean([pair.rendered for pair in pairs], axis=0, dtype=np.float32))
+        )
         rows.append([measured(pair, perceptual) for pair in (*pairs, mean)])
     if not rows:
         raise UserError(f"{run.path} has no held-out photos to evaluate on", "train it with some held out: --holdout")

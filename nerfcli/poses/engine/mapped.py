@@ -106,7 +106,7 @@ def read_models(folder: Path, key: str) -> tuple[list[pycolmap.Reconstruction], 
 
 def mapping_key(job: Job) -> str:
     """Return a hash of everything that the models of a job depend on."""
-    content = asdict(job)
+    content: dict[str, Any] = asdict(job)
     for name in ("folder", "originals", "threads", "component", "skipped_checks"):
         del content[name]
     return stage_key(content, nerfcli.__version__, pycolmap.__version__)

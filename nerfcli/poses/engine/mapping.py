@@ -112,7 +112,7 @@ def map_photos(
     if (found := read_models(output, key)) is None:
         placed = 0 if base is None else base.num_reg_images()
         options = _options(job, attempt=attempt, start=start)
-        models = _run_mapper(job, report, options, base and base_folder, placed=placed)
+        models = _run_mapper(job, report, options, None if base is None else base_folder, placed=placed)
         write_models(output, models, key)
         found = read_models(output, key)
     if found is None:

@@ -144,5 +144,5 @@ def job_from_json(content: dict[str, Any]) -> Job:
 
 def _group(content: dict[str, Any]) -> CameraGroup:
     params = content["params"]
-    lists = {"photos": tuple(content["photos"]), "params": None if params is None else tuple(params)}
+    lists: dict[str, Any] = {"photos": tuple(content["photos"]), "params": None if params is None else tuple(params)}
     return CameraGroup(**content | lists)

@@ -122,7 +122,7 @@ def judge(
         lambda: _held_out_measure(model, seed=seed, threads=threads, fixed=fixed),
         otherwise=_UNKNOWN_HELD_OUT,
     )
-    measures = {
+    measures: dict[str, Any] = {
         "pairs": _pair_measure(found),
         "strong_contradictions": [asdict(c) for c in contradictions[:_MOST_LISTED]],
         "strong_contradictions_share": fraction,
