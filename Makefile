@@ -24,10 +24,10 @@ test: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	# Types are checked beside the rest. The CPU kernels are compiled once: two test processes would both do it.
-	@$(BIN)/basedpyright & types=$$!; failed=0; \
+	@$(BIN)/pyrefly check --progress-bar no & types=$$!; failed=0; \
 	$(BIN)/python -c 'from nerfcli import kernels; kernels.prepare(print)' && \
 	$(BIN)/pytest -n 2 --dist loadfile || failed=1; \
-	wait $$types || { echo "basedpyright found errors, see above" >&2; failed=1; }; exit $$failed
+	wait $$types || { echo "pyrefly found errors, see above" >&2; failed=1; }; exit $$failed
 
 test-slow: .venv/installed-dev
 	$(BIN)/pytest -n 2 --dist worksteal -m 'slow or hypothesis' --hypothesis-profile=thorough

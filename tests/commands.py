@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 from nerfcli import cli
 
 # Otherwise each call of the runner would rebuild all commands, which takes as long as most refusals of an input.
-typer.testing._get_command = cache(typer.testing._get_command)  # pyright: ignore[reportPrivateUsage, reportPrivateImportUsage]
+typer.testing._get_command = cache(typer.testing._get_command)
 
 
 def nerfcli(*arguments: str | Path, stdin: str | None = None) -> Result:

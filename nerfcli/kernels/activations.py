@@ -33,7 +33,7 @@ def density_from_log(log_density: Tensor) -> Tensor:
 
     The gradient is the density itself, even beyond the limits: a plain clamp would trap values beyond them forever.
     """
-    return _BoundedExp.apply(log_density)  # type: ignore[return-value]
+    return _BoundedExp.apply(log_density)
 
 
 class _Opacity(torch.autograd.Function):
@@ -57,4 +57,4 @@ def opacity(optical_depth: Tensor) -> Tensor:
     torch computes the gradient of expm1 as its value plus 1, which cancels to 0 where x is above 17 in float32, or
     above 37 in float64.
     """
-    return _Opacity.apply(optical_depth)  # type: ignore[return-value]
+    return _Opacity.apply(optical_depth)

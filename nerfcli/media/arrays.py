@@ -49,7 +49,7 @@ def write_npz(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
         check_map(values, channels=name == "rgb")
     text = np.array(meta.to_text())
     with atomic_path(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **maps, **{META: text})  # pyright: ignore[reportArgumentType]
+        np.savez_compressed(file, allow_pickle=False, **maps, **{META: text})
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:

@@ -41,4 +41,4 @@ def write_photo_depths(run: Path, maps: Sequence[DepthMap], *, digest: str) -> N
     """
     arrays = {str(index): view.distances for index, view in enumerate(maps)}
     with atomic_path(run / PHOTO_DEPTHS) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays, digest=np.array(digest))  # pyright: ignore[reportArgumentType]
+        np.savez_compressed(file, allow_pickle=False, **arrays, digest=np.array(digest))

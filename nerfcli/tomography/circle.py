@@ -58,13 +58,13 @@ class Circle:
             "columns": self.columns,
         }
         if self.beam == "parallel":
-            geometry = circular_parallel(self.angles, **pixels)  # type: ignore[arg-type]
+            geometry = circular_parallel(self.angles, **pixels)
         else:
             geometry = circular_cone(
                 self.angles,
                 source_origin=self.source_origin,
                 source_detector=self.source_detector,
-                **pixels,  # type: ignore[arg-type]
+                **pixels,
             )
         right = geometry.column_step / self.pixel_width
         moved = geometry.centre + self.lateral * right

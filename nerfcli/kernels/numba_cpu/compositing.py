@@ -146,7 +146,7 @@ class _Distortion(torch.autograd.Function):
 
 def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
     """See `reference.distortion`; float32 on the CPU, differentiable in the weights."""
-    return _Distortion.apply(weights, starts, ends, offsets)  # type: ignore[return-value]
+    return _Distortion.apply(weights, starts, ends, offsets)
 
 
 class _Composite(torch.autograd.Function):
@@ -176,7 +176,7 @@ def composite(
     density: Tensor, rgb: Tensor, lengths: Tensor, *, offsets: Tensor, background: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.composite`; float32 on the CPU, differentiable in density and rgb."""
-    return _Composite.apply(density, rgb, lengths, offsets, background)  # type: ignore[return-value]
+    return _Composite.apply(density, rgb, lengths, offsets, background)
 
 
 def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:

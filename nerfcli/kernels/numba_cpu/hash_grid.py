@@ -250,4 +250,4 @@ def hash_encode(
         sink: see `Backend.hash_encode`.
         computed: (N, L * F), the result, if it has already been computed without gradients.
     """
-    return _HashEncode.apply(points, table, resolutions, sink, computed, widths)  # type: ignore[return-value]
+    return _HashEncode.apply(points, table, resolutions, sink, computed, widths)

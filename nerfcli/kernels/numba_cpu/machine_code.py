@@ -26,7 +26,8 @@ def _nothing() -> None:
 
 def folder() -> Path:
     """Return the cache folder: next to the kernels or, if that is not writable, in the user's cache."""
-    place = _nothing.stats.cache_path
+    # numba does not say what `njit` returns, and pyrefly infers a plain function.
+    place = _nothing.stats.cache_path  # pyrefly: ignore[missing-attribute]
     assert place is not None  # it has cache=True
     return Path(place)
 

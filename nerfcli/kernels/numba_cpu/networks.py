@@ -325,7 +325,7 @@ def can_radiance(encoded: Tensor, weights: tuple[Tensor, ...]) -> bool:
 
 def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
     """See `reference.radiance`; float32 on the CPU, differentiable in `encoded`, `harmonics` and the weights."""
-    return _Radiance.apply(encoded, harmonics, rays, *weights)  # type: ignore[return-value]
+    return _Radiance.apply(encoded, harmonics, rays, *weights)
 
 
 def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:

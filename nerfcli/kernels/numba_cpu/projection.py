@@ -122,7 +122,7 @@ def project(
     volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
 ) -> Tensor:
     """See `reference.project`; a float32 volume, lines in float64. Differentiable in the volume alone."""
-    return _Project.apply(volume, origins, directions, first, size)  # type: ignore[no-any-return]
+    return _Project.apply(volume, origins, directions, first, size)
 
 
 def back_project(

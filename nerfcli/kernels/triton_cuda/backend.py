@@ -117,7 +117,7 @@ class TritonBackend(ReferenceBackend):
         if not _fits(grid):
             return super()._radiance(samples, directions, index, grid, widths=widths, sink=sink)
         assert samples.encoded is not None
-        return _Radiance.apply(  # type: ignore[return-value]
+        return _Radiance.apply(
             samples.coordinates, directions, grid.table, self._half.of(grid.table), sink, samples.encoded, index,
             samples.offsets, grid.resolutions, grid.view_degree, widths, *grid.layers,
         )  # fmt: skip

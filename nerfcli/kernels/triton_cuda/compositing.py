@@ -257,12 +257,12 @@ def composite(
     density: Tensor, rgb: Tensor, lengths: Tensor, *, offsets: Tensor, background: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.composite`; float32, differentiable in density and rgb."""
-    return _Composite.apply(density, rgb, lengths, offsets, background)  # type: ignore[return-value]
+    return _Composite.apply(density, rgb, lengths, offsets, background)
 
 
 def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
     """See `reference.distortion`; float32, differentiable in the weights."""
-    return _Distortion.apply(weights, starts, ends, offsets)  # type: ignore[return-value]
+    return _Distortion.apply(weights, starts, ends, offsets)
 
 
 def off_target(weights: Tensor, transmittance: Tensor, middles: Tensor, *, rays: Tensor, distances: Tensor) -> Tensor:

@@ -119,4 +119,4 @@ def sample_coordinates(
         computed: (N, 3), the result, already computed without gradients.
     """
     number = CONTRACTIONS.index(contraction)
-    return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, computed)  # type: ignore[return-value]
+    return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, computed)

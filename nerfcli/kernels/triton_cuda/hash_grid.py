@@ -4,9 +4,6 @@ Same operation as `reference.hash_encode`, for rows of 4 features, which are loa
 read in float16 or float32; sums are float32. Gradients of rows are added atomically, in no fixed order.
 """
 
-# pyright: reportGeneralTypeIssues=false
-# `tl.static_range` can be iterated over only in kernels.
-
 import functools
 from typing import Any
 
@@ -270,4 +267,4 @@ def hash_encode(
     widths: Tensor | None = None,
 ) -> Tensor:
     """See `reference.hash_encode`; float32, rows of 4 features, differentiable in points and table."""
-    return _HashEncode.apply(points, table, resolutions, sink, widths)  # type: ignore[return-value]
+    return _HashEncode.apply(points, table, resolutions, sink, widths)

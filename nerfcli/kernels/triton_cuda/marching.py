@@ -5,9 +5,6 @@ then to write. The number of samples stays on the device, as the host would have
 earlier steps needed, and the host waits only once, to learn whether they were large enough.
 """
 
-# pyright: reportGeneralTypeIssues=false
-# `tl.static_range` can be iterated over only in kernels.
-
 from dataclasses import dataclass
 
 import torch

@@ -5,9 +5,6 @@ A program processes many blocks, so that weights are loaded once. Only the input
 recomputes hidden layers, and scales gradients so that the largest one of a step is well inside the range of float16.
 """
 
-# pyright: reportGeneralTypeIssues=false
-# `tl.static_range` can be iterated over only in kernels.
-
 import functools
 
 import torch

@@ -1,8 +1,5 @@
 """Rays and colours of the pixels drawn in training, in one launch. Same operation as `reference.pixel_rays`."""
 
-# pyright: reportGeneralTypeIssues=false
-# `tl.static_range` can be iterated over only in kernels.
-
 import torch
 import triton.language as tl
 from torch import Tensor

@@ -1,8 +1,5 @@
 """Common parts of kernels along rays: a program owns some rays, and processes some samples of each at a time."""
 
-# pyright: reportGeneralTypeIssues=false
-# `tl.static_range` can be iterated over only in kernels.
-
 import torch
 import triton.language as tl
 from torch import Tensor
