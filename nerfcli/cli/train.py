@@ -65,7 +65,7 @@ def train(
     log2_rows: Annotated[
         int | None,
         typer.Option(
-            help="Rows of each hash table, as a power of two.  [default: 16 to 18 by the budget, on a GPU 19]",
+            help="Rows of each hash table, as a power of two.  [default: 16 to 19 by the budget, on a GPU 19]",
             min=4,
             max=24,
             show_default=False,

@@ -67,7 +67,7 @@ class Facts:
         cameras: their check against matched features; None if there is none.
         points: number of pixels that see a point at a known distance.
         stereo: number of pixels with a depth from stereo matching.
-        sky_share: fraction of the pixels that look like a sky, see `multiview.sky`.
+        sky_fraction: fraction of the pixels that look like a sky, see `multiview.sky`.
         exposure_spread: standard deviation of the photos' brightness at points that they share, in logarithms of light.
         fixed: names of the components that the user has set.
     """
