@@ -76,7 +76,7 @@ def read_volume(path: Path) -> VolumeFile:
         return readers[path.suffix.lower()](path)
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}", "give a volume file") from error
-    except (KeyError, ValueError, IndexError, struct.error, tifffile.TiffFileError) as error:
+    except (KeyError, ValueError, IndexError, struct.error) as error:
         raise UserError(
             f"{path} is damaged or not a volume written by nerfcli: {error}", "export the volume again"
         ) from error
@@ -102,7 +102,7 @@ def is_volume_file(path: Path) -> bool:
     try:
         with tifffile.TiffFile(path) as tiff:
             return {"first", "spacing"} <= set(tiff.imagej_metadata or {})
-    except (OSError, ValueError, IndexError, struct.error, tifffile.TiffFileError):  # damaged, or no TIFF
+    except (OSError, ValueError, IndexError, struct.error):  # damaged, or no TIFF
         return False
 
 
