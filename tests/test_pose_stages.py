@@ -12,7 +12,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
@@ -20,6 +20,7 @@ from pathlib import Path
 
 import pytest
 from corner import NAMES, write_capture
+from in_this_process import worker_in_this_process
 
 import nerfcli
 from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
@@ -32,7 +33,7 @@ from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene, p
 from nerfcli.poses.workspace import database_bytes, drop_database, workspace
 
 # A fixed lens model: choosing one would only add adjustments.
-ONE_THREAD = PoseSettings(max_features=300, threads=1, camera_model="SIMPLE_RADIAL")
+ONE_THREAD = PoseSettings(max_features=200, max_image_size=256, threads=1, camera_model="SIMPLE_RADIAL")
 Progress = Callable[[str, int, int], None]
 
 
@@ -72,6 +73,13 @@ def rows(scene: Path, table: str, column: str = "image_id") -> dict[int, bytes]:
         return dict(database.execute(f"SELECT {column}, data FROM {table}"))
 
 
+@pytest.fixture
+def same_process() -> Iterator[None]:
+    """For tests of what is done again: only the others need a worker that can be killed."""
+    with worker_in_this_process():
+        yield
+
+
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture") / "my photos"
@@ -90,7 +98,7 @@ def unpublished(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(structure_from_motion, "publish", interrupted)
-        with pytest.raises(KilledError):
+        with worker_in_this_process(), pytest.raises(KilledError):
             estimate(photos, scene)
     return scene
 
@@ -100,7 +108,9 @@ def whole(photos: Path, unpublished: Path, tmp_path_factory: pytest.TempPathFact
     """The complete scene, made from the unpublished model: only the last step is done."""
     scene = shutil.copytree(unpublished, tmp_path_factory.mktemp("whole") / "scene")
     stages: list[str] = []
-    assert estimate(photos, scene, progress=lambda stage, done, total: stages.append(stage)).registered == len(NAMES)
+    with worker_in_this_process():
+        report = estimate(photos, scene, progress=lambda stage, done, total: stages.append(stage))
+    assert report.registered == len(NAMES)
     assert "map" not in stages
     return scene
 
@@ -117,11 +127,13 @@ def test_after_kills_in_two_stages_the_result_is_the_same_to_the_last_bit(photos
         with pytest.raises(KilledError):
             estimate(photos, scene, progress=killed_at(stage, done))
         assert not (scene / "scene.json").exists()
-    assert estimate(photos, scene).registered == len(NAMES)
+    with worker_in_this_process():
+        assert estimate(photos, scene).registered == len(NAMES)
     assert model(scene) == model(whole)
     assert rows(scene, "two_view_geometries", "pair_id") == rows(whole, "two_view_geometries", "pair_id")
 
 
+@pytest.mark.usefixtures("same_process")
 @pytest.mark.parametrize(
     ("damaged", "repeated"),
     [
@@ -144,6 +156,7 @@ def test_a_damaged_model_is_made_again_from_what_is_whole(
     assert model(scene) == model(whole)
 
 
+@pytest.mark.usefixtures("same_process")
 def test_another_camera_model_extracts_and_matches_nothing_again(photos: Path, whole: Path, again: Path):
     stages: dict[str, int] = {}
     settings = replace(ONE_THREAD, camera_model="SIMPLE_PINHOLE")
@@ -161,6 +174,7 @@ def void(value: object) -> None:
     """Discard a value, so that a lambda returns None."""
 
 
+@pytest.mark.usefixtures("same_process")
 def test_another_photo_and_other_pairs_do_only_what_is_new(photos: Path, whole: Path, again: Path, tmp_path: Path):
     """A photo that is first by name shifts the others' positions, but not their ids in the database."""
     more = shutil.copytree(photos, tmp_path / "more")
@@ -184,6 +198,7 @@ def chain() -> list[str]:
     return [f"{one} {other}" for one, other in pairwise(NAMES)]
 
 
+@pytest.mark.usefixtures("same_process")
 def test_a_changed_photo_is_extracted_again_and_no_other(photos: Path, whole: Path, again: Path, tmp_path: Path):
     changed = shutil.copytree(photos, tmp_path / "changed")
     shutil.copy(changed / NAMES[3], changed / NAMES[2])
@@ -202,6 +217,7 @@ def _holds_the_same_again(photos: Path, whole: Path, scene: Path) -> None:
         assert rows(scene, table, key) == rows(whole, table, key)
 
 
+@pytest.mark.usefixtures("same_process")
 def test_a_damaged_database_is_made_anew(photos: Path, whole: Path, again: Path):
     """As a machine that lost its power may leave it."""
     content = bytearray((again / "database.db").read_bytes())
@@ -237,6 +253,7 @@ def test_a_damaged_stage_is_none(tmp_path: Path, text: str):
     assert read_stage(path, "k") is None
 
 
+@pytest.mark.usefixtures("same_process")
 def test_damaged_stages_are_done_again(photos: Path, whole: Path, again: Path):
     """Each is damaged in another way: cut off, of the wrong type, with other content, not text."""
     stages = sorted(path for path in (again / "work").glob("*.json"))
@@ -324,8 +341,8 @@ def test_ten_kills_at_random_moments_change_nothing(photos: Path, whole: Path, t
     """The whole command is killed (SIGKILL); its worker then ends by itself, and the next call waits for neither."""
     rng = random.Random(0)
     scene = tmp_path / "scene"
-    command = [sys.executable, "-m", "nerfcli", "poses", str(photos), "-o", str(scene), "--max-features", "300"]
-    command += ["--camera-model", "SIMPLE_RADIAL"]
+    command = [sys.executable, "-m", "nerfcli", "poses", str(photos), "-o", str(scene), "--max-features", "200"]
+    command += ["--max-size", "256", "--camera-model", "SIMPLE_RADIAL"]
     environment = {**os.environ, "PYTHONPATH": str(Path(nerfcli.__file__).parent.parent)}
     for _ in range(10):
         process = subprocess.Popen([*command, "--threads", "1", "--quiet"], env=environment, stderr=subprocess.PIPE)
