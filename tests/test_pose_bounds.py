@@ -168,7 +168,7 @@ def test_a_check_that_never_ends_is_left_out(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
     notes: list[str] = []
     stages: list[tuple[str, int]] = []
-    settings = PoseSettings(max_features=300, threads=1, camera_model="SIMPLE_RADIAL")
+    settings = PoseSettings(max_features=200, max_image_size=256, threads=1, camera_model="SIMPLE_RADIAL")
     report = estimate_poses(
         photos,
         tmp_path / "scene",

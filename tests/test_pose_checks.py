@@ -8,7 +8,7 @@ import json
 import math
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from corner import NAMES, write_capture
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from in_this_process import worker_in_this_process
 from synthetic_captures import LONG, WIDE, Noise
 
 from nerfcli import scene as scenes
@@ -37,7 +38,7 @@ from nerfcli.poses.judge.checks import UNDERWAY, Checks
 from nerfcli.poses.report import PosesReport, closing_notes, refusal
 from nerfcli.poses.structure_from_motion import estimate_poses
 
-ONE_THREAD = PoseSettings(max_features=300, threads=1, camera_model="SIMPLE_RADIAL")
+ONE_THREAD = PoseSettings(max_features=200, max_image_size=256, threads=1, camera_model="SIMPLE_RADIAL")
 PLACES = st.sampled_from([0.0, 1e-300, 1.0, 1e30, math.inf, -math.inf, math.nan])
 
 
@@ -177,6 +178,12 @@ def test_components_say_what_joins_them(job: Job):
 # From here on the whole command, on the room corner of `corner`.
 
 
+@pytest.fixture
+def same_process() -> Iterator[None]:
+    with worker_in_this_process():
+        yield
+
+
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("photos") / "corner"
@@ -197,11 +204,30 @@ def estimate(
     return report, notes
 
 
+class EndedError(Exception):
+    """The time is over."""
+
+
 @pytest.fixture(scope="module")
-def estimated(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PosesReport]:
+def mapped(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a call that was ended in its first check, after mapping."""
+    scene = tmp_path_factory.mktemp("mapped") / "scene"
+
+    def end_in_check(stage: str, done: int, total: int) -> None:
+        if stage == "check":
+            raise EndedError
+
+    with worker_in_this_process(), pytest.raises(EndedError):
+        estimate(photos, scene, progress=end_in_check)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def estimated(photos: Path, mapped: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PosesReport]:
     """The scene of these photos, and what was reported."""
-    scene = tmp_path_factory.mktemp("estimated") / "scene"
-    return scene, estimate(photos, scene)[0]
+    scene = shutil.copytree(mapped, tmp_path_factory.mktemp("estimated") / "scene")
+    with worker_in_this_process():
+        return scene, estimate(photos, scene)[0]
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
@@ -225,26 +251,16 @@ def test_a_check_that_ends_the_process_is_left_out(photos: Path, tmp_path: Path,
     assert scenes.load(tmp_path / "scene").frames
 
 
-@pytest.fixture(scope="module")
-def refusing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder for PYTHONPATH whose sitecustomize makes the program refuse every model."""
-    site = tmp_path_factory.mktemp("site")
-    (site / "sitecustomize.py").write_text(
-        "from nerfcli.poses.judge import acceptance\n"
-        "judge = acceptance.judge\n"
-        "def refuse(*a, **o):\n"
-        "    failure = acceptance.Failure('it is wrong', 'so', 'do better')\n"
-        "    return acceptance.Verdict(judge(*a, **o).measures, (failure,))\n"
-        "acceptance.judge = refuse\n"
-    )
-    return site
-
-
+@pytest.mark.usefixtures("same_process")
 def test_a_refused_model_stays_and_can_be_accepted(
-    photos: Path, tmp_path: Path, refusing: Path, monkeypatch: pytest.MonkeyPatch
+    photos: Path, mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setenv("PYTHONPATH", str(refusing))
-    scene = tmp_path / "scene"
+    def refuse(*arguments: Any, **options: Any) -> acceptance.Verdict:
+        failure = acceptance.Failure("it is wrong", "so", "do better")
+        return acceptance.Verdict(acceptance.judge(*arguments, **options).measures, (failure,))
+
+    monkeypatch.setattr(examine, "judge", refuse)
+    scene = shutil.copytree(mapped, tmp_path / "scene")
     with pytest.raises(UserError, match=r"cannot be trusted: it is wrong: so") as caught:
         estimate(photos, scene)
     assert caught.value.exit_code == TOO_FEW_PHOTOS
@@ -268,6 +284,7 @@ def test_a_refused_model_stays_and_can_be_accepted(
     assert len(scenes.load(scene).frames) == len(NAMES)
 
 
+@pytest.mark.usefixtures("same_process")
 @pytest.mark.parametrize("component", [2, 3])
 def test_a_component_that_is_not_there_is_bad_input(
     photos: Path, estimated: tuple[Path, PosesReport], tmp_path: Path, component: int
@@ -278,21 +295,13 @@ def test_a_component_that_is_not_there_is_bad_input(
         estimate(photos, tmp_path / "scene", settings)
 
 
-def test_after_the_time_limit_in_a_check_only_the_checks_are_left(photos: Path, tmp_path: Path):
+@pytest.mark.usefixtures("same_process")
+def test_after_the_time_limit_in_a_check_only_the_checks_are_left(photos: Path, mapped: Path, tmp_path: Path):
     """The first call is ended in its first check, after mapping; the next call maps nothing."""
-
-    class EndedError(Exception):
-        pass
-
-    def end_in_check(stage: str, done: int, total: int) -> None:
-        if stage == "check":
-            raise EndedError
-
-    with pytest.raises(EndedError):
-        estimate(photos, tmp_path / "scene", progress=end_in_check)
-    assert pycolmap.Reconstruction(str(tmp_path / "scene/work/mapped/0")).num_reg_images() == len(NAMES)
+    scene = shutil.copytree(mapped, tmp_path / "scene")
+    assert pycolmap.Reconstruction(str(scene / "work/mapped/0")).num_reg_images() == len(NAMES)
     stages: set[str] = set()
-    report, notes = estimate(photos, tmp_path / "scene", progress=lambda stage, done, total: stages.add(stage))
+    report, notes = estimate(photos, scene, progress=lambda stage, done, total: stages.add(stage))
     assert report.registered == len(NAMES)
     assert stages == {"read", "check"}
     assert "the photos are already mapped: running the checks" in notes
