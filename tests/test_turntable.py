@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic_captures as synthetic
+from in_this_process import worker_in_this_process
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from synthetic_captures import WIDE, Scene, View
@@ -167,7 +168,7 @@ class TestTogether:
 
 @pytest.fixture(scope="module")
 def capture() -> Turntable:
-    return turntable(12, size=(480, 360), turn_deg=120, supersampled=1, seed=1)
+    return turntable(9, size=(480, 360), turn_deg=90, supersampled=1, seed=1)
 
 
 class TestMasks:
@@ -203,13 +204,14 @@ class TestMasks:
         assert still.agreement(still.small(other.photos[0]), behind) < 0.2
 
 
-SETTINGS = PoseSettings(max_image_size=480, threads=1)
+SETTINGS = PoseSettings(max_image_size=480, max_features=500, threads=1)
 
 
 def solved(photos: Path, scene_dir: Path, **options: Any) -> tuple[dict, list[str]]:
     notes: list[str] = []
     settings = replace(SETTINGS, **options)
-    estimate_poses(photos, scene_dir, settings=settings, notify=notes.append, progress=lambda *reported: None)
+    with worker_in_this_process():
+        estimate_poses(photos, scene_dir, settings=settings, notify=notes.append, progress=lambda *reported: None)
     return json.loads((scene_dir / "poses_report.json").read_text(encoding="utf-8")), notes
 
 
