@@ -536,14 +536,17 @@ def test_corners_through_distorted_lenses_and_how_well_their_error_is_told():
     offsets = 1.2 * np.array([[0.0, 0, 0], [1, 0, 0.2], [0, 1, -0.2], [-1, 0, 0.1], [0, -1, 0]])
     sides = [Side(f"marker {m}", (m, k), (m, (k + 1) % 4), 0.1) for m in range(len(offsets)) for k in range(4)]
 
+    corners = {(m, k): square[k] + offset for m, offset in enumerate(offsets) for k in range(4)}
+    seen = [
+        f.camera.project(rigid.apply(rigid.inverse(f.world_from_cam), np.array(list(corners.values()))))[0]
+        for f in frames
+    ]
+
     def estimate(noise: float) -> ScaleEstimate:
         sightings = {
-            (m, k): [
-                (i, f.camera.project(rigid.apply(rigid.inverse(f.world_from_cam), square[k] + offset)[None])[0][0] + e)
-                for (i, f), e in zip(enumerate(frames), noise * rng.normal(size=(len(frames), 2)), strict=True)
-            ]
-            for m, offset in enumerate(offsets)
-            for k in range(4)
+            corner: [(i, pixels[number] + e) for (i, pixels), e in zip(enumerate(seen), errors, strict=True)]
+            for number, corner in enumerate(corners)
+            for errors in [noise * rng.normal(size=(len(frames), 2))]
         }
         return scale_from_corners(frames, sightings, sides, pattern="markers")
 

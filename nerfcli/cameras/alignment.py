@@ -43,15 +43,23 @@ def align(x: np.ndarray, y: np.ndarray) -> Similarity:
 
     Source: Umeyama 1991, Least-squares estimation of transformation parameters between two point patterns.
     """
-    mx, my = x.mean(axis=0), y.mean(axis=0)
-    variance = np.sum((x - mx) ** 2)
+    variance = np.sum((x - x.mean(axis=0)) ** 2)
     if len(x) < 2 or not variance > 0:
         raise ValueError(f"align needs two points apart, got {len(x)} with a variance of {variance}")
-    u, d, vt = np.linalg.svd((y - my).T @ (x - mx))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = (u * sign) @ vt
-    scale = float(d @ sign / variance)
-    return Similarity(scale, rotation, my - scale * rotation @ mx)
+    return _aligned(x[None], y[None])[0]
+
+
+def _aligned(x: np.ndarray, y: np.ndarray) -> list[Similarity]:
+    """Return `align` of each of many sets of points, (sets, N, 3), all of them with points apart."""
+    mx, my = x.mean(axis=1), y.mean(axis=1)
+    from_mx, from_my = x - mx[:, None], y - my[:, None]
+    u, d, vt = np.linalg.svd(np.swapaxes(from_my, 1, 2) @ from_mx)
+    sign = np.ones_like(d)
+    sign[:, 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    rotations = (u * sign[:, None]) @ vt
+    scales = np.sum(d * sign, axis=1) / np.sum(from_mx**2, axis=(1, 2))
+    translations = my - scales[:, None] * (rotations @ mx[..., None])[..., 0]
+    return [Similarity(float(s), r, t) for s, r, t in zip(scales, rotations, translations, strict=True)]
 
 
 def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
@@ -73,10 +81,9 @@ def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
         return Alignment(best, everywhere, _sigma(best, x, y))
     half = (count + 4) // 2 - 1  # half of the points beyond the three that define an alignment must agree
     least = np.partition(_squared(best, x, y), half)[half]
-    for triple in _triples(count):
-        if np.ptp(x[triple], axis=0).max() == 0:
-            continue
-        candidate = align(x[triple], y[triple])
+    triples = _triples(count)
+    apart = np.ptp(x[triples], axis=1).max(axis=1) > 0
+    for candidate in _aligned(x[triples[apart]], y[triples[apart]]):
         median = np.partition(_squared(candidate, x, y), half)[half]
         if median < least:
             best, least = candidate, median
@@ -104,8 +111,9 @@ def _sigma(b_from_a: Similarity, x: np.ndarray, y: np.ndarray) -> float:
     return float(np.sqrt(_squared(b_from_a, x, y).sum() / free)) if len(x) >= 4 else float("nan")
 
 
-def _triples(count: int) -> list[list[int]]:
+def _triples(count: int) -> np.ndarray:
+    """Return the indices (triples, 3) of the points that define the hypotheses."""
     if comb(count, 3) <= _TRIPLES:
-        return [list(triple) for triple in combinations(range(count), 3)]
+        return np.array(list(combinations(range(count), 3)))
     rng = np.random.default_rng(0)
-    return [rng.choice(count, 3, replace=False).tolist() for _ in range(_TRIPLES)]
+    return np.array([rng.choice(count, 3, replace=False) for _ in range(_TRIPLES)])

@@ -59,8 +59,8 @@ def scale_from_corners(
         UserError: no side has two corners seen in two photos, in directions that differ enough, whose rays meet.
     """
     points, reasons = {}, []
-    for corner, seen in sightings.items():
-        point = _triangulated(frames, seen)
+    for corner, rays in _rays(frames, sightings).items():
+        point = _triangulated(rays)
         if isinstance(point, str):
             reasons.append(point)
         else:
@@ -84,10 +84,24 @@ def scale_from_corners(
     )
 
 
-def _triangulated(frames: Sequence[Frame], seen: Sequence[tuple[int, np.ndarray]]) -> np.ndarray | str:
+def _rays(frames: Sequence[Frame], sightings: Sightings) -> dict[Any, list[tuple[Frame, np.ndarray]]]:
+    """Return, for each corner, the frames that see it and the unit directions (3,) in which their cameras do."""
+    pixels: dict[int, list[tuple[Any, np.ndarray]]] = {}
+    for corner, seen in sightings.items():
+        for index, pixel in seen:
+            pixels.setdefault(index, []).append((corner, pixel))
+    rays: dict[Any, list[tuple[Frame, np.ndarray]]] = {corner: [] for corner in sightings}
+    for index, found in pixels.items():
+        # All pixels of a lens at once: one by one takes twenty times as long.
+        directions, valid = frames[index].camera.bearings(np.array([pixel for _, pixel in found]))
+        for (corner, _), direction, there in zip(found, directions, valid, strict=True):
+            if there:
+                rays[corner].append((frames[index], direction))
+    return rays
+
+
+def _triangulated(rays: Sequence[tuple[Frame, np.ndarray]]) -> np.ndarray | str:
     """Return the point (3,) where the rays meet, or the reason why there is none."""
-    rays = [(frames[index], *frames[index].camera.bearings(pixel)) for index, pixel in seen]
-    rays = [(frame, directions[0]) for frame, directions, valid in rays if valid[0]]
     if len({frame.name for frame, _ in rays}) < 2:
         return "visible in only one photo"
     c = np.stack([frame.centre for frame, _ in rays])
