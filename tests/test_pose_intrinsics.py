@@ -15,6 +15,7 @@ import pytest
 from captures import CAMERAS, ring
 from commands import error_of, nerfcli
 from corner import CENTRES, FOCAL_PX, NAMES, write_capture
+from in_this_process import worker_in_this_process
 from PIL import Image
 from test_cli import USAGE, write_photos
 from test_pose_stages import model, rows
@@ -39,9 +40,10 @@ TRUE = Camera("OPENCV", 960, 720, (2 * FOCAL_PX, 2 * FOCAL_PX, 480, 360, 0, 0, 0
 def estimate(
     photos: Path, scene: Path, given: GivenIntrinsics | None, notify: Callable[[str], None] = lambda note: None
 ) -> PosesReport:
-    return estimate_poses(
-        photos, scene, settings=ONE_THREAD, notify=notify, progress=lambda *reported: None, given=given
-    )
+    with worker_in_this_process():
+        return estimate_poses(
+            photos, scene, settings=ONE_THREAD, notify=notify, progress=lambda *reported: None, given=given
+        )
 
 
 def worst_centre(scene: Path) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 from corner import CENTRES, NAMES, cam_from_world, write_capture
+from in_this_process import worker_in_this_process
 from test_poses import FAST, similarity
 
 from nerfcli import scene
@@ -26,14 +27,15 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, PoseSe
     folder = tmp_path_factory.mktemp("strict")
     write_capture(folder / "photos")
     (folder / "test.txt").write_text(f"{NAMES[HELD_OUT]}\nwall.png\n")
-    settings = replace(FAST, strict=True, holdout=str(folder / "test.txt"))
-    report = estimate_poses(
-        folder / "photos",
-        folder / "scene",
-        settings=settings,
-        notify=lambda note: None,
-        progress=lambda stage, done, total: None,
-    )
+    settings = replace(FAST, max_features=400, strict=True, holdout=str(folder / "test.txt"))
+    with worker_in_this_process():
+        report = estimate_poses(
+            folder / "photos",
+            folder / "scene",
+            settings=settings,
+            notify=lambda note: None,
+            progress=lambda stage, done, total: None,
+        )
     return folder / "photos", folder / "scene", settings, report
 
 

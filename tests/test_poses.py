@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 from corner import CENTRES, FOCAL_PX, NAMES, cam_from_world, wall, write_capture
+from in_this_process import worker_in_this_process
 from PIL import Image
 
 from nerfcli import scene
@@ -176,7 +177,8 @@ def estimate(photos: Path, scene_dir: Path, progress: Callable[[str, int, int], 
 def test_photos_without_overlap_are_too_few_and_leave_no_scene(tmp_path: Path):
     write_noise(tmp_path / "photos")
     reported: list[str] = []
-    with pytest.raises(UserError, match=r"only 0 of 5 photos registered.*matches no other photo well") as caught:
+    said = r"only 0 of 5 photos registered.*matches no other photo well"
+    with worker_in_this_process(), pytest.raises(UserError, match=said) as caught:
         estimate_poses(
             tmp_path / "photos",
             tmp_path / "scene",
