@@ -15,7 +15,7 @@ from nerfcli.cameras.frame_names import frames_named
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 
-few = examples(10)
+few = examples(5)
 seeds = st.integers(0, 2**32 - 1)
 
 
