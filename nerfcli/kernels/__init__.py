@@ -134,7 +134,15 @@ def prepare(notify: Callable[[str], None], device: str = "cpu") -> None:
     if numba_cpu is not None:
         if not numba_cpu.is_compiled():
             notify("compiling the CPU kernels (once per machine, about a minute)")
-        numba_cpu.warm_up()
+        _warm_up_cpu()
+
+
+@functools.cache
+def _warm_up_cpu() -> None:
+    """Compile or load the CPU kernels, once per process: each time takes 0.1 s."""
+    numba_cpu = _numba_cpu()
+    assert numba_cpu is not None
+    numba_cpu.warm_up()
 
 
 def _fast_backend(device: torch.device, dtype: torch.dtype, wanted: str) -> tuple[Backend | None, str | None]:
