@@ -78,7 +78,7 @@ def test_blocks_of_one_field_render_what_it_renders_in_float64(kind):
     alone = replace(alone, field=alone.field.double())
     together = joined([alone] * 4, division())
     assert together.training_from_scene.scale == pytest.approx(0.5, rel=1e-14)
-    origins, directions = random_rays(50, torch.float64)
+    origins, directions = random_rays(15, torch.float64)
     background = torch.tensor(alone.background, dtype=torch.float64)
     expected, seen = (
         render_rays(model, origins, directions, background=background, fractions=(0.05, 0.5, 0.9), tolerance=1e-13)
@@ -95,7 +95,7 @@ def test_blocks_of_one_field_render_what_it_renders_in_float64(kind):
 def test_pictures_of_blocks_of_one_field_are_those_of_the_field(spheres, convention, axis):
     """To float32 rounding, with hardly anything left out: the spans of compiled marching join into the whole ray."""
     frame = spheres.test_frames[0]
-    frame = replace(frame, camera=frame.camera.resized(24, 18))
+    frame = replace(frame, camera=frame.camera.resized(12, 9))
     alone = cloudy(Similarity(0.4, np.eye(3), np.zeros(3)))
     depth = DepthRequest(convention, axis, background_distance=9.0)
     expected, seen = (
@@ -111,7 +111,7 @@ def test_blocks_of_other_fields_render_what_the_joined_field_gives_sample_by_sam
     models = [cloudy(Similarity(1.0 + n / 4, np.eye(3), np.full(3, n / 9)), seed=n) for n in range(4)]
     models = [replace(model, field=model.field.double()) for model in models]
     together = joined(models, division())
-    origins, directions = random_rays(50, torch.float64)
+    origins, directions = random_rays(15, torch.float64)
     rays = Rays(origins, directions, torch.zeros_like(origins[:, 0]))
     cuts = uniform_cuts(together.marching)
     march = March(torch.cat([cuts, cuts[-1:]]), together.occupied, "l2", deepest(1e-13))
@@ -130,7 +130,7 @@ def test_what_spans_leave_out_of_a_colour_is_within_its_bound(contrast):
         assert isinstance(model.field, HashField)
         with torch.no_grad():
             model.field.weights[1][0] *= contrast
-    together, rays, tolerance = joined(models, division()), random_rays(400, torch.float32), 0.05
+    together, rays, tolerance = joined(models, division()), random_rays(150, torch.float32), 0.05
     exact, seen = (render_rays(together, *rays, background=torch.zeros(3), tolerance=t) for t in (1e-12, tolerance))
     apart = (seen.rgb - exact.rgb).abs().amax(1)
     assert (apart <= seen.truncation_error + 2e-6).all()
@@ -142,12 +142,12 @@ def test_every_bit_of_a_picture_of_blocks_is_the_same_in_tiles_of_any_size(spher
     models = [cloudy(Similarity(0.4 + n / 4, np.eye(3), np.full(3, n / 9)), seed=n) for n in range(4)]
     together = joined(models, division())
     frame = spheres.test_frames[0]
-    frame = replace(frame, camera=frame.camera.resized(24, 18))
+    frame = replace(frame, camera=frame.camera.resized(12, 9))
     large, small = (
         render_picture(
             together, frame, background=together.background, depth=DepthRequest("median", "z"), rays_per_tile=rays
         )
-        for rays in (2**14, 50)
+        for rays in (2**14, 25)
     )
     for name in ("rgb", "opacity", "depth", "spread", "truncation_error"):
         np.testing.assert_array_equal(getattr(large, name), getattr(small, name), err_msg=name)
@@ -220,11 +220,11 @@ def test_occupied_cells_of_a_joined_field_hold_all_that_its_blocks_have(fraction
 @pytest.fixture
 def captured(tmp_path):
     """A COLMAP project of 12 photos around 600 points that all of them see."""
-    capture = ring(CAMERAS["SIMPLE_PINHOLE"].resized(32, 24), num_frames=12, num_points=600)
+    capture = ring(CAMERAS["SIMPLE_PINHOLE"].resized(8, 6), num_frames=12, num_points=600)
     frames = tuple(replace(frame, name=f"{index:02d}.png") for index, frame in enumerate(capture.frames))
     (tmp_path / "town" / "images").mkdir(parents=True)
     for number, frame in enumerate(frames):
-        Image.new("RGB", (32, 24), (20 * number, 100, 200)).save(tmp_path / "town" / "images" / frame.name)
+        Image.new("RGB", (8, 6), (20 * number, 100, 200)).save(tmp_path / "town" / "images" / frame.name)
     write_colmap_binary(replace(capture, frames=frames), tmp_path / "town" / "sparse/0")
     return tmp_path / "town"
 
