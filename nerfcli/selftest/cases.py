@@ -57,8 +57,8 @@ def coarse(value: float) -> float:
 
 def fog(optical_depth: float, samples: int) -> Segments:
     """Return intervals of about the same optical depth, with varying densities and lengths."""
-    density = tuple(coarse(optical_depth * 64 * (3 + k % 5) / 4) for k in range(samples))
-    return Segments(density, tuple(2.0 ** -(6 + k % 3) for k in range(samples)))
+    densities = [coarse(optical_depth * 64 * (3 + k) / 4) for k in range(5)]
+    return Segments(tuple(densities[k % 5] for k in range(samples)), tuple(2.0 ** -(6 + k % 3) for k in range(samples)))
 
 
 def groups() -> tuple[Group, ...]:
