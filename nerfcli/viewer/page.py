@@ -150,10 +150,11 @@ def _element(name: str, kind: str, text: str) -> str:
 def array_element(name: str, values: np.ndarray) -> str:
     """Return an element that holds an array, see `bytesOf` in field.js.
 
-    Bytes of equal significance are grouped, which compresses better; then deflate and base64.
+    Bytes of equal significance are grouped, which compresses better; then deflate and base64. Level 9 of deflate would
+    take 20 times as long as level 6, for a table 1 % smaller.
     """
     significance = np.ascontiguousarray(values).view(np.uint8).reshape(-1, values.itemsize).T
-    text = base64.b64encode(zlib.compress(significance.tobytes(), 9)).decode()
+    text = base64.b64encode(zlib.compress(significance.tobytes(), 6)).decode()
     return f'<script type="text/plain" id="{name}" data-itemsize="{values.itemsize}">{text}</script>'
 
 
