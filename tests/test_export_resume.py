@@ -3,11 +3,13 @@
 import hashlib
 import json
 import multiprocessing
+import shutil
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -72,10 +74,16 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def in_one_go(model, tmp_path_factory) -> dict[str, str]:
+def rendered(model, tmp_path_factory) -> Path:
+    """The folder of an export in one go. Do not write into it."""
     folder = tmp_path_factory.mktemp("in one go") / "views"
     export(model, order(), folder)
-    return contents(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def in_one_go(rendered) -> dict[str, str]:
+    return contents(rendered)
 
 
 @pytest.mark.parametrize(
@@ -227,19 +235,23 @@ def test_an_error_in_a_thread_ends_the_others_and_keeps_what_is_complete(model, 
     assert threading.active_count() == before
 
 
-def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in_one_go):
-    """One of two processes is killed after the first frame: another renders its frame, and each frame is reported."""
+def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in_one_go, monkeypatch):
+    """One of two processes is killed with its first frame: another renders its frame, and each frame is reported."""
+    start = multiprocessing.get_context("spawn").Process.start
+    started: list[Any] = []
     reported: list[str] = []
     done: list[int] = []
 
-    def kill_one(rays: int) -> None:
-        done.append(rays)
-        if len(done) == 1:
-            multiprocessing.active_children()[-1].kill()
+    def start_and_kill_the_first(process: Any) -> None:
+        start(process)
+        if not started:
+            process.kill()  # before it has loaded torch, which takes long
+        started.append(process)
 
+    monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start_and_kill_the_first)
     export_frames(
         *(model, order(), tmp_path / "views"),
-        on_rays=kill_one,
+        on_rays=done.append,
         notify=reported.append,
         workers=Workers(jobs=2, threads=2),
     )
@@ -247,6 +259,7 @@ def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in
     assert contents(tmp_path / "views") == in_one_go
     (death,) = [text for text in reported if "process" in text]
     assert "was ended by signal 9 (SIGKILL) while rendering" in death
+    assert len(started) == 3
     assert not multiprocessing.active_children()
 
 
@@ -257,7 +270,10 @@ def test_ctrl_c_or_sigterm_while_a_process_starts_is_kept_and_ends_it(sent, rais
     started: list[Any] = []
 
     def start_and_interrupt(process: Any) -> None:
+        """Start it with nothing to load, neither torch nor the model: it waits until its connection is closed."""
         signal.raise_signal(sent)
+        monkeypatch.setattr(process, "_target", methodcaller("poll", None))
+        monkeypatch.setattr(process, "_args", process._args[:1])
         start(process)
         started.append(process)
 
@@ -331,12 +347,11 @@ def test_processes_that_die_again_and_again_end_the_export(model, tmp_path, monk
     ],
     ids=["video", "colours", "range", "levels"],
 )
-def test_other_videos_and_colours_of_a_finished_folder_are_made_without_rendering(model, tmp_path, changes, in_one_go):
+def test_other_videos_and_colours_of_a_finished_folder_are_made_without_rendering(model, tmp_path, changes, rendered):
     """The files are the same as if this order had been rendered from the start."""
     changed = replace(order(), settings=replace(order().settings, **changes))
     export(model, changed, tmp_path / "other")
-    export(model, order(), tmp_path / "views")
-    assert contents(tmp_path / "views") == in_one_go
+    shutil.copytree(rendered, tmp_path / "views")
     done: list[int] = []
     export(model, changed, tmp_path / "views", on_rays=done.append)
     assert done == [4 * PIXELS]  # all at once, as they exist
@@ -365,9 +380,9 @@ def test_a_picture_that_is_damaged_is_rendered_again(model, tmp_path, in_one_go)
     assert contents(tmp_path / "views") == in_one_go
 
 
-def test_the_same_order_renders_again(model, tmp_path):
+def test_the_same_order_renders_again(model, tmp_path, rendered):
     """As --overwrite says."""
-    export(model, order(), tmp_path / "views")
+    shutil.copytree(rendered, tmp_path / "views")
     done: list[int] = []
     export(model, order(), tmp_path / "views", on_rays=done.append)
     assert done == [PIXELS] * 4
