@@ -65,17 +65,16 @@ def check_cameras(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> 
     count = sum(len(matches.pixels[0]) for matches in usable)
     if count < FEWEST_MATCHES or len(usable) < FEWEST_PAIRS:
         return None
-    every = -(-count // MOST_MATCHES)
-    pairs = [_Pair(photos, matches, every) for matches in usable]
+    rays = _Rays(photos, usable, every=-(-count // MOST_MATCHES))
 
     def costs(places: np.ndarray) -> np.ndarray:
         """Return the costs (places, pairs) of log factors (places,)."""
-        return np.array([[np.log1p(np.square(pair.misses(place))).sum() for pair in pairs] for place in places])
+        return np.array([rays.sums(np.log1p(np.square(rays.misses(place)))) for place in places])
 
     coarse = np.arange(-FARTHEST, FARTHEST + COARSE / 2, COARSE)
     lowest = int(costs(coarse).sum(1).argmin())
     if lowest in (0, len(coarse) - 1):
-        miss = _median_miss(pairs, 0.0)
+        miss = _median_miss(rays, 0.0)
         return CameraCheck(0.0, math.inf, (miss, miss), count)
     fine = coarse[lowest] + np.arange(-COARSE, COARSE + FINE / 2, FINE)
     by_pair = costs(fine)
@@ -83,23 +82,29 @@ def check_cameras(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> 
     without = np.array([_lowest(fine, by_pair[:, (part != left).all(1)].sum(1)) for left in range(PARTS)])
     error = float(np.sqrt((PARTS - 1) / PARTS * np.square(without - without.mean()).sum()))
     best = _lowest(fine, by_pair.sum(1))
-    return CameraCheck(best, error, (_median_miss(pairs, 0.0), _median_miss(pairs, best)), count)
+    return CameraCheck(best, error, (_median_miss(rays, 0.0), _median_miss(rays, best)), count)
 
 
-class _Pair:
-    """Every n-th match of two photos, with its rays at any focal length."""
+class _Rays:
+    """Every n-th match of each pair of photos, with its rays at any focal length."""
 
-    def __init__(self, photos: Sequence[LoadedPhoto], matches: Matches, every: int):
-        one, other = (photos[index].frame for index in matches.photos)
-        self._baseline = other.centre - one.centre
-        self._unit = MISS_PX * max(radians_per_pixel(frame.camera) for frame in (one, other))
-        rays = []
-        for frame, pixels in zip((one, other), matches.pixels, strict=True):
-            at_nodes = [changed(frame.camera, (FOCAL,), np.array([node])).bearings(pixels[::every]) for node in NODES]
-            bearings = np.array([np.where(valid[:, None], bearings, np.nan) for bearings, valid in at_nodes])
-            rays.append(bearings @ frame.world_from_cam[:3, :3].T)
+    def __init__(self, photos: Sequence[LoadedPhoto], pairs: Sequence[Matches], *, every: int):
+        self._pairs = len(pairs)
+        pixels = [np.concatenate([matches.pixels[side][::every] for matches in pairs]) for side in (0, 1)]
+        self._pair = np.repeat(np.arange(len(pairs)), [len(matches.pixels[0][::every]) for matches in pairs])
+        indices = np.array([matches.photos for matches in pairs])[self._pair]  # (matches, 2)
+        rays = [_rays_at_nodes(photos, indices[:, side], pixels[side]) for side in (0, 1)]
         finite = np.isfinite(rays[0]).all((0, 2)) & np.isfinite(rays[1]).all((0, 2))
         self._rays = [ray[:, finite] for ray in rays]
+        self._pair, indices = self._pair[finite], indices[finite]
+        centres = np.array([photo.frame.centre for photo in photos])
+        angles = np.array([radians_per_pixel(photo.frame.camera) for photo in photos])
+        self._baselines = centres[indices[:, 1]] - centres[indices[:, 0]]
+        self._units = MISS_PX * angles[indices].max(axis=1)
+
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """Return the sums (pairs,) of values (N,) of the matches of each pair."""
+        return np.bincount(self._pair, values, minlength=self._pairs)
 
     def misses(self, log_focal: float) -> np.ndarray:
         """Return the angles (N,) between rays and their epipolar planes, in units of MISS_PX."""
@@ -109,16 +114,30 @@ class _Pair:
         one, other = (np.tensordot(fractions, ray, axes=1) for ray in self._rays)
         away = []
         for ray, partner in ((one, other), (other, one)):
-            normal = np.cross(self._baseline, partner)
+            normal = np.cross(self._baselines, partner)
             length = np.linalg.norm(normal, axis=1)
             # A ray along the baseline has no epipolar plane: its miss is 0.
             away.append(np.abs(np.einsum("ni,ni->n", ray, normal)) / np.maximum(length, 1e-300))
-        return np.maximum(*away) / self._unit
+        return np.maximum(*away) / self._units
 
 
-def _median_miss(pairs: Sequence[_Pair], log_focal: float) -> float:
+def _rays_at_nodes(photos: Sequence[LoadedPhoto], indices: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the directions (nodes, N, 3) in the world of pixels (N, 2) of photos (N,); NaN where there is none."""
+    numbers = {camera: number for number, camera in enumerate({photos[index].frame.camera for index in set(indices)})}
+    camera_of_ray = np.array([numbers.get(photo.frame.camera, -1) for photo in photos])[indices]
+    rays = np.empty((len(NODES), len(pixels), 3))
+    for camera, number in numbers.items():
+        rows = camera_of_ray == number
+        for node, of_node in zip(NODES, rays, strict=True):
+            bearings, valid = changed(camera, (FOCAL,), np.array([node])).bearings(pixels[rows])
+            of_node[rows] = np.where(valid[:, None], bearings, np.nan)
+    world_from_cam = np.array([photo.frame.world_from_cam[:3, :3] for photo in photos])[indices]
+    return np.einsum("nij,knj->kni", world_from_cam, rays)
+
+
+def _median_miss(rays: _Rays, log_focal: float) -> float:
     """Return the median miss of all matches, pixels."""
-    return MISS_PX * float(np.median(np.concatenate([pair.misses(log_focal) for pair in pairs])))
+    return MISS_PX * float(np.median(rays.misses(log_focal)))
 
 
 def _lowest(places: np.ndarray, costs: np.ndarray) -> float:
