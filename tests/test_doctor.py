@@ -135,7 +135,7 @@ def test_a_photo_of_nothing_is_no_blurred_photo(clean, tmp_path):
 
 
 def test_a_photo_of_another_place_hangs_on_nothing(clean, tmp_path):
-    diagnosis = clean.spoilt(view(seed=70), tmp_path)
+    diagnosis = clean.spoilt(view(seed=50), tmp_path)
     assert alarms(diagnosis) == {"connectivity": ("03.jpg",)}
     np.testing.assert_allclose(finding(diagnosis, "connectivity").number or 0, 6 / 7)
 
@@ -182,10 +182,10 @@ def test_exif_of_another_picture_is_named(clean):
 
 
 def test_a_camera_that_only_turns_is_told_from_one_that_moves(tmp_path):
-    turning = examined(tmp_path / "turning", [view(pan_deg=angle) for angle in np.linspace(-15, 15, 6)]).diagnosis()
+    turning = examined(tmp_path / "turning", [view(pan_deg=angle) for angle in np.linspace(-15, 15, 5)]).diagnosis()
     assert list(alarms(turning)) == ["movement"]
     found = finding(turning, "movement")
-    assert (found.verdict, len(found.names)) == (BAD, 6)
+    assert (found.verdict, len(found.names)) == (BAD, 5)
     assert (found.number or 0) < 0.03
 
 
@@ -211,7 +211,7 @@ def test_something_that_moves_by_itself_is_found_where_it_is(tmp_path):
 
 
 def test_a_flat_world_is_told_from_a_camera_that_only_turns(tmp_path):
-    places = [((0.9 * s, 0.4 * s * s, 0.5 * s), -14 * s) for s in np.linspace(-1.5, 1.5, 5)]
+    places = [((0.9 * s, 0.4 * s * s, 0.5 * s), -14 * s) for s in np.linspace(-1.5, 1.5, 4)]
     flat = examined(tmp_path / "flat", [view(c, pan_deg=a, boards=BOARDS[:1]) for c, a in places]).diagnosis()
     assert list(alarms(flat)) == ["depth relief"]
 
@@ -228,8 +228,9 @@ def test_intrinsics_that_are_known_tell_how_far_things_are(tmp_path):
         assert pair.views is not None
         return pair.views.baseline_over_depth
 
-    assert 0.5 / 6 < baseline_over_depth(FOCAL_PX) < 0.5 / 2.6
-    np.testing.assert_allclose(baseline_over_depth(2 * FOCAL_PX), baseline_over_depth(FOCAL_PX) / 2, rtol=0.05)
+    right = baseline_over_depth(FOCAL_PX)
+    assert 0.5 / 6 < right < 0.5 / 2.6
+    np.testing.assert_allclose(baseline_over_depth(2 * FOCAL_PX), right / 2, rtol=0.05)
 
 
 # Parts
@@ -237,7 +238,7 @@ def test_intrinsics_that_are_known_tell_how_far_things_are(tmp_path):
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_detail_falls_with_blur_and_not_with_content_or_contrast(seed):
-    photo = cv2.cvtColor(view(seed=100 * seed), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    photo = cv2.cvtColor(view(seed=seed), cv2.COLOR_RGB2GRAY).astype(np.float32)
     blurred = [photo, *(cv2.GaussianBlur(photo, (0, 0), sigma) for sigma in (0.5, 1, 1.5, 2, 3))]
     details = np.array([measure(picture)[0].detail for picture in blurred])
     assert (np.diff(details) < -0.05).all()
@@ -401,8 +402,8 @@ def test_missing_photos_and_masks_that_only_some_have_are_named():
 # Files and the page
 
 
-def test_damaged_files_are_named_and_the_rest_is_examined(tmp_path):
-    folder = write(tmp_path / "photos", [view((0.2 * step, 0, 0)) for step in range(3)])
+def test_damaged_files_are_named_and_the_rest_is_examined(clean, tmp_path):
+    folder = write(tmp_path / "photos", list(clean.photos[:2]))
     (folder / "cut <b>.jpg").write_bytes((folder / "00.jpg").read_bytes()[:3000])
     (folder / "empty.png").touch()
     diagnosis = examine(find_subject(folder), threads=2, progress=lambda fraction, detail: None)
@@ -413,8 +414,8 @@ def test_damaged_files_are_named_and_the_rest_is_examined(tmp_path):
     assert content(diagnosis)["verdict"] == BAD
 
 
-def test_a_check_that_raises_is_listed_and_the_others_are_made(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    folder = write(tmp_path / "photos", [view((0.2 * step, 0, 0)) for step in range(3)])
+def test_a_check_that_raises_is_listed_and_the_others_are_made(clean, tmp_path, monkeypatch: pytest.MonkeyPatch):
+    folder = write(tmp_path / "photos", list(clean.photos[:2]))
 
     def singular(*arguments: object) -> None:
         raise np.linalg.LinAlgError("singular matrix")
@@ -428,7 +429,7 @@ def test_a_check_that_raises_is_listed_and_the_others_are_made(tmp_path, monkeyp
     assert page_html(diagnosis).count("singular matrix") == 2
     photos = content(diagnosis)["photos"]
     assert isinstance(photos, list)
-    assert [photo["stops"] for photo in photos] == [None] * 3
+    assert [photo["stops"] for photo in photos] == [None] * 2
 
 
 def test_nothing_readable_is_a_finding_too(tmp_path):
