@@ -26,9 +26,10 @@ from nerfcli import cli, scene
 from nerfcli.atomic import write_json
 from nerfcli.cli.options import seconds_from_text, thread_count
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TERMINATED, TOO_FEW_PHOTOS
+from nerfcli.interrupts import install_handlers
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
-from nerfcli.runs.log import read_log
+from nerfcli.runs.log import append_log, read_log
 from nerfcli.train import loop
 from nerfcli.train.loop import Progress
 from nerfcli.workflows import poses as poses_workflow
@@ -793,20 +794,49 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
 # Processes of their own
 
 
-@pytest.mark.parametrize(("sent", "exit_code"), [(signal.SIGINT, INTERRUPTED), (signal.SIGTERM, TERMINATED)])
-def test_ctrl_c_and_sigterm_save_a_checkpoint_and_say_how_to_go_on(sent, exit_code, capture):
-    run = capture.with_name("spheres-run")
-    options = ("--downscale", "8", "--log2-rows", "10", "--threads", "1", "--model", "default")
-    process = started("train", capture, "--budget", "10m", *options)
+SMALL = ("--downscale", "8", "--log2-rows", "10", "--threads", "1", "--model", "default")
+
+
+def terminated_training(capture: Path, run: Path) -> tuple[int, str, str]:
+    """Send SIGTERM twice, as `timeout` does to a command and to its group; return exit code, stdout and stderr."""
+    process = started("train", capture, "--budget", "10m", *SMALL)
     deadline = time.monotonic() + 120
     while not (run / "log.jsonl").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.1)
-    process.send_signal(sent)
-    if sent == signal.SIGTERM:  # as `timeout` does: to the command, and to its group
-        time.sleep(0.01)
-        process.send_signal(sent)
+    process.send_signal(signal.SIGTERM)
+    time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
     stdout, stderr = process.communicate(timeout=60)
-    assert process.returncode == exit_code, stderr
+    return process.returncode, stdout, stderr
+
+
+def interrupted_training(capture: Path, run: Path) -> tuple[int, str, str]:
+    """Send SIGINT to a training in this process once it has a log; return exit code, stdout and stderr."""
+
+    def log_and_interrupt(*entry: Any) -> None:
+        append_log(*entry)
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in background suites
+    install_handlers()
+    try:
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(loop, "append_log", log_and_interrupt)
+            result = nerfcli("train", capture, "--budget", "10m", *SMALL)
+    finally:
+        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    assert (run / "log.jsonl").exists()
+    return result.exit_code, result.stdout, result.stderr
+
+
+@pytest.mark.parametrize(
+    ("stopped", "exit_code"), [(interrupted_training, INTERRUPTED), (terminated_training, TERMINATED)]
+)
+def test_ctrl_c_and_sigterm_save_a_checkpoint_and_say_how_to_go_on(stopped, exit_code, capture):
+    run = capture.with_name("spheres-run")
+    code, stdout, stderr = stopped(capture, run)
+    assert code == exit_code, stderr
     assert stdout == ""
     assert not any(word in stderr for word in ("Traceback", "stack trace"))
     saved, ended = stderr.splitlines()[-2:]
@@ -816,7 +846,7 @@ def test_ctrl_c_and_sigterm_save_a_checkpoint_and_say_how_to_go_on(sent, exit_co
     assert {path.name for path in run.iterdir()} >= {"config.json", "field.safetensors", "state.safetensors"}
     assert not list(run.rglob("*partial*"))
     trained = read_log(run)[-1]
-    resumed = nerfcli("train", capture, "-o", run, "--resume", "--steps", str(trained["step"] + 2), *options)
+    resumed = nerfcli("train", capture, "-o", run, "--resume", "--steps", str(trained["step"] + 2), *SMALL)
     assert resumed.exit_code == 0, resumed.stderr
     assert f"resumed at step {trained['step']}, " in resumed.stderr
     assert read_log(run)[-1]["step"] == trained["step"] + 2
