@@ -232,10 +232,9 @@ def test_interpolation_begins_and_ends_at_the_frames(seed, count):
     np.testing.assert_allclose(path[0].world_from_cam, frames[0].world_from_cam, rtol=0, atol=1e-9)
     if count > 1:
         np.testing.assert_allclose(path[-1].world_from_cam, frames[-1].world_from_cam, rtol=0, atol=1e-9)
-    for frame in path:
-        np.testing.assert_allclose(
-            frame.world_from_cam[:3, :3] @ frame.world_from_cam[:3, :3].T, np.eye(3), rtol=0, atol=1e-12
-        )
+    rotations = np.array([frame.world_from_cam[:3, :3] for frame in path])
+    identities = np.broadcast_to(np.eye(3), rotations.shape)
+    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), identities, rtol=0, atol=1e-12)
 
 
 def test_interpolation_flies_at_constant_speed_through_all_frames():

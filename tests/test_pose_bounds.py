@@ -1,4 +1,7 @@
-"""Time limits: matching, merging and each check are stopped far beyond their plan, and the result says so."""
+"""Time limits: matching and merging are stopped far beyond their plan, and the result says so.
+
+That of a check is in test_pose_checks.
+"""
 
 import json
 import shutil
@@ -8,10 +11,8 @@ from pathlib import Path
 import pycolmap
 import pytest
 import synthetic_captures as synthetic
-from corner import NAMES, write_capture
 from synthetic_captures import WIDE, Noise
 
-from nerfcli import scene as scenes
 from nerfcli.poses.engine import features, ladder, worker
 from nerfcli.poses.engine.database import clear_matches
 from nerfcli.poses.engine.ladder import climb
@@ -19,9 +20,7 @@ from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.pairs import all_pairs, in_blocks
 from nerfcli.poses.input.plan import checking_seconds, limit_seconds
-from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.model import merging
-from nerfcli.poses.structure_from_motion import estimate_poses
 
 
 @pytest.fixture(scope="module")
@@ -147,38 +146,3 @@ def test_merging_ends_at_its_limit(job: Job, tmp_path: Path):
         sizes[seconds] = [model.num_reg_images() for model in merged]
     assert sizes == {-1.0: [5, 4], 1e9: [8]}
     assert said == ["merging: 2 of 2 sub-models are left after -1 s"]
-
-
-def test_a_check_that_never_ends_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The check may take half a second and sleeps for an hour; the scene is mapped once, and says what it lacks."""
-    photos = tmp_path / "corner"
-    write_capture(photos)
-    (photos / "notes.jpg").unlink()
-    (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "sitecustomize.py").write_text(
-        "import time\n"
-        "from nerfcli.poses.judge import checks, uncertainty\n"
-        "uncertainty.pose_blur_px = lambda *a, **o: time.sleep(3600)\n"
-        "run = checks.Checks.run\n"
-        "def bounded(self, name, compute, *, otherwise, seconds=None):\n"
-        "    most = 0.5 if name == 'pose uncertainty' else seconds\n"
-        "    return run(self, name, compute, otherwise=otherwise, seconds=most)\n"
-        "checks.Checks.run = bounded\n"
-    )
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
-    notes: list[str] = []
-    stages: list[tuple[str, int]] = []
-    settings = PoseSettings(max_features=200, max_image_size=256, threads=1, camera_model="SIMPLE_RADIAL")
-    report = estimate_poses(
-        photos,
-        tmp_path / "scene",
-        settings=settings,
-        notify=notes.append,
-        progress=lambda stage, done, total: stages.append((stage, done)),
-    )
-    assert report.registered == len(NAMES)
-    assert report.not_computed == {"pose uncertainty": "it took longer than 0 s"}
-    assert report.cut_short == ()
-    assert sum("could not compute a check (pose uncertainty): it took longer" in note for note in notes) == 2
-    assert stages.count(("map", 2)) == 1
-    assert scenes.load(tmp_path / "scene").frames

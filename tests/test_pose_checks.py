@@ -231,12 +231,25 @@ def estimated(photos: Path, mapped: Path, tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
-def test_a_check_that_ends_the_process_is_left_out(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The worker aborts in the covariance, as C++ may; the scene is written and says which check it lacks."""
+def test_checks_that_end_the_process_or_never_end_are_left_out(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The worker aborts in the covariance, as C++ may, and sleeps for an hour where half a second is allowed.
+
+    The scene is mapped once, and says which checks it lacks.
+    """
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(
-        "import os\nfrom nerfcli.poses.judge import uncertainty\n"
+        "import os, time\n"
+        "from nerfcli.poses.judge import checks, uncertainty\n"
+        "from nerfcli.poses.model import intrinsics\n"
         "uncertainty.pose_blur_px = lambda *a, **o: os.abort()\n"
+        "intrinsics.choose_lenses = lambda *a, **o: time.sleep(3600)\n"
+        "run = checks.Checks.run\n"
+        "def bounded(self, name, compute, *, otherwise, seconds=None):\n"
+        "    most = 0.5 if name == 'lens models' else seconds\n"
+        "    return run(self, name, compute, otherwise=otherwise, seconds=most)\n"
+        "checks.Checks.run = bounded\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
     stages: list[str] = []
@@ -244,9 +257,13 @@ def test_a_check_that_ends_the_process_is_left_out(photos: Path, tmp_path: Path,
         photos, tmp_path / "scene", progress=lambda stage, done, total: stages.append(f"{stage} {done}")
     )
     assert report.registered == len(NAMES)
+    assert set(report.not_computed) == {"pose uncertainty", "lens models"}
     assert "SIGABRT" in report.not_computed["pose uncertainty"]
-    assert sum("could not compute a check (pose uncertainty)" in note for note in notes) == 2
-    assert stages.count("check 0") == 2
+    assert report.not_computed["lens models"] == "it took longer than 0 s"
+    assert report.cut_short == ()
+    for check in report.not_computed:
+        assert sum(f"could not compute a check ({check}): " in note for note in notes) == 2
+    assert stages.count("check 0") == 3
     assert len([stage for stage in stages if stage == "map 2"]) == 1  # mapped once
     assert scenes.load(tmp_path / "scene").frames
 
