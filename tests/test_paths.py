@@ -223,7 +223,7 @@ def test_a_spiral_in_a_ring_stays_on_one_side_and_looks_inwards():
 
 
 @given(seed=seeds, count=st.sampled_from([1, 2, 7, 50]))
-@few
+@examples(8)
 def test_interpolation_begins_and_ends_at_the_frames(seed, count):
     rng = np.random.default_rng(seed)
     frames = frames_at(rng.normal(size=(5, 3)), rng.normal(size=(5, 3)) + 10)
