@@ -38,7 +38,7 @@ def test_bytes_are_those_of_the_module_and_of_its_optimiser(settings):
     optimiser = FieldOptimiser(field)
     density, rgb = radiance_of(field, torch.rand(3, 3), torch.eye(3), torch.arange(3))
     (density.sum() + rgb.sum()).backward()
-    optimiser.step(1, 0.0)
+    optimiser.step(1, 0.0, decay=0.0)
     moments = [value for name, value in optimiser.state().items() if not name.endswith("step")]
     held = sum(4 * value.numel() for value in moments) + field_bytes(field)  # and a gradient per parameter
     assert optimiser_bytes(work(settings).parameters) == held

@@ -20,9 +20,14 @@ from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import KINDS, fresh_field, settings_from_json
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
+from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.optimiser import FieldOptimiser
 from nerfcli.kernels import March, Rays, numba_cpu, reference, spherical_harmonics
+from nerfcli.photos.loading import load_photos
+from nerfcli.photos.pool import PixelPool
 from nerfcli.render.model import Marching, Model, load_model, save_model
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.scene import Scene
 
 SMALL: dict[str, FieldSettings] = {
     "hash": HashFieldSettings(contraction="none", log2_rows=8, coarsest=4, finest=32),
@@ -241,7 +246,7 @@ def test_the_sink_gets_the_gradient_of_the_rows(field):
         torch.testing.assert_close(sink, wanted, rtol=1e-4, atol=1e-4 * float(wanted.abs().max()))
         touched = (sink != 0).any(-1)
         assert touched.any()
-    optimiser.step(1, 1e-3)
+    optimiser.step(1, 1e-3, decay=field.row_decay)
     assert sink is None or not sink.any()
     for name, value in field.named_parameters():
         changed = value != before[name]
@@ -262,13 +267,38 @@ def test_rows_of_the_hash_grid_decay_where_photos_say_little():
         rows.data.fill_(0.1)
         rows_in_a_line, sink = rows.data.view(-1, 4), optimiser.sink.view(-1, 4)
         sink[3] = -1e-15
-        optimiser.step(1, 1e-3)
+        optimiser.step(1, 1e-3, decay=made.row_decay)
         moved = rows_in_a_line - 0.1
         assert (moved[:3] == 0).all()
         assert (moved[4:] == 0).all()
         assert (moved[3] * towards_zero < 0).all()
         if towards_zero > 0:
             torch.testing.assert_close(moved[3], torch.full((4,), -1e-3), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("has_alpha", [True, False])
+def test_decay_shrinks_with_the_rays_of_a_step_only_where_photos_have_alpha(
+    has_alpha, spheres: Scene, monkeypatch: pytest.MonkeyPatch
+):
+    """The law of `Fitting.row_decay`, and what the optimiser gets in a step of all rays that there may be."""
+    photos = [
+        replace(p, pixels=p.pixels[..., : 3 + has_alpha])
+        for p in load_photos(spheres.train_frames[:2], factor=8, threads=1)
+    ]
+    pool = PixelPool(photos, Similarity(1.0, np.eye(3), np.zeros(3)), torch.device("cpu"))
+    settings = TrainSettings(
+        budget_seconds=None, steps=9, log2_rows=8, first_samples_per_step=2**20, samples_per_step=2**20
+    )
+    training = Fitting(pool, Marching(0.1, 4.0, 0.5, 0.0), contraction="none", settings=settings)
+    full = training.field.row_decay
+    assert full > 0
+    assert [training.row_decay(rays) for rays in (1, 4000)] == [full, full]
+    assert training.row_decay(16000) == (full / 4 if has_alpha else full)
+    given: list[float] = []
+    monkeypatch.setattr(training.optimiser, "step", lambda number, rate, *, decay: given.append(decay))
+    rays = training.advance(0.5).rays
+    assert rays > 8000
+    assert given == [training.row_decay(rays)]
 
 
 def test_marching_and_learning_see_pixels_of_the_same_width():
@@ -317,7 +347,7 @@ def test_the_state_of_the_optimiser_comes_back(field):
         if rows is not None and optimiser.sink is not None and rows.grad is not None:
             optimiser.sink.add_(rows.grad)
             rows.grad = None
-        optimiser.step(number, 1e-3)
+        optimiser.step(number, 1e-3, decay=field.row_decay)
 
     first = FieldOptimiser(field)
     stepped(first, 1)

@@ -19,7 +19,8 @@ FIRST_LEVELS, ALL_LEVELS_FRACTION = 4, 0.5
 RANDOM_LEVELS = 2
 # Trainings of smaller tables are too short to learn the details.
 DETAILED_LOG2_ROWS = 17
-# Weight decay. Values in rows are about 0.1; their gradients have a median of 2e-8 to 5e-8, a root mean square of 1e-5.
+# Weight decay. Values in rows are about 0.1; in steps of some thousand rays, their gradients have a median of 2e-8 to
+# 5e-8, a root mean square of 1e-5. See `Fitting.row_decay` for more rays.
 ROW_DECAY = 1e-6
 
 

@@ -38,6 +38,8 @@ SKY_WEIGHT = 0.1
 # Weight of the roughness of a learned background. Directions that no photo shows take the colours of their neighbours;
 # without it, Adam makes large steps from the little light that leaks through surfaces, and their colours are arbitrary.
 ROUGHNESS_WEIGHT = 1e-6
+# With more rays in a step than this, rows decay less where photos have alpha, see `Fitting.row_decay`.
+DECAY_RAYS = 4000
 # The warm-up ends by this fraction of the budget at the latest, however few steps that is.
 WARMUP_FRACTION = 0.1
 # After this many steps, fields of long trainings, with large tables, have the detail that other fields have at the end.
@@ -165,7 +167,7 @@ class Fitting:
         value = self._finite_loss(loss, drawn, watch)
         rate = self.learning_rate(fraction)
         self.step += 1
-        self.optimiser.step(self.step, rate)
+        self.optimiser.step(self.step, rate, decay=self.row_decay(rays))
         self.parts_optimiser.step(rate)
         self.parts.step_cameras(drawn, losses, of_cameras, factor=self.rate_factor, ranks=ranks)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
@@ -203,6 +205,15 @@ class Fitting:
         rate = settings.final_learning_rate + left * (settings.learning_rate - settings.final_learning_rate)
         warmup = min(1.0, max((self.step + 1) / settings.warmup_steps, fraction / WARMUP_FRACTION))
         return self.rate_factor * warmup * rate
+
+    def row_decay(self, rays: int) -> float:
+        """Return the weight decay of rows beside the mean loss of a step's rays.
+
+        In photos that fill the frame, decay keeps space empty that few of them look into. Photos with alpha tell what
+        is empty, and decay only blurs. There it shrinks as steps grow, like the gradient of a row that one ray touches:
+        otherwise fields of long trainings get no sharper after a few minutes.
+        """
+        return self.field.row_decay * (min(1.0, DECAY_RAYS / rays) if self.pool.has_alpha else 1.0)
 
     def _loss(
         self, drawn: PixelBatch, *, whole: PixelBatch, edges: Tensor, fraction: float, watch: Watch

@@ -40,8 +40,8 @@ class FieldOptimiser:
             return {"rows": self.sink}
         return {name: weight.grad for name, weight in self._weights.items() if weight.grad is not None}
 
-    def step(self, number: int, rate: float) -> None:
-        """Take step `number`, counted from 1, at a learning rate."""
+    def step(self, number: int, rate: float, *, decay: float) -> None:
+        """Take step `number`, counted from 1, at a learning rate and with a weight decay of rows."""
         rate = rate * self._field.rate_factor
         self._adam.step(rate)
         rows = self._field.rows()
@@ -55,7 +55,7 @@ class FieldOptimiser:
                 rate=rate,
                 betas=BETAS,
                 eps=EPS,
-                decay=self._field.row_decay,
+                decay=decay,
             )
 
     def state(self) -> dict[str, Tensor]:
