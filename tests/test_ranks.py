@@ -113,7 +113,7 @@ def two_ranks(program: str, *arguments: str | Path) -> list[subprocess.Popen[str
 def ended(processes: Sequence[subprocess.Popen[str]]) -> list[tuple[int, str, list[str]]]:
     """Return exit code, stdout and lines of stderr of each process; a process that hangs fails the test."""
     try:
-        said = [process.communicate(timeout=90) for process in processes]
+        said = [process.communicate(timeout=300) for process in processes]
     finally:
         for process in processes:
             process.kill()
