@@ -817,15 +817,16 @@ def interrupted_training(capture: Path, run: Path) -> tuple[int, str, str]:
         append_log(*entry)
         signal.raise_signal(signal.SIGINT)
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in background suites
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in background suites
     install_handlers()
     try:
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(loop, "append_log", log_and_interrupt)
             result = nerfcli("train", capture, "--budget", "10m", *SMALL)
     finally:
-        signal.signal(signal.SIGINT, before)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     assert (run / "log.jsonl").exists()
     return result.exit_code, result.stdout, result.stderr
 

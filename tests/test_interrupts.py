@@ -8,7 +8,7 @@ import time
 from commands import started
 from corner import write_capture
 
-from nerfcli.errors import TERMINATED
+from nerfcli.errors import INTERRUPTED, TERMINATED
 from nerfcli.poses.workspace import workspace
 
 
@@ -56,6 +56,42 @@ except Terminated:
 """
     done = ended(program)
     assert (done.stdout, done.stderr) == ("heard\n", "")
+
+
+def test_two_interrupts_while_threads_are_in_cpp_code_end_a_command_in_one_line():
+    """The second one comes while the pool waits for its threads; Python then ends without them."""
+    program = """
+import signal, sys
+from concurrent.futures import ThreadPoolExecutor
+import cv2, numpy as np
+from nerfcli import cli
+from nerfcli.cli.console import command
+
+def blur(number):
+    print("at work", flush=True)
+    for _ in range(400):
+        cv2.GaussianBlur(np.zeros((400, 400), np.uint8), (31, 31), 5)
+
+@cli.app.command()
+@command
+def work():
+    with ThreadPoolExecutor(1) as pool:
+        list(pool.map(blur, [0]))
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in background suites
+sys.argv = ["nerfcli", "work"]
+cli.main()
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "at work\n"
+    for _ in range(2):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.02)
+    _, stderr = process.communicate(timeout=60)
+    assert (process.returncode, stderr) == (INTERRUPTED, "Interrupted; completed work is kept.\n")
 
 
 def test_sigterm_ends_poses_and_its_worker_without_a_stack_trace(tmp_path):

@@ -1,6 +1,8 @@
 """The command line: one file per command; each parses, calls one library function and prints what was written."""
 
 import os
+import sys
+from contextlib import suppress
 
 import typer
 
@@ -22,6 +24,7 @@ from nerfcli.cli import (
     view,
 )
 from nerfcli.cli.usage import Command
+from nerfcli.errors import INTERRUPTED, TERMINATED
 from nerfcli.interrupts import install_handlers
 from nerfcli.memory import keep_freed_memory
 
@@ -91,4 +94,12 @@ def main() -> None:
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     keep_freed_memory()
     install_handlers()
-    app(prog_name="nerfcli")  # not "python -m nerfcli", for which no shell has completion
+    try:
+        app(prog_name="nerfcli")  # not "python -m nerfcli", for which no shell has completion
+    except SystemExit as ended:
+        if ended.code not in (INTERRUPTED, TERMINATED):
+            raise
+        # A second Ctrl-C makes Python forget threads that still run; if these are in C++, it would abort at its exit.
+        with suppress(OSError):
+            sys.stdout.flush()
+        os._exit(ended.code)
