@@ -8,9 +8,9 @@ from synthetic_captures import Lens
 from test_pose_lenses import camera_of, ring_model, started_from
 
 from nerfcli.poses.model import held_out
-from nerfcli.poses.model.determined import determine, uncertainty
 from nerfcli.poses.model.intrinsics import choose_lenses
 from nerfcli.poses.model.lens_evidence import NAMES, UndeterminedError, lens_evidence
+from nerfcli.poses.model.lens_observability import determine, uncertainty
 
 FOCAL_PX = 1400.0
 

@@ -13,11 +13,11 @@ import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import WIDE, Noise, View
 
-from nerfcli.poses.engine import chosen, second_chance
-from nerfcli.poses.engine.chosen import ChosenModel, choose_component
+from nerfcli.poses.engine import second_chance, selected_component
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import MappedModels
 from nerfcli.poses.engine.second_chance import AlternativeMapping
+from nerfcli.poses.engine.selected_component import ChosenModel, choose_component
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.examine import examine
 
@@ -129,7 +129,7 @@ def test_a_component_has_most_of_its_photos_for_itself(
     def chance(mapped: MappedModels, *arguments: object, **options: object) -> AlternativeMapping:
         return AlternativeMapping(replace(mapped, models=[grown]), accepted)
 
-    monkeypatch.setattr(chosen, "second_chance", chance)
+    monkeypatch.setattr(selected_component, "second_chance", chance)
     found, _ = choose(misled, 1)
     assert [model.num_reg_images() for model in found.mapped.models] == components
     last, _ = choose(misled, len(components) + 1)

@@ -18,7 +18,7 @@ from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
 from nerfcli.poses.model import localise as localising
 from nerfcli.poses.model.localise import Attempt, left_out, localise, shared_pairs
-from nerfcli.poses.model.point_looks import KnownPoints, PhotoFeatures
+from nerfcli.poses.model.point_descriptors import KnownPoints, PhotoFeatures
 
 POINTS = synthetic.boulder(700, seed=0)
 VIEWS = synthetic.ring(7, [WIDE], seed=0, turn_deg=180)

@@ -19,13 +19,13 @@ from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine import ladder, mapping
 from nerfcli.poses.engine import second_chance as chances
-from nerfcli.poses.engine.chosen import choose_component
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.engine.features import match
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import MappedModels
 from nerfcli.poses.engine.mapping import MapperOptions, map_photos
 from nerfcli.poses.engine.second_chance import grow, is_contradicted, second_chance
+from nerfcli.poses.engine.selected_component import choose_component
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge.acceptance import Failure, Verdict, judge
 from nerfcli.poses.judge.checks import Checks

@@ -10,8 +10,8 @@ from scan_files import WRITERS, Written, naf, nikon, stack
 
 from nerfcli.tomography.circle import Circle, circle_from_json, circle_of, differences
 from nerfcli.tomography.formats.assemble import axis_column
-from nerfcli.tomography.formats.given import ScanOptions
 from nerfcli.tomography.formats.read import read_scan, recognise
+from nerfcli.tomography.formats.scan_options import ScanOptions
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.scan import load_scan
 from nerfcli.tomography.truth import load_truth

@@ -48,13 +48,13 @@ def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console
         if recognise(path) is None:
             _refuse(path, [name for name in given if name in OF_SCANS], of="X-ray scans, and this is not one")
             return False
-        from nerfcli.tomography.formats.given import ScanOptions
+        from nerfcli.tomography.formats.scan_options import ScanOptions
         from nerfcli.workflows.scans import ASTRA, OWN, convert_scan, detect_scan, judgement_record
 
         _refuse(
             path, [name for name in given if name not in (*OF_SCANS, *OF_BOTH)], of="photos, and this is an X-ray scan"
         )
-        said = ScanOptions(
+        options = ScanOptions(
             photons=values["photons"],
             unit=values["unit"],
             centre_column=values["centre_of_rotation"],
@@ -65,7 +65,7 @@ def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console
             if to is not None or target is not None:
                 raise typer.BadParameter("--detect writes nothing; leave OUT and --to out")
             with console.progress(f"detect {path.name}") as update:
-                found = detect_scan(path, given=said, notify=console.note, progress=update)
+                found = detect_scan(path, given=options, notify=console.note, progress=update)
             if values["json"]:
                 console.result(path, judgement_record(found))
             else:
@@ -76,7 +76,9 @@ def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console
         place = target
         if one_of_many:
             place = target / (path.stem + ".npy" if to == ASTRA else path.stem if path.is_file() else path.name)
-        done = convert_scan(path, place, to=to or OWN, given=said, overwrite=values["overwrite"], notify=console.note)
+        done = convert_scan(
+            path, place, to=to or OWN, given=options, overwrite=values["overwrite"], notify=console.note
+        )
         console.result(done.path, done.record)
         return True
 

@@ -61,13 +61,13 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
         for photo in (pair.first, pair.second):
             best[photo] = max(best[photo], pair.inliers)
             partners[photo] += 1
-    said = [(photos[i].name, _apart_text(i, parts)) for i in loose]
+    remarks = [(photos[i].name, _apart_text(i, parts)) for i in loose]
     weak = [
         i
         for i in sorted(parts[0], key=lambda photo: (best[photo], partners[photo]))
         if len(photos) > 2 and (best[i] < WEAK_MATCHES or partners[i] < _FEWEST_PARTNERS) and i not in loose
     ]
-    said += [(photos[i].name, f"{several(partners[i], 'partner')}, best {best[i]} matches") for i in weak]
+    remarks += [(photos[i].name, f"{several(partners[i], 'partner')}, best {best[i]} matches") for i in weak]
     fraction = len(parts[0]) / len(photos)
     verdict = worst([GOOD if len(parts) == 1 else BAD if fraction < 0.9 else LOOK, LOOK if weak else GOOD])
     sizes = " + ".join(str(len(part)) for part in parts[:6]) + (" + ..." if len(parts) > 6 else "")
@@ -84,7 +84,7 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
         f"fraction of photos in the largest part: look below 1, bad below 0.9; per photo: look below {WEAK_MATCHES} "
         f"matches with its best partner or fewer than {_FEWEST_PARTNERS} partners",
         "" if verdict == GOOD else "add photos in between, so that each overlaps its neighbours by two thirds",
-        tuple(said),
+        tuple(remarks),
     )
 
 

@@ -124,11 +124,11 @@ def intrinsics(scene: Scene) -> Finding | None:
     weak = [one for one in certain if one["weak"]]
     focal = max(one["focal_percent"] for one in certain)
     border_px = max(one["distortion_border_px"] for one in certain)
-    said = f"focal length ± {focal:.2g} %, distortion ± {border_px:.2g} px at the corners"
+    accuracy = f"focal length ± {focal:.2g} %, distortion ± {border_px:.2g} px at the corners"
     return Finding(
         "intrinsics",
         LOOK if weak else GOOD,
-        f"intrinsics are weakly determined: {said}" if weak else said,
+        f"intrinsics are weakly determined: {accuracy}" if weak else accuracy,
         focal,
         "standard deviation: look from 1 % of the focal length, or 0.5 % of half the image diagonal",
         "use nerfcli poses --intrinsics, or add photos from more directions and distances" if weak else "",

@@ -87,7 +87,7 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
         for patch in pair.patches:
             seen.setdefault(pair.first, []).append((patch.box, patch))
             seen.setdefault(pair.second, []).append((patch.other_box, patch))
-    said = []
+    moving_photos = []
     still = False
     for photo, boxes in seen.items():
         confirmed = [
@@ -99,21 +99,21 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
             width, height = photos[photo].features.size
             across, down = 100 * (left + right) / 2 / width, 100 * (top + bottom) / 2 / height
             stays = ", fixed in the image" if patch.still else ""
-            said.append(
+            moving_photos.append(
                 (patch.matches, photos[photo].name, f"at {across:.0f} % across, {down:.0f} % down{stays}"),
             )
-    fraction = len(said) / len(photos)
+    fraction = len(moving_photos) / len(photos)
     advice = "mask it, or train --with movers: moving objects become fog, and disturb poses"
     if still:
         advice += "; content fixed in the image is a watermark, a strap, or the background of a turntable"
     return Finding(
         "moving content",
-        BAD if fraction > 0.5 else LOOK if said else GOOD,
-        f"independent movement in {several(len(said), 'photo')}" if said else "none found",
+        BAD if fraction > 0.5 else LOOK if moving_photos else GOOD,
+        f"independent movement in {several(len(moving_photos), 'photo')}" if moving_photos else "none found",
         fraction,
         "look from 1 photo, bad from half of them",
-        advice if said else "",
-        tuple((name, what) for _, name, what in sorted(said, reverse=True)),
+        advice if moving_photos else "",
+        tuple((name, what) for _, name, what in sorted(moving_photos, reverse=True)),
     )
 
 

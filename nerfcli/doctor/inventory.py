@@ -153,35 +153,35 @@ def orientation(photos: Sequence[PhotoFacts]) -> Finding:
 
 def duplicates(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
     """Find photos that are stored twice, or were taken twice from the same place."""
-    said: dict[str, str] = {}
+    remarks: dict[str, str] = {}
     exact = 0
     first_of: dict[str, str] = {}
     for photo in photos:
         if photo.digest in first_of:
-            said[photo.name] = f"same file as {first_of[photo.digest]}"
+            remarks[photo.name] = f"same file as {first_of[photo.digest]}"
             exact += 1
         first_of.setdefault(photo.digest, photo.name)
     for pair in pairs:
         one, other = photos[pair.first], photos[pair.second]
         likeness = float((one.tiny * other.tiny).sum())
-        if not pair.linked or other.name in said:
+        if not pair.linked or other.name in remarks:
             continue
         if pair.shift < _SAME_PIXELS and likeness > _SAME_PICTURE:
-            said[other.name] = f"same picture as {one.name}"
+            remarks[other.name] = f"same picture as {one.name}"
             exact += 1
         elif pair.shift < _SAME_PLACE and likeness > _ALIKE:
-            said[other.name] = f"nearly the same as {one.name}"
-    fraction = len(said) / len(photos)
+            remarks[other.name] = f"nearly the same as {one.name}"
+    fraction = len(remarks) / len(photos)
     return Finding(
         "duplicates",
         verdict_above(fraction, look=1e-9, bad=0.3) if exact or fraction > 0.1 else GOOD,
-        f"{exact} exact duplicates, {len(said) - exact} taken from the same place as another" if said else "none",
-        len(said),
+        f"{exact} exact duplicates, {len(remarks) - exact} taken from the same place as another" if remarks else "none",
+        len(remarks),
         "look from 1 duplicate file or 10 % from the same place, bad from 30 % of the photos",
         "remove them: they cost time, and a held-out photo is no test if its duplicate is used for training"
-        if said
+        if remarks
         else "",
-        tuple(said.items()),
+        tuple(remarks.items()),
     )
 
 

@@ -55,7 +55,7 @@ def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
     blurred = ~blank & ((lack > BLURRED) | smeared)
     very = ~blank & (lack > VERY_BLURRED)
     order = [int(i) for i in np.argsort(-np.nan_to_num(lack, nan=-9)) if blurred[i]]
-    said = [
+    flagged = [
         (photos[i].name, f"{100 * 2 ** -lack[i]:.0f} % of the usual detail{', smeared' if smeared[i] else ''}")
         for i in order
     ]
@@ -82,7 +82,7 @@ def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
         fraction,
         f"detail: look below {100 * 2 ** (-BLURRED):.0f} % of the usual detail, bad from 30 % of the photos",
         "; ".join(advice),
-        tuple(said),
+        tuple(flagged),
     )
 
 
@@ -182,7 +182,7 @@ def white_balance(photos: Sequence[PhotoFacts], redder: np.ndarray) -> Finding:
 
 def clipping(photos: Sequence[PhotoFacts]) -> Finding:
     """Find photos with large pure white or black areas, or that are dark as a whole."""
-    said: list[tuple[float, str, str]] = []
+    flagged: list[tuple[float, str, str]] = []
     verdicts = [GOOD]
     for photo in photos:
         light = photo.exposure
@@ -190,23 +190,23 @@ def clipping(photos: Sequence[PhotoFacts]) -> Finding:
         verdict = verdict_above(clipped, look=CLIPPED_LOOK, bad=CLIPPED_BAD)
         if verdict != GOOD:
             kind = "white" if light.white >= light.black else "black"
-            said.append((clipped, photo.name, f"{100 * clipped:.0f} % pure {kind}"))
+            flagged.append((clipped, photo.name, f"{100 * clipped:.0f} % pure {kind}"))
         elif light.mean < _DARK:
             verdict = verdict_below(light.mean, look=_DARK, bad=_VERY_DARK)
-            said.append((_DARK - light.mean, photo.name, f"dark: mean level {255 * light.mean:.0f} of 255"))
+            flagged.append((_DARK - light.mean, photo.name, f"dark: mean level {255 * light.mean:.0f} of 255"))
         verdicts.append(verdict)
-    fraction = len(said) / len(photos)
+    fraction = len(flagged) / len(photos)
     return Finding(
         "clipping",
-        BAD if verdicts.count(BAD) > 0.3 * len(photos) else LOOK if said else GOOD,
-        f"{several(len(said), 'photo')} of {len(photos)} with large pure white or black areas, or dark"
-        if said
+        BAD if verdicts.count(BAD) > 0.3 * len(photos) else LOOK if flagged else GOOD,
+        f"{several(len(flagged), 'photo')} of {len(photos)} with large pure white or black areas, or dark"
+        if flagged
         else "little",
         fraction,
         f"per photo: look from {100 * CLIPPED_LOOK:g} % of its pixels, bad from {100 * CLIPPED_BAD:g} %; all: bad "
         "from 30 % of the photos",
         "expose so that the subject is neither; such areas cannot be matched (in a background this is fine)"
-        if said
+        if flagged
         else "",
-        tuple((name, what) for _, name, what in sorted(said, key=lambda item: -item[0])),
+        tuple((name, what) for _, name, what in sorted(flagged, key=lambda item: -item[0])),
     )

@@ -126,10 +126,10 @@ class Ranks(SingleProcess):
         return values[0]
 
     def announce(self, fraction: float) -> float:
-        said = torch.tensor(fraction, dtype=torch.float64)
+        announced = torch.tensor(fraction, dtype=torch.float64)
         with lost_ranks_reported():
-            dist.broadcast(said, src=0)
-        return float(said)
+            dist.broadcast(announced, src=0)
+        return float(announced)
 
     def copy_from_first(self, *tensors: Tensor) -> None:
         with lost_ranks_reported():

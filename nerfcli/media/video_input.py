@@ -79,7 +79,7 @@ def open_video(path: Path) -> Video:
         first = next(decoder.frames(), None)
         decoder.finish()
     head = "\n".join(decoder.head)
-    if _NO_VIDEO.search(head) or "matches no streams" in decoder.said:
+    if _NO_VIDEO.search(head) or "matches no streams" in decoder.last_errors:
         raise UserError(f"{path} contains no video stream", "give a video file, or a folder of photos")
     if first is None:
         raise _unreadable(path, decoder)
@@ -152,8 +152,8 @@ def read_frames(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
 class _Decoder:
     """A running ffmpeg: its pictures come from stdout, and a separate thread sorts its messages on stderr.
 
-    Of a possibly endless log only this is kept: the first lines (head), the last errors (said), their number (errors),
-    the seconds that showinfo prints (times), and whether the file is truncated (cut_short).
+    Of a possibly endless log only this is kept: the first lines (head), the last errors, their number (errors), the
+    seconds that showinfo prints (times), and whether the file is truncated (cut_short).
     """
 
     def __init__(self, process: "subprocess.Popen[bytes]"):
@@ -162,14 +162,14 @@ class _Decoder:
         self.times: list[str] = []
         self.errors = 0
         self.cut_short = False
-        self._said: deque[str] = deque(maxlen=_LINES_KEPT)
+        self._last_errors: deque[str] = deque(maxlen=_LINES_KEPT)
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 
     @property
-    def said(self) -> str:
+    def last_errors(self) -> str:
         """The last errors."""
-        return "\n".join(self._said)
+        return "\n".join(self._last_errors)
 
     @property
     def returncode(self) -> int | None:
@@ -199,7 +199,7 @@ class _Decoder:
                 self.head.append(line)
             if error := _ERROR.search(line):
                 self.errors += 1
-                self._said.append(error[2])
+                self._last_errors.append(error[2])
 
 
 @contextmanager
@@ -266,8 +266,8 @@ def _cut_short(video: Video, decoder: _Decoder) -> UserError:
 
 
 def _unreadable(path: Path, decoder: _Decoder) -> UserError:
-    said = decoder.said.splitlines()
-    reason = said[0] if said else "no frame can be decoded"
+    errors = decoder.last_errors.splitlines()
+    reason = errors[0] if errors else "no frame can be decoded"
     if decoder.cut_short:
         return UserError(f"{path} is truncated: {reason}", "copy the video again")
     hint = "give a video or a folder of photos; copy a damaged video again, or convert it to MP4 (H.264)"

@@ -106,15 +106,15 @@ def follow(scene: Scene, run: Path, settings: TrainSettings, ranks: SingleProces
     with deferred_interrupts() as interrupts:
         last = float("inf")
         try:
-            while (said := ranks.announce(END)) != END:
+            while (message := ranks.announce(END)) != END:
                 if interrupts.came is not None:
                     last = min(last, time.monotonic() + GRACE_SECONDS)
                 if time.monotonic() > last:
                     interrupts.raise_if_pending()
-                if said == SETTLE:
+                if message == SETTLE:
                     sentinel.settle()
-                elif said != WAIT:
-                    sentinel.advance(said)
+                elif message != WAIT:
+                    sentinel.advance(message)
                     storage.release_pages()
         except UserError:
             interrupts.raise_if_pending()  # an interrupt may be why rank 0 has ended

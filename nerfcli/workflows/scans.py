@@ -13,8 +13,8 @@ from nerfcli.tomography.checks.examine import ScanDiagnosis, examine_scan
 from nerfcli.tomography.checks.page import refuse_foreign, write_scan_page
 from nerfcli.tomography.circle import circle_from_json, circle_of, differences
 from nerfcli.tomography.formats.assemble import axis_column
-from nerfcli.tomography.formats.given import ScanOptions
 from nerfcli.tomography.formats.read import read_scan
+from nerfcli.tomography.formats.scan_options import ScanOptions
 from nerfcli.tomography.hypotheses import Judgement, judge
 from nerfcli.tomography.scan import Scan, is_scan, load_scan, save_scan
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent

@@ -105,23 +105,23 @@ def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[st
     start = time.perf_counter()
     features = _Features(featured)
     compared = _compared(features)
-    said = _together(compared)
-    if not said.two_motions:
+    motions = _together(compared)
+    if not motions.two_motions:
         write_stage(Path(job.folder) / _STAGE, _key(job), {})
         return job, None
-    facts = _facts(said)
+    facts = _facts(motions)
     masks: list[np.ndarray | None] = [None] * len(job.files)
-    if said.found:
+    if motions.found:
         places = {number: job.files.index(file) for number, file in enumerate(featured.files)}
         masks = _masks(job, compared, groups=_same_place(compared, places), places=places)
         facts |= _judged(masks, compared, places)
-    facts["masked"] = facts.get("why_not") is None and said.found
+    facts["masked"] = facts.get("why_not") is None and motions.found
     facts["unmasked"] = [name for name, mask in zip(job.names, masks, strict=True) if mask is None]
     if facts["masked"]:
         job = replace(job, masks=_written(job, masks))
     facts["seconds"] = round(time.perf_counter() - start, 3)
     write_stage(Path(job.folder) / _STAGE, _key(job), facts)
-    if said.found:
+    if motions.found:
         tell(sentence(facts))
     return job, facts
 
@@ -191,8 +191,8 @@ def _compared(features: _Features) -> list[ComparedPair]:
     if sum(pair.motions.still > 0 for pair in pairs) < _FEW_STILL * len(pairs):
         return pairs
     pairs += _all_compared(features, [pair for pair in _pairs(count, _ANCHORS) if pair not in set(first)])
-    said = _together(pairs)
-    if said.still > said.moved and not said.two_motions:
+    motions = _together(pairs)
+    if motions.still > motions.moved and not motions.two_motions:
         done = {(pair.first, pair.second) for pair in pairs}
         pairs += _all_compared(
             features, [pair for pair in combinations(_anchors(count, _ANCHORS), 2) if pair not in done]
@@ -308,14 +308,14 @@ def _written(job: Job, masks: Sequence[np.ndarray | None]) -> tuple[WorkMask, ..
     return tuple(laid_out)
 
 
-def _facts(said: Stationary) -> dict[str, Any]:
+def _facts(motions: Stationary) -> dict[str, Any]:
     return {
-        "pairs": said.two + said.still + said.moved,
-        "pairs_two_motions": said.two,
-        "pairs_still": said.still,
-        "pairs_one_motion": said.moved,
-        "still_share": round(said.cells, 4),
-        "wide": said.wide,
+        "pairs": motions.two + motions.still + motions.moved,
+        "pairs_two_motions": motions.two,
+        "pairs_still": motions.still,
+        "pairs_one_motion": motions.moved,
+        "still_share": round(motions.cells, 4),
+        "wide": motions.wide,
     }
 
 

@@ -23,13 +23,13 @@ import pycolmap
 
 from nerfcli.child import take_stdout
 from nerfcli.finite import finite
-from nerfcli.poses.engine.chosen import choose_component
 from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import MappedModels, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
 from nerfcli.poses.engine.retrieval import with_neighbours
+from nerfcli.poses.engine.selected_component import choose_component
 from nerfcli.poses.engine.separate_models import describe_components
 from nerfcli.poses.engine.strict import place_held_out, training_part
 from nerfcli.poses.engine.turntable import recalled, with_object_masks

@@ -15,7 +15,7 @@ from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import Contradiction, strong_contradictions
 from nerfcli.poses.judge.parallax import RotationFit
 from nerfcli.poses.model import held_out
-from nerfcli.poses.model.determined import is_centred
+from nerfcli.poses.model.lens_observability import is_centred
 from nerfcli.poses.model.two_views import Agreement, RotationError, VerifiedPair, agreements, rotation_errors
 
 # Pairs with fewer verified matches neither support nor contradict a model.

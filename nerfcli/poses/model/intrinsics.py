@@ -17,8 +17,14 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from nerfcli.poses.model import held_out
-from nerfcli.poses.model.determined import DeterminedLens, determine, has_open_distortion, is_centred, uncertainty
 from nerfcli.poses.model.lens_evidence import UndeterminedError, parameters_of
+from nerfcli.poses.model.lens_observability import (
+    DeterminedLens,
+    determine,
+    has_open_distortion,
+    is_centred,
+    uncertainty,
+)
 
 Array = NDArray[np.float64]
 

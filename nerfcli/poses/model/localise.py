@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 
 from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.model.intrinsics import settle
-from nerfcli.poses.model.point_looks import (
+from nerfcli.poses.model.point_descriptors import (
     ALIKE,
     BLOCK,
     KnownPoints,
@@ -211,8 +211,8 @@ def _place(photo: PhotoFeatures, model_points: KnownPoints, *, seed: int) -> tup
     )
     attempt = replace(attempt, found=count, beside=max(beside))
     if count < _LEAST_FOUND or count < _CLEARLY * max(beside):
-        said = f"{count} features match the expected positions, but {max(beside)} match wrong ones by chance"
-        return None, replace(attempt, refused=said)
+        reason = f"{count} features match the expected positions, but {max(beside)} match wrong ones by chance"
+        return None, replace(attempt, refused=reason)
     area = _area(photo, placed.features)
     if area < _LEAST_AREA:
         return None, replace(attempt, refused=f"only {100 * area:.0f} % of the picture agrees with the model")

@@ -11,7 +11,7 @@ from nerfcli.errors import UserError
 from nerfcli.findings import several
 from nerfcli.holdout import names_held_out
 from nerfcli.tomography.circle import Circle
-from nerfcli.tomography.formats.given import MILLIMETRES, ScanOptions, check_pixel_size
+from nerfcli.tomography.formats.scan_options import MILLIMETRES, ScanOptions, check_pixel_size
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.open_beam import OpenBeam
 from nerfcli.tomography.scan import Kind, Scan, held_out_views

@@ -13,7 +13,7 @@ import numpy as np
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
 from nerfcli.tomography.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
-from nerfcli.tomography.formats.given import ScanOptions, angles_in_radians, millimetres
+from nerfcli.tomography.formats.scan_options import ScanOptions, angles_in_radians, millimetres
 from nerfcli.tomography.open_beam import open_beam_of
 from nerfcli.tomography.scan import Scan
 

@@ -12,7 +12,7 @@ import numpy as np
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
 from nerfcli.tomography.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
-from nerfcli.tomography.formats.given import ScanOptions, angles_in_radians
+from nerfcli.tomography.formats.scan_options import ScanOptions, angles_in_radians
 from nerfcli.tomography.formats.statement import Statement, read_object
 from nerfcli.tomography.scan import Scan
 

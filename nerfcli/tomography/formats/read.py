@@ -15,7 +15,7 @@ from nerfcli.tomography.formats import (
     stated_stack,
     transmission_transforms,
 )
-from nerfcli.tomography.formats.given import ScanOptions
+from nerfcli.tomography.formats.scan_options import ScanOptions
 from nerfcli.tomography.scan import SCENE_FILE, Scan, is_scan, load_scan
 
 Reader = Callable[[Path, ScanOptions], Scan]

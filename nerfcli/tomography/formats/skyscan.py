@@ -12,8 +12,8 @@ import numpy as np
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
 from nerfcli.tomography.formats.assemble import ReaderOutput, scan_of
-from nerfcli.tomography.formats.given import ScanOptions, angles_in_radians
 from nerfcli.tomography.formats.pictures import numbered, read_stack
+from nerfcli.tomography.formats.scan_options import ScanOptions, angles_in_radians
 from nerfcli.tomography.formats.statement import Statement, read_lines
 from nerfcli.tomography.scan import Scan
 

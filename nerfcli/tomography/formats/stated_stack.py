@@ -34,8 +34,8 @@ import numpy as np
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
 from nerfcli.tomography.formats.assemble import ReaderOutput, scan_of
-from nerfcli.tomography.formats.given import ScanOptions, angles_in_radians, millimetres
 from nerfcli.tomography.formats.pictures import SUFFIXES, numbered, read_stack
+from nerfcli.tomography.formats.scan_options import ScanOptions, angles_in_radians, millimetres
 from nerfcli.tomography.formats.statement import Statement, read_object
 from nerfcli.tomography.geometry import Beam, ScanGeometry, from_vectors
 from nerfcli.tomography.open_beam import OpenBeam, open_beam_of

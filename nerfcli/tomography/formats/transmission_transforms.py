@@ -14,8 +14,8 @@ import numpy as np
 from nerfcli.errors import UserError
 from nerfcli.tomography.circle import circle_of
 from nerfcli.tomography.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
-from nerfcli.tomography.formats.given import ScanOptions
 from nerfcli.tomography.formats.pictures import read_stack
+from nerfcli.tomography.formats.scan_options import ScanOptions
 from nerfcli.tomography.formats.statement import Statement, read_object
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.scan import Scan
