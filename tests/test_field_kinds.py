@@ -20,6 +20,7 @@ from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import KINDS, fresh_field, settings_from_json
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
+from nerfcli.fit import fitting
 from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.optimiser import FieldOptimiser
 from nerfcli.kernels import March, Rays, numba_cpu, reference, spherical_harmonics
@@ -299,6 +300,22 @@ def test_decay_shrinks_with_the_rays_of_a_step_only_where_photos_have_alpha(
     rays = training.advance(0.5).rays
     assert rays > 8000
     assert given == [training.row_decay(rays)]
+
+
+@pytest.mark.parametrize(("log2_rows", "most"), [(6, 16), (8, 32)])
+def test_steps_of_large_tables_have_more_rays(log2_rows, most, spheres: Scene, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(fitting, "MOST_RAYS", 16)
+    monkeypatch.setattr(fitting, "ROWS_PER_RAY", 8)
+    pool = PixelPool(
+        load_photos(spheres.train_frames[:2], factor=8, threads=1),
+        Similarity(1.0, np.eye(3), np.zeros(3)),
+        torch.device("cpu"),
+    )
+    settings = TrainSettings(
+        budget_seconds=None, steps=9, log2_rows=log2_rows, first_samples_per_step=2**16, samples_per_step=2**16
+    )
+    training = Fitting(pool, Marching(0.1, 4.0, 0.5, 0.0), contraction="none", settings=settings)
+    assert training.advance(0.5).rays == most
 
 
 def test_marching_and_learning_see_pixels_of_the_same_width():

@@ -27,7 +27,9 @@ from nerfcli.photos.pool import PixelBatch, Pool
 from nerfcli.render.model import Marching
 from nerfcli.runs.settings import TrainSettings
 
-MOST_RAYS = 2**14
+# Rays of a step, at most. The optimiser takes longer with larger tables, for any number of rays: there is one more ray
+# for this many rows of a level.
+MOST_RAYS, ROWS_PER_RAY = 2**14, 2**5
 # Optical depth at which training rays end: less than a thousandth of the light is left.
 DEEPEST = 7.0
 # Samples that absorb less of their ray's light than this have hardly any gradient: they are left out before their
@@ -129,7 +131,9 @@ class Fitting:
         if sky is not None:
             self.parts.show_sky(sky)
         self.edges = marching.edges().to(device, torch.float32)
-        self._most_rays = MOST_RAYS if device.type == "cpu" else max(MOST_RAYS, settings.samples_per_step // 4)
+        rows = self.field.rows()
+        most_rays = MOST_RAYS if rows is None else max(MOST_RAYS, rows.shape[-2] // ROWS_PER_RAY)
+        self._most_rays = most_rays if device.type == "cpu" else max(most_rays, settings.samples_per_step // 4)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
         self.optimiser = FieldOptimiser(self.field)
         self.parts_optimiser = PartsOptimiser(self.parts.groups())
