@@ -7,7 +7,7 @@
 
 PYTHON =
 BIN = .venv/bin
-# Python compiles a module when it is first imported: to compile all of torch at once takes a minute longer.
+# Python compiles a module when it is first imported: to compile all of torch at once takes 20 s longer.
 PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 
