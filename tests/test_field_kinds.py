@@ -277,20 +277,24 @@ def test_rows_of_the_hash_grid_decay_where_photos_say_little():
             torch.testing.assert_close(moved[3], torch.full((4,), -1e-3), rtol=1e-4, atol=0)
 
 
+def training_of_two_photos(scene: Scene, *, has_alpha: bool, log2_rows: int) -> Fitting:
+    photos = [
+        replace(photo, pixels=photo.pixels[..., : 3 + has_alpha])
+        for photo in load_photos(scene.train_frames[:2], factor=8, threads=1)
+    ]
+    pool = PixelPool(photos, Similarity(1.0, np.eye(3), np.zeros(3)), torch.device("cpu"))
+    settings = TrainSettings(
+        budget_seconds=None, steps=9, log2_rows=log2_rows, first_samples_per_step=2**20, samples_per_step=2**20
+    )
+    return Fitting(pool, Marching(0.1, 4.0, 0.5, 0.0), contraction="none", settings=settings)
+
+
 @pytest.mark.parametrize("has_alpha", [True, False])
 def test_decay_shrinks_with_the_rays_of_a_step_only_where_photos_have_alpha(
     has_alpha, spheres: Scene, monkeypatch: pytest.MonkeyPatch
 ):
     """The law of `Fitting.row_decay`, and what the optimiser gets in a step of all rays that there may be."""
-    photos = [
-        replace(p, pixels=p.pixels[..., : 3 + has_alpha])
-        for p in load_photos(spheres.train_frames[:2], factor=8, threads=1)
-    ]
-    pool = PixelPool(photos, Similarity(1.0, np.eye(3), np.zeros(3)), torch.device("cpu"))
-    settings = TrainSettings(
-        budget_seconds=None, steps=9, log2_rows=8, first_samples_per_step=2**20, samples_per_step=2**20
-    )
-    training = Fitting(pool, Marching(0.1, 4.0, 0.5, 0.0), contraction="none", settings=settings)
+    training = training_of_two_photos(spheres, has_alpha=has_alpha, log2_rows=8)
     full = training.field.row_decay
     assert full > 0
     assert [training.row_decay(rays) for rays in (1, 4000)] == [full, full]
@@ -306,15 +310,7 @@ def test_decay_shrinks_with_the_rays_of_a_step_only_where_photos_have_alpha(
 def test_steps_of_large_tables_have_more_rays(log2_rows, most, spheres: Scene, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(fitting, "MOST_RAYS", 16)
     monkeypatch.setattr(fitting, "ROWS_PER_RAY", 8)
-    pool = PixelPool(
-        load_photos(spheres.train_frames[:2], factor=8, threads=1),
-        Similarity(1.0, np.eye(3), np.zeros(3)),
-        torch.device("cpu"),
-    )
-    settings = TrainSettings(
-        budget_seconds=None, steps=9, log2_rows=log2_rows, first_samples_per_step=2**16, samples_per_step=2**16
-    )
-    training = Fitting(pool, Marching(0.1, 4.0, 0.5, 0.0), contraction="none", settings=settings)
+    training = training_of_two_photos(spheres, has_alpha=True, log2_rows=log2_rows)
     assert training.advance(0.5).rays == most
 
 
