@@ -8,8 +8,6 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import pytest
-
 import nerfcli
 
 ROOT = Path(nerfcli.__file__).parent
@@ -187,13 +185,16 @@ def test_there_is_something_to_check():
     assert {part_of(path) for path in FILES} >= {"cli", "train", "render", "field", "kernels", "cameras", "media"}
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_point_down(path):
-    part = part_of(path)
-    if path == ROOT / "__init__.py":
-        return  # the public interface, whose imports are lazy: see test_package.py
-    allowed = {*MAY_IMPORT, "cli"} if part in ("cli", "__main__") else MAY_IMPORT[part] | LEAVES | {part}
-    wrong = [f"line {line}: {part} imports {other}" for line, other in imported_parts(path) if other not in allowed]
+def test_imports_point_down():
+    wrong = []
+    for path in FILES:
+        if path == ROOT / "__init__.py":
+            continue  # the public interface, whose imports are lazy: see test_package.py
+        part = part_of(path)
+        allowed = {*MAY_IMPORT, "cli"} if part in ("cli", "__main__") else MAY_IMPORT[part] | LEAVES | {part}
+        wrong += [
+            f"{path}:{line}: {part} imports {other}" for line, other in imported_parts(path) if other not in allowed
+        ]
     assert not wrong
 
 
@@ -205,11 +206,13 @@ def test_the_rules_have_no_circle():
         seen |= ready
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_heavy_libraries_stay_where_they_belong(path):
-    part = part_of(path)
-    libraries = [(line, name.split(".")[0]) for line, name in imported(path)]
-    assert not [f"line {line}: {name} in {part}" for line, name in libraries if part not in CONFINED.get(name, {part})]
+def test_heavy_libraries_stay_where_they_belong():
+    wrong = []
+    for path in FILES:
+        part = part_of(path)
+        libraries = [(line, name.split(".")[0]) for line, name in imported(path)]
+        wrong += [f"{path}:{line}: {name}" for line, name in libraries if part not in CONFINED.get(name, {part})]
+    assert not wrong
 
 
 def test_the_command_line_starts_without_heavy_libraries():
@@ -219,32 +222,28 @@ def test_the_command_line_starts_without_heavy_libraries():
     assert not set(NOT_AT_START) & set(loaded)
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_only_the_command_line_prints_and_exits(path):
-    if part_of(path) == "cli":
-        return
-    calls = source(path).calls
-    assert not [f"line {line}: {name}" for line, name in calls if name in ("print", "exit", "quit", "sys.exit")]
+def test_only_the_command_line_prints_and_exits():
+    calls = [(path, *call) for path in FILES if part_of(path) != "cli" for call in source(path).calls]
+    ends = ("print", "exit", "quit", "sys.exit")
+    assert not [f"{path}:{line}: {name}" for path, line, name in calls if name in ends]
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_the_files_of_a_run_have_one_reader_each(path):
+def test_the_files_of_a_run_have_one_reader_each():
     """Other code reads these files through `runs`, and the cameras of a run through their format."""
-    if path.relative_to(ROOT).as_posix() in ("runs/files.py", "cameras/formats/run_cameras.py"):
-        return
-    names = source(path).constants
-    assert not names & {"config.json", "log.jsonl", "field.safetensors", "state.safetensors", "metrics.json"}
+    files = {"config.json", "log.jsonl", "field.safetensors", "state.safetensors", "metrics.json"}
+    readers = {ROOT / "runs/files.py", ROOT / "cameras/formats/run_cameras.py"}
+    found = {path: files & source(path).constants for path in FILES if path not in readers}
+    assert not {path: names for path, names in found.items() if names}
 
 
-@pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: path.name)
-def test_a_folder_holds_several_ideas(folder):
-    assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) >= 2
+def test_a_folder_holds_several_ideas():
+    for folder in FOLDERS:
+        assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) >= 2, folder
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_file_holds_one_idea_and_says_which(path):
-    text = path.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= MOST_LINES
-    assert path.stem not in ("utils", "util", "helpers", "misc", "common")
-    if text.strip():
-        assert source(path).docstring, "a module says in its docstring what it is for"
+def test_a_file_holds_one_idea_and_says_which():
+    for path in FILES:
+        text = path.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= MOST_LINES, path
+        assert path.stem not in ("utils", "util", "helpers", "misc", "common"), path
+        assert not text.strip() or source(path).docstring, f"{path}: a module says in its docstring what it is for"
