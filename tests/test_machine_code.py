@@ -2,12 +2,16 @@
 
 import errno
 import os
+import subprocess
 from pathlib import Path
 
 import pytest
+import torch
 
+from nerfcli import child
 from nerfcli.errors import UserError
 from nerfcli.kernels import numba_cpu
+from nerfcli.kernels.numba_cpu import compile_all, machine_code
 from nerfcli.kernels.numba_cpu.machine_code import discard_outdated, folder, is_there
 
 
@@ -70,7 +74,57 @@ def test_no_room_for_what_is_compiled_is_told(monkeypatch):
     def full(*arguments: object, **named: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(numba_cpu, "visible_samples", full)
+    monkeypatch.setattr(compile_all, "visible_samples", full)
     with pytest.raises(UserError, match=r"cannot cache compiled kernels in .*: No space left on device") as caught:
         numba_cpu.warm_up()
     assert "NUMBA_CACHE_DIR" in caught.value.hint
+
+
+class TestSecondProcess:
+    """Nothing is compiled: the kernels are on disk, though `is_there` says that they are not."""
+
+    @pytest.fixture
+    def started(self, monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
+        monkeypatch.setattr(machine_code, "is_there", lambda: False)
+        started, spawn = [], child.spawn
+
+        def record(*arguments, **named):
+            started.append(spawn(*arguments, **named))
+            return started[-1]
+
+        monkeypatch.setattr(child, "spawn", record)
+        return started
+
+    def test_it_runs_the_kernels_that_render_and_ends(self, started):
+        numba_cpu.warm_up()
+        assert [process.returncode for process in started] == [0]
+
+    def test_what_it_has_not_compiled_is_compiled_without_it(self, monkeypatch, started):
+        run = []
+        monkeypatch.setattr(compile_all, "RENDERING_PROCESS", "nerfcli.no_such_module")
+        monkeypatch.setattr(compile_all, "visible_samples", lambda *a: run.append(1) or numba_cpu.visible_samples(*a))
+        numba_cpu.warm_up()
+        assert [process.returncode for process in started] == [1]
+        assert run
+
+    def test_one_that_cannot_be_started_is_done_without(self, monkeypatch, started):
+        def refuse(*arguments, **named):
+            raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+        monkeypatch.setattr(child, "spawn", refuse)
+        numba_cpu.warm_up()
+        assert not started
+
+    def test_an_interrupt_ends_it(self, monkeypatch, started):
+        def interrupt(*arguments, **named):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(compile_all, "hash_encode", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            numba_cpu.warm_up()
+        assert [process.returncode for process in started] == [-9]
+
+    def test_one_thread_compiles_alone(self, started):
+        torch.set_num_threads(1)
+        numba_cpu.warm_up()
+        assert not started
