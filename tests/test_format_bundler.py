@@ -1,5 +1,6 @@
 """Bundler's model against the formula of its manual written out here, by hand, and damaged."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.bundler import parse_bundler
 from nerfcli.cameras.frame import Capture
+from nerfcli.convert.finding import find_bundler
 from nerfcli.errors import BAD_INPUT, UserError
 
 LENSES = [(60.0, 0.1, -0.05), (55.0, 0.02, 0.0), (50.0, 0.0, 0.0)]
@@ -132,6 +134,18 @@ def test_the_list_is_found_where_colmap_writes_it(tmp_path):
     assert len(parse_bundler(path, measure, images=tmp_path).frames) == 3
     given = parse_bundler(path, measure, images=tmp_path, image_list=tmp_path / "bundle" / "model.list.txt")
     assert [frame.image for frame in given.frames] == [tmp_path / name for name in NAMES]
+
+
+def test_a_folder_with_one_model_of_any_name_is_found(tmp_path):
+    path = write(tmp_path, model_text())
+    assert find_bundler(tmp_path) == path
+    cameras = path.rename(tmp_path / "cameras.out")
+    (tmp_path / "nohup.out").write_text("32 photos\n")
+    (tmp_path / "empty.out").write_bytes(b"")
+    assert find_bundler(tmp_path) == cameras
+    shutil.copy(cameras, tmp_path / "others.out")
+    assert find_bundler(tmp_path) is None
+    assert find_bundler(cameras) == cameras
 
 
 def edited(number: int, line: str | None) -> str:

@@ -6,6 +6,7 @@ A folder is recognised by the names of files in it, a file by its suffix and its
 from collections.abc import Callable
 from pathlib import Path
 
+from nerfcli.cameras.formats.bundler import BEGINS as BUNDLER_BEGINS
 from nerfcli.cameras.formats.camera_path import is_camera_path
 from nerfcli.cameras.formats.colmap import is_model
 from nerfcli.cameras.formats.fields import read_json_object
@@ -56,6 +57,20 @@ def find_llff(path: Path) -> Path | None:
     if path.is_file():
         return path.parent if path.name == "poses_bounds.npy" else None
     return path if (path / "poses_bounds.npy").is_file() else None
+
+
+def find_bundler(path: Path) -> Path | None:
+    """Find a file .out, Bundler's own in a folder, or the only one in it that begins as a file of Bundler does."""
+    found = by_suffix(".out", "bundle.out", "bundle/bundle.out")(path)
+    if found is not None or not path.is_dir():
+        return found
+    others = [other for other in sorted(path.glob("*.out")) if other.is_file() and _begins(other, BUNDLER_BEGINS)]
+    return others[0] if len(others) == 1 else None
+
+
+def _begins(path: Path, text: str) -> bool:
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        return stream.read(len(text)) == text
 
 
 def find_json(path: Path, *, opening: str, name: str) -> Path | None:

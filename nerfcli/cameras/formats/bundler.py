@@ -22,7 +22,8 @@ from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.orientation import Measure
 
-_HEADER = "# Bundle file v0.3"
+BEGINS = "# Bundle file"
+_HEADER = f"{BEGINS} v0.3"
 _EXPECTED = f'expected a file of Bundler, which begins with "{_HEADER}"'
 _LIST_EXPECTED = "expected Bundler's list of images, one name per line"
 
@@ -79,8 +80,8 @@ def parse_bundler(
 
 def _lines(path: Path) -> list[Numbered]:
     text = read_text(path, _EXPECTED)
-    if not text.startswith("# Bundle file"):
-        raise malformed(str(path), "does not begin with # Bundle file", _EXPECTED)
+    if not text.startswith(BEGINS):
+        raise malformed(str(path), f"does not begin with {BEGINS}", _EXPECTED)
     if not text.startswith(_HEADER):
         raise malformed(f"{path}: line 1", "is of an unsupported version of the format", _EXPECTED)
     return content_lines(text)
@@ -115,7 +116,11 @@ def _find_list(path: Path) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    raise malformed(str(path), f"the list of images next to it is missing ({candidates[1]})", _LIST_EXPECTED)
+    raise malformed(
+        str(path),
+        f"the list of images next to it is missing ({candidates[1]})",
+        "write one: the names of the photos in the order of the cameras, one per line",
+    )
 
 
 def _list_lines(path: Path) -> list[Numbered]:
