@@ -22,7 +22,6 @@ from nerfcli.errors import UserError
 from nerfcli.render.model import Model, load_model
 from nerfcli.runs.files import FIELD
 
-SWEEPS = ("both", "render", "train")
 # Fraction of the budget for rendering where training is measured as well: renderings are short, trainings are not.
 _RENDERING_FRACTION = 0.4
 # Fraction of the budget that is reserved for the report.
@@ -39,7 +38,7 @@ class BenchOptions:
 
     Args:
         budget_seconds: time limit for everything.
-        sweep: one of `SWEEPS`.
+        sweep: "both", "render" or "train".
         seed: seed of the trainings.
     """
 
