@@ -52,6 +52,7 @@ TRAINING: tuple[Group, ...] = (
         (),
         (
             Mutant("return self._given @ self.motions.numpy()", "return self.motions.numpy() @ self._given"),
+            Mutant("focal[:, None] ** 2 * np", "focal[:, None] * np"),
             Mutant(
                 "turns = now[:, :3, :3] @ np.swapaxes(self._given[:, :3, :3], -1, -2)",
                 "turns = self._given[:, :3, :3] @ np.swapaxes(now[:, :3, :3], -1, -2)",
@@ -212,6 +213,17 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
+        "fit/extent.py",
+        ("tests/test_trials.py", "tests/test_training_rays.py"),
+        "field_ends or extent or narrow or baseline or background",
+        (),
+        (
+            Mutant("self.reach is None or sky_known", "self.reach is None"),
+            Mutant("min(self.marching.far, self.reach)", "self.reach"),
+            Mutant("farthest + BALLS", "BALLS"),
+        ),
+    ),
+    Group(
         "photos/held_out_exposure.py",
         ("tests/test_held_out_exposure.py",),
         "",
@@ -330,7 +342,6 @@ TRAINING: tuple[Group, ...] = (
         (),
         (
             Mutant("_FARTHEST_STEP / seen.clamp_min(_FARTHEST_STEP)", "1.0"),
-            Mutant("focal[:, None] ** 2 * np", "focal[:, None] * np"),
             Mutant("rate * self.newton.change(", "self.newton.change("),
             Mutant("if fraction > HOLDING_FRACTIONS[0] else 0.0", "if fraction > 0.0 else 0.0"),
             Mutant("fraction, DAMPING_FRACTIONS, DAMPINGS", "fraction, DAMPING_FRACTIONS, DAMPINGS[::-1]"),

@@ -190,6 +190,18 @@ def test_compiled_pictures_stay_within_their_bound(negligible):
     assert torch.equal(alone.truncation_error, seen.truncation_error[300:310])
 
 
+def test_compiled_pictures_leave_out_no_more_of_a_ray_than_they_may():
+    """Samples in steps so short that each may be left out: all of them together may not."""
+    field, (rays, march), negligible = (
+        field_of("compiled sizes", torch.float32, "numba_cpu"),
+        rays_and_march(100, torch.float32),
+        0.05,
+    )
+    march = march._replace(edges=torch.linspace(0.3, 4.0, 600), max_optical_depth=1e9)
+    seen = field.backend.trace_rays(rays, march, field.medium(), background=torch.zeros(3), negligible=negligible)
+    assert 0.99 * negligible < 2.0 * float(seen.truncation_error.max()) <= negligible * (1 + 1e-6)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_sums_along_rays_are_those_of_a_double_loop(dtype):
     """Colour, transmittance, distortion and distance of light from its target, from the samples shown to `trace`."""

@@ -16,6 +16,7 @@ from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
 from nerfcli.field.background import SphereBackground, colours_behind
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.exposure import Exposure, exposed, linear_from_srgb, srgb_from_linear
+from nerfcli.fit import fitting
 from nerfcli.fit.appearance import Appearance
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.loading import LoadedPhoto
@@ -195,27 +196,28 @@ def test_a_background_begins_with_the_colour_of_the_sky():
         )
 
 
-def test_light_of_the_sky_does_not_end_before_it(capture, tmp_path):
+def test_light_of_the_sky_does_not_end_before_it(capture, tmp_path, monkeypatch):
     prepared = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
-    passed = []
-    for sky in (None, torch.ones(len(prepared.pool.colours), dtype=torch.bool)):
-        fitting = replace(prepared, sky=sky).fitting()
+    passed, sky = [], torch.ones(len(prepared.pool.colours), dtype=torch.bool)
+    for weight in (0.0, fitting.SKY_WEIGHT):
+        monkeypatch.setattr(fitting, "SKY_WEIGHT", weight)
+        training = replace(prepared, sky=sky).fitting()
         for step in range(60):
-            fitting.advance(step / 60)
+            training.advance(step / 60)
         drawn = prepared.pool.draw(64, torch.Generator().manual_seed(0))
-        passed.append(float(fitting.light_from_beyond(drawn, distance=math.inf).mean()))
+        passed.append(float(training.light_from_beyond(drawn, distance=math.inf).mean()))
     assert 1.0 - passed[1] < 0.7 * (1.0 - passed[0])
 
 
 def test_directions_without_pixels_take_the_colours_of_their_neighbours(capture, tmp_path):
     """No direction reads the middle of the grid, so only the roughness penalty lowers an outlying vertex there."""
     prepared = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
-    fitting = prepared.fitting()
-    assert fitting.parts.background is not None
-    logits = fitting.parts.background.logits
+    training = prepared.fitting()
+    assert training.parts.background is not None
+    logits = training.parts.background.logits
     logits.data[:, 16, 16, 16] = 1.0
     for step in range(10):
-        fitting.advance(step / 10)
+        training.advance(step / 10)
     assert (logits[:, 16, 16, 16] < 0.9).all()
     assert (logits[:, 16, 16, 17] > 0.0).all()
 

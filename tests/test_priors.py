@@ -169,6 +169,8 @@ def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
     assert (len(both.numbers), len(both.distances), len(both.trust)) == (90, 10, 10)
     of_pixel = dict(zip(of_points.numbers.tolist(), of_points.distances.tolist(), strict=True))
     assert both.distances.tolist() == [of_pixel[number] for number in both.numbers[-10:].tolist()]
+    of_both = PointRays([of_points, of_points], pool).added_to(pool.draw(80, generator), generator)
+    assert len(of_both.distances) == 10  # sets share them
     assert len(PointRays([of_points], pool).added_to(pool.draw(3, generator), generator).distances) == 1
 
 

@@ -239,8 +239,10 @@ def test_how_the_picture_moves_with_a_pose(small):
         )
         columns.append((ahead - behind).ravel() / (2 * step * camera.focal_px * np.sqrt(len(points))))
     jacobian = np.stack(columns, axis=-1)
-    found = PoseRefinement(pose[None], [camera]).picture[0].numpy()
-    np.testing.assert_allclose(found, jacobian.T @ jacobian, rtol=1e-5, atol=1e-7)
+    refinement = PoseRefinement(pose[None], [camera])
+    np.testing.assert_allclose(refinement.picture[0], jacobian.T @ jacobian, rtol=1e-5, atol=1e-7)
+    in_pixels = (camera.focal_px**2 * jacobian**2).sum(0)
+    np.testing.assert_allclose(refinement.newton._picture_px[0], in_pixels, rtol=1e-5)
 
 
 @given(seed=seeds, turned_only=st.booleans())

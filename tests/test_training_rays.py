@@ -14,7 +14,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_quaternion
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.fit.extent import choose_extent
+from nerfcli.fit.extent import BALLS_BEFORE_BACKGROUND, choose_extent
 from nerfcli.fit.losses import colour_losses, over_background
 from nerfcli.fit.normalisation import (
     box_frame,
@@ -179,6 +179,9 @@ def test_a_narrow_baseline_is_one_below_half_of_the_nearest_depth(spread):
     ball, marching = narrow_frame(scene)[:2] if spread < 1.0 else contracted_frame(scene)
     assert extent.training_from_scene.scale == ball.scale
     assert extent.marching == marching
+    if spread > 1.0:  # a learned background surrounds the unit ball, seen from the farthest camera
+        centres = training_centres(scene, extent.training_from_scene)
+        assert extent.reach == pytest.approx(np.linalg.norm(centres, axis=1).max() + BALLS_BEFORE_BACKGROUND)
     assert not has_narrow_baseline(replace(scene, depth_bounds=None))
     # Bounds that begin at the cameras give no radius, not even to cameras that only turn.
     assert not has_narrow_baseline(
@@ -202,8 +205,8 @@ def test_narrow_captures_lie_in_contracted_space_behind_a_ball_around_the_camera
         assert marching.near == pytest.approx(0.9)  # of the nearest depth, which is 1 here
         assert background == pytest.approx(2.5 * 3.2 / 2.0)  # the harmonic mean of the bounds is 3.2
         extent = choose_extent(scene, TrainSettings(), fills_frame=True)
-        assert extent.before("sphere").marching.far == pytest.approx(background)
-        assert extent.before("black").marching == marching
+        assert extent.before("sphere", sky_known=False).marching.far == pytest.approx(background)
+        assert extent.before("black", sky_known=False).marching == marching
 
 
 def test_points_tell_a_narrow_baseline_and_rays_begin_before_them():

@@ -231,10 +231,16 @@ def test_photos_of_one_exposure_have_no_spread_and_an_empty_photo_is_left_alone(
 
 
 def test_the_field_ends_where_a_background_begins(trials):
-    """It ends beyond the unit ball, seen from the farthest camera; without a learned background it is unchanged."""
+    """It ends beyond the unit ball, seen from the farthest camera; without a learned background, or with pixels that
+    show the sky, it is unchanged.
+    """
     extent = replace(trials._extent, reach=2.0 + BALLS_BEFORE_BACKGROUND)
-    assert extent.before("sphere").marching.far == min(extent.marching.far, 3.5)
-    assert extent.before("auto") is extent
+    ended = extent.before("sphere", sky_known=False)
+    assert ended.marching.far == min(extent.marching.far, 3.5)
+    assert replace(extent, reach=1e9).before("sphere", sky_known=False).marching == extent.marching
+    assert extent.before("sphere", sky_known=True) is extent
+    assert extent.before("auto", sky_known=False) is extent
     assert Extent.from_json(extent.to_json()).to_json() == extent.to_json()
-    assert extent.before("constant").before("constant").to_json() == extent.before("constant").to_json()
-    assert trials._extent.before("sphere") is trials._extent  # photos with alpha: it is already bounded
+    assert ended.before("constant", sky_known=False).to_json() == ended.to_json()
+    # Photos with alpha: it is already bounded.
+    assert trials._extent.before("sphere", sky_known=False) is trials._extent

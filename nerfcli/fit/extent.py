@@ -60,12 +60,14 @@ class Extent:
         similarity = Similarity.from_json(content["training_from_scene"])
         return Extent(content["contraction"], similarity, Marching(**content["marching"]), content.get("reach"))
 
-    def before(self, background: str) -> "Extent":
+    def before(self, background: str, *, sky_known: bool) -> "Extent":
         """Return the extent for a kind of background, see `Components`: the field ends where a learned one begins.
 
         Otherwise the initial fog would hide the background for good, and the field would have to paint distant things.
+        Pixels that are known to show the sky clear the fog before it: then the field keeps what is far away but not at
+        infinity, such as the buildings around a square.
         """
-        if background not in LEARNED_BACKGROUNDS or self.reach is None:
+        if background not in LEARNED_BACKGROUNDS or self.reach is None or sky_known:
             return self
         return replace(self, marching=replace(self.marching, far=min(self.marching.far, self.reach)))
 

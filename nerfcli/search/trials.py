@@ -242,16 +242,17 @@ class Trials:
         # A trial is a short training, however long the training after it.
         rows = min(self._settings.chosen_log2_rows, FEWEST_LOG2_ROWS)
         settings = replace(self._settings, components=components, seed=seed, log2_rows=rows)
+        sky = self._sky if components.background == "sphere" else None
         return Fitting(
             self._pool,
-            self._extent.before(components.background).marching,
+            self._extent.before(components.background, sky_known=sky is not None).marching,
             contraction=self._extent.contraction,
             settings=settings,
             log_gains=log_gains,
             log_focal=self._log_focal,
             cameras_from=cameras_from,
             points=self._points if components.points else None,
-            sky=self._sky if components.background == "sphere" else None,
+            sky=sky,
             error_map=ErrorMap(self._pool) if components.pixels == "error" else None,
             movers=Movers(self._pool) if components.movers else None,
         )

@@ -204,14 +204,14 @@ def prepare(
         _, log_focal, decisions = with_known_cameras(settings.components, facts)
         for decision in decisions:
             notify(decision.in_words())
-    extent = extent.before(settings.components.background)
+    sky = evidence.sky if settings.components.background == "sphere" else None
+    extent = extent.before(settings.components.background, sky_known=sky is not None)
     reference, gains = _exposures(scene, settings.components, notify=notify)
     if selection is not None and selection.log_gains is not None:
         gains = selection.log_gains
     elif settings.components.exposure == "learned" and settings.components.stereo:
         gains = evidence.gains_or(gains)
     points = _points(scene, settings, evidence, pool=pool) if settings.components.points else None
-    sky = evidence.sky if settings.components.background == "sphere" else None
     seconds = evidence.stereo_seconds if selection is None else selection.seconds
     return Prepared(
         settings, factor, storage, extent, pool, selection, reference, gains, log_focal, points, seconds, sky
