@@ -55,6 +55,36 @@ def test_what_is_elsewhere_in_each_photo_is_no_sky():
     assert not any(mask.any() for mask in sky_masks(plain, threads=1))
 
 
+def test_what_is_plain_below_something_else_is_no_sky():
+    """The same photos with a roof above: what was the sky may be a wall of its colour."""
+    under_roofs = photos()
+    for k, one in enumerate(under_roofs):
+        one.pixels[:16] = np.random.default_rng(k).integers(0, 255, (16, 160, 3))
+    assert not any(mask.any() for mask in sky_masks(under_roofs, threads=1))
+
+
+def test_a_wire_does_not_end_a_sky():
+    with_wires = photos()
+    for one in with_wires:
+        one.pixels[20:22] = 0
+    for mask in sky_masks(with_wires, threads=1):
+        assert mask[:16].mean() > 0.7
+        assert mask[26:30].mean() > 0.7
+
+
+def test_the_sky_of_a_camera_on_its_side_is_found():
+    upright, one_aside = photos(), photos()
+    clockwise = np.eye(4)
+    clockwise[:2, :2] = [[0.0, 1.0], [-1.0, 0.0]]  # its x axis is down, its y axis to the right
+    frame = Frame("aside.png", Camera.pinhole(120, 160, 140.0), one_aside[2].frame.world_from_cam @ clockwise)
+    one_aside[2] = LoadedPhoto(frame, np.ascontiguousarray(np.rot90(one_aside[2].pixels, -1)), None)
+    mask, turned = sky_masks(upright, threads=1)[2], sky_masks(one_aside, threads=1)[2]
+    assert (np.rot90(turned) != mask).mean() < 0.02
+    assert mask.any()
+    one_aside[2].pixels[:, -16:] = np.random.default_rng(0).integers(0, 255, (160, 16, 3))  # a roof
+    assert not sky_masks(one_aside, threads=1)[2].any()
+
+
 def test_a_single_photo_has_no_sky():
     assert not sky_masks(photos()[:1], threads=1)[0].any()
 

@@ -1,6 +1,7 @@
 """Pixels of training photos that may show the sky.
 
-They have no texture, are above the horizon, and look alike in all photos that look the same way, wherever taken.
+They have no texture, are above the horizon with nothing else above them, and look alike in all photos that look the
+same way, wherever taken.
 """
 
 import math
@@ -20,6 +21,8 @@ MOST_SPREAD, WINDOW_PX = 6.0, 7
 MOST_DIFFERENCE, WHITE = 32.0, 245.0
 # Photos that look elsewhere show another part of the sky.
 SAME_WAY_COS = np.cos(np.radians(60.0))
+# Regions are one sky if less than this separates them: a line of 2 pixels, around which a window has texture.
+LINKED_PX = WINDOW_PX + 2
 # Smallest sky region, as a fraction of the photo. Fewest pixels for a gain, and fewest in a region that must agree.
 LEAST_PART, FEWEST_SHARED = 0.005, 50
 # A region may be sky if more than this fraction of its pixels that other photos see agrees with them.
@@ -92,11 +95,16 @@ def _agreed(own: _Small, others: Sequence[_Small], up: np.ndarray) -> np.ndarray
         off = np.abs(np.where(theirs < WHITE, expected - theirs, np.minimum(expected - WHITE, 0.0))).max(1)
         votes += np.where(plain & (off < MOST_DIFFERENCE), 1, np.where(seen, -1, 0))
         seen_by += seen
-    return _regions(own.plain.shape, candidate, agreed=votes > 0, seen=seen_by > 0)
+    uppermost = _uppermost(valid.reshape(own.plain.shape), up @ own.turn)
+    return _regions(own.plain.shape, candidate, agreed=votes > 0, seen=seen_by > 0, uppermost=uppermost)
 
 
-def _regions(shape: tuple[int, ...], candidate: np.ndarray, *, agreed: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the mask (h, w) of connected regions of candidates of which enough pixels agree with other photos."""
+def _regions(
+    shape: tuple[int, ...], candidate: np.ndarray, *, agreed: np.ndarray, seen: np.ndarray, uppermost: np.ndarray
+) -> np.ndarray:
+    """Return the mask (h, w) of connected regions of candidates of which enough pixels agree with other photos, and
+    that extend to the uppermost pixels.
+    """
     mask = np.zeros(math.prod(shape), dtype=np.uint8)
     mask[candidate] = 1
     count, labels = cv2.connectedComponents(mask.reshape(shape), connectivity=4)
@@ -105,4 +113,21 @@ def _regions(shape: tuple[int, ...], candidate: np.ndarray, *, agreed: np.ndarra
     sizes, agreeing, visible = (np.bincount(of_candidate, which, count) for which in (None, agreed, seen))
     kept = (agreeing > MOST_OF * visible) & (agreeing >= FEWEST_SHARED) & (sizes >= LEAST_PART * mask.size)
     kept[0] = False
-    return kept[labels]
+    # Wires and poles divide a sky, but do not bound it.
+    linked = cv2.connectedComponents(cv2.dilate(mask.reshape(shape), np.ones((LINKED_PX, LINKED_PX), np.uint8)))[1]
+    return kept[labels] & np.isin(linked, linked[uppermost & (labels > 0)])
+
+
+def _uppermost(valid: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return the mask (h, w) of the pixels at the upper border of a photo, or of the part of it that has rays.
+
+    Args:
+        valid: (h, w) the pixels that have a ray.
+        up: (3,) the upward direction in the camera's axes.
+    """
+    axis = int(abs(up[1]) >= abs(up[0]))  # the side of the photo that is up, also if the camera was turned
+    beyond = np.pad(valid, WINDOW_PX // 2)
+    step = int(np.sign(up[axis])) * (WINDOW_PX // 2)
+    moved = np.roll(beyond, -step, axis=1 - axis)
+    inner = slice(WINDOW_PX // 2, -(WINDOW_PX // 2))
+    return valid & ~moved[inner, inner]
