@@ -557,6 +557,7 @@ def test_exposures_are_kept_on_evidence():
     assert with_evidence(Components(exposure="exif"), fixed)[0] == replace(both, exposure="exif")
     assert with_evidence(Components(), replace(facts, has_alpha=True))[0] == Components()
     learned = replace(both, exposure="learned")
+    assert "exposure" not in [d.component for d in proposals(learned, signs(0.0), facts)[1]]  # it is not declined, too
     tried, _ = proposals(learned, signs(0.3, 0.0), replace(facts, has_exif=True))
     assert [change for change in tried if change[0] == "exposure"] == []
 

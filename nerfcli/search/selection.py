@@ -177,7 +177,7 @@ def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list
         candidates.append(("exposure", "exif"))
     if signs.exposure_spread > LEAST_EXPOSURE_SPREAD:
         candidates.append(("exposure", "learned"))
-    else:
+    elif start.exposure != "learned":
         spread = 100.0 * math.expm1(signs.exposure_spread)
         declined.append(
             untried("exposure", "learned", f"not tried, photos differ in brightness by only {spread:.1f} %")
