@@ -16,6 +16,7 @@ from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
 from nerfcli.field.background import SphereBackground, colours_behind
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.exposure import Exposure, exposed, linear_from_srgb, srgb_from_linear
+from nerfcli.field.hash_field import DETAILED_LOG2_ROWS
 from nerfcli.fit import fitting
 from nerfcli.fit.appearance import Appearance
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
@@ -26,6 +27,7 @@ from nerfcli.render.pictures import render_picture
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
+from nerfcli.train.checkpoints import Checkpoints, Totals
 from nerfcli.train.loop import Progress, train
 from nerfcli.train.preparation import prepare
 
@@ -207,6 +209,19 @@ def test_light_of_the_sky_does_not_end_before_it(capture, tmp_path, monkeypatch)
         drawn = prepared.pool.draw(64, torch.Generator().manual_seed(0))
         passed.append(float(training.light_from_beyond(drawn, distance=math.inf).mean()))
     assert 1.0 - passed[1] < 0.7 * (1.0 - passed[0])
+
+
+def test_space_that_no_training_ray_has_reached_is_empty_before_a_known_sky(capture, tmp_path):
+    detailed = replace(SHORT, log2_rows=DETAILED_LOG2_ROWS)
+    prepared = prepare(capture, detailed, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    for sky in (None, torch.ones(len(prepared.pool.colours), dtype=torch.bool)):
+        training = replace(prepared, sky=sky).fitting()
+        for step in range(3):
+            training.advance(step / 3)
+        model = Checkpoints(tmp_path, training, Totals(), prepared=prepared, scene=capture).model()
+        assert torch.equal(model.occupied, training.cells.coarse if sky is None else training.cells.visited)
+        assert bool(model.occupied.all()) == (sky is None)
+        assert model.occupied.any()
 
 
 def test_directions_without_pixels_take_the_colours_of_their_neighbours(capture, tmp_path):

@@ -168,9 +168,21 @@ def test_nothing_is_looked_at_between_refreshes_nor_before_the_first_step():
         assert cells.at(step).all()
 
 
+def test_visited_cells_are_the_open_ones_in_which_there_was_a_sample():
+    cells = cells_of(Slab())
+    assert not cells.visited.any()
+    visit(cells, (2, 3, 5), 0.5)
+    visit(cells, (2, 3, FINE_SIDE - 1), 0.5)  # where the slab has ended
+    assert cells.visited.nonzero().tolist() == [[1, 1, 2], [1, 1, OCCUPANCY_SIDE - 1]]
+    for turn in range(1, 3):
+        refresh(cells, turn * REFRESH_EVERY)
+        assert cells.visited.nonzero().tolist() == [[1, 1, 2]]
+
+
 def test_a_field_without_detail_has_the_coarse_cells_alone():
     cells = cells_of(Slab(detailed=False))
     refresh(cells, REFRESH_EVERY)
+    assert cells.visited is cells.coarse
     assert cells.visits is None
     assert cells.at(1) is cells.coarse
     assert set(cells.state()) == {"optical_depth", "occupied"}

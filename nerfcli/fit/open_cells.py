@@ -51,6 +51,20 @@ class OpenCells:
         """Return the open cells (G, G, G) for one step: those of the fine grid, if there is one, in most steps."""
         return self.coarse if self.visits is None or step % LOOK_AROUND_EVERY == 0 else self._fine
 
+    @property
+    def visited(self) -> Tensor:
+        """The open cells of the coarse grid, (G, G, G) bool, in which a training ray has ever had a sample.
+
+        The others still hold the initial fog, behind surfaces or beside all photos. Without a fine grid these are all
+        open cells.
+        """
+        if self.visits is None:
+            return self.coarse
+        parts = FINE_SIDE // OCCUPANCY_SIDE
+        fine = self._depths.isfinite() | (self.visits >= 0)
+        blocks = fine.view(OCCUPANCY_SIDE, parts, OCCUPANCY_SIDE, parts, OCCUPANCY_SIDE, parts)
+        return self.coarse & blocks.any(5).any(3).any(1)
+
     def refresh(
         self,
         step: int,

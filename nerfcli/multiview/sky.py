@@ -43,7 +43,9 @@ def sky_masks(photos: Sequence[LoadedPhoto], *, threads: int) -> list[np.ndarray
             same_way = np.flatnonzero(views @ views[index] > SAME_WAY_COS)
             same_way = same_way[same_way != index]
             chosen = np.unique(np.linspace(0, len(same_way) - 1, OTHERS).round().astype(int)) if len(same_way) else []
-            mask = _agreed(small[index], [small[other] for other in same_way[chosen]], up)
+            mask = _up_to_its_border(
+                small[index], _agreed(small[index], [small[other] for other in same_way[chosen]], up)
+            )
             height, width = photos[index].pixels.shape[:2]
             return cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
 
@@ -51,7 +53,7 @@ def sky_masks(photos: Sequence[LoadedPhoto], *, threads: int) -> list[np.ndarray
 
 
 class _Small:
-    """A reduced photo: its mean levels around each pixel, and the mask of pixels without texture."""
+    """A reduced photo: its levels, their means around each pixel, and the masks of usable pixels and of plain ones."""
 
     def __init__(self, photo: LoadedPhoto):
         camera = photo.frame.camera
@@ -61,11 +63,12 @@ class _Small:
         colours = np.ascontiguousarray(photo.pixels[..., :3])
         levels = cv2.resize(colours, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         window = (WINDOW_PX, WINDOW_PX)
-        self.levels = cv2.blur(levels, window)
+        self.sharp, self.levels = levels, cv2.blur(levels, window)
         spread = cv2.blur(levels * levels, window) - self.levels * self.levels
-        self.plain = np.asarray((spread < MOST_SPREAD**2).all(-1))
+        self.used = np.ones(levels.shape[:2], dtype=bool)
         if photo.used is not None:
-            self.plain &= cv2.resize(photo.used.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+            self.used = cv2.resize(photo.used.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        self.plain = np.asarray((spread < MOST_SPREAD**2).all(-1)) & self.used
         self.turn = photo.frame.world_from_cam[:3, :3]
 
 
@@ -116,6 +119,18 @@ def _regions(
     # Wires and poles divide a sky, but do not bound it.
     linked = cv2.connectedComponents(cv2.dilate(mask.reshape(shape), np.ones((LINKED_PX, LINKED_PX), np.uint8)))[1]
     return kept[labels] & np.isin(linked, linked[uppermost & (labels > 0)])
+
+
+def _up_to_its_border(own: _Small, mask: np.ndarray) -> np.ndarray:
+    """Return the mask (h, w) extended to the pixels beside it that have its colour, half a window at most.
+
+    The window of a pixel near the skyline has texture although the pixel itself shows the sky.
+    """
+    window = (WINDOW_PX, WINDOW_PX)
+    part = cv2.blur(mask.astype(np.float32), window)
+    of_sky = cv2.blur(own.sharp * mask[..., None], window) / np.maximum(part, 1e-6)[..., None]
+    alike = np.abs(own.sharp - of_sky).max(-1) < 2.0 * MOST_SPREAD
+    return mask | (alike & (part > 0) & own.used)
 
 
 def _uppermost(valid: np.ndarray, up: np.ndarray) -> np.ndarray:

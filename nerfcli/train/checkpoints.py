@@ -60,13 +60,17 @@ class Checkpoints:
         self._prepared, self._scene = prepared, scene
 
     def model(self) -> Model:
-        """Return the current field as a model."""
+        """Return the current field as a model.
+
+        Where the sky is known, it is shown instead of the fog that is left where no training ray has come.
+        """
         fitting, prepared = self._fitting, self._prepared
+        cells = fitting.cells
         alone = ALPHA_BACKGROUND if prepared.pool.has_alpha else OPAQUE_BACKGROUND
         marching = prepared.extent.marching
         return Model(
             fitting.field,
-            fitting.cells.coarse,
+            cells.coarse if fitting.parts.sky is None else cells.visited,
             marching.stretched(DETAILED_STEP) if fitting.field.settings.detailed else marching,
             fitting.parts.background or alone,
             prepared.extent.training_from_scene,
