@@ -27,6 +27,7 @@ from nerfcli.poses.engine.mapping import MapperOptions, map_photos
 from nerfcli.poses.engine.second_chance import grow, is_contradicted, second_chance
 from nerfcli.poses.engine.selected_component import choose_component
 from nerfcli.poses.input.job import Job
+from nerfcli.poses.judge import acceptance
 from nerfcli.poses.judge.acceptance import Failure, Verdict, judge
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
@@ -39,6 +40,12 @@ from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verifie
 from nerfcli.poses.model.view_graph import Bottlenecks, consistent_groups
 
 pytestmark = pytest.mark.usefixtures("_quiet")
+PLAUSIBLE = {
+    "triangulation_angle_deg": 20.0,
+    "share_in_front": 1.0,
+    "held_out": {"median_px": 0.5},
+    "observations_per_photo": {"median": 500.0},
+}
 
 
 @pytest.fixture(scope="module")
@@ -674,3 +681,24 @@ def test_the_bottleneck_is_the_weakest_join_of_the_strongest_chain():
     assert chains.between(1, 2) == 9
     assert chains.between(1, 4) == 0
     assert connected_groups([1, 2, 3, 4, 5], [(1, 2), (2, 3), (1, 3), (4, 5)]) == [[1, 2, 3], [4, 5]]
+
+
+@pytest.mark.parametrize(
+    ("photos", "focal", "refused"),
+    [(1, 3.2, False), (1, 0.25, False), (1, 11.0, True), (1, 0.1, True), (2, 3.2, True), (2, 0.25, True)],
+)
+def test_a_few_photos_may_have_a_focal_length_that_others_may_not(photos, focal, refused):
+    """Of 20 photos, one with a camera of its own, or two that share one; the cameras of the others are usual."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 20 // photos, 1, photos
+    options.num_points3D = 50
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(options)
+    for camera in model.cameras.values():
+        camera.params = [1.2 * camera.width, *camera.params[1:]]
+    assert acceptance._implausible(model, PLAUSIBLE, given=()) == []
+    first = model.cameras[min(model.cameras)]
+    first.params = [focal * first.width, *first.params[1:]]
+    failures = acceptance._implausible(model, PLAUSIBLE, given=())
+    assert [failure.kind for failure in failures] == ["the intrinsics are implausible"] * refused
+    assert acceptance._implausible(model, PLAUSIBLE, given=[first.camera_id]) == []

@@ -4,6 +4,7 @@ The number of placed photos and the reprojection error say little: a wrong model
 the verified matches of all pairs are tested again, and so are observations held out from the adjustment.
 """
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -30,7 +31,9 @@ _LEAST_ANGLE_DEG = 1.5
 _LEAST_IN_FRONT = 0.95
 # Root mean square distance of the cameras from their centre, over the median distance to the points.
 _LEAST_SPREAD = 0.003
-_FOCAL_RANGE = (0.3, 3.0)
+# Focal lengths over the longer side. A model without depth may have any; cameras of a few photos only are determined by
+# the points of the others, and among photos from the internet are some at 3 times and more.
+_FOCAL_RANGE, _FOCAL_RANGE_OF_FEW, _FEW = (0.3, 3.0), (0.2, 10.0), 0.1
 _MOST_HELD_OUT_PX = 4.0
 _LEAST_OBSERVATIONS = 15
 # Contradictions listed in the report; the fraction counts all.
@@ -306,8 +309,10 @@ def _implausible(
         for value, limit, above, text in checks
         if value is not None and (value > limit if above else value < limit)
     ]
-    low, high = _FOCAL_RANGE
+    photos = Counter(model.image(photo).camera_id for photo in model.reg_image_ids())
     for camera in _cameras_in_use(model):
+        is_of_few = photos[camera.camera_id] < _FEW * photos.total()
+        low, high = _FOCAL_RANGE_OF_FEW if is_of_few else _FOCAL_RANGE
         focal = _focal_measure(camera)
         if camera.camera_id not in given and not camera.is_perspective_fisheye() and not low < focal < high:
             evidence = f"the estimated focal length is {focal:.2f} times the longer side"
