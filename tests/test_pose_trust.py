@@ -702,3 +702,6 @@ def test_a_few_photos_may_have_a_focal_length_that_others_may_not(photos, focal,
     failures = acceptance._implausible(model, PLAUSIBLE, given=())
     assert [failure.kind for failure in failures] == ["the intrinsics are implausible"] * refused
     assert acceptance._implausible(model, PLAUSIBLE, given=[first.camera_id]) == []
+    for camera in model.cameras.values():  # each has few photos, but all together have not
+        camera.params = [3.2 * camera.width, *camera.params[1:]]
+    assert len(acceptance._implausible(model, PLAUSIBLE, given=())) == len(model.cameras)

@@ -5,6 +5,7 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
+from nerfcli.multiview import sky
 from nerfcli.multiview.sky import sky_masks
 from nerfcli.photos.loading import LoadedPhoto
 
@@ -70,6 +71,12 @@ def test_a_wire_does_not_end_a_sky():
     for mask in sky_masks(with_wires, threads=1):
         assert mask[:16].mean() > 0.7
         assert mask[26:30].mean() > 0.7
+
+
+def test_a_sky_is_extended_by_half_a_window_at_most():
+    plain = sky._Small(LoadedPhoto(photo(0.0).frame, np.full((120, 160, 3), 200, np.uint8), None))
+    mask = np.arange(120)[:, None] < np.full(160, 10)
+    assert np.array_equal(sky._up_to_its_border(plain, mask), np.arange(120)[:, None] < np.full(160, 13))
 
 
 def test_the_sky_of_a_camera_on_its_side_is_found():

@@ -130,7 +130,7 @@ def _up_to_its_border(own: _Small, mask: np.ndarray) -> np.ndarray:
     part = cv2.blur(mask.astype(np.float32), window)
     of_sky = cv2.blur(own.sharp * mask[..., None], window) / np.maximum(part, 1e-6)[..., None]
     alike = np.abs(own.sharp - of_sky).max(-1) < 2.0 * MOST_SPREAD
-    return mask | (alike & (part > 0) & own.used)
+    return mask | (alike & (part > 0.5 / WINDOW_PX**2) & own.used)
 
 
 def _uppermost(valid: np.ndarray, up: np.ndarray) -> np.ndarray:

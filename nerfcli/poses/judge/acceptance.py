@@ -31,8 +31,8 @@ _LEAST_ANGLE_DEG = 1.5
 _LEAST_IN_FRONT = 0.95
 # Root mean square distance of the cameras from their centre, over the median distance to the points.
 _LEAST_SPREAD = 0.003
-# Focal lengths over the longer side. A model without depth may have any; cameras of a few photos only are determined by
-# the points of the others, and among photos from the internet are some at 3 times and more.
+# Focal lengths over the longer side. A model without depth may have any; if only cameras of a few photos are outside
+# the usual range, the points of the others determine them. Photos from the internet have up to 3 times and more.
 _FOCAL_RANGE, _FOCAL_RANGE_OF_FEW, _FEW = (0.3, 3.0), (0.2, 10.0), 0.1
 _MOST_HELD_OUT_PX = 4.0
 _LEAST_OBSERVATIONS = 15
@@ -309,12 +309,18 @@ def _implausible(
         for value, limit, above, text in checks
         if value is not None and (value > limit if above else value < limit)
     ]
+    focals = {
+        camera.camera_id: _focal_measure(camera)
+        for camera in _cameras_in_use(model)
+        if camera.camera_id not in given and not camera.is_perspective_fisheye()
+    }
+    low, high = _FOCAL_RANGE
     photos = Counter(model.image(photo).camera_id for photo in model.reg_image_ids())
-    for camera in _cameras_in_use(model):
-        is_of_few = photos[camera.camera_id] < _FEW * photos.total()
-        low, high = _FOCAL_RANGE_OF_FEW if is_of_few else _FOCAL_RANGE
-        focal = _focal_measure(camera)
-        if camera.camera_id not in given and not camera.is_perspective_fisheye() and not low < focal < high:
+    unusual = sum(photos[camera_id] for camera_id, focal in focals.items() if not low < focal < high)
+    if unusual < _FEW * photos.total():
+        low, high = _FOCAL_RANGE_OF_FEW
+    for focal in focals.values():
+        if not low < focal < high:
             evidence = f"the estimated focal length is {focal:.2f} times the longer side"
             failures.append(
                 Failure(
