@@ -8,7 +8,7 @@ TRITON: tuple[Group, ...] = (
     Group(
         "kernels/triton_cuda/compositing.py",
         KERNELS,
-        "composite or distortion or digits",
+        "composite or distortion or digits or contracted",
         (),
         (
             Mutant("gained = _worth(rgb, by_weight, i + 1,", "gained = _worth(rgb, by_weight, i,"),
@@ -17,6 +17,7 @@ TRITON: tuple[Group, ...] = (
             Mutant("return tl.where(x < 0.5, series, 1.0 - tl.exp(-x))", "return 1.0 - tl.exp(-x)"),
             Mutant("(2.0 * distances + weight * length / 3.0)", "(2.0 * distances + weight * length)"),
             Mutant("        mass += tl.sum(behind, 1)\n", ""),
+            Mutant("tl.where(end <= 1.0, end, 2.0 - 1.0 /", "tl.where(end <= 1.0, end, 2.0 - 1.1 /"),
         ),
     ),
     Group(
@@ -76,10 +77,8 @@ TRITON: tuple[Group, ...] = (
             Mutant("valid & (before < deepest)", "valid & (before <= 2.0 * deepest)"),
             Mutant("own * tl.exp(-before) < least", "own < least"),
             Mutant("            least = 0.0  # all", "            break  # all"),
-            Mutant(
-                "tl.store(thickness + i, own, mask=reached)",
-                "tl.store(thickness + i, own, mask=reached & (own >= least))",
-            ),
+            Mutant("mask=reached & (own == own)", "mask=reached & (own >= least)"),
+            Mutant("mask=reached & (own == own)", "mask=reached & (own != own)"),
             Mutant("middle + shift * (far - middle)", "middle + shift * (middle - near)"),
         ),
     ),

@@ -107,9 +107,11 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
             if len(found.lines) == self._before:
                 found.note()
 
-    def count(variant: object, device: int) -> SimpleNamespace:
+    def count(grid: object, values: object, stream: int) -> None:
         found.launches += 1
-        return SimpleNamespace(launch=lambda grid, values, stream: None)
+
+    def load(variant: object, device: int) -> SimpleNamespace:
+        return SimpleNamespace(launch=count)
 
     monkeypatch.setattr(torch, "Generator", OfCpu)
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: self)
@@ -117,8 +119,11 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
     monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device=None: SimpleNamespace(cuda_stream=0))
-    monkeypatch.setattr(launch, "_function", count)
+    monkeypatch.setattr(torch.Tensor, "get_device", lambda tensor: 0)
+    monkeypatch.setattr(launch, "_stream", lambda device: 0)
+    monkeypatch.setattr(launch, "_load", load)
     monkeypatch.setattr(launch, "_with_triton", set())
+    monkeypatch.setattr(launch, "_loaded", {})
     monkeypatch.setattr(pools, "backend_for", lambda device, dtype: TritonBackend(device))
     with found:
         yield found

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -215,7 +214,8 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Callable[[FakeDriver], torch.devi
         monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
         monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: capability)
-        monkeypatch.setattr(torch.cuda, "current_stream", lambda: SimpleNamespace(cuda_stream=4711))
+        monkeypatch.setattr(torch.Tensor, "get_device", lambda tensor: 1)
+        monkeypatch.setattr(launch, "_stream", lambda device: 4711)
         return torch.device("cpu")
 
     return install
@@ -254,13 +254,15 @@ def test_nothing_is_launched_for_nothing(device):
     assert fake.calls == []
 
 
-def test_what_is_not_aligned_is_compiled_for_that(device, kernel_cache):
+def test_what_is_not_aligned_is_compiled_for_that(device, monkeypatch):
     fake = FakeDriver()
     device(fake)
-    launch.launch(launch._count, (1,), torch.zeros(9)[1:], 7, 0.5, 8, BLOCK=32)
-    (variant, number), *_ = launch._loaded
-    assert variant.aligned == ()
-    assert number == 1
+    variants = []
+    monkeypatch.setattr(launch, "_load", lambda variant, device: variants.append((variant.aligned, device)))
+    for tensor in (torch.zeros(8), torch.zeros(9)[1:]):
+        with pytest.raises(AttributeError):  # nothing was loaded
+            launch.launch(launch._count, (1,), tensor, 7, 0.5, 8, BLOCK=32)
+    assert variants == [((0,), 1), ((), 1)]
 
 
 def test_an_error_of_the_driver_is_named(device, kernel_cache):

@@ -378,6 +378,17 @@ def test_distortion(samples, far, generator):
 
 
 @pytest.mark.parametrize("samples", SIZES)
+def test_contracted_distances(samples, generator):
+    """At the camera, beside the place where the formula changes, and at the largest numbers."""
+    starts = 10.0 ** (4.0 * torch.rand(samples, generator=generator) - 2.0)
+    starts[::7], starts[1::7], starts[2::7], starts[3::7] = 0.0, 1.0, 1e30, math.inf
+    ends = (1.5 * starts).clamp_min(1e-20)
+    found = compositing.contracted_distances(*on_device(starts, ends))
+    for distances, contracted in zip((starts, ends), found, strict=True):
+        assert_close(contracted, reference.contracted_distance(distances.double()), "contracted distances")
+
+
+@pytest.mark.parametrize("samples", SIZES)
 @pytest.mark.parametrize("magnitude", [0.01, 3.0, 100.0])
 @pytest.mark.parametrize("fractions", [(), (0.9, 0.1, 0.5)])
 def test_light_ends(samples, magnitude, fractions, generator):

@@ -24,7 +24,7 @@ class Adam:
         self._parameters = list(parameters)
         self._state = [
             {
-                "step": torch.zeros(()),
+                "step": torch.zeros((), device=_place_of_count(parameter)),
                 "exp_avg": torch.zeros_like(parameter, requires_grad=False),
                 "exp_avg_sq": torch.zeros_like(parameter, requires_grad=False),
             }
@@ -61,6 +61,7 @@ class Adam:
             weight_decay=0.0,
             eps=EPS,
             maximize=False,
+            fused=True if learned[0][0].is_cuda else None,
         )
 
     def state(self, prefix: str) -> dict[str, Tensor]:
@@ -72,5 +73,9 @@ class Adam:
         for index, entry in enumerate(self._state):
             for name, value in entry.items():
                 stored = tensors.get(f"{prefix}.{index}.{name}")
-                # The step count stays on the host, where it is read.
                 entry[name] = torch.zeros_like(value) if stored is None else stored.to(value.device)
+
+
+def _place_of_count(parameter: Tensor) -> torch.device:
+    """Return where the number of steps is read: on a GPU by the one kernel that steps all parameters."""
+    return parameter.device if parameter.is_cuda else torch.device("cpu")

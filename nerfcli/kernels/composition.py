@@ -108,7 +108,7 @@ class ComposedBackend(abc.ABC):
         )
         apart = off = transmittance[:0]
         if targets.distortion:
-            near, far = contracted_distance(starts), contracted_distance(ends)
+            near, far = self._contracted(starts, ends)
             apart = self.parts.distortion(weights, near, far, offsets)
         if targets.distances is not None and len(targets.distances):
             middles = (starts + ends) / 2
@@ -189,6 +189,10 @@ class ComposedBackend(abc.ABC):
     @abc.abstractmethod
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         """Return densities and colours of encoded features, seen along directions (R, 3) of rays `index` (N,)."""
+
+    def _contracted(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `reference.contracted_distance` of the ends of intervals."""
+        return contracted_distance(starts), contracted_distance(ends)
 
     def _off_target(
         self,

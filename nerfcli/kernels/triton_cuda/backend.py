@@ -122,6 +122,9 @@ class TritonBackend(ReferenceBackend):
             samples.offsets, grid.resolutions, grid.view_degree, widths, *grid.layers,
         )  # fmt: skip
 
+    def _contracted(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+        return compositing.contracted_distances(starts, ends)
+
     def _off_target(
         self,
         weights: Tensor,

@@ -11,8 +11,11 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfcli.kernels.reference.compositing import MOST_DEVIATION
-from nerfcli.kernels.triton_cuda.launch import jit, launch
+from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
 from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, span_of
+
+# Distances that a program contracts.
+BLOCK = Size.of(1024, interpreted=4096)
 
 
 @jit
@@ -201,6 +204,15 @@ def _distortion_backward(
         apart += tl.sum(terms, 1)
 
 
+@jit
+def _contract(starts, ends, near, far, samples, BLOCK: tl.constexpr):
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    valid = i < samples
+    start, end = tl.load(starts + i, mask=valid, other=1.0), tl.load(ends + i, mask=valid, other=1.0)
+    tl.store(near + i, tl.where(start <= 1.0, start, 2.0 - 1.0 / tl.maximum(start, 1.0)) * 0.5, mask=valid)
+    tl.store(far + i, tl.where(end <= 1.0, end, 2.0 - 1.0 / tl.maximum(end, 1.0)) * 0.5, mask=valid)
+
+
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -263,6 +275,15 @@ def composite(
 def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
     """See `reference.distortion`; float32, differentiable in the weights."""
     return _Distortion.apply(weights, starts, ends, offsets)
+
+
+def contracted_distances(starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `reference.contracted_distance` of both ends of intervals, in one launch instead of fourteen."""
+    near, far, samples = torch.empty_like(starts), torch.empty_like(ends), len(starts)
+    launch(
+        _contract, (blocks(samples, BLOCK),), starts.contiguous(), ends.contiguous(), near, far, samples, BLOCK=BLOCK
+    )  # fmt: skip
+    return near, far
 
 
 def off_target(weights: Tensor, transmittance: Tensor, middles: Tensor, *, rays: Tensor, distances: Tensor) -> Tensor:

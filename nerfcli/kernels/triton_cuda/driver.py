@@ -19,6 +19,7 @@ MAX_DYNAMIC_SHARED_SIZE_BYTES = 8
 SHARED_BYTES_AT_ONCE = 48 * 1024
 # Keys of a launch's list of extras.
 END, BUFFER, BUFFER_SIZE = 0, 1, 2
+Extras = ctypes.c_void_p * 5
 
 _of_thread = threading.local()
 
@@ -34,6 +35,8 @@ class Function:
         self._handle, self._device = handle, device
         self._parameters = struct.Struct(f"@{cubin.formats}")
         self._count = len(cubin.formats)
+        self._buffer = ctypes.c_char * self._parameters.size
+        self._size = ctypes.c_size_t(self._parameters.size)
         self._threads, self._shared_bytes = 32 * cubin.warps, cubin.shared_bytes
 
     def launch(self, grid: tuple[int, ...], values: Sequence[float], stream: int) -> None:
@@ -47,10 +50,10 @@ class Function:
         _bind(self._device)
         x, y, z = (*grid, 1, 1)[:3]
         # One buffer with the layout of a C struct: the driver refuses it if it is not as large as the parameters.
-        packed = self._parameters.pack(*values, *(0,) * (self._count - len(values)))
-        size = ctypes.c_size_t(len(packed))
-        address = ctypes.cast(ctypes.c_char_p(packed), ctypes.c_void_p).value
-        extra = (ctypes.c_void_p * 5)(BUFFER, address, BUFFER_SIZE, ctypes.addressof(size), END)
+        packed = self._buffer.from_buffer_copy(
+            self._parameters.pack(*values, *(0,) * (self._count - len(values)))
+        )  # fmt: skip
+        extra = Extras(BUFFER, ctypes.addressof(packed), BUFFER_SIZE, ctypes.addressof(self._size), END)
         shape = (x, y, z, self._threads, 1, 1, self._shared_bytes)
         call("cuLaunchKernel", self._handle, *shape, ctypes.c_void_p(stream), None, extra)
 

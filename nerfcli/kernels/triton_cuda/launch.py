@@ -66,7 +66,8 @@ jit: Callable[[Callable[..., Any]], Any] = triton.jit
 
 # The variants of all launches in the interpreter so far, from which tests learn what to compile.
 seen: dict[Variant, None] = {}
-_loaded: dict[tuple[Variant, int], driver.Function] = {}
+# Loaded kernels, by kernel, device, kinds of the arguments and constants.
+_loaded: dict[tuple[Any, ...], driver.Function] = {}
 # The devices on which Triton's own launcher is used.
 _with_triton: set[int] = set()
 
@@ -75,6 +76,9 @@ def launch(
     kernel: Any, grid: tuple[int, ...], *arguments: Tensor | float, warps: int = 4, stages: int = 1, **constants: Any
 ) -> None:
     """Run a kernel on the device of its first tensor.
+
+    A step of a training has about twenty launches, and its host takes longer for them than its GPU for the kernels: so
+    as little as possible is done here before a kernel that is loaded already.
 
     Args:
         kernel: the function under `triton.jit`.
@@ -85,19 +89,35 @@ def launch(
     """
     if 0 in grid:
         return
-    variant = variant_of(kernel, arguments, constants, warps=warps, stages=stages)
     if INTERPRETED:
-        seen[variant] = None
+        seen[variant_of(kernel, arguments, constants, warps=warps, stages=stages)] = None
         kernel[grid](*arguments, **constants)
         return
-    (device,) = {value.device for value in arguments if isinstance(value, Tensor)}
-    with torch.cuda.device(device):
-        number = torch.cuda.current_device()
-        if number in _with_triton:
-            kernel[grid](*arguments, **constants, num_warps=warps, num_stages=stages)
+    device = next(value.get_device() for value in arguments if isinstance(value, Tensor))
+    if device != torch.cuda.current_device():
+        with torch.cuda.device(device):
+            launch(kernel, grid, *arguments, warps=warps, stages=stages, **constants)
+        return
+    if device in _with_triton:
+        kernel[grid](*arguments, **constants, num_warps=warps, num_stages=stages)
+        return
+    values, kinds = [], []
+    for value in arguments:
+        if isinstance(value, Tensor):
+            assert value.is_contiguous()
+            assert value.get_device() == device
+            address = value.data_ptr()
+            values.append(address)
+            kinds.append((value.dtype, address % ALIGNMENT == 0))
         else:
-            values = [value.data_ptr() if isinstance(value, Tensor) else value for value in arguments]
-            _function(variant, number).launch(grid, values, torch.cuda.current_stream().cuda_stream)
+            values.append(value)
+            kinds.append(isinstance(value, int))
+    key = (kernel.fn, device, *kinds, *constants.items(), warps, stages)
+    function = _loaded.get(key)
+    if function is None:
+        variant = variant_of(kernel, arguments, constants, warps=warps, stages=stages)
+        function = _loaded[key] = _load(variant, device)
+    function.launch(grid, values, _stream(device))
 
 
 def choose_launcher(device: torch.device) -> str | None:
@@ -155,13 +175,14 @@ def variant_of(
     return Variant(kernel, tuple(types), tuple(aligned), fixed, warps, stages)
 
 
-def _function(variant: Variant, device: int) -> driver.Function:
-    function = _loaded.get((variant, device))
-    if function is None:
-        major, minor = torch.cuda.get_device_capability(device)
-        built = cubin.compiled(variant, 10 * major + minor)
-        function = _loaded[variant, device] = driver.load(built, device)
-    return function
+def _load(variant: Variant, device: int) -> driver.Function:
+    major, minor = torch.cuda.get_device_capability(device)
+    return driver.load(cubin.compiled(variant, 10 * major + minor), device)
+
+
+def _stream(device: int) -> int:
+    """Return the handle of torch's current stream; `torch.cuda.current_stream` makes an object first, in 10 us."""
+    return torch._C._cuda_getCurrentRawStream(device)
 
 
 @jit

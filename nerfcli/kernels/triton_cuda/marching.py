@@ -11,7 +11,6 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from nerfcli.kernels import reference
 from nerfcli.kernels.contraction import CONTRACTIONS, sample_widths
 from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
 from nerfcli.kernels.triton_cuda import hash_grid, networks
@@ -86,13 +85,13 @@ def _march(
 
 @jit
 def _visible(
-    density, starts, ends, offsets, counts, sources, thickness, deepest, least, room, rays,
-    WRITES: tl.constexpr, MEASURES: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
+    density, starts, ends, offsets, counts, sources, coordinates, visits, side, deepest, least, room, rays,
+    WRITES: tl.constexpr, VISITS: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
     """Count the samples of each ray that are not faint, and in front of which the optical depth is below a limit.
 
-    With WRITES, `counts` are the offsets of these samples, and their places are written to `sources`. With MEASURES,
-    the optical depth of each sample in front of the limit is written to `thickness`.
+    With WRITES, `counts` are the offsets of these samples, and their places are written to `sources`. With VISITS, the
+    cells of `visits` are raised to the optical depths of the samples in front of the limit.
     """
     ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
     there = ray < rays
@@ -114,8 +113,16 @@ def _visible(
         length = tl.load(ends + i, mask=valid, other=0.0) - tl.load(starts + i, mask=valid, other=0.0)
         own = tl.load(density + i, mask=valid, other=0.0) * length
         reached = valid & (before < deepest)
-        if MEASURES:
-            tl.store(thickness + i, own, mask=reached)
+        if VISITS:
+            scale = side.to(tl.float32)
+            column = tl.minimum((tl.load(coordinates + i * 3, mask=reached, other=0.0) * scale).to(tl.int32), side - 1)
+            row = tl.minimum((tl.load(coordinates + i * 3 + 1, mask=reached, other=0.0) * scale).to(tl.int32), side - 1)
+            layer = tl.load(coordinates + i * 3 + 2, mask=reached, other=0.0) * scale
+            layer = tl.minimum(layer.to(tl.int32), side - 1)
+            # A NaN is left out; it differs from itself.
+            tl.atomic_max(
+                visits + (layer * side + row) * side + column, own, mask=reached & (own == own), sem="relaxed"
+            )
         faint = own * tl.exp(-before) < least
         number = tl.where(reached & (faint == 0), 1, 0)
         if WRITES:
@@ -177,11 +184,11 @@ def visible_samples(
         density = networks.density(code, grid.layers, count=limit)
         spans = density, starts, ends, offsets
         counts = torch.empty(count, dtype=torch.int64, device=offsets.device)
-        thickness = density if visits is None else torch.full_like(density, torch.nan)
+        cells, side = (density, 0) if visits is None else (visits, len(visits))
         ends_at = float(along.max_optical_depth)
         launch(
-            _visible, blocks_of(count), *spans, counts, counts, thickness, ends_at, least, room, count,
-            WRITES=False, MEASURES=visits is not None, RAYS=RAYS, STEPS=STEPS,
+            _visible, blocks_of(count), *spans, counts, counts, coordinates, cells, side, ends_at, least, room, count,
+            WRITES=False, VISITS=visits is not None, RAYS=RAYS, STEPS=STEPS,
         )  # fmt: skip
         kept = _offsets(counts)
         candidates, samples = torch.stack([needed, kept[-1]]).tolist()  # the host waits
@@ -190,14 +197,12 @@ def visible_samples(
             if samples > 0 or candidates == 0 or least == 0.0:
                 break
             least = 0.0  # all are faint: keep them, see `reference.visible_samples`
-    if visits is not None:
-        reference.keep_largest(visits, coordinates, thickness)  # NaN in unused places, which is ignored
     index = ray_indices(kept, samples)
     device = starts.device
     sources = torch.empty(samples, dtype=torch.int64, device=device)
     launch(
-        _visible, blocks_of(count), *spans, kept, sources, thickness, ends_at, least, room, count,
-        WRITES=True, MEASURES=False, RAYS=RAYS, STEPS=STEPS,
+        _visible, blocks_of(count), *spans, kept, sources, coordinates, cells, side, ends_at, least, room, count,
+        WRITES=True, VISITS=False, RAYS=RAYS, STEPS=STEPS,
     )  # fmt: skip
     reached = [torch.empty(samples, device=device) for _ in range(3)]
     places = torch.empty(samples, 3, device=device)
