@@ -259,7 +259,8 @@ class Fitting:
             loss = loss + SKY_WEIGHT * opacity.sum() / count
         if self.parts.background is not None:
             loss = loss + ROUGHNESS_WEIGHT * self.parts.background.roughness() / self.ranks.count
-        watch.rows("rendered colour", seen.rgb, torch.arange(len(drawn.origins), device=device))
+        if watch is not UNWATCHED:
+            watch.rows("rendered colour", seen.rgb, torch.arange(len(drawn.origins), device=device))
         watch.values("loss", loss)
         return loss, losses.detach(), int(seen.samples)
 
