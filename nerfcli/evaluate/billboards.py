@@ -80,7 +80,7 @@ class GeometryEvidence:
 
 
 class Billboards:
-    """The baseline: photos, and a distance for each. Fitting takes about 0.02 s per photo.
+    """The baseline: photos, and a distance for each. Fitting takes about 0.04 s per photo.
 
     Args:
         frames: the training views, at least one; their cameras are those of the photos.
@@ -124,20 +124,25 @@ class Billboards:
         errors, hits = np.zeros(len(distances)), np.zeros(len(distances))
         for other in others:
             directions, colours = self._sampled[other]
-            for number, distance in enumerate(distances):
-                rgb, hit, _ = self._seen(index, self._centres[other], directions, distance)
-                errors[number] += np.square(rgb - colours)[hit].sum()
-                hits[number] += hit.sum()
+            # All distances at once, each with all rays: NumPy takes longer to call than for the 400 rays of one.
+            rays = len(directions)
+            rgb, hit, _ = self._seen(
+                index, self._centres[other], np.tile(directions, (len(distances), 1)), np.repeat(distances, rays)
+            )
+            off = np.square(rgb.reshape(-1, rays, 3) - colours).sum(axis=-1) * hit.reshape(-1, rays)
+            errors += off.sum(axis=1)
+            hits += hit.reshape(-1, rays).sum(axis=1)
         if not hits.any():
             return float(distances[-1])
         enough = hits >= ENOUGH_HITS * hits.max()
         return float(distances[int(np.argmin(np.where(enough, errors / np.maximum(hits, 1.0), np.inf)))])
 
     def _seen(
-        self, index: int, origin: np.ndarray, directions: np.ndarray, distance: float
+        self, index: int, origin: np.ndarray, directions: np.ndarray, distance: float | np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what rays see of a photo's billboard: colours (N, 3), which rays hit it, and the angles between the
-        rays and the camera's lines of sight, in radians."""
+        """Return what rays see of a photo's billboard at a distance, or of one at the distance of each ray, (N,):
+        colours (N, 3), which rays hit it, and the angles between the rays and the camera's lines of sight, in radians.
+        """
         frame = self._frames[index]
         # |from_camera + t * direction| = distance, from inside and on the far side.
         from_camera = origin - frame.centre
