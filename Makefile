@@ -38,7 +38,12 @@ test-slow: .venv/installed-dev
 	$(PIP_INSTALL) -e .
 	@touch $@
 
+# Torch and Triton are half of what is unpacked, which takes one core: the rest is installed at the same time. If one of the
+# two fails, the last line does its work, or says why it cannot.
 .venv/installed-dev: $(BIN)/python pyproject.toml constraints.txt
+	@echo 'installing nerfcli and the tools of its tests, about a minute'
+	@$(PIP_INSTALL) --no-deps torch triton & large=$$!; \
+	$(PIP_INSTALL) --no-deps $$(grep '^[a-z].*==' constraints.txt | grep -vE '^(torch|triton)=='); wait $$large || true
 	$(PIP_INSTALL) -e '.[dev]'
 	@touch $@ .venv/installed
 
