@@ -334,6 +334,18 @@ def test_large_captures_are_not_compared_exhaustively(clean):
 # Scenes
 
 
+def test_focal_lengths_of_a_scene_are_those_of_its_cameras_and_their_pixels_are_square():
+    scene = ring(8, span_deg=360)
+    found = coverage.focal_lengths(scene)
+    assert (found.verdict, found.summary) == (GOOD, "0.94 times the longer side, from the scene")
+    narrow = Camera("PINHOLE", 640, 480, (600.0, 720.0, 320.0, 240.0))
+    fisheye = Camera("OPENCV_FISHEYE", 640, 480, (600.0, 609.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))  # 1.5 % is usual
+    first, second, *others = scene.frames
+    frames = (replace(first, camera=narrow), replace(second, camera=fisheye), *others)
+    found = coverage.focal_lengths(replace(scene, frames=frames))
+    assert (found.verdict, found.photos) == (LOOK, (("0.jpg", "focal lengths along x and y differ by 20.0 %"),))
+
+
 def ring(count: int, *, span_deg: float, radius: float = 3.0) -> Scene:
     camera = Camera.pinhole(640, 480, 600.0)
     up = np.array([0.0, 0.0, 1.0])

@@ -84,6 +84,12 @@ class Camera:
         return self.width / (2 * np.pi) if self.is_spherical else _colmap_camera(self).mean_focal_length()
 
     @property
+    def pixel_aspect(self) -> float:
+        """Focal length along y over that along x: 1 for square pixels."""
+        colmap = _colmap_camera(self)
+        return colmap.focal_length_y / colmap.focal_length_x if len(colmap.focal_length_idxs()) == 2 else 1.0
+
+    @property
     def principal_point(self) -> tuple[float, float]:
         """Principal point in pixels (x, y)."""
         index = _colmap_camera(self).principal_point_idxs()

@@ -21,6 +21,8 @@ _SPAN_LOOK, _SPAN_BAD = 20.0, 6.0
 # A camera is an outlier beyond this many times the median distance from the median camera position.
 _FAR_OFF = 8.0
 _POINTS_LOOK = 100
+# Focal lengths along x and y that differ by more than this mean pixels that are not square, or a wrong calibration.
+_ASPECT_LOOK = 0.02
 # GPS of phones is off by 5 m under open sky and by tens of metres indoors; a metric scale needs a wider capture.
 _GPS_NOISE = 5.0
 _GPS_WIDE = 100.0
@@ -90,6 +92,31 @@ def directions(scene: Scene) -> Finding:
         widest,
         f"gap around the scene: look from {_GAP_LOOK:g} degrees, bad from {_GAP_BAD:g}",
         "" if verdict == GOOD else "add photos in the gap: the scene is unknown from there",
+    )
+
+
+def focal_lengths(scene: Scene) -> Finding:
+    """Check whether the focal lengths of a scene's cameras along x and y agree, as pixels of nearly all cameras are
+    square."""
+    apart = sorted(((abs(frame.camera.pixel_aspect - 1.0), frame.name) for frame in scene.frames), reverse=True)
+    stretched = [
+        (name, f"focal lengths along x and y differ by {100 * off:.1f} %") for off, name in apart if off > _ASPECT_LOOK
+    ]
+    fractions = [frame.camera.focal_px / max(frame.camera.width, frame.camera.height) for frame in scene.frames]
+    summary = f"{np.median(fractions):.2f} times the longer side, from the scene"
+    if stretched:
+        summary += f"; {several(len(stretched), 'photo')} whose {stretched[0][1]}"
+    return Finding(
+        "focal length",
+        LOOK if stretched else GOOD,
+        summary,
+        apart[0][0],
+        f"difference along x and y: look from {100 * _ASPECT_LOOK:g} %",
+        "pixels of nearly all cameras are square: unless these photos were stretched, the calibration is wrong; "
+        "estimate poses with nerfcli poses and compare held-out photos"
+        if stretched
+        else "",
+        tuple(stretched),
     )
 
 

@@ -144,7 +144,7 @@ def judged(
         ("number of photos", lambda: inventory.enough(len(photos))),
         ("size", lambda: inventory.size(photos)),
         ("cameras", lambda: inventory.cameras(photos)),
-        ("focal length", lambda: inventory.focal_length(photos)),
+        ("focal length", lambda: _focal_length(subject, photos)),
         ("orientation", lambda: inventory.orientation(photos)),
         ("duplicates", lambda: inventory.duplicates(photos, pairs)),
         ("sharpness", lambda: quality.sharpness(photos, lack)),
@@ -186,6 +186,10 @@ def judged(
     not_checked += [(name, f"could not be computed: {why}") for name, why in checks.not_computed.items()]
     findings = tuple(finding for finding in found if finding is not None)
     return Diagnosis(subject, findings, tuple(not_checked), tuple(photos), lack, lighter, tuple(pairs))
+
+
+def _focal_length(subject: ExaminedCapture, photos: Sequence[PhotoFacts]) -> Finding:
+    return inventory.focal_length(photos) if subject.scene is None else coverage.focal_lengths(subject.scene)
 
 
 def _or_not_checked(
