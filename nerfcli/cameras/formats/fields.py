@@ -80,7 +80,8 @@ def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
         UserError: there are more or fewer than `count`, or one of them is not a finite number.
     """
     if len(words) != count:
-        raise malformed(where, f"has {len(words)} numbers", f"expected {count}")
+        found = "1 number" if len(words) == 1 else f"{len(words)} numbers"
+        raise malformed(where, f"has {found}", f"expected {count}")
     try:
         values = list(map(float, words))
     except ValueError:
