@@ -159,7 +159,7 @@ def edited(number: int, line: str | None) -> str:
     [
         ("", NAMES, "does not begin with # Bundle file"),
         (edited(1, "# Bundle file v0.2"), NAMES, "line 1: is of an unsupported version"),
-        (edited(2, "3"), NAMES, "line 2: has 1 numbers"),
+        (edited(2, "3"), NAMES, "line 2: has 1 number"),
         (edited(2, "3 -7"), NAMES, "line 2: announces 3 cameras and -7 points"),
         (edited(2, "900000000000 7"), NAMES, "announces 900000000000 cameras and 7 points, but the file has 37"),
         (edited(20, None), NAMES, "but the file has 36 lines"),
