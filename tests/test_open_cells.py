@@ -161,6 +161,22 @@ def test_what_samples_found_fades_where_they_find_less_and_stays_where_none_is()
         visit(cells, seen, 0.0)
 
 
+def test_a_coarse_cell_stays_open_while_samples_hit_what_random_points_miss():
+    """Here these never hit it: the field is empty wherever it is evaluated at random."""
+    cells, needle = cells_of(Slab()), (10, 12, FINE_SIDE - 7)
+    coarse = (5, 6, OCCUPANCY_SIDE - 4)
+    for turn in range(1, 100):
+        visit(cells, needle, 0.02)
+        refresh(cells, turn * REFRESH_EVERY)
+        assert cells.coarse[coarse]
+        assert cells.at(1)[needle]
+    assert int(cells.coarse[:, :, OCCUPANCY_SIDE // 2 :].sum()) == 1
+    for turn in range(100, 140):  # 0.02 * 0.8^4 is below the threshold; an eighth of the cells decays at each refresh
+        visit(cells, needle, 1e-4)
+        refresh(cells, turn * REFRESH_EVERY)
+    assert not cells.coarse[coarse]
+
+
 def test_nothing_is_looked_at_between_refreshes_nor_before_the_first_step():
     cells = cells_of(Slab())
     for step in (0, 1, REFRESH_EVERY - 1):
@@ -172,7 +188,7 @@ def test_visited_cells_are_the_open_ones_in_which_there_was_a_sample():
     cells = cells_of(Slab())
     assert not cells.visited.any()
     visit(cells, (2, 3, 5), 0.5)
-    visit(cells, (2, 3, FINE_SIDE - 1), 0.5)  # where the slab has ended
+    visit(cells, (2, 3, FINE_SIDE - 1), 1e-3)  # where the slab has ended
     assert cells.visited.nonzero().tolist() == [[1, 1, 2], [1, 1, OCCUPANCY_SIDE - 1]]
     for turn in range(1, 3):
         refresh(cells, turn * REFRESH_EVERY)

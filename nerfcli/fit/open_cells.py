@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool3d
 
 from nerfcli.field.interface import Field
 from nerfcli.fit.ranks import SingleProcess
@@ -28,9 +29,9 @@ UNVISITED = -1.0
 class OpenCells:
     """The cells that rays sample, of a coarse grid and, for detailed fields, of a fine one.
 
-    The coarse grid is filled from random points of the field, see `Occupancy`. Surfaces are much thinner than its
-    cells. The fine grid holds the optical depths of the samples that the training takes anyway, and closes the cells in
-    which these samples were empty.
+    The coarse grid is filled from random points of the field, see `Occupancy`, and beside a fine grid from the samples
+    of the training, too. Surfaces are much thinner than its cells. The fine grid holds the optical depths of these
+    samples, and closes the cells in which they were empty.
 
     Args:
         field: the field being trained.
@@ -97,6 +98,10 @@ class OpenCells:
         )
         if self.visits is not None:
             ranks.keep_largest(self.visits)
+            # A random point often misses a surface that takes a small part of its cell, such as the tip of a stem,
+            # until the cell closes for good. The samples of the training hit it.
+            parts = FINE_SIDE // OCCUPANCY_SIDE
+            self._occupancy.raise_to(max_pool3d(self.visits[None], parts)[0])
             # The host waits for a GPU to count these; computing all cells instead takes a CPU 1.6 times as long.
             visits, depths = self.visits.view(-1), self._depths.view(-1)
             visited = (visits >= 0).nonzero()[:, 0]
