@@ -373,7 +373,7 @@ TRAINING: tuple[Group, ...] = (
             Mutant("before * DECAY)", "before)"),
             Mutant("(visits >= 0).nonzero()", "(visits > -2).nonzero()"),
             Mutant(".maximum(visits[visited])", ""),
-            Mutant("self._occupancy.raise_to(max_pool3d(self.visits[None], parts)[0])", "pass"),
+            Mutant("self.coarse |= largest > least", "pass"),
             Mutant("visits[visited] = UNVISITED", "pass"),
             Mutant("ranks.keep_largest(self.visits)", "pass"),
             Mutant(".logical_and_(rows)", ".logical_and(rows)"),

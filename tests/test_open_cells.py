@@ -171,7 +171,7 @@ def test_a_coarse_cell_stays_open_while_samples_hit_what_random_points_miss():
         assert cells.coarse[coarse]
         assert cells.at(1)[needle]
     assert int(cells.coarse[:, :, OCCUPANCY_SIDE // 2 :].sum()) == 1
-    for turn in range(100, 140):  # 0.02 * 0.8^4 is below the threshold; an eighth of the cells decays at each refresh
+    for turn in range(100, 105):  # 0.02 * 0.8^4 is below the threshold
         visit(cells, needle, 1e-4)
         refresh(cells, turn * REFRESH_EVERY)
     assert not cells.coarse[coarse]

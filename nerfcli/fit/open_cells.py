@@ -29,9 +29,9 @@ UNVISITED = -1.0
 class OpenCells:
     """The cells that rays sample, of a coarse grid and, for detailed fields, of a fine one.
 
-    The coarse grid is filled from random points of the field, see `Occupancy`, and beside a fine grid from the samples
-    of the training, too. Surfaces are much thinner than its cells. The fine grid holds the optical depths of these
-    samples, and closes the cells in which they were empty.
+    The coarse grid is filled from random points of the field, see `Occupancy`. Surfaces are much thinner than its
+    cells. The fine grid holds the optical depths of the samples that the training takes anyway, and closes the cells in
+    which these samples were empty; a coarse cell is open as long as they find something in one of its fine cells.
 
     Args:
         field: the field being trained.
@@ -98,10 +98,6 @@ class OpenCells:
         )
         if self.visits is not None:
             ranks.keep_largest(self.visits)
-            # A random point often misses a surface that takes a small part of its cell, such as the tip of a stem,
-            # until the cell closes for good. The samples of the training hit it.
-            parts = FINE_SIDE // OCCUPANCY_SIDE
-            self._occupancy.raise_to(max_pool3d(self.visits[None], parts)[0])
             # The host waits for a GPU to count these; computing all cells instead takes a CPU 1.6 times as long.
             visits, depths = self.visits.view(-1), self._depths.view(-1)
             visited = (visits >= 0).nonzero()[:, 0]
@@ -112,11 +108,17 @@ class OpenCells:
         self._open(FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed)
 
     def _open(self, threshold: float) -> None:
-        self.coarse = self._occupancy.above(threshold)
+        self.coarse, least = self._occupancy.above(threshold), self._occupancy.least(threshold)
+        if self.visits is not None:
+            # Random points often miss a surface that takes a small part of its cell, such as the tip of a stem, until
+            # the cell closes for good. The samples of the training hit it.
+            found = torch.where(self._depths.isinf(), UNVISITED, self._depths)
+            largest = max_pool3d(found[None], FINE_SIDE // OCCUPANCY_SIDE)[0]
+            self.coarse |= largest > least
         if self._covered is not None:
             self.coarse &= self._covered
         if self.visits is not None:
-            fine = self._depths > self._occupancy.least(threshold)
+            fine = self._depths > least
             parts = FINE_SIDE // OCCUPANCY_SIDE
             # Only the two outer axes are expanded by broadcasting: whole rows of fine cells are fast, pairs are not.
             rows = self.coarse.repeat_interleave(parts, dim=2)[:, None, :, None]

@@ -35,10 +35,6 @@ class Occupancy:
         """
         return self.optical_depth.nanmean().clamp_max(optical_depth)
 
-    def raise_to(self, optical_depth: Tensor) -> None:
-        """Raise cells to optical depths (side, side, side) that samples have had in them; negative where none was."""
-        self.optical_depth = torch.maximum(self.optical_depth, optical_depth)
-
     @torch.no_grad()
     def refresh(
         self,
