@@ -24,8 +24,13 @@ def colmap_of(camera: Camera) -> pycolmap.Camera:
 
 
 def assert_same_pixels(pixels: np.ndarray, expected: np.ndarray) -> None:
-    """Assert equality to 1e-8 px within the size of a picture, and to as many digits far outside of it."""
-    np.testing.assert_allclose(pixels, expected, rtol=1e-11, atol=1e-8)
+    """Assert equality to 1e-8 px within the size of a picture, and to as many digits far outside of it.
+
+    Pixels beyond 1e6 px are beside a pole of the model, where digits cancel in its denominator: the relative error of
+    rounding is multiplied by how much farther out they are than a picture is wide.
+    """
+    allowed = 1e-8 + 1e-11 * np.abs(expected) + 100 * np.finfo(float).eps * np.square(expected) / WIDTH
+    np.testing.assert_array_less(np.abs(pixels - expected), allowed)
 
 
 def has_colmaps_wrong_series(camera: Camera) -> bool:
