@@ -69,7 +69,7 @@ TRITON: tuple[Group, ...] = (
     Group(
         "kernels/triton_cuda/marching.py",
         KERNELS,
-        "visible or occupied or faint",
+        "visible or occupied or faint or visits",
         (),
         (
             Mutant("if candidates <= room:", "if True:"),
@@ -78,7 +78,7 @@ TRITON: tuple[Group, ...] = (
             Mutant("own * tl.exp(-before) < least", "own < least"),
             Mutant("            least = 0.0  # all", "            break  # all"),
             Mutant("mask=reached & (own == own)", "mask=reached & (own >= least)"),
-            Mutant("mask=reached & (own == own)", "mask=reached & (own != own)"),
+            Mutant("mask=reached & (own == own)", "mask=reached"),
             Mutant("middle + shift * (far - middle)", "middle + shift * (middle - near)"),
         ),
     ),

@@ -377,6 +377,20 @@ def test_distortion(samples, far, generator):
     assert_close(fast.grad, exact.grad, "gradient")
 
 
+def test_visits_leave_out_densities_that_are_not_a_number(generator):
+    rays, march = rays_and_march(60, "l2", generator)
+    table = 0.7 * torch.randn(8, 64, 4, generator=generator)
+    table[0, ::16] = torch.nan
+    grid = HashGrid(table, (4, 5, 6, 7, 8, 9, 10, 11), on_device(*layers_of(32, generator)))
+    visits = torch.full((8, 8, 8), -1.0, device=DEVICE)
+    seen = marching.visible_samples(
+        rays, march, grid, table=table.half().to(DEVICE), capacity=marching.Capacity(), visits=visits
+    )
+    assert seen.density.isnan().any()
+    assert not visits.isnan().any()
+    assert (visits >= 0).any()
+
+
 @pytest.mark.parametrize("samples", SIZES)
 def test_contracted_distances(samples, generator):
     """At the camera, beside the place where the formula changes, and at the largest numbers."""

@@ -109,17 +109,17 @@ class OpenCells:
 
     def _open(self, threshold: float) -> None:
         self.coarse, least = self._occupancy.above(threshold), self._occupancy.least(threshold)
+        parts = FINE_SIDE // OCCUPANCY_SIDE
         if self.visits is not None:
             # Random points often miss a surface that takes a small part of its cell, such as the tip of a stem, until
             # the cell closes for good. The samples of the training hit it.
             found = torch.where(self._depths.isinf(), UNVISITED, self._depths)
-            largest = max_pool3d(found[None], FINE_SIDE // OCCUPANCY_SIDE)[0]
+            largest = max_pool3d(found[None], parts)[0]
             self.coarse |= largest > least
         if self._covered is not None:
             self.coarse &= self._covered
         if self.visits is not None:
             fine = self._depths > least
-            parts = FINE_SIDE // OCCUPANCY_SIDE
             # Only the two outer axes are expanded by broadcasting: whole rows of fine cells are fast, pairs are not.
             rows = self.coarse.repeat_interleave(parts, dim=2)[:, None, :, None]
             fine.view(OCCUPANCY_SIDE, parts, OCCUPANCY_SIDE, parts, FINE_SIDE).logical_and_(rows)

@@ -77,8 +77,8 @@ def launch(
 ) -> None:
     """Run a kernel on the device of its first tensor.
 
-    A step of a training has about twenty launches, and its host takes longer for them than its GPU for the kernels: so
-    as little as possible is done here before a kernel that is loaded already.
+    A training step has about twenty launches, and on a large GPU the host takes longer to launch the kernels than the
+    GPU to run them. So a kernel that is loaded already is launched with as little work as possible.
 
     Args:
         kernel: the function under `triton.jit`.
