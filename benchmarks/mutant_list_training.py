@@ -272,8 +272,8 @@ TRAINING: tuple[Group, ...] = (
             ),
             Mutant("return bool(requested.points)", "return True"),
             Mutant(
-                "judge_supported([without.trial], (one.component, one.value), [start.trial]",
-                "judge_supported([start.trial], (one.component, one.value), [without.trial]",
+                "judge_evidence([without.trial], (one.component, one.value), [start.trial]",
+                "judge_evidence([start.trial], (one.component, one.value), [without.trial]",
             ),
             Mutant("model, start = requested, without", "model = requested"),
             Mutant(

@@ -20,6 +20,7 @@ from nerfcli.search.judgement import (
     LEAST_GAIN_DB,
     MOST_LOSS_DB,
     SEED_DB,
+    judge_evidence,
     judge_one,
     judge_removal,
     judge_supported,
@@ -255,8 +256,8 @@ def test_what_gains_is_in_the_model_what_does_not_is_not_and_seeds_are_paired():
 POINTED = replace(FITTED, points=7)
 
 
-@pytest.mark.parametrize(("gain", "kept"), [(0.3, True), (0.0, True), (-0.3, False)])
-def test_points_that_photos_share_are_in_the_model_from_the_start_unless_they_lose(gain, kept):
+@pytest.mark.parametrize(("gain", "kept"), [(0.3, True), (0.0, True), (-0.7, True), (-2.0, False)])
+def test_points_that_photos_share_are_in_the_model_from_the_start_unless_they_lose_much(gain, kept):
     """Two starts, with and without; all trials go on from the one that is taken."""
     scripted = Scripted(lambda c: gain * (c.points > 0))
     chosen = chosen_by(scripted, facts=POINTED)
@@ -527,6 +528,19 @@ def test_what_is_supported_must_not_lose_more_than_its_error():
     for gains, kept in (((0.05, 0.01), True), ((0.03, -0.05), True), ((-0.01, -0.05), False)):
         decision = judge_supported(base, ("cameras", "poses"), [trial(20.0 + gain) for gain in gains], by_time=True)
         assert decision.kept == kept  # mean m and distance d of two seeds: m > -d / 2
+
+
+@pytest.mark.parametrize(
+    ("gain", "kept", "why"),
+    [(0.1, True, "and does not lose"), (-0.9, True, "and loses less than 1 dB"), (-1.2, False, "loses, although")],
+)
+def test_evidence_is_kept_unless_it_loses_a_decibel_more_than_its_error(gain, kept, why):
+    """Two seeds that gain alike: the error is 0."""
+    base = [trial(20.0), trial(20.0)]
+    decision = judge_evidence(base, ("points", 0.1), [trial(20.0 + gain)] * 2, by_time=True)
+    assert decision.kept == kept
+    assert why in decision.why
+    assert judge_supported(base, ("points", 0.1), [trial(20.0 + gain)] * 2, by_time=True).kept == (gain > 0.0)
 
 
 def test_depths_of_stereo_matching_come_with_evidence_and_as_the_user_says():

@@ -16,7 +16,7 @@ from nerfcli.multiview.camera_check import CameraCheck
 from nerfcli.runs.components import CHOICES, Change, Components
 from nerfcli.runs.decisions import Decision, Selection, untried
 from nerfcli.search.diagnostics import Diagnostics
-from nerfcli.search.judgement import Rule, judge_likely, judge_supported
+from nerfcli.search.judgement import Rule, judge_evidence, judge_likely, judge_supported
 from nerfcli.search.race import Race, SearchBudget
 from nerfcli.search.trials import Trials
 
@@ -295,7 +295,7 @@ def select(
         assert without is not None  # no minimum number of steps was given
         budget.charge(without.steps)
         decided = [
-            judge_supported([without.trial], (one.component, one.value), [start.trial], by_time=budget.is_time)
+            judge_evidence([without.trial], (one.component, one.value), [start.trial], by_time=budget.is_time)
             for one in decided  # all together: they share one trial
         ]
         if not decided[0].kept:
