@@ -21,8 +21,8 @@ CLEAR_ERRORS, SEED_DB = 5.0, 0.1
 LEAST_GAIN_DB = 0.05
 # Loss that is accepted for a simpler model.
 MOST_LOSS_DB = 0.1
-# Loss in a trial that is accepted for what photos tell before the training. A field of 120 steps is still fog: known
-# distances that gained 6 dB in the whole training of one capture measured -0.3, +0.1, +0.4 and +0.5 dB in four trials.
+# Loss in a trial that is accepted for components that rest on measurements of the photos. After 120 steps a field is
+# still fog: in one capture, known distances gained 6 dB by the end of the training, and -0.3 to +0.5 dB in the trials.
 MOST_LOSS_OF_EVIDENCE_DB = 1.0
 # Photos that show next to nothing have hardly any error, and its logarithm is noise: this fraction of the mean error is
 # added to that of every photo.
@@ -95,9 +95,10 @@ def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial
 
 
 def judge_evidence(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
-    """Judge components that use what photos tell before the training, such as known distances.
+    """Judge components that rest on measurements of the photos, such as known distances.
 
-    They must not lose more than `MOST_LOSS_OF_EVIDENCE_DB`. Arguments as for `judge_one`.
+    They must not lose more than `MOST_LOSS_OF_EVIDENCE_DB`, or than the error of the gain if that is larger. Arguments
+    as for `judge_one`.
     """
     return _unless_it_loses(judge_one(base, change, tried, by_time=by_time), most_db=MOST_LOSS_OF_EVIDENCE_DB)
 
@@ -118,10 +119,10 @@ def judge_removal(base: Sequence[Trial], change: Change, tried: Sequence[Trial],
 
 
 def _unless_it_loses(measured: Decision, *, most_db: float) -> Decision:
-    """Keep a component unless it loses more than this beyond the error of its gain."""
+    """Keep a component unless it loses more than this and more than the error of its gain."""
     gain, error = measured.gain_db or 0.0, measured.error_db or 0.0
-    if gain > -error - most_db:
-        why = f"loses less than {most_db:g} dB" if gain <= -error else "does not lose"
+    if gain > -max(error, most_db):
+        why = "does not lose" if gain > -error else f"loses less than {most_db:g} dB"
         return replace(measured, kept=True, why=f"measured before training, and {why}")
     return replace(measured, kept=False, why="loses, although measured before training")
 
