@@ -182,6 +182,26 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
+        "fit/losses.py",
+        ("tests/test_priors.py",),
+        "log_likelihood or nearly_empty",
+        (),
+        (
+            Mutant("-most * torch.log1p", "-torch.log1p"),
+            Mutant("most = 1.0 + FAINT", "most = 1.0 + 2 * FAINT"),
+        ),
+    ),
+    Group(
+        "fit/fitting.py",
+        ("tests/test_priors.py",),
+        "emerged",
+        (),
+        (
+            Mutant("fraction < EMERGING_FRACTION else", "fraction > EMERGING_FRACTION else"),
+            Mutant("EMERGING_FRACTION = 0.3", "EMERGING_FRACTION = 1.0"),
+        ),
+    ),
+    Group(
         "fit/ranks.py",
         ("tests/test_ranks.py",),
         "two_processes",

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import mpmath
 import numpy as np
 import pytest
 import torch
@@ -15,7 +16,7 @@ from nerfcli.cameras.formats.colmap_write import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
-from nerfcli.fit.losses import opacity_entropy
+from nerfcli.fit.losses import distance_losses, opacity_entropy
 from nerfcli.fit.point_depth import PointRays, fading, point_depths
 from nerfcli.kernels import reference
 from nerfcli.multiview.camera_check import CameraCheck
@@ -172,6 +173,50 @@ def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
     of_both = PointRays([of_points, of_points], pool).added_to(pool.draw(80, generator), generator)
     assert len(of_both.distances) == 10  # sets share them
     assert len(PointRays([of_points], pool).added_to(pool.draw(3, generator), generator).distances) == 1
+
+
+def test_the_loss_of_distances_is_a_log_likelihood_with_a_bounded_slope():
+    off_target = torch.tensor([0.0, 1e-9, 0.3, 0.999, 1.0], dtype=torch.float64, requires_grad=True)
+    losses = distance_losses(off_target)
+    for off, loss in zip(off_target.tolist(), losses.tolist(), strict=True):
+        with mpmath.workdps(40):
+            expected = mpmath.mpf("1.1") * mpmath.log(mpmath.mpf("1.1") / (mpmath.mpf("1.1") - mpmath.mpf(off)))
+        assert loss == pytest.approx(float(expected), rel=1e-12)
+    losses.sum().backward()
+    assert off_target.grad is not None
+    assert off_target.grad[[0, -1]].tolist() == pytest.approx([1.0, 11.0])
+    assert torch.autograd.gradcheck(distance_losses, (off_target[1:4].detach().requires_grad_(),))
+
+
+def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
+    gradients = []
+    for loss in (torch.clone, distance_losses):
+        log_density = torch.tensor([-30.0, -12.0, -30.0], dtype=torch.float64, requires_grad=True)
+        offsets, lengths = torch.tensor([0, 3]), torch.full((3,), 0.1, dtype=torch.float64)
+        weights, transmittance = reference.interval_weights(log_density.exp(), lengths, offsets)
+        middles, distances = torch.tensor([0.5, 1.0, 1.5]).double(), torch.tensor([1.0]).double()
+        off = reference.off_target(weights, transmittance, middles, offsets=offsets, distances=distances)
+        loss(off).sum().backward()
+        assert log_density.grad is not None
+        gradients.append(log_density.grad[1].item())
+    assert gradients[1] / gradients[0] == pytest.approx(11.0, rel=1e-4)
+
+
+def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(capture, tmp_path, monkeypatch):
+    settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
+    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    fitting, called = prepared.fitting(), []
+
+    def recorded(off_target: torch.Tensor) -> torch.Tensor:
+        called.append(len(off_target))
+        return distance_losses(off_target)
+
+    monkeypatch.setattr("nerfcli.fit.fitting.distance_losses", recorded)
+    counts = []
+    for fraction in (0.0, 0.29, 0.31, 0.9):
+        fitting.advance(fraction)
+        counts.append(len(called))
+    assert counts == [1, 2, 2, 2]
 
 
 def test_points_fade_out():

@@ -14,7 +14,7 @@ from nerfcli.field.sizes import chosen_size
 from nerfcli.fit.appearance import Appearance
 from nerfcli.fit.delayed import Delayed
 from nerfcli.fit.error_map import BEGINS, ErrorMap
-from nerfcli.fit.losses import colour_losses, opacity_entropy
+from nerfcli.fit.losses import colour_losses, distance_losses, opacity_entropy
 from nerfcli.fit.movers import Movers
 from nerfcli.fit.open_cells import OpenCells
 from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
@@ -35,6 +35,9 @@ DEEPEST = 7.0
 # Samples that absorb less of their ray's light than this have hardly any gradient: they are left out before their
 # colours are computed, so that steps with the same number of samples have more rays.
 LEAST_WEIGHT = 1e-3
+# Until this fraction of the budget, when most cells have closed, known distances are a log likelihood, which keeps thin
+# surfaces. Later, it would also keep what stereo matching puts in the wrong place.
+EMERGING_FRACTION = 0.3
 # Weight of the opacity of rays that see the sky.
 SKY_WEIGHT = 0.1
 # Weight of the roughness of a learned background. Directions that no photo shows take the colours of their neighbours;
@@ -252,8 +255,9 @@ class Fitting:
         if components.entropy:
             loss = loss + components.entropy * (opacity_entropy(seen.transmittance).sum() / count)
         if len(whole.distances):
-            off_target = (drawn.trust * seen.off_target).sum() / len(whole.distances)
-            loss = loss + components.points * fading(fraction) * off_target
+            off_target = distance_losses(seen.off_target) if fraction < EMERGING_FRACTION else seen.off_target
+            of_distances = (drawn.trust * off_target).sum() / len(whole.distances)
+            loss = loss + components.points * fading(fraction) * of_distances
         if self.parts.sky is not None:
             opacity = (1.0 - seen.transmittance) * self.parts.sky[drawn.numbers]
             loss = loss + SKY_WEIGHT * opacity.sum() / count

@@ -4,6 +4,8 @@ import torch
 from torch import Tensor
 
 HUBER_DELTA = 0.1
+# Light on target, of all light, at which the slope of the loss of distances is about half of its largest.
+FAINT = 0.1
 
 
 def colour_losses(rendered: Tensor, measured: Tensor) -> Tensor:
@@ -17,6 +19,25 @@ def colour_losses(rendered: Tensor, measured: Tensor) -> Tensor:
     """
     losses = torch.nn.functional.huber_loss(rendered, measured, delta=HUBER_DELTA, reduction="none")
     return losses.mean(-1) / HUBER_DELTA
+
+
+def distance_losses(off_target: Tensor) -> Tensor:
+    """Return the negative log likelihood of known distances.
+
+    (1 + c) log((1 + c) / (1 + c - off target)),  c = 0.1
+
+    The gradient of a nearly empty sample is in proportion to the light that it absorbs. Here it is divided by this
+    light, down to c: thin surfaces that the free space around them has nearly erased still come back.
+
+    Args:
+        off_target: (K,) in [0, 1], see `kernels.RaySums`.
+
+    Returns:
+        (K,) from 0, where all light is absorbed at the known distance, with a slope of 1, to (1 + c) log(1 + 1 / c),
+        with a slope of 1 + 1 / c. Differentiable.
+    """
+    most = 1.0 + FAINT
+    return -most * torch.log1p(-off_target / most)
 
 
 def opacity_entropy(transmittance: Tensor) -> Tensor:
