@@ -187,18 +187,10 @@ TRAINING: tuple[Group, ...] = (
         "log_likelihood or nearly_empty",
         (),
         (
+            Mutant("if fraction >= EMERGING_FRACTION", "if fraction < EMERGING_FRACTION"),
+            Mutant("EMERGING_FRACTION = 0.3", "EMERGING_FRACTION = 1.0"),
             Mutant("-most * torch.log1p", "-torch.log1p"),
             Mutant("most = 1.0 + FAINT", "most = 1.0 + 2 * FAINT"),
-        ),
-    ),
-    Group(
-        "fit/fitting.py",
-        ("tests/test_priors.py",),
-        "emerged",
-        (),
-        (
-            Mutant("fraction < EMERGING_FRACTION else", "fraction > EMERGING_FRACTION else"),
-            Mutant("EMERGING_FRACTION = 0.3", "EMERGING_FRACTION = 1.0"),
         ),
     ),
     Group(

@@ -175,9 +175,13 @@ def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
     assert len(PointRays([of_points], pool).added_to(pool.draw(3, generator), generator).distances) == 1
 
 
+def likelihood(off_target: torch.Tensor) -> torch.Tensor:
+    return distance_losses(off_target, fraction=0.0)
+
+
 def test_the_loss_of_distances_is_a_log_likelihood_with_a_bounded_slope():
     off_target = torch.tensor([0.0, 1e-9, 0.3, 0.999, 1.0], dtype=torch.float64, requires_grad=True)
-    losses = distance_losses(off_target)
+    losses = distance_losses(off_target, fraction=0.1)
     for off, loss in zip(off_target.tolist(), losses.tolist(), strict=True):
         with mpmath.workdps(40):
             expected = mpmath.mpf("1.1") * mpmath.log(mpmath.mpf("1.1") / (mpmath.mpf("1.1") - mpmath.mpf(off)))
@@ -185,12 +189,12 @@ def test_the_loss_of_distances_is_a_log_likelihood_with_a_bounded_slope():
     losses.sum().backward()
     assert off_target.grad is not None
     assert off_target.grad[[0, -1]].tolist() == pytest.approx([1.0, 11.0])
-    assert torch.autograd.gradcheck(distance_losses, (off_target[1:4].detach().requires_grad_(),))
+    assert torch.autograd.gradcheck(likelihood, (off_target[1:4].detach().requires_grad_(),))
 
 
 def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
     gradients = []
-    for loss in (torch.clone, distance_losses):
+    for loss in (torch.clone, likelihood):
         log_density = torch.tensor([-30.0, -12.0, -30.0], dtype=torch.float64, requires_grad=True)
         offsets, lengths = torch.tensor([0, 3]), torch.full((3,), 0.1, dtype=torch.float64)
         weights, transmittance = reference.interval_weights(log_density.exp(), lengths, offsets)
@@ -203,20 +207,22 @@ def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
 
 
 def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(capture, tmp_path, monkeypatch):
+    off_target = torch.tensor([0.25, 1.0])
+    assert torch.equal(distance_losses(off_target, fraction=0.29), likelihood(off_target))
+    assert torch.equal(distance_losses(off_target, fraction=0.3), off_target)
+    # A training passes on its fraction of the budget.
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
-    fitting, called = prepared.fitting(), []
+    fitting, fractions = prepared.fitting(), []
 
-    def recorded(off_target: torch.Tensor) -> torch.Tensor:
-        called.append(len(off_target))
-        return distance_losses(off_target)
+    def recorded(off_target: torch.Tensor, *, fraction: float) -> torch.Tensor:
+        fractions.append(fraction)
+        return distance_losses(off_target, fraction=fraction)
 
     monkeypatch.setattr("nerfcli.fit.fitting.distance_losses", recorded)
-    counts = []
     for fraction in (0.0, 0.29, 0.31, 0.9):
         fitting.advance(fraction)
-        counts.append(len(called))
-    assert counts == [1, 2, 2, 2]
+    assert fractions == [0.0, 0.29, 0.31, 0.9]
 
 
 def test_points_fade_out():

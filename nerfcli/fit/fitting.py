@@ -35,9 +35,6 @@ DEEPEST = 7.0
 # Samples that absorb less of their ray's light than this have hardly any gradient: they are left out before their
 # colours are computed, so that steps with the same number of samples have more rays.
 LEAST_WEIGHT = 1e-3
-# Until this fraction of the budget, when most cells have closed, known distances are a log likelihood, which keeps thin
-# surfaces. Later, it would also keep what stereo matching puts in the wrong place.
-EMERGING_FRACTION = 0.3
 # Weight of the opacity of rays that see the sky.
 SKY_WEIGHT = 0.1
 # Weight of the roughness of a learned background. Directions that no photo shows take the colours of their neighbours;
@@ -255,9 +252,8 @@ class Fitting:
         if components.entropy:
             loss = loss + components.entropy * (opacity_entropy(seen.transmittance).sum() / count)
         if len(whole.distances):
-            off_target = distance_losses(seen.off_target) if fraction < EMERGING_FRACTION else seen.off_target
-            of_distances = (drawn.trust * off_target).sum() / len(whole.distances)
-            loss = loss + components.points * fading(fraction) * of_distances
+            losses_of_distances = drawn.trust * distance_losses(seen.off_target, fraction=fraction)
+            loss = loss + components.points * fading(fraction) * (losses_of_distances.sum() / len(whole.distances))
         if self.parts.sky is not None:
             opacity = (1.0 - seen.transmittance) * self.parts.sky[drawn.numbers]
             loss = loss + SKY_WEIGHT * opacity.sum() / count
