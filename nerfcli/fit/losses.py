@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 
 HUBER_DELTA = 0.1
-# Until this fraction of the budget, when most cells have closed, known distances are a log likelihood, which keeps thin
-# surfaces. Later, it would also keep what stereo matching puts in the wrong place.
+# Until this fraction of the budget, known distances are a log likelihood, which keeps thin surfaces. If it lasts until
+# the end, it puts matter in the wrong place where few photos look.
 EMERGING_FRACTION = 0.3
-# Fraction of the light on target at which the slope of this likelihood is about half of its largest.
+# Fraction of the light on target at which the slope of this likelihood is half of its largest.
 FAINT = 0.1
 
 

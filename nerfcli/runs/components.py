@@ -38,7 +38,7 @@ class Components:
         cameras: camera parameters of the training photos that are trained with the field: "poses"; "focal", the focal
             length of each lens; "all", both and radial distortion; or "fixed", none. See `refinement`.
         masks: meaning of black in masks: "ignore", not used; or "empty", empty space, as with alpha.
-        points: weight of `kernels.RaySums.off_target`.
+        points: weight of known distances, see `fit.losses.distance_losses`.
         stereo: whether the points include pixels of training photos with a depth from stereo matching, see
             `multiview.stereo`.
         overlap: whether space near a camera that no other photo looks into stays empty; see `fit.coverage`.
