@@ -194,6 +194,19 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
+        "fit/strides.py",
+        ("tests/test_ray_steps.py",),
+        "steps or pictures",
+        (),
+        (
+            Mutant("cells / 2**n < CELLS_PER_STEP", "cells / 2**n <= CELLS_PER_STEP"),
+            Mutant("cells = parallax * step", "cells = step"),
+            Mutant("MOST_HALVINGS = 2", "MOST_HALVINGS = 3"),
+            Mutant("stride * self._halved for", "stride for"),
+            Mutant("max(2, self._halved)", "self._halved"),
+        ),
+    ),
+    Group(
         "fit/ranks.py",
         ("tests/test_ranks.py",),
         "two_processes",

@@ -13,7 +13,6 @@ import torch
 from nerfcli.field.exposure import exposed
 from nerfcli.fit.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
 from nerfcli.fit.fitting import Fitting
-from nerfcli.fit.strides import DETAILED_STEPS
 from nerfcli.photos.pool import load_album
 from nerfcli.photos.storage import IN_MEMORY
 from nerfcli.runs.components import Components
@@ -161,8 +160,7 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
     exif = np.zeros(len(album.photos))
     trials = Trials(album.photos, everywhere, settings=SETTINGS, exif=exif, colours=album.colours)
     fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
-    fitting.edges = torch.linspace(0.1, 1.4, 14)
-    fitting.step, fitting.largest_fraction = DETAILED_STEPS, 1.0  # no steps are skipped
+    monkeypatch.setattr(fitting.ray_steps, "edges", lambda fraction, step: torch.linspace(0.1, 1.4, 14))
     sigma = 0.1
 
     class Fog:

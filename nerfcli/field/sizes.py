@@ -77,7 +77,12 @@ def chosen_size(
 
 def cells_of_footprint(footprint: float, contraction: str) -> float:
     """Return how many cells as wide as a pixel's footprint fit along the cube's side, see `grid_coordinates`."""
-    return (2.0 if contraction == "none" else 4.0) / footprint
+    return cube_side(contraction) / footprint
+
+
+def cube_side(contraction: str) -> float:
+    """Return the side of the field's cube in units of the training frame, those at its centre if it is contracted."""
+    return 2.0 if contraction == "none" else 4.0
 
 
 def largest_within(sizes: Sequence[int], settings: Callable[[int], FieldSettings], memory_bytes: int) -> FieldSettings:

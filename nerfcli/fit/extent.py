@@ -7,6 +7,7 @@ import numpy as np
 
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.fit.normalisation import (
+    NARROW_SPREAD,
     block_frame,
     box_frame,
     contracted_frame,
@@ -35,12 +36,15 @@ class Extent:
         marching: the steps along rays there.
         reach: distance along rays at which the last ray has left the ball that a learned background surrounds; None if
             the field is bounded.
+        parallax: shift of a point in the pictures of other cameras when it moves along a ray, relative to its motion:
+            about 1 where cameras surround a scene, less where they are close together.
     """
 
     contraction: str
     training_from_scene: Similarity
     marching: Marching
     reach: float | None = None
+    parallax: float = 1.0
 
     def __str__(self) -> str:
         return _IN_WORDS[self.contraction]
@@ -52,13 +56,15 @@ class Extent:
             "training_from_scene": self.training_from_scene.to_json(),
             "marching": vars(self.marching),
             "reach": self.reach,
+            "parallax": self.parallax,
         }
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> "Extent":
         """Return the extent that `to_json` described."""
         similarity = Similarity.from_json(content["training_from_scene"])
-        return Extent(content["contraction"], similarity, Marching(**content["marching"]), content.get("reach"))
+        marching, parallax = Marching(**content["marching"]), content.get("parallax", 1.0)
+        return Extent(content["contraction"], similarity, marching, content.get("reach"), parallax)
 
     def before(self, background: str, *, sky_known: bool) -> "Extent":
         """Return the extent for a kind of background, see `Components`: the field ends where a learned one begins.
@@ -102,7 +108,7 @@ def choose_extent(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -
     if contraction == "none":
         return Extent(contraction, *box_frame(scene))
     if not settings.block and has_narrow_baseline(scene):
-        return Extent(contraction, *narrow_frame(scene))
+        return Extent(contraction, *narrow_frame(scene), parallax=NARROW_SPREAD)
     similarity, marching = block_frame(scene) if settings.block else contracted_frame(scene)
     farthest = max(float(np.linalg.norm(similarity.apply(frame.centre))) for frame in scene.frames)
     return Extent(contraction, similarity, marching, farthest + BALLS_BEFORE_BACKGROUND)

@@ -20,7 +20,7 @@ from nerfcli.fit.open_cells import OpenCells
 from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.fit.point_depth import PointRays, fading
 from nerfcli.fit.ranks import ALONE, SingleProcess
-from nerfcli.fit.strides import stride_at
+from nerfcli.fit.strides import RaySteps
 from nerfcli.fit.watch import UNWATCHED, NonFiniteError, Watch
 from nerfcli.kernels import March, Rays, Targets
 from nerfcli.photos.pool import PixelBatch, Pool
@@ -62,8 +62,7 @@ class Fitting:
 
     Args:
         pool: the training photos.
-        marching: the steps along rays.
-        contraction: of the field.
+        marching, contraction, parallax: of the extent; see `RaySteps` for the steps along rays.
         settings: of the training.
         log_gains: (photos, 3) logarithms of the photos' initial exposures.
         log_focal: logarithm of the initial factor of focal lengths, if these are learned.
@@ -83,6 +82,7 @@ class Fitting:
         marching: Marching,
         *,
         contraction: str,
+        parallax: float = 1.0,
         settings: TrainSettings,
         log_gains: Tensor | None = None,
         log_focal: float = 0.0,
@@ -98,7 +98,7 @@ class Fitting:
         device = pool.colours.device
         torch.manual_seed(settings.seed)
         self.pool = pool
-        self.marching = marching
+        self.marching, self.parallax = marching, parallax
         self.settings = settings
         self.ranks = ranks
         self.step = 0
@@ -130,14 +130,14 @@ class Fitting:
         self.cells = OpenCells(self.field, device, covered=covered)
         if sky is not None:
             self.parts.show_sky(sky)
-        self.edges = marching.edges().to(device, torch.float32)
+        self.ray_steps = RaySteps(marching, self.field.settings, parallax=parallax, device=device)
         rows = self.field.rows()
         most_rays = MOST_RAYS if rows is None else max(MOST_RAYS, rows.shape[-2] // ROWS_PER_RAY)
         self._most_rays = most_rays if device.type == "cpu" else max(most_rays, settings.samples_per_step // 4)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
         self.optimiser = FieldOptimiser(self.field)
         self.parts_optimiser = PartsOptimiser(self.parts.groups())
-        self.samples_per_ray = float(len(self.edges) - 2)
+        self.samples_per_ray = float(self.ray_steps.most)
         self.rate_factor, self.rollbacks = 1.0, 0
         self.in_step = False
         self.loss: float | None = None  # the last one that was read
@@ -161,7 +161,7 @@ class Fitting:
         ranks, whole = self.ranks, self.draw(fraction)
         drawn = self.parts.with_learning_rays(whole.every(ranks.rank, ranks.count), of_cameras)
         rays = len(whole.origins)
-        edges = self.edges[:: stride_at(fraction, self.step)].contiguous()
+        edges = self.ray_steps.edges(fraction, self.step)
         loss, losses, samples = self._loss(drawn, whole=whole, edges=edges, fraction=fraction, watch=watch)
         self.optimiser.zero_grad()
         self.parts_optimiser.zero_grad()
@@ -186,7 +186,7 @@ class Fitting:
             self.step,
             fraction=self.largest_fraction,
             detail=self._detail,
-            marching=self.marching,
+            marching=self.ray_steps.finest,
             generator=self.generator,
             ranks=self.ranks,
         )
@@ -269,7 +269,7 @@ class Fitting:
         """Return the model's and the photos' colours of pixels, both (N, 3) sRGB, alpha on white."""
         drawn = self.parts.refined(drawn)
         behind = torch.full_like(drawn.origins, 1.0 if self.pool.has_alpha else 0.0)
-        edges = self.edges[:: stride_at(self.largest_fraction, self.step)].contiguous()
+        edges = self.ray_steps.edges(self.largest_fraction, self.step)
         rendered, transmittance = self._seen(drawn, edges=edges, behind=behind)
         return self.parts.compared(rendered, transmittance, drawn, behind=behind)
 
@@ -277,7 +277,7 @@ class Fitting:
     def light_from_beyond(self, drawn: PixelBatch, *, distance: float) -> Tensor:
         """Return the fraction of each pixel's light, (N,), that comes from beyond a distance in the current field."""
         drawn = self.parts.refined(drawn)
-        edges = self.edges[:: stride_at(self.largest_fraction, self.step)].contiguous()
+        edges = self.ray_steps.edges(self.largest_fraction, self.step)
         near = edges[: max(2, int(torch.searchsorted(edges, distance, right=True)))]
         return self._seen(drawn, edges=near, behind=torch.zeros_like(drawn.origins))[1]
 

@@ -1,12 +1,59 @@
 """Length of the steps along rays in the course of a training."""
 
-# Until this fraction of the budget, steps along rays are this many times as long: the initial fog has no detail.
-# Short trainings do not reach the detail and learn more from more rays: their fractions are those of this many steps.
-STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
+import torch
+from torch import Tensor
+
+from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.interface import FieldSettings
+from nerfcli.field.sizes import cube_side
+from nerfcli.render.model import Marching
+
+# Until this fraction of the budget, steps along rays are this many times as long as those of the capture: the initial
+# fog has no detail. Short trainings do not reach the detail and learn more from more rays: their fractions are those of
+# this many steps.
+STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2))
 DETAILED_STEPS = 2500
+# Detailed fields end with shorter steps, halved until they are shorter than this many cells of the finest level as seen
+# from other cameras: along a ray, a surface is at least as thick as a step, which blurs its edges in their pictures.
+CELLS_PER_STEP = 2.0
+# Each halving costs a quarter of a training's rays.
+MOST_HALVINGS = 2
 
 
-def stride_at(fraction: float, step: int) -> int:
-    """Return the number of shortest ray steps to combine into one, at a fraction of the budget and at step `step`."""
-    fraction = min(fraction, step / DETAILED_STEPS)
-    return next(stride for until, stride in STRIDES if fraction <= until)
+class RaySteps:
+    """The steps along the rays of one training: long ones first, those of `finest` from 40 % of the budget on.
+
+    Pictures have the steps of `of_pictures`; those of detailed fields have at most half of the capture's.
+
+    Args:
+        marching: the steps of the capture.
+        settings: of the field.
+        parallax: of the capture, see `Extent`.
+    """
+
+    def __init__(self, marching: Marching, settings: FieldSettings, *, parallax: float, device: torch.device):
+        self._halved = 2 ** halvings(marching, settings, parallax)
+        self.finest = marching.stretched(1 / self._halved)
+        self.of_pictures = marching.stretched(1 / max(2, self._halved)) if settings.detailed else marching
+        self._edges = self.finest.edges().to(device, torch.float32)
+
+    @property
+    def most(self) -> int:
+        """Largest number of steps of a ray."""
+        return len(self._edges) - 2
+
+    def edges(self, fraction: float, step: int) -> Tensor:
+        """Return the edges of the steps, see `Marching.edges`, at a fraction of the budget and at step `step`."""
+        fraction = min(fraction, step / DETAILED_STEPS)
+        stride = next((stride * self._halved for until, stride in STRIDES if fraction <= until), 1)
+        return self._edges[::stride].contiguous()
+
+
+def halvings(marching: Marching, settings: FieldSettings, parallax: float) -> int:
+    """Return how often the steps of a capture are halved by the end of a field's training."""
+    if not (isinstance(settings, HashFieldSettings) and settings.detailed):
+        return 0
+    # In contracted space, steps grow with distance as cells do; `growth` is the step at distance 1.
+    step = max(marching.shortest_step, marching.growth)
+    cells = parallax * step / cube_side(settings.contraction) * settings.finest
+    return next((n for n in range(MOST_HALVINGS) if cells / 2**n < CELLS_PER_STEP), MOST_HALVINGS)

@@ -30,9 +30,6 @@ STATE_FORMAT = "nerfcli training 2"
 # Photos without alpha fill the frame; behind the field is black, and little of it shows through.
 OPAQUE_BACKGROUND = (0.0, 0.0, 0.0)
 ALPHA_BACKGROUND = (1.0, 1.0, 1.0)
-# Length of ray steps in pictures of detailed fields, relative to those of the training, where longer steps allow more
-# rays for the same number of samples.
-DETAILED_STEP = 0.5
 
 
 @dataclass
@@ -67,11 +64,10 @@ class Checkpoints:
         fitting, prepared = self._fitting, self._prepared
         cells = fitting.cells
         alone = ALPHA_BACKGROUND if prepared.pool.has_alpha else OPAQUE_BACKGROUND
-        marching = prepared.extent.marching
         return Model(
             fitting.field,
             cells.coarse if fitting.parts.sky is None else cells.visited,
-            marching.stretched(DETAILED_STEP) if fitting.field.settings.detailed else marching,
+            fitting.ray_steps.of_pictures,
             fitting.parts.background or alone,
             prepared.extent.training_from_scene,
             self._scene.unit,

@@ -100,6 +100,7 @@ class Prepared:
             self.pool,
             self.extent.marching,
             contraction=self.extent.contraction,
+            parallax=self.extent.parallax,
             settings=self.settings,
             log_gains=self.log_gains,
             log_focal=self.log_focal,

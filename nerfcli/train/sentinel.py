@@ -171,6 +171,7 @@ class Sentinel:
             "pixels": [list(pixel) for pixel in pixels],
             "settings": fitting.settings.to_json(),
             "marching": vars(fitting.marching),
+            "parallax": fitting.parallax,
             "cameras": [camera.to_json() for camera in fitting.pool.cameras],
             "state": description,
         }
@@ -225,6 +226,7 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
         _SavedBatch(tensors, description.get("cameras", ())),
         Marching(**description["marching"]),
         contraction=size.contraction,
+        parallax=description.get("parallax", 1.0),
         settings=settings,
         size=size,
     )

@@ -1,0 +1,60 @@
+"""Steps along rays in the course of a training."""
+
+import pytest
+import torch
+
+from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.voxel_field import VoxelFieldSettings
+from nerfcli.fit.strides import DETAILED_STEPS, RaySteps, halvings
+from nerfcli.render.model import Marching
+
+BALL = Marching(near=0.5, far=300.0, shortest_step=1 / 256, growth=1 / 128)
+CUBE = Marching(near=0.5, far=4.0, shortest_step=1 / 128, growth=0.0)
+
+
+def grid(finest: int, *, log2_rows: int = 17, contraction: str = "l2") -> HashFieldSettings:
+    return HashFieldSettings(finest=finest, log2_rows=log2_rows, contraction=contraction)
+
+
+@pytest.mark.parametrize(
+    ("marching", "settings", "parallax", "times"),
+    [
+        # A step of 1/128 in a cube of side 4 is finest / 512 cells long, at distance 1 as anywhere else.
+        (BALL, grid(1023), 1.0, 0),
+        (BALL, grid(1024), 1.0, 1),
+        (BALL, grid(2047), 1.0, 1),
+        (BALL, grid(2048), 1.0, 2),
+        (BALL, grid(4096), 1.0, 2),
+        # From cameras that are close together, it is seen half as long.
+        (BALL, grid(2047), 0.5, 0),
+        (BALL, grid(2048), 0.5, 1),
+        # The cube of a bounded field has a side of 2.
+        (CUBE, grid(511, contraction="none"), 1.0, 0),
+        (CUBE, grid(512, contraction="none"), 1.0, 1),
+        # Trainings of small tables are too short, and other fields have no levels.
+        (BALL, grid(4096, log2_rows=16), 1.0, 0),
+        (BALL, VoxelFieldSettings(contraction="l2"), 1.0, 0),
+    ],
+)
+def test_steps_are_halved_until_they_are_shorter_than_two_cells_at_most_twice(marching, settings, parallax, times):
+    assert halvings(marching, settings, parallax) == times
+
+
+@pytest.mark.parametrize(
+    ("fraction", "step", "multiple"),
+    [(0.0, 9999, 8), (0.05, 9999, 8), (0.06, 9999, 4), (0.15, 9999, 4), (0.16, 9999, 2), (0.4, 9999, 2),
+     (0.41, 9999, 0.25), (1.0, 9999, 0.25), (1.0, DETAILED_STEPS * 2 // 5, 2), (1.0, 0, 8)],
+)  # fmt: skip
+def test_steps_begin_eight_times_as_long_as_those_of_the_capture_and_end_with_a_quarter(fraction, step, multiple):
+    marching = Marching(near=1.0, far=3.0, shortest_step=1 / 128, growth=0.0)
+    steps = RaySteps(marching, grid(1024, contraction="none"), parallax=1.0, device=torch.device("cpu"))
+    edges = steps.edges(fraction, step)
+    torch.testing.assert_close(edges.diff(), torch.full_like(edges[1:], multiple / 128), rtol=1e-4, atol=0)
+    assert edges[0] == 1.0
+    assert len(edges) - 1 <= steps.most + 1
+
+
+def test_pictures_of_detailed_fields_have_at_most_half_of_the_steps_of_the_capture():
+    for settings, part in ((grid(4096), 1 / 4), (grid(1024), 1 / 2), (grid(800), 1 / 2), (grid(4096, log2_rows=16), 1)):
+        steps = RaySteps(BALL, settings, parallax=1.0, device=torch.device("cpu"))
+        assert steps.of_pictures == BALL.stretched(part)
