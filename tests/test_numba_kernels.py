@@ -14,6 +14,7 @@ import torch
 
 from nerfcli import kernels
 from nerfcli.kernels import HashGrid, March, PixelTable, Rays, numba_cpu, reference
+from nerfcli.kernels.numba_cpu import visible
 from nerfcli.kernels.numba_cpu.exponential import exponential, sigmoid, sigmoid_slope
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
@@ -377,8 +378,10 @@ def test_visible_samples_misses_no_lonely_cell(side, contraction, steps, generat
     assert (counts[0] - counts[1]).abs().sum() <= 2
 
 
-def test_visible_samples_holds_many_rays_of_many_samples(generator):
-    # More samples than the buffers first hold, in order of rays, in fog so thin that no ray ends early.
+@pytest.mark.parametrize("room", [2**19, 5000])
+def test_visible_samples_holds_many_rays_of_many_samples(room, generator, monkeypatch):
+    # 80,000 samples, in order of rays, in fog so thin that no ray ends early; or more than there is room for at first.
+    monkeypatch.setattr(visible, "USUAL_SAMPLES", room)
     rays, edges = 200, torch.linspace(0, 2, 402)
     origins = torch.tensor([0.0, 0.0, -1.0]).repeat(rays, 1)
     directions = torch.tensor([0.0, 0.0, 1.0]).repeat(rays, 1)

@@ -43,7 +43,7 @@ def test_steps_are_halved_until_they_are_shorter_than_two_cells_at_most_twice(ma
 @pytest.mark.parametrize(
     ("fraction", "step", "multiple"),
     [(0.0, 9999, 8), (0.05, 9999, 8), (0.06, 9999, 4), (0.15, 9999, 4), (0.16, 9999, 2), (0.4, 9999, 2),
-     (0.41, 9999, 0.25), (1.0, 9999, 0.25), (1.0, DETAILED_STEPS * 2 // 5, 2), (1.0, 0, 8)],
+     (0.41, 9999, 1), (0.51, 9999, 0.25), (1.0, 9999, 0.25), (1.0, DETAILED_STEPS * 2 // 5, 2), (1.0, 0, 8)],
 )  # fmt: skip
 def test_steps_begin_eight_times_as_long_as_those_of_the_capture_and_end_with_a_quarter(fraction, step, multiple):
     marching = Marching(near=1.0, far=3.0, shortest_step=1 / 128, growth=0.0)

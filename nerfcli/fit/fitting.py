@@ -186,7 +186,7 @@ class Fitting:
             self.step,
             fraction=self.largest_fraction,
             detail=self._detail,
-            marching=self.ray_steps.finest,
+            marching=self.marching,
             generator=self.generator,
             ranks=self.ranks,
         )

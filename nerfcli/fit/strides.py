@@ -11,7 +11,7 @@ from nerfcli.render.model import Marching
 # Until this fraction of the budget, steps along rays are this many times as long as those of the capture: the initial
 # fog has no detail. Short trainings do not reach the detail and learn more from more rays: their fractions are those of
 # this many steps.
-STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2))
+STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (0.5, 1))
 DETAILED_STEPS = 2500
 # Detailed fields end with shorter steps, halved until they are shorter than this many cells of the finest level as seen
 # from other cameras: along a ray, a surface is at least as thick as a step, which blurs its edges in their pictures.
@@ -21,7 +21,7 @@ MOST_HALVINGS = 2
 
 
 class RaySteps:
-    """The steps along the rays of one training: long ones first, those of `finest` from 40 % of the budget on.
+    """The steps along the rays of one training: long ones first, the shortest ones from half of the budget on.
 
     Pictures have the steps of `of_pictures`; those of detailed fields have at most half of the capture's.
 
@@ -33,9 +33,8 @@ class RaySteps:
 
     def __init__(self, marching: Marching, settings: FieldSettings, *, parallax: float, device: torch.device):
         self._halved = 2 ** halvings(marching, settings, parallax)
-        self.finest = marching.stretched(1 / self._halved)
         self.of_pictures = marching.stretched(1 / max(2, self._halved)) if settings.detailed else marching
-        self._edges = self.finest.edges().to(device, torch.float32)
+        self._edges = marching.stretched(1 / self._halved).edges().to(device, torch.float32)
 
     @property
     def most(self) -> int:

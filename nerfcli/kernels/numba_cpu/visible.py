@@ -23,6 +23,9 @@ from nerfcli.kernels.numba_cpu.threads import use_threads
 LANES = 256
 AHEAD = 4
 ROUND = LANES * AHEAD
+# Room for the samples of each thread, 92 MB; if there are more, all are found again with room for every step of every
+# ray. That would be up to 1.7 GB in each step, and trainings would keep the pages that any of them has touched.
+USUAL_SAMPLES = 2**19
 # Empty blocks of cells are skipped as a whole: blocks along a side of the grid, and smallest width of one in cells.
 BLOCKS, LEAST_BLOCK = 16, 4
 
@@ -184,7 +187,8 @@ def _follow(
     """Write the samples of rays from `coming` up to `last_ray`, in the order in which they are found.
 
     A sample's ray goes to `owner`, its start, end, density and coordinates to `record`, its features to `code`. If it
-    is left out for its weight, its coordinates and optical depth go to `left` instead. Returns the number of both.
+    is left out for its weight, its coordinates and optical depth go to `left` instead. Returns the number of both, the
+    first -1 if there is not enough room.
     """
     intervals = edges.shape[0] - 2 - CHUNK
     (lane_ray, lane_next, lane_depth), (places, cells), (sample_lane, sample_span, points) = new_round()
@@ -202,6 +206,8 @@ def _follow(
         )  # fmt: skip
         if filled == 0:
             return found, missing
+        if max(found, missing) + filled > len(owner):
+            return -1, missing
         encode_range(
             points.reshape(-1), ROUND, widths, 0, filled, flat, rows, resolutions, scratch, encoded.reshape(-1)
         )
@@ -240,6 +246,7 @@ def _visible(
     counts: Any, owner: Any, record: Any, code: Any, left: Any, found: Any, missing: Any,
 ) -> None:  # fmt: skip
     """Call `_follow` in parallel, with one thread for the rays from each border to the next."""
+    counts[:] = 0
     for thread in numba.prange(len(borders) - 1):
         found[thread], missing[thread] = _follow(
             origins, directions, edges, jitter, occupied, blocks, side, contraction, flat, rows,
@@ -272,19 +279,22 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: torch.Tens
     threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
     cones = rays.cones if grid.antialias and rays.cones is not None else rays.origins.new_empty(0)
     borders = np.arange(threads + 1) * count // threads
-    # Room for all samples of all rays: the system allocates memory only when it is first written to.
-    room = (threads, -(-count // threads) * intervals)
-    owner, record = np.empty(room, np.int64), np.empty((*room, 6), np.float32)
-    code, left = np.empty((*room, WIDTH), np.float32), np.empty((*room, 4), np.float32)
-    counts, (found, missing) = np.zeros(count, np.int64), np.zeros((2, threads), np.int64)
-    _visible(
-        rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
-        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), occupied_blocks(along.occupied.numpy()),
-        along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
-        grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
-        np.array(grid.resolutions, dtype=np.int32), flat_weights(grid.layers[:2]), along.max_optical_depth,
-        along.least_weight, cones.contiguous().numpy(), borders, counts, owner, record, code, left, found, missing,
-    )  # fmt: skip
+    counts, (found, missing) = np.empty(count, np.int64), np.empty((2, threads), np.int64)
+    most = -(-count // threads) * intervals
+    for samples in (min(USUAL_SAMPLES, most), most):
+        room = (threads, samples)
+        owner, record = np.empty(room, np.int64), np.empty((*room, 6), np.float32)
+        code, left = np.empty((*room, WIDTH), np.float32), np.empty((*room, 4), np.float32)
+        _visible(
+            rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
+            rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), occupied_blocks(along.occupied.numpy()),
+            along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
+            grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
+            np.array(grid.resolutions, dtype=np.int32), flat_weights(grid.layers[:2]), along.max_optical_depth,
+            along.least_weight, cones.contiguous().numpy(), borders, counts, owner, record, code, left, found, missing,
+        )  # fmt: skip
+        if (found >= 0).all():
+            break
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     samples = int(offsets[-1])
     if samples == 0 and along.least_weight > 0.0:  # all are faint
