@@ -203,7 +203,8 @@ TRAINING: tuple[Group, ...] = (
             Mutant("cells = parallax * step", "cells = step"),
             Mutant("MOST_HALVINGS = 2", "MOST_HALVINGS = 3"),
             Mutant("stride * self._halved for", "stride for"),
-            Mutant("max(2, self._halved)", "self._halved"),
+            Mutant("max(2, shortest)", "shortest"),
+            Mutant("self._halved if self._stride(fraction, step) == 1 else 1", "self._halved"),
         ),
     ),
     Group(

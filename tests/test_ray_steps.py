@@ -1,5 +1,7 @@
 """Steps along rays in the course of a training."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,6 +9,8 @@ from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.voxel_field import VoxelFieldSettings
 from nerfcli.fit.strides import DETAILED_STEPS, RaySteps, halvings
 from nerfcli.render.model import Marching
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.train.preparation import prepare
 
 BALL = Marching(near=0.5, far=300.0, shortest_step=1 / 256, growth=1 / 128)
 CUBE = Marching(near=0.5, far=4.0, shortest_step=1 / 128, growth=0.0)
@@ -57,4 +61,18 @@ def test_steps_begin_eight_times_as_long_as_those_of_the_capture_and_end_with_a_
 def test_pictures_of_detailed_fields_have_at_most_half_of_the_steps_of_the_capture():
     for settings, part in ((grid(4096), 1 / 4), (grid(1024), 1 / 2), (grid(800), 1 / 2), (grid(4096, log2_rows=16), 1)):
         steps = RaySteps(BALL, settings, parallax=1.0, device=torch.device("cpu"))
-        assert steps.of_pictures == BALL.stretched(part)
+        assert steps.of_pictures(1.0, DETAILED_STEPS) == BALL.stretched(part)
+        # A training that ends before it gets to the shortest steps has not learned what they would show.
+        assert steps.of_pictures(1.0, DETAILED_STEPS // 2) == BALL.stretched(max(part, 1 / 2))
+
+
+def test_a_training_sees_the_parallax_of_its_capture(spheres, tmp_path):
+    # Steps of 2 sqrt(3) / 512 in a cube of side 2 are 3.46 cells long where 1024 fit along its side.
+    settings = TrainSettings(budget_seconds=None, steps=10, log2_rows=17, model="default")
+    prepared = prepare(spheres, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    assert prepared.extent.parallax == 1.0
+    most = []
+    for parallax in (1.0, 0.5):
+        seen = replace(prepared, extent=replace(prepared.extent, parallax=parallax)).fitting()
+        most.append(seen.ray_steps.most)
+    assert most[0] == pytest.approx(2 * most[1], abs=2)

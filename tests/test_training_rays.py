@@ -14,7 +14,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_quaternion
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.fit.extent import BALLS_BEFORE_BACKGROUND, choose_extent
+from nerfcli.fit.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
 from nerfcli.fit.losses import colour_losses, over_background
 from nerfcli.fit.normalisation import (
     box_frame,
@@ -179,6 +179,9 @@ def test_a_narrow_baseline_is_one_below_half_of_the_nearest_depth(spread):
     ball, marching = narrow_frame(scene)[:2] if spread < 1.0 else contracted_frame(scene)
     assert extent.training_from_scene.scale == ball.scale
     assert extent.marching == marching
+    # Cameras that are close together see a motion along a ray half as large as its length, at most.
+    assert extent.parallax == (0.5 if spread < 1.0 else 1.0)
+    assert Extent.from_json(extent.to_json()).to_json() == extent.to_json()
     if spread > 1.0:  # a learned background surrounds the unit ball, seen from the farthest camera
         centres = training_centres(scene, extent.training_from_scene)
         assert extent.reach == pytest.approx(np.linalg.norm(centres, axis=1).max() + BALLS_BEFORE_BACKGROUND)

@@ -23,8 +23,6 @@ MOST_HALVINGS = 2
 class RaySteps:
     """The steps along the rays of one training: long ones first, the shortest ones from half of the budget on.
 
-    Pictures have the steps of `of_pictures`; those of detailed fields have at most half of the capture's.
-
     Args:
         marching: the steps of the capture.
         settings: of the field.
@@ -32,8 +30,8 @@ class RaySteps:
     """
 
     def __init__(self, marching: Marching, settings: FieldSettings, *, parallax: float, device: torch.device):
+        self._marching, self._detailed = marching, settings.detailed
         self._halved = 2 ** halvings(marching, settings, parallax)
-        self.of_pictures = marching.stretched(1 / max(2, self._halved)) if settings.detailed else marching
         self._edges = marching.stretched(1 / self._halved).edges().to(device, torch.float32)
 
     @property
@@ -43,9 +41,20 @@ class RaySteps:
 
     def edges(self, fraction: float, step: int) -> Tensor:
         """Return the edges of the steps, see `Marching.edges`, at a fraction of the budget and at step `step`."""
+        return self._edges[:: self._stride(fraction, step)].contiguous()
+
+    def of_pictures(self, fraction: float, step: int) -> Marching:
+        """Return the steps of pictures of the field: those of the training so far, at most those of the capture.
+
+        Pictures of detailed fields have at most half of the capture's, with which the training had more rays.
+        """
+        shortest = self._halved if self._stride(fraction, step) == 1 else 1
+        return self._marching.stretched(1 / max(2, shortest)) if self._detailed else self._marching
+
+    def _stride(self, fraction: float, step: int) -> int:
+        """Return how many of the shortest steps make one."""
         fraction = min(fraction, step / DETAILED_STEPS)
-        stride = next((stride * self._halved for until, stride in STRIDES if fraction <= until), 1)
-        return self._edges[::stride].contiguous()
+        return next((stride * self._halved for until, stride in STRIDES if fraction <= until), 1)
 
 
 def halvings(marching: Marching, settings: FieldSettings, parallax: float) -> int:

@@ -67,7 +67,7 @@ class Checkpoints:
         return Model(
             fitting.field,
             cells.coarse if fitting.parts.sky is None else cells.visited,
-            fitting.ray_steps.of_pictures,
+            fitting.ray_steps.of_pictures(fitting.largest_fraction, fitting.step),
             fitting.parts.background or alone,
             prepared.extent.training_from_scene,
             self._scene.unit,
