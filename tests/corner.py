@@ -51,9 +51,13 @@ def cam_from_world(centre: np.ndarray) -> np.ndarray:
     return np.column_stack([rotation, -rotation @ centre])
 
 
-def render(centre: np.ndarray, scale: float) -> np.ndarray:
-    """Render the corner x = 0, y = 0, z = 0 with walls of side 2, each by its homography; no wall hides another."""
-    intrinsics = np.array([[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, HEIGHT / 2], [0, 0, 1]]) * [[scale], [scale], [1]]
+def render(centre: np.ndarray, scale: float, shift: np.ndarray) -> np.ndarray:
+    """Render the corner x = 0, y = 0, z = 0 with walls of side 2, each by its homography; no wall hides another.
+
+    `shift` (2,) is the distance of the principal point from the middle of the picture, before scaling.
+    """
+    x, y = np.array([WIDTH / 2, HEIGHT / 2]) + shift
+    intrinsics = np.array([[FOCAL_PX, 0, x], [0, FOCAL_PX, y], [0, 0, 1]]) * [[scale], [scale], [1]]
     size = (round(WIDTH * scale), round(HEIGHT * scale))
     pose = cam_from_world(centre)
     image = np.full((size[1], size[0], 3), 90, np.uint8)
@@ -69,11 +73,14 @@ def render(centre: np.ndarray, scale: float) -> np.ndarray:
     return image
 
 
-def write_capture(folder: Path) -> None:
-    """Write the seven views, a blank photo and a text file named like a photo."""
+def write_capture(folder: Path, shifts: np.ndarray = np.zeros((len(NAMES), 2))) -> None:
+    """Write the seven views, a blank photo and a text file named like a photo.
+
+    `shifts` (7, 2) are those of the views' principal points, see `render`.
+    """
     folder.mkdir()
     for index, name in enumerate(NAMES):
-        picture = Image.fromarray(render(CENTRES[index], 0.8 if index in SMALLER else 1.0))
+        picture = Image.fromarray(render(CENTRES[index], 0.8 if index in SMALLER else 1.0, shifts[index]))
         exif = Image.Exif()
         if index in LYING:
             picture = picture.transpose(Image.Transpose.ROTATE_90)

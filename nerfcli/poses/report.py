@@ -71,6 +71,7 @@ class PosesReport:
     not_computed: dict[str, str] = field(default_factory=dict)
     not_finite: dict[str, str] = field(default_factory=dict)
     moving_foreground: dict[str, Any] | None = None
+    principal_points: dict[str, Any] | None = None
     cut_short: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
@@ -122,6 +123,7 @@ def make_report(
         not_computed=result["not_computed"],
         not_finite=result["not_finite"],
         moving_foreground=result.get("moving_foreground"),
+        principal_points=result.get("principal_points"),
         cut_short=tuple(result.get("cut_short", ())),
     )
 
@@ -151,6 +153,12 @@ def closing_notes(report: PosesReport) -> list[str]:
             f"intrinsics are weakly determined ({which} {images} photo{'' if images == 1 else 's'}: focal length ± "
             f"{certain['focal_percent']:.1f} %, distortion ± {certain['distortion_border_px']:.1f} px at the corners): "
             "give --intrinsics"
+        )
+    stabilised = report.principal_points
+    if stabilised is not None and stabilised["kept"]:
+        notes.append(
+            "each photo has its own principal point, as with image stabilisation: error of held-out observations "
+            f"{stabilised['shared_px']:.2f} -> {stabilised['own_px']:.2f} px"
         )
     notes += [f"cut short: {what}" for what in report.cut_short]
     for check, why in report.not_computed.items():

@@ -14,6 +14,7 @@ from nerfcli.poses.engine.mapped import file_keys, mapping_key, read_models, wri
 from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.input.plan import limit_seconds, mapping_seconds
 from nerfcli.poses.input.stages import file_key, stage_key
+from nerfcli.poses.model.principal_points import camera_of_lens
 from nerfcli.poses.model.reasons import FEW_MATCHES
 
 # Least time limit of one run of the mapper, however few the photos.
@@ -38,25 +39,32 @@ def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
 
 
 def describe_cameras(
-    model: pycolmap.Reconstruction, job: Job, uncertainty: Mapping[str, dict[str, Any]] | None = None
+    model: pycolmap.Reconstruction,
+    job: Job,
+    uncertainty: Mapping[str, dict[str, Any]] | None = None,
+    *,
+    lens_of: Mapping[int, int],
 ) -> list[dict[str, Any]]:
-    """Describe, for the report, the intrinsics of the cameras of the placed photos, and their uncertainty."""
-    counts: dict[int, int] = {}
+    """Describe, for the report, the intrinsics of the lenses of the placed photos, and their uncertainty.
+
+    `lens_of` has the lens of each photo, by image id. Photos may have principal points of their own; the lens has their
+    median.
+    """
+    photos: dict[int, list[int]] = {}
     for image_id in model.reg_image_ids():
-        camera_id = model.image(image_id).camera_id
-        counts[camera_id] = counts.get(camera_id, 0) + 1
+        photos.setdefault(lens_of[image_id], []).append(image_id)
     return [
         {
             "model": camera.model.name,
             "width": camera.width,
             "height": camera.height,
             "params": [float(value) for value in camera.params],
-            "focal_from_exif": camera.has_prior_focal_length and camera_id not in job.given_cameras,
-            "images": counts[camera_id],
-            "uncertainty": (uncertainty or {}).get(str(camera_id)),
+            "focal_from_exif": camera.has_prior_focal_length and lens not in job.given_cameras,
+            "images": len(taken),
+            "uncertainty": (uncertainty or {}).get(str(lens)),
         }
-        for camera_id, camera in sorted(model.cameras.items())
-        if camera_id in counts
+        for lens, taken in sorted(photos.items())
+        if (camera := camera_of_lens(model, taken)) is not None
     ]
 
 

@@ -19,6 +19,7 @@ from nerfcli.poses.engine.features import extract, match, start_matching
 from nerfcli.poses.engine.retrieval import with_neighbours
 from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.input.stages import stage_key
+from nerfcli.poses.model.principal_points import LEAST_OBSERVATIONS, camera_of_lens, refine_with_principal_point
 from nerfcli.poses.model.reasons import FEW_MATCHES, NO_TRAINING_PHOTO
 
 # As in pycolmap's mapper (abs_pose_max_error, abs_pose_min_inlier_ratio).
@@ -90,8 +91,9 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     before = fingerprint(model)
     placed: dict[int, Placed] = {}
     reasons: dict[str, str] = {}
+    own = (result.get("principal_points") or {"kept": False})["kept"]
     for done, number in enumerate(job.held_out):
-        found = _place(model, job, number, across)
+        found = _place(model, job, number, across, own_principal_point=own)
         if isinstance(found, Placed):
             placed[number] = found
         else:
@@ -119,7 +121,12 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
 
 def fingerprint(model: pycolmap.Reconstruction, *, without: frozenset[str] = frozenset()) -> str:
     """Return a hash of every bit of cameras, points with tracks, and poses of the images that are not in `without`."""
-    cameras = [(number, camera.model.name, _bits(camera.params)) for number, camera in sorted(model.cameras.items())]
+    others = {image.camera_id for image in model.images.values() if image.name not in without}
+    cameras = [
+        (number, camera.model.name, _bits(camera.params))
+        for number, camera in sorted(model.cameras.items())
+        if number in others
+    ]
     points = [
         (number, _bits(point.xyz), sorted((e.image_id, e.point2D_idx) for e in point.track.elements))
         for number, point in sorted(model.points3D.items())
@@ -136,10 +143,19 @@ def _bits(values: Any) -> str:
     return np.ascontiguousarray(values, dtype=np.float64).tobytes().hex()
 
 
-def _place(model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[tuple[int, int], ...]) -> Placed | str:
+def _place(
+    model: pycolmap.Reconstruction,
+    job: Job,
+    number: int,
+    pairs: tuple[tuple[int, int], ...],
+    *,
+    own_principal_point: bool,
+) -> Placed | str:
     """Add one photo with its pose to the model, or return the reason why it has none."""
-    camera_id = next(at for at, group in enumerate(job.groups, start=1) if number in group.photos)
-    if camera_id not in model.cameras:
+    group = next(group for group in job.groups if number in group.photos)
+    training = sorted(set(group.photos) - set(job.held_out))
+    camera = camera_of_lens(model, [job.image_ids[photo] for photo in training])
+    if camera is None:
         return NO_TRAINING_PHOTO
     pixels, points = _seen_points(model, job, number, pairs)
     options = pycolmap.AbsolutePoseEstimationOptions()
@@ -151,16 +167,23 @@ def _place(model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[t
     refinement.refine_extra_params = False
     found = None
     if len(points) >= FEW_MATCHES:
-        found = pycolmap.estimate_and_refine_absolute_pose(
-            pixels, points, model.cameras[camera_id], options, refinement
-        )
+        found = pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, options, refinement)
     if found is None or found["num_inliers"] < FEW_MATCHES:
         count = 0 if found is None else found["num_inliers"]
         return f"matches too few points of the training photos ({count} inliers of {len(points)})"
     inside = np.asarray(found["inlier_mask"], dtype=bool)
-    image = pycolmap.Image(name=job.names[number], camera_id=camera_id, image_id=job.image_ids[number])
+    pose: pycolmap.Rigid3d = found["cam_from_world"]
+    if own_principal_point:
+        camera.camera_id = job.image_ids[number]
+        if found["num_inliers"] >= LEAST_OBSERVATIONS and not group.fixed:
+            refined, shift = refine_with_principal_point(camera, pose.matrix(), pixels[inside], points[inside])
+            pose = pycolmap.Rigid3d(refined)
+            camera.principal_point_x += shift[0]
+            camera.principal_point_y += shift[1]
+        model.add_camera_with_trivial_rig(camera)
+    image = pycolmap.Image(name=job.names[number], camera_id=camera.camera_id, image_id=job.image_ids[number])
     image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels[inside]])
-    model.add_image_with_trivial_frame(image, found["cam_from_world"])
+    model.add_image_with_trivial_frame(image, pose)
     there = model.image(job.image_ids[number])
     projected = [there.project_point(point) for point in points[inside]]
     errors = [np.linalg.norm(p - xy) for p, xy in zip(projected, pixels[inside], strict=True) if p is not None]

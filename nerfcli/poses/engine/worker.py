@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,9 +37,12 @@ from nerfcli.poses.input.job import Job, Report, Tell, read_job
 from nerfcli.poses.input.plan import checking_seconds, limit_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.model.principal_points import StabilisedModel, choose_principal_points
 
 # The last stage's file, with the data for the report. The model is beside it, in sparse/0.
 RESULT = "result.json"
+# Increased when the same models would give another result, so that scenes of earlier versions are checked again.
+_RESULT_VERSION = 2
 # Least time limit of each check in seconds, however few the photos.
 _LEAST_LIMIT_SECONDS = 300
 
@@ -80,7 +83,7 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
 
 def result_key(job: Job) -> str:
     """Return a hash of all that the result depends on."""
-    return stage_key(mapping_key(job), job.component, job.skipped_checks)
+    return stage_key(mapping_key(job), job.component, job.skipped_checks, _RESULT_VERSION)
 
 
 def _looked_at(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> tuple[Job, dict[str, Any] | None]:
@@ -140,11 +143,18 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
         **examined.details,
     }
     if model is not None:
-        colouring = checks()
-        model = _coloured(model, job, colouring)
-        result["not_computed"] |= colouring.not_computed
+        finishing = checks()
+        lens_of = {image_id: model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+        uncertainty = examined.uncertainty
+        if examined.verdict.accepted:
+            with _timed(seconds, "stabilisation"):
+                found = _stabilised(model, job, finishing)
+            model, result["principal_points"] = found.model, found.evidence and asdict(found.evidence)
+            uncertainty = uncertainty | {str(lens): certain for lens, certain in found.uncertainty.items()}
+        result["cameras"] = describe_cameras(model, job, uncertainty, lens_of=lens_of)
+        model = _coloured(model, job, finishing)
+        result["not_computed"] |= finishing.not_computed
         result["mean_reprojection_error_px"] = model.compute_mean_reprojection_error()
-        result["cameras"] = describe_cameras(model, job, examined.uncertainty)
         result["points"] = model.num_points3D()
         write_model(model, job)
     result["model_files"] = model_keys(job) if model is not None else {}
@@ -185,6 +195,14 @@ def _checks(job: Job) -> Checks:
     """Make a check runner for one model."""
     most = limit_seconds(checking_seconds(len(job.files)), least=_LEAST_LIMIT_SECONDS)
     return Checks(Path(job.folder), skip=dict(job.skipped_checks), seconds=most)
+
+
+def _stabilised(model: pycolmap.Reconstruction, job: Job, checks: Checks) -> StabilisedModel:
+    return checks.run(
+        "principal points",
+        lambda: choose_principal_points(model, seed=job.seed, threads=job.threads, fixed=job.fixed_cameras),
+        otherwise=StabilisedModel(model, None, {}),
+    )
 
 
 def _coloured(model: pycolmap.Reconstruction, job: Job, checks: Checks) -> pycolmap.Reconstruction:

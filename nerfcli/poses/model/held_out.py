@@ -21,6 +21,10 @@ _LOSS_FROM = 2.4
 _LEAST_LOSS_PX = 0.3
 # A point with fewer observations gives none away: at least two must remain to determine it.
 _MIN_TRACK = 3
+# Observations with larger errors do not fit a model. Errors are clipped at this value: one wrong match must not decide.
+MOST_ERROR_PX = 4.0
+# As in pycolmap's mapper.
+_LEAST_ANGLE_DEG = 1.5
 
 
 @dataclass(frozen=True)
@@ -70,12 +74,27 @@ def errors_px(model: pycolmap.Reconstruction, held: HeldOutObservations) -> Arra
     return errors
 
 
+def gain(before: Array, after: Array) -> float:
+    """Return by how many standard errors the mean of paired errors fell."""
+    difference = before - after
+    if len(difference) < 2 or difference.std() == 0:
+        return 0.0
+    return float(difference.mean() / (difference.std() / np.sqrt(len(difference))))
+
+
+def drop_misfits(model: pycolmap.Reconstruction) -> None:
+    """Drop the observations of a model that do not fit it, and the points with too small an angle, in place."""
+    pycolmap.ObservationManager(model).filter_all_points3D(MOST_ERROR_PX, _LEAST_ANGLE_DEG)
+    model.update_point_3d_errors()
+
+
 def adjust(
     model: pycolmap.Reconstruction,
     *,
     threads: int,
     principal_points: bool = False,
     focal_lengths: bool = True,
+    distortion: bool = True,
     fixed: Sequence[int] = (),
     robust_px: float | None = None,
     tolerance: float = 1e-9,
@@ -86,7 +105,7 @@ def adjust(
         model: the model to adjust.
         threads: -1 for all.
         principal_points: whether they are adjusted too.
-        focal_lengths: whether they are adjusted too.
+        focal_lengths, distortion: whether they are adjusted too.
         fixed: camera ids whose intrinsics are kept fixed.
         robust_px: error from which observations are downweighted (Cauchy loss); None for squared errors.
         tolerance: the relative change of the cost per iteration at which it ends. The default is full convergence: of
@@ -96,6 +115,7 @@ def adjust(
     options.print_summary = False
     options.refine_principal_point = principal_points
     options.refine_focal_length = focal_lengths
+    options.refine_extra_params = distortion
     options.ceres.solver_options.num_threads = threads
     options.ceres.solver_options.max_num_iterations = 200
     options.ceres.solver_options.function_tolerance = tolerance

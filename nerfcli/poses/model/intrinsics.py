@@ -39,16 +39,13 @@ START_FISHEYE = "OPENCV_FISHEYE"
 # The gain must be this many standard errors, and this fraction of the error; a smaller one changes no picture.
 _GAIN_DEVIATIONS = 2.0
 _GAIN_FRACTION = 0.001
-# Errors are clipped at this value: one wrong match must not decide on a lens.
-_CLIP_PX = 4.0
 # An added parameter must be this many standard deviations from zero.
 _PARAMETER_DEVIATIONS = 3.0
 # Each lens costs some adjustments; beyond this many lenses, and for those with fewer photos, the simplest model stays.
 _MOST_CAMERAS = 4
 _LEAST_PHOTOS = 3
-_MOST_DESCRIBED = 8
-# As in pycolmap's mapper.
-_LEAST_ANGLE_DEG = 1.5
+# Lenses whose uncertainty the report has.
+MOST_DESCRIBED = 8
 # Tolerances of the two adjustments of `settle`. Measured on 261 frames of a walk: the robust one ends after 19
 # iterations instead of 328, with cameras within 4e-5 of the radius from where these take them; with 1e-4 it is 1.3e-4.
 _TOLERANCE, _ROBUST_TOLERANCE = 1e-6, 1e-5
@@ -166,7 +163,7 @@ def choose_lenses(
         camera_id: uncertainty(
             result, camera_id, principal_point=camera_id in freed and camera_id not in strayed, seed=seed, fixed=fixed
         )
-        for camera_id in sorted(photos)[:_MOST_DESCRIBED]
+        for camera_id in sorted(photos)[:MOST_DESCRIBED]
     }
     return ModelLenses(result, candidates, certain)
 
@@ -252,11 +249,10 @@ def settle(
     """
     adjust = partial(held_out.adjust, model, threads=threads, principal_points=principal_points, fixed=fixed)
     adjust(tolerance=_TOLERANCE)
-    pycolmap.ObservationManager(model).filter_all_points3D(_CLIP_PX, _LEAST_ANGLE_DEG)
+    held_out.drop_misfits(model)
     scale_px = held_out.loss_scale_px(held_out.observation_errors_px(model))
     adjust(robust_px=scale_px, tolerance=_ROBUST_TOLERANCE)
-    pycolmap.ObservationManager(model).filter_all_points3D(_CLIP_PX, _LEAST_ANGLE_DEG)
-    model.update_point_3d_errors()
+    held_out.drop_misfits(model)
 
 
 def converted(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
@@ -339,7 +335,7 @@ class _Choice:
 
     def _better(self, best: _Trial, name: str, *, principal_point: bool) -> _Trial:
         trial = self._trial(best.model, name, principal_point=principal_point)
-        gain, significance = _gain(best.errors, trial.errors), _significance(best, trial, self.camera_id)
+        gain, significance = held_out.gain(best.errors, trial.errors), _significance(best, trial, self.camera_id)
         pays = bool(
             gain > _GAIN_DEVIATIONS
             and trial.errors.mean() < (1 - _GAIN_FRACTION) * best.errors.mean()
@@ -359,7 +355,7 @@ class _Choice:
         others = [c for c in model.cameras if c != self.camera_id] if principal_point else self.fixed
         adjuster = held_out.adjust(model, threads=self.threads, principal_points=principal_point, fixed=others)
         mine = np.array([model.image(int(i)).camera_id == self.camera_id for i in self.held.images], dtype=bool)
-        errors = np.minimum(held_out.errors_px(model, self.held)[mine], _CLIP_PX)
+        errors = np.minimum(held_out.errors_px(model, self.held)[mine], held_out.MOST_ERROR_PX)
         deviations = held_out.intrinsic_deviations(model, adjuster, principal_points=principal_point)
         return _Trial(model, principal_point, errors, deviations[self.camera_id])
 
@@ -367,14 +363,6 @@ class _Choice:
         error = float(trial.errors.mean()) if len(trial.errors) else None
         name = trial.model.cameras[self.camera_id].model.name
         self.tried.append(Candidate(self.camera_id, name, trial.principal_point, error, gain, significance, kept))
-
-
-def _gain(before: Array, after: Array) -> float:
-    """Return by how many standard errors the mean of paired errors fell."""
-    difference = before - after
-    if len(difference) < 2 or difference.std() == 0:
-        return 0.0
-    return float(difference.mean() / (difference.std() / np.sqrt(len(difference))))
 
 
 def _significance(before: _Trial, after: _Trial, camera_id: int) -> float:

@@ -13,7 +13,7 @@ Letters: x and y are a ray's coordinates at z = 1, r its distance from the axis;
 model as COLMAP's OPENCV has them; f the focal length, fa the difference of the two along the axes of the picture.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -123,24 +123,40 @@ class Estimate:
 
 
 def lens_evidence(
-    model: pycolmap.Reconstruction, camera_id: int, *, seed: int, fixed: Sequence[int] = ()
+    model: pycolmap.Reconstruction,
+    camera_id: int,
+    *,
+    seed: int,
+    fixed: Sequence[int] = (),
+    lens_of: Mapping[int, int] | None = None,
+    shifting: Collection[int] = (),
 ) -> LensEvidence:
     """Compute the evidence of a converged model's observations about a perspective camera.
 
     Observations are weighted as the robust adjustment does, see `held_out.adjust`.
 
     Args:
+        camera_id: of the camera; of its lens with `lens_of`.
         seed: of the selection of points of a large model, and of the clusters.
         fixed: cameras whose intrinsics are exact.
+        lens_of: by image id, the lens of each photo, if photos have cameras of their own that differ in the principal
+            point.
+        shifting: ids of images whose principal points are free, as poses are.
 
     Raises:
         UndeterminedError: there are fewer observations than unknowns.
     """
-    seen = _observations(model, seed=seed)
+    if lens_of is None:
+        lens_of = {image_id: model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+    seen = _observations(model, lens_of, seed=seed)
     others = [c for c in seen.cameras if c != camera_id and c not in fixed][:_MOST_OTHERS]
     poses, points, lens, residuals = _jacobians(model, seen, camera_id, others=others)
+    if shifting:
+        moves = np.isin(seen.photos, [seen.images.index(image_id) for image_id in shifting])
+        moves &= (poses != 0).any(axis=(1, 2))  # of points that are projected
+        poses = np.concatenate([poses, moves[:, None, None] * np.eye(2)], axis=2)
     rows, columns = len(residuals), lens.shape[2]
-    unknowns = 6 * len(seen.images) + 3 * len(seen.xyz) - 7 + columns
+    unknowns = poses.shape[2] * len(seen.images) + 3 * len(seen.xyz) - 7 + columns
     if 2 * rows <= unknowns:
         raise UndeterminedError(f"{rows} observations for {unknowns} unknowns")
     errors = np.linalg.norm(residuals, axis=1)
@@ -157,7 +173,8 @@ def lens_evidence(
     scores = np.einsum("nij,ni->nj", own, residuals)
     products = np.einsum("nij,nik->njk", own, own)
     clusters = (seen.photos, _scene_clusters(seen, seed=seed))
-    camera = model.cameras[camera_id]
+    photo = next(image_id for image_id, lens_id in lens_of.items() if lens_id == camera_id)
+    camera = model.camera(model.image(photo).camera_id)
     return LensEvidence(
         current=_current(camera),
         information=products.sum(axis=0),
@@ -182,9 +199,13 @@ def parameters_of(camera: pycolmap.Camera) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Observations: photos and points (n,) are positions in `images` and `xyz`; pixels (n, 2)."""
+    """Observations: photos and points (n,) are positions in `images` and `xyz`; pixels (n, 2).
+
+    lenses: the lens of each of the images. cameras: all lenses.
+    """
 
     images: list[int]
+    lenses: list[int]
     cameras: list[int]
     photos: NDArray[np.int64]
     points: NDArray[np.int64]
@@ -192,7 +213,7 @@ class _Seen:
     xyz: Array
 
 
-def _observations(model: pycolmap.Reconstruction, *, seed: int) -> _Seen:
+def _observations(model: pycolmap.Reconstruction, lens_of: Mapping[int, int], *, seed: int) -> _Seen:
     finite = [i for i, point in model.points3D.items() if np.isfinite(point.xyz).all()]
     ids = np.array(sorted(finite), dtype=np.int64)
     kept = _MOST_OBSERVATIONS / max(model.compute_num_observations(), 1)
@@ -210,10 +231,11 @@ def _observations(model: pycolmap.Reconstruction, *, seed: int) -> _Seen:
         points.append(places[inside])
         pixels += [seen[i].xy for i in inside]
     xyz = np.array([model.point3D(int(i)).xyz for i in ids], dtype=np.float64).reshape(-1, 3)
-    cameras = sorted({model.image(image_id).camera_id for image_id in images})
+    lenses = [lens_of[image_id] for image_id in images]
     return _Seen(
         images,
-        cameras,
+        lenses,
+        sorted(set(lenses)),
         np.concatenate([np.zeros(0, dtype=np.int64), *photos]),
         np.concatenate([np.zeros(0, dtype=np.int64), *points]),
         np.array(pixels, dtype=np.float64).reshape(-1, 2),
@@ -244,11 +266,11 @@ def _jacobians(
         poses[rows] = np.concatenate([jacobian @ turned, jacobian], axis=2)
         points[rows] = jacobian @ rotation
         residuals[rows] = seen.pixels[rows] - np.asarray(camera.img_from_cam(local), dtype=np.float64).reshape(-1, 2)
-        terms = _lens_terms(camera, local)
-        if image.camera_id == camera_id:
+        terms, of = _lens_terms(camera, local), seen.lenses[position]
+        if of == camera_id:
             lens[rows, :, : len(NAMES)] = terms
-        elif image.camera_id in others:
-            start = len(NAMES) + 2 * others.index(image.camera_id)
+        elif of in others:
+            start = len(NAMES) + 2 * others.index(of)
             lens[rows, :, start : start + 2] = terms[:, :, [NAMES.index("f"), NAMES.index("k1")]]
     # Points that cannot be projected contribute nothing.
     bad = ~(
@@ -291,9 +313,12 @@ def _lens_terms(camera: pycolmap.Camera, local: Array) -> Array:
 
 
 def _freed(poses: Array, points: Array, lens: Array, seen: _Seen) -> Array:
-    """Return the effect of lens parameters that no motion of poses and points can imitate, (n, 2, columns)."""
+    """Return the effect of lens parameters that no motion of poses and points can imitate, (n, 2, columns).
+
+    `poses` are (n, 2, 6), or (n, 2, 8) with principal points.
+    """
     count, columns = len(poses), lens.shape[2]
-    by_pose = _sparse(poses, seen.photos, width=6 * len(seen.images))
+    by_pose = _sparse(poses, seen.photos, width=poses.shape[2] * len(seen.images))
     by_point = _sparse(points, seen.points, width=3 * len(seen.xyz))
     flat = lens.reshape(2 * count, columns)
     blocks = np.zeros((len(seen.xyz), 3, 3))

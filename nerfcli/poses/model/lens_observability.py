@@ -6,7 +6,7 @@ observations clearly support another value, judged by photos and by parts of the
 length that they do not determine stays at EXIF's.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,10 +127,50 @@ def determine(
     return DeterminedLens(_camera(camera, found, named=named), "cx" in free, False, tuple(steps))
 
 
+def with_own_principal_points(
+    model: pycolmap.Reconstruction,
+    lens: int,
+    *,
+    lens_of: Mapping[int, int],
+    shifting: Collection[int],
+    seed: int,
+    fixed: Sequence[int] = (),
+) -> pycolmap.Camera | None:
+    """Return a lens as the observations determine it if photos have principal points of their own: one Newton step.
+
+    Args:
+        model: with a camera for each photo; it is not changed.
+        lens: the number of the lens.
+        lens_of, shifting, seed, fixed: see `lens_evidence`.
+
+    Returns:
+        The camera of the lens's first photo with these parameters, with its principal point; None if the observations
+        do not determine them, or the lens cannot be examined in this way.
+    """
+    camera = _of_lens(model, lens, lens_of)
+    free = parameters_of(camera)
+    if not free or lens in fixed:
+        return None
+    try:
+        evidence = lens_evidence(model, lens, seed=seed, fixed=fixed, lens_of=lens_of, shifting=shifting)
+        return _camera(camera, evidence.estimate(free), named=True)
+    except (UndeterminedError, np.linalg.LinAlgError):
+        return None
+
+
 def uncertainty(
-    model: pycolmap.Reconstruction, camera_id: int, *, principal_point: bool, seed: int, fixed: Sequence[int] = ()
+    model: pycolmap.Reconstruction,
+    camera_id: int,
+    *,
+    principal_point: bool,
+    seed: int,
+    fixed: Sequence[int] = (),
+    lens_of: Mapping[int, int] | None = None,
+    shifting: Collection[int] = (),
 ) -> dict[str, Any]:
     """Compute the uncertainty of the intrinsics of a camera, one standard deviation each, for the report.
+
+    `lens_of` and `shifting` are those of `lens_evidence`.
 
     Returns:
         {"focal_percent", "principal_point_px": its uncertainty if it were free, "principal_point_free",
@@ -138,7 +178,7 @@ def uncertainty(
         uncertain enough for a warning, "reason": None}. If the lens cannot be examined in this way or the observations
         are too few, "reason" says so and the numbers and "weak" are None.
     """
-    camera = model.cameras[camera_id]
+    camera = model.cameras[camera_id] if lens_of is None else _of_lens(model, camera_id, lens_of)
     nothing = {"focal_percent": None, "principal_point_px": None, "distortion_border_px": None}
     nothing |= {"principal_point_free": principal_point, "weak": None}
     free = parameters_of(camera)
@@ -147,7 +187,7 @@ def uncertainty(
     if not free:
         return nothing | {"reason": f"not supported for {camera.model.name}"}
     try:
-        evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed)
+        evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed, lens_of=lens_of, shifting=shifting)
         found = evidence.estimate([*free, *(_PRINCIPAL_POINT if principal_point else ())])
         freed = evidence.estimate([*free, *_PRINCIPAL_POINT])
     except (UndeterminedError, np.linalg.LinAlgError) as error:
@@ -162,6 +202,12 @@ def uncertainty(
         "weak": bool(focal > _WEAK_FOCAL or border > _WEAK_BORDER * np.hypot(camera.width, camera.height) / 2),
         "reason": None,
     }
+
+
+def _of_lens(model: pycolmap.Reconstruction, lens: int, lens_of: Mapping[int, int]) -> pycolmap.Camera:
+    """Return the camera of a lens's first photo."""
+    photo = next(image_id for image_id, number in lens_of.items() if number == lens)
+    return model.camera(model.image(photo).camera_id)
 
 
 def is_centred(camera: pycolmap.Camera) -> bool:

@@ -1,0 +1,246 @@
+"""Give each photo its own principal point where the observations show that these differ.
+
+Optical image stabilisation shifts the lens or the sensor during each exposure. To first order, a shift s looks like a
+rotation of the camera by s / f, and the pose absorbs it. What remains, s x^2 / f^2 and s x y / f^2 at pixels (x, y)
+from the centre, no pose can describe: for a shift of one degree in a picture of 1000 pixels and a common focal length,
+these are 5 pixels at the border.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from nerfcli.cameras.rigid import transform_from_twist
+from nerfcli.poses.model import held_out
+from nerfcli.poses.model.intrinsics import MOST_DESCRIBED
+from nerfcli.poses.model.lens_observability import uncertainty, with_own_principal_points
+
+Array = NDArray[np.float64]
+
+# The principal points stay shared unless their own ones reduce the error of held-out observations by this fraction, and
+# by this many standard errors. A shift that matters reduced it by a third, noise by less than a twentieth.
+_GAIN_FRACTION = 0.1
+_GAIN_DEVIATIONS = 3.0
+# Errors are clipped at this multiple of their median: wrong matches must not decide.
+_CLIP = 4.0
+# Photos with fewer observations keep the shared principal point, as do those whose own would be farther from it than
+# this fraction of the picture's size: stabilisers shift by up to 2 degrees.
+LEAST_OBSERVATIONS = 60
+_FARTHEST = 0.1
+_LEAST_PHOTOS = 3
+# Robust adjustments. The first ones reduce the errors by so much that what counts as an outlier changes.
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class PrincipalPoints:
+    """Whether photos have their own principal points, and why.
+
+    shared_px, own_px: mean error of the held-out observations with shared and with own principal points, each clipped
+    to four times the median. gain: the difference in standard errors. photos: how many may have their own. kept:
+    whether they do.
+    """
+
+    shared_px: float
+    own_px: float
+    gain: float
+    photos: int
+    kept: bool
+
+
+@dataclass(frozen=True)
+class StabilisedModel:
+    """A model in which each photo has its own principal point, or the model as it was, and the evidence.
+
+    evidence: None if too few photos have enough observations. uncertainty: of the lenses with own principal points, by
+    camera id, see `lens_observability.uncertainty`; empty if they are shared.
+    """
+
+    model: pycolmap.Reconstruction
+    evidence: PrincipalPoints | None
+    uncertainty: dict[int, dict[str, Any]]
+
+
+def choose_principal_points(
+    model: pycolmap.Reconstruction, *, seed: int, threads: int, fixed: Sequence[int] = ()
+) -> StabilisedModel:
+    """Return the model with a camera for each photo if their principal points differ, else the model as it is.
+
+    Photos of one lens keep a common focal length and distortion, which are adjusted too.
+
+    Args:
+        model: a converged model; it is not changed.
+        seed: of the choice of observations to hold out.
+        threads: of the adjustments, -1 for all.
+        fixed: ids of cameras whose intrinsics are kept fixed.
+    """
+    shared, held = held_out.split(model, seed=seed)
+    free = _free_photos(shared, fixed)
+    if len(free) < _LEAST_PHOTOS:
+        return StabilisedModel(model, None, {})
+    scale_px = held_out.loss_scale_px(held_out.observation_errors_px(shared))
+    _adjust(shared, set(), threads=threads, robust_px=scale_px)
+    own = with_own_cameras(shared)
+    _adjust(own, free, threads=threads, robust_px=scale_px)
+    before, after = held_out.errors_px(shared, held), held_out.errors_px(own, held)
+    most = _CLIP * float(np.median(before)) if len(before) else 0.0
+    before, after = np.minimum(before, most), np.minimum(after, most)
+    gain = held_out.gain(before, after)
+    kept = gain > _GAIN_DEVIATIONS and after.mean() < (1 - _GAIN_FRACTION) * before.mean()
+    evidence = PrincipalPoints(float(before.mean()), float(after.mean()), gain, len(free), bool(kept))
+    if not kept:
+        return StabilisedModel(model, evidence, {})
+    return _settled(model, evidence, seed=seed, threads=threads, fixed=fixed)
+
+
+def with_own_cameras(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Return a copy of a model in which each photo has a camera of its own, with the id of the image."""
+    own = pycolmap.Reconstruction()
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        camera = pycolmap.Camera(model.camera(image.camera_id).todict())
+        camera.camera_id = image_id
+        own.add_camera_with_trivial_rig(camera)
+        fresh = pycolmap.Image(name=image.name, camera_id=image_id, image_id=image_id)
+        fresh.points2D = pycolmap.Point2DList([pycolmap.Point2D(point.xy) for point in image.points2D])
+        own.add_image_with_trivial_frame(fresh, image.cam_from_world())
+    for point_id in sorted(model.point3D_ids()):
+        own.add_point3D_with_id(point_id, model.point3D(point_id))
+    return own
+
+
+def camera_of_lens(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.Camera | None:
+    """Return the camera of a lens by the ids of images taken with it: with the median of their principal points."""
+    cameras = [model.camera(model.image(photo).camera_id) for photo in photos if model.exists_image(photo)]
+    if not cameras:
+        return None
+    middle = pycolmap.Camera(cameras[0].todict())
+    middle.principal_point_x = float(np.median([camera.principal_point_x for camera in cameras]))
+    middle.principal_point_y = float(np.median([camera.principal_point_y for camera in cameras]))
+    return middle
+
+
+def refine_with_principal_point(
+    camera: pycolmap.Camera, cam_from_world: Array, pixels: Array, points: Array
+) -> tuple[Array, Array]:
+    """Refine the pose and the principal point of one photo on fixed points; errors beyond the usual ones count less.
+
+    Args:
+        camera: of the photo, with a principal point near its own.
+        cam_from_world: (3, 4) its pose, near the best one.
+        pixels, points: (N, 2) where the photo shows the points (N, 3). N >= 4, for 8 unknowns.
+
+    Returns:
+        The pose (3, 4), and the shift (2,) of the principal point in pixels.
+    """
+
+    def moved(values: Array) -> Array:
+        return (np.vstack([cam_from_world, [0, 0, 0, 1]]) @ transform_from_twist(values[:6]))[:3]
+
+    def misses(values: Array) -> Array:
+        pose = moved(values)
+        projected = np.asarray(camera.img_from_cam(points @ pose[:, :3].T + pose[:, 3]), dtype=np.float64)
+        return np.nan_to_num(projected.reshape(-1, 2) + values[6:] - pixels, nan=1e3).ravel()
+
+    found = np.zeros(8)
+    for _ in range(_ROUNDS):
+        usual = held_out.loss_scale_px(np.linalg.norm(misses(found).reshape(-1, 2), axis=1))
+        found = least_squares(misses, found, x_scale="jac", loss="cauchy", f_scale=usual).x
+    return moved(found), found[6:]
+
+
+def _settled(
+    model: pycolmap.Reconstruction, evidence: PrincipalPoints, *, seed: int, threads: int, fixed: Sequence[int]
+) -> StabilisedModel:
+    """Adjust the model with own principal points, and drop the observations that no longer fit."""
+    own, lens_of = with_own_cameras(model), _lenses(model)
+    free, held = _free_photos(model, fixed), set[int]()
+    _adjust(own, free, threads=threads, robust_px=held_out.loss_scale_px(held_out.observation_errors_px(own)))
+    for number in range(_ROUNDS):
+        # Before cameras move: poses and points have not followed yet.
+        scale_px = held_out.loss_scale_px(held_out.observation_errors_px(own))
+        held = _anchored(own, model, free)
+        if number > 0:
+            _move_lenses(own, lens_of, shifting=free - held, seed=seed, fixed=fixed)
+        _adjust(own, free - held, threads=threads, robust_px=scale_px)
+    held_out.drop_misfits(own)
+    certain = {
+        lens: uncertainty(
+            own, lens, principal_point=False, seed=seed, fixed=fixed, lens_of=lens_of, shifting=free - held
+        )
+        for lens in sorted(set(lens_of.values()))[:MOST_DESCRIBED]
+    }
+    return StabilisedModel(own, evidence, certain)
+
+
+def _anchored(own: pycolmap.Reconstruction, model: pycolmap.Reconstruction, free: set[int]) -> set[int]:
+    """Put back the principal points that are too far from the shared one, in place; return the photos to hold there.
+
+    The mean of a lens's principal points is hardly determined and drifts. So the photo nearest to their median gets the
+    shared principal point, and the others move with it.
+    """
+    held: set[int] = set()
+    lens_of = _lenses(model)
+    for lens in {lens_of[photo] for photo in free}:
+        photos = sorted(photo for photo in free if lens_of[photo] == lens)
+        camera = model.cameras[lens]
+        shared = np.array([camera.principal_point_x, camera.principal_point_y])
+        points = np.array([(own.cameras[p].principal_point_x, own.cameras[p].principal_point_y) for p in photos])
+        anchor = int(np.linalg.norm(points - np.median(points, axis=0), axis=1).argmin())
+        shifts = points - points[anchor]
+        far = np.linalg.norm(shifts / [camera.width, camera.height], axis=1) > _FARTHEST
+        shifts[far] = 0.0
+        for photo, (x, y) in zip(photos, shared + shifts, strict=True):
+            own.cameras[photo].principal_point_x, own.cameras[photo].principal_point_y = float(x), float(y)
+        held |= {photos[anchor], *np.array(photos)[far].tolist()}
+    return held
+
+
+def _lenses(model: pycolmap.Reconstruction) -> dict[int, int]:
+    return {image_id: model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+
+
+def _move_lenses(
+    own: pycolmap.Reconstruction,
+    lens_of: Mapping[int, int],
+    *,
+    shifting: set[int],
+    seed: int,
+    fixed: Sequence[int],
+) -> None:
+    """Take a step of focal lengths and distortions, which shared principal points have biased, in place."""
+    for lens in sorted(set(lens_of.values())):
+        found = with_own_principal_points(own, lens, lens_of=lens_of, shifting=shifting, seed=seed, fixed=fixed)
+        if found is None:
+            continue
+        kept = [*found.focal_length_idxs(), *found.extra_params_idxs()]
+        for photo in (image_id for image_id, number in lens_of.items() if number == lens):
+            params = np.array(own.cameras[photo].params)
+            params[kept] = np.array(found.params)[kept]
+            own.cameras[photo].params = params.tolist()
+
+
+def _adjust(model: pycolmap.Reconstruction, free: set[int], *, threads: int, robust_px: float) -> None:
+    """Adjust poses, points and the principal points of the photos in `free`, which have cameras of their own."""
+    held_out.adjust(
+        model,
+        threads=threads,
+        principal_points=bool(free),
+        focal_lengths=False,
+        distortion=False,
+        fixed=sorted(set(model.cameras) - free),
+        robust_px=robust_px,
+    )
+
+
+def _free_photos(model: pycolmap.Reconstruction, fixed: Sequence[int]) -> set[int]:
+    """Return the ids of images with enough observations for a principal point, without those of fixed cameras."""
+    images = [model.image(image_id) for image_id in model.reg_image_ids()]
+    return {
+        image.image_id for image in images if image.camera_id not in fixed and image.num_points3D >= LEAST_OBSERVATIONS
+    }
