@@ -5,7 +5,7 @@
 A mutant is one text of one file replaced by another (a sign, an index, a factor, a missing clamp) in a copy of the
 program; the tests of that file run against it until the first fails. The mutant is killed if one fails, else it
 survives. A survivor needs a test, or a reason why no test can detect it. The lists of mutants are in `mutant_list.py`,
-`mutant_list_training.py` and `mutant_list_triton.py`.
+`mutant_list_training.py`, `mutant_list_poses.py` and `mutant_list_triton.py`.
 """
 
 import csv
@@ -30,6 +30,7 @@ import scipy.interpolate  # noqa: F401
 import torch
 import typer
 from mutant_list import GROUPS, Group, Mutant
+from mutant_list_poses import POSES
 from mutant_list_training import TRAINING
 from mutant_list_triton import TRITON
 from rich.console import Console
@@ -116,7 +117,10 @@ def main(
     torch.set_num_threads(2)
     console, table = Console(), Table("file", "what is broken", "verdict", "s")
     chosen = [
-        (group, mutant) for group in (*GROUPS, *TRAINING, *TRITON) if only in group.file for mutant in group.mutants
+        (group, mutant)
+        for group in (*GROUPS, *TRAINING, *POSES, *TRITON)
+        if only in group.file
+        for mutant in group.mutants
     ][skip:]
     rows = []
     for group, mutant in chosen:

@@ -31,16 +31,23 @@ from nerfcli.poses.structure_from_motion import estimate_poses
 PHOTOS = 12
 
 
-def capture(shifts: np.ndarray, *, seed: int = 0, points: int = 500) -> pycolmap.Reconstruction:
-    """Twelve photos of one lens in a room, shifted by (12, 2) pixels, as a mapper leaves them; noise of 0.5 px."""
+def capture(shifts: np.ndarray, *, seed: int = 0, points: int = 500, wrong: float = 0.0) -> pycolmap.Reconstruction:
+    """Twelve photos of one lens in a room, shifted by (12, 2) pixels, as a mapper leaves them; noise of 0.5 px.
+
+    A fraction `wrong` of the observations is 100 px off.
+    """
     lens = Lens("SIMPLE_RADIAL", 1024, 768, (820.0, 512.0, 384.0, 0.02))
     views = synthetic.ring(PHOTOS, [lens], seed=1, radius=2.5)
     around = synthetic.together(synthetic.boulder(points * 3 // 10, seed=2), synthetic.room(points * 7 // 10, seed=3))
     model = synthetic.observed_model(views, around, noise_px=0.5, seed=seed)
+    rng = np.random.default_rng(seed)
     for number, shift in enumerate(shifts, start=1):
         for point in model.image(number).points2D:
             point.xy = np.asarray(point.xy) + shift
-    held_out.adjust(model, threads=1)
+            if rng.uniform() < wrong:
+                angle = rng.uniform(0, 2 * np.pi)
+                point.xy = np.asarray(point.xy) + 100 * np.array([np.cos(angle), np.sin(angle)])
+    held_out.adjust(model, threads=1, robust_px=2.0 if wrong else None)
     return model
 
 
@@ -86,9 +93,41 @@ def test_the_shifts_of_a_stabiliser_are_found(seed):
     focal, distortion = lenses.pop()
     assert focal == pytest.approx(820.0, rel=0.005)
     assert distortion == pytest.approx(0.02, abs=0.006)
-    shared, own = uncertainty(model, 1, principal_point=False, seed=0), certain[1]
-    assert own["focal_percent"] < 0.5
-    assert own["focal_percent"] < shared["focal_percent"]
+    assert certain[1]["focal_percent"] < 0.5
+
+
+def test_free_principal_points_leave_the_focal_length_less_certain():
+    """A law: each principal point that is free takes evidence away; the report's uncertainty has all but one free."""
+    found, _, certain = chosen(capture(stabiliser(0)))
+    photos = sorted(found.reg_image_ids())
+
+    def percent(shifting: list[int]) -> float:
+        lens_of = dict.fromkeys(photos, 1)
+        return uncertainty(found, 1, principal_point=False, seed=0, lens_of=lens_of, shifting=shifting)["focal_percent"]
+
+    assert percent([]) < 0.98 * certain[1]["focal_percent"]
+    assert certain[1]["focal_percent"] < 0.999 * percent(photos)
+
+
+def test_a_gain_that_changes_no_picture_is_not_kept():
+    """Shifts of 2.5 px are found beyond doubt, and change the errors by a few percent."""
+    model = capture(stabiliser(0, px=2.5), points=2500)
+    found, evidence, _ = chosen(model)
+    assert found is model
+    assert evidence.gain > 3
+    assert evidence.own_px < 0.99 * evidence.shared_px
+
+
+def test_a_gain_within_its_noise_is_not_kept(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(held_out, "gain", lambda before, after: 2.9)
+    model = capture(stabiliser(0))
+    assert chosen(model)[0] is model
+
+
+def test_wrong_matches_do_not_hide_the_shifts():
+    """One observation in 25 is 100 px off; unclipped, these would be most of the mean error, before and after."""
+    model = capture(stabiliser(0), wrong=0.04)
+    assert chosen(model)[1].kept
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -216,5 +255,6 @@ def test_a_scene_of_stabilised_photos_has_their_principal_points(stabilised):
     misses = (found - found.mean(axis=0)) - (shifts[large] - shifts[large].mean(axis=0))
     assert np.sqrt((misses**2).mean()) < 3.0  # mostly a drift along the row of five photos
     assert report.strict["placed"][NAMES[2]]["error_px"] < 0.8
-    assert len(report.cameras) == 2  # the report lists lenses
+    assert [camera["images"] for camera in report.cameras] == [4, 2]  # by lens; the held-out photo is not counted
+    assert abs(report.cameras[0]["params"][3]) < 0.06  # shared principal points look like a distortion of -0.13
     assert len({frame.camera for frame in scene.load(scene_dir).frames}) == len(NAMES)

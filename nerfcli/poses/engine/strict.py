@@ -175,7 +175,7 @@ def _place(
     pose: pycolmap.Rigid3d = found["cam_from_world"]
     if own_principal_point:
         camera.camera_id = job.image_ids[number]
-        if found["num_inliers"] >= LEAST_OBSERVATIONS and not group.fixed:
+        if found["num_inliers"] >= LEAST_OBSERVATIONS:
             refined, shift = refine_with_principal_point(camera, pose.matrix(), pixels[inside], points[inside])
             pose = pycolmap.Rigid3d(refined)
             camera.principal_point_x += shift[0]
