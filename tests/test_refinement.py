@@ -115,9 +115,17 @@ def test_pose_gradient_is_the_difference_of_a_loss(small):
             assert found[photo, axis].item() == pytest.approx(wanted, abs=1e-4 * found.abs().max().item() + 1e-3)
 
 
-def test_lens_gradient_is_the_difference_of_a_loss(small):
+def with_lens(small: Scene, shifts: tuple[float, ...]) -> Scene:
+    """Return the scene with photos of one lens, whose principal points a stabiliser has moved by `shifts`."""
     lens = Camera("RADIAL", 96, 72, (100.0, 48.0, 36.0, 0.05, -0.02))
-    scene = replace(small, frames=tuple(replace(frame, camera=lens) for frame in small.frames))
+    cameras = [lens.with_principal_point(48.0 + shift, 36.0 - shift) for shift in shifts]
+    frames = tuple(replace(frame, camera=camera) for frame, camera in zip(small.frames, cameras, strict=True))
+    return replace(small, frames=frames)
+
+
+@pytest.mark.parametrize("shifts", [(0.0, 0.0, 0.0, 0.0), (0.0, 3.2, -1.7, 2.0)])
+def test_lens_gradient_is_the_difference_of_a_loss(small, shifts):
+    scene = with_lens(small, shifts)
     pool, generator = pool_of(scene), torch.Generator().manual_seed(3)
     numbers = pool.draw(300, generator).numbers
     slopes = torch.randn(2, 300, 3, generator=generator, dtype=torch.float64)
@@ -136,6 +144,19 @@ def test_lens_gradient_is_the_difference_of_a_loss(small):
             losses.append(linear_loss(pool, refinement, numbers, slopes))
         wanted = (losses[0] - losses[1]) / 2e-2
         assert found[0, index].item() == pytest.approx(wanted, abs=2e-3 * found.abs().max().item())
+
+
+def test_photos_of_a_stabilised_lens_change_together(small):
+    """Whatever a lens learns holds for all its photos, the held-out one too; principal points stay where they are."""
+    scene = with_lens(small, (0.0, 3.2, -1.7, 2.0))
+    refinement = Refinement("all", pool_of(scene))
+    assert refinement.lenses is not None
+    refinement.lenses.values.copy_(torch.tensor([[0.02, 0.01, -0.01]], dtype=torch.float64))
+    training, held_out = refinement.frames(scene.train_frames, scene.test_frames, scale=1.0)
+    before = {frame.name: frame.camera for frame in scene.frames}
+    for frame in (*training, *held_out):
+        assert frame.camera == changed(before[frame.name], ("focal", "k1", "k2"), np.array([0.02, 0.01, -0.01]))
+        assert frame.camera.principal_point == before[frame.name].principal_point
 
 
 def test_only_a_sphere_has_nothing_to_change():

@@ -5,7 +5,7 @@ picture spans [0, width] x [0, height]. Camera axes are OpenCV's: +x right, +y d
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -238,6 +238,12 @@ class Camera:
         colmap = pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
         colmap.rescale(width, height)
         return Camera(self.model, width, height, tuple(colmap.params))
+
+    def with_principal_point(self, x: float, y: float) -> "Camera":
+        """Return the same lens with its principal point at (x, y) pixels; a spherical picture has none and is kept."""
+        names = parameter_names(self.model)
+        values = dict(zip(names, self.params, strict=True)) | {"cx": x, "cy": y}
+        return replace(self, params=tuple(values[name] for name in names))
 
     def undistorted(self) -> "Camera":
         """Return a PINHOLE camera of the same size and focal length, for rendered views."""

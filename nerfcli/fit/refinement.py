@@ -20,6 +20,7 @@ from nerfcli.fit.gauge import relative_motions, without_mean
 from nerfcli.fit.newton import NewtonSteps
 from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.fit.whitening import WhitenedAdam, whitening
+from nerfcli.photos.bearings import by_lens
 from nerfcli.photos.pool import PixelBatch, Pool
 
 # Points that represent what a camera sees: this many pixels along each side, at these multiples of the camera's
@@ -142,7 +143,9 @@ class PoseRefinement(nn.Module):
 
 
 class LensRefinement(nn.Module):
-    """The lenses of C cameras: `values` (C, K) are the changes of K parameters; those a camera does not have stay 0.
+    """The lenses of cameras: `values` (L, K) are the changes of K parameters of L lenses; those a lens lacks stay 0.
+
+    Cameras that differ in the principal point alone are of one lens, as those of stabilised photos.
 
     Args:
         pool: the photos, with their cameras as given.
@@ -152,7 +155,9 @@ class LensRefinement(nn.Module):
 
     def __init__(self, pool: Pool, names: tuple[str, ...], log_focal: float):
         super().__init__()
-        self._cameras = tuple(dict.fromkeys(pool.cameras))
+        lenses = list(by_lens(pool.cameras).values())
+        self._cameras = tuple(camera for lens in lenses for camera in lens)
+        self._lens_of = [number for number, lens in enumerate(lenses) for _ in lens]
         number = {camera: index for index, camera in enumerate(self._cameras)}
         self._camera_of = torch.tensor([number[camera] for camera in pool.cameras])
         self._widths = torch.tensor([camera.width for camera in pool.cameras])
@@ -161,11 +166,12 @@ class LensRefinement(nn.Module):
         self._names = names
         self._own = [tuple(name for name in names if name in changeable(camera)) for camera in self._cameras]
         self.values: Tensor
-        self.register_buffer("values", torch.zeros(len(self._cameras), len(names), dtype=torch.float64))
+        self.register_buffer("values", torch.zeros(len(lenses), len(names), dtype=torch.float64))
         for index, own in enumerate(self._own):
             if FOCAL in own:
-                self.values[index, names.index(FOCAL)] = log_focal
-        self.adam = WhitenedAdam(np.array([self._whitening(index) for index in range(len(self._cameras))]))
+                self.values[self._lens_of[index], names.index(FOCAL)] = log_focal
+        first = [self._lens_of.index(number) for number in range(len(lenses))]
+        self.adam = WhitenedAdam(np.array([self._whitening(index) for index in first]))
 
     def changed(self, camera: Camera, photo: int) -> Camera:
         """Return `camera`, that of a photo, with the current changes; its pictures may have another size."""
@@ -176,7 +182,7 @@ class LensRefinement(nn.Module):
 
     def _changed(self, camera: Camera, index: int) -> Camera:
         own = [self._names.index(name) for name in self._own[index]]
-        return changed(camera, self._own[index], self.values[index, own].numpy())
+        return changed(camera, self._own[index], self.values[self._lens_of[index], own].numpy())
 
     def directions(self, drawn: PixelBatch, photos: Tensor) -> Tensor:
         """Return ray directions (R, 3) for the given poses and the current lenses."""
@@ -191,7 +197,7 @@ class LensRefinement(nn.Module):
         return torch.where(now.isnan(), drawn.directions, now)
 
     def gradient(self, numbers: Tensor, photos: Tensor, *, turns: Tensor, by_direction: Tensor) -> Tensor:
-        """Return the gradient (C, K) by the changes, from gradients (R, 3) by ray directions.
+        """Return the gradient (L, K) by the changes, from gradients (R, 3) by ray directions.
 
         `turns` (P, 3, 3) are the photos' rotations.
         """
@@ -200,11 +206,12 @@ class LensRefinement(nn.Module):
             names = self._own[index]
             by_change = torch.from_numpy(bearings_by_change(self._now(index), names, pixels))
             by_bearing = turns[photos[rays]].transpose(-1, -2) @ by_direction[rays][..., None]
-            gradient[index, [self._names.index(name) for name in names]] = (by_change * by_bearing).sum((0, 1))
+            of = [self._names.index(name) for name in names]
+            gradient[self._lens_of[index], of] += (by_change * by_bearing).sum((0, 1))
         return gradient
 
     def step(self, gradient: Tensor, rate: float) -> None:
-        """Take one step against a gradient (C, K)."""
+        """Take one step against a gradient (L, K)."""
         self.values += self.adam.change(gradient, rate)
 
     def _by_camera(self, numbers: Tensor, photos: Tensor) -> list[tuple[int, Tensor, np.ndarray]]:
@@ -311,10 +318,12 @@ class Refinement(nn.Module):
             held_out: further frames, of the same size as `training`.
             scale: units of the training frame per scene unit.
         """
-        lens_of = {frame.camera: self._lens(index, frame.camera) for index, frame in enumerate(training)}
+        photo_of = {frame.camera.with_principal_point(0.0, 0.0): index for index, frame in enumerate(training)}
 
         def refined(frame: Frame, pose: np.ndarray) -> Frame:
-            return replace(frame, camera=lens_of.get(frame.camera, frame.camera), world_from_cam=pose)
+            photo = photo_of.get(frame.camera.with_principal_point(0.0, 0.0))
+            camera = frame.camera if photo is None else self._lens(photo, frame.camera)
+            return replace(frame, camera=camera, world_from_cam=pose)
 
         poses = [frame.world_from_cam for frame in training]
         if self.poses is not None:

@@ -14,12 +14,10 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.kernels import PixelTable, backend_for
+from nerfcli.photos.bearings import BearingTables
 from nerfcli.photos.footprint import pixel_footprint
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photo
 from nerfcli.photos.storage import IN_MEMORY, PhotoStorage
-
-# Bearings are computed in blocks: in float64, those of a whole large photo would take more memory than the photo.
-PIXELS_AT_A_TIME = 2**18
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,7 @@ class Pool(Protocol):
 class PixelPool:
     """All usable pixels of a set of photos, and their rays in the training frame.
 
-    Bearings are stored once per camera, so photos that share intrinsics share them. `frames` are those of the photos;
+    Photos of one lens share its bearings, see `BearingTables`. `frames` are those of the photos;
     `without_ray` is the number of pixels without a direction in the lens model, which are left out; `footprint` is from
     `pixel_footprint`; `cones` (P,) are the widths of a pixel of each photo at distance 1; `sizes` (P, 2) are the
     heights and widths of the photos.
@@ -170,19 +168,11 @@ class PixelPool:
         self.cones = torch.tensor(widths, dtype=torch.float32, device=device)
         self.footprint = pixel_footprint([photo.frame for photo in photos], training_from_scene)
 
-        cameras = dict.fromkeys(photo.frame.camera for photo in photos)
-        sizes = [camera.width * camera.height for camera in cameras]
-        first_bearing = dict(zip(cameras, np.cumsum([0, *sizes[:-1]]).tolist(), strict=True))
-        bearings = storage.array((sum(sizes), 3), np.float32)
-        good_rays: dict[Camera, np.ndarray] = {}
-        for camera, first in first_bearing.items():
-            good_rays[camera] = _fill_bearings(camera, bearings[first : first + camera.width * camera.height], storage)
-        self.bearings = torch.from_numpy(bearings).to(device)
-        self.first_bearing = torch.tensor([first_bearing[photo.frame.camera] for photo in photos], device=device)
-        self.without_ray = sum(int((~good_rays[photo.frame.camera]).sum()) for photo in photos)
+        self._bearings = BearingTables(self.cameras, device, storage=storage)
+        self.without_ray = sum(int((~self._bearings.valid(camera)).sum()) for camera in self.cameras)
 
         def usable(photo: LoadedPhoto) -> np.ndarray:
-            good = good_rays[photo.frame.camera]
+            good = self._bearings.valid(photo.frame.camera)
             return good if photo.used is None else good & photo.used.ravel()
 
         usable_counts = [int(usable(photo).sum()) for photo in photos]
@@ -222,10 +212,17 @@ class PixelPool:
 
     def rays_of(self, numbers: Tensor) -> PixelBatch:
         """Return the rays and colours of pixels (N,), counted through all photos."""
-        pixels = PixelTable(self.first_pixel, self.first_bearing, self.bearings, self.poses, self.colours)
-        rays = self._backend.pixel_rays(numbers, pixels)
+        bearings = self._bearings
+        pixels = PixelTable(self.first_pixel, bearings.first, bearings.values, self.poses, self.colours)
+        origins, directions, colours = self._backend.pixel_rays(numbers, pixels)
+        if bearings.moved is not None:
+            photos = self.photo_of(numbers)
+            places, widths = numbers - self.first_pixel[photos], self.sizes[photos, 1]
+            seen = bearings.interpolated(photos, places % widths, places // widths)
+            turned = (self.poses[photos, :3, :3] * seen[:, None, :]).sum(-1)
+            directions = torch.where(bearings.moved[photos][:, None], turned, directions)
         none = torch.zeros(0, device=numbers.device)
-        return PixelBatch(*rays, numbers, distances=none, trust=none, weights=none)
+        return PixelBatch(origins, directions, colours, numbers, distances=none, trust=none, weights=none)
 
     def photo_of(self, numbers: Tensor) -> Tensor:
         """Return the photo index of each pixel (N,)."""
@@ -237,18 +234,6 @@ class PixelPool:
         name, width = self.names_and_widths[photo]
         row, column = divmod(number - int(self.first_pixel[photo]), width)
         return name, column, row
-
-
-def _fill_bearings(camera: Camera, bearings: np.ndarray, storage: PhotoStorage) -> np.ndarray:
-    """Fill in the camera's bearings block by block, and return which pixels have one, (N,) bool."""
-    valid = np.empty(len(bearings), dtype=bool)
-    for begin in range(0, len(bearings), PIXELS_AT_A_TIME):
-        part = slice(begin, min(begin + PIXELS_AT_A_TIME, len(bearings)))
-        numbers = np.arange(part.start, part.stop)
-        centres = np.stack([numbers % camera.width, numbers // camera.width], axis=-1) + 0.5
-        bearings[part], valid[part] = camera.bearings(centres)
-        storage.release_pages()
-    return valid
 
 
 def _one_after_another(photos: Sequence[LoadedPhoto]) -> np.ndarray:

@@ -1,0 +1,125 @@
+"""Bearings of the pixels of photos: a table for each lens, which photos share.
+
+Photos of a stabilised lens have principal points of their own and see the same bearings, moved by a fraction of a
+pixel. They share one table that is a little larger than a photo, and their bearings are interpolated in it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.photos.storage import PhotoStorage
+
+# Bearings are computed in blocks: in float64, those of a whole large photo would take more memory than the photo.
+_PIXELS_AT_A_TIME = 2**18
+
+
+class BearingTables:
+    """The bearings of the pixels of P photos.
+
+    `values` (B, 3) are those of all tables; those of a photo whose principal point is the table's begin at `first`
+    (P,) and have its pixels' order. `moved` (P,) tells which photos need `interpolated`; None if none does.
+
+    Accuracy: an interpolated bearing is off by a fraction of 1 / (8 f) of a pixel, f the focal length in pixels.
+
+    Args:
+        cameras: (P,) of the photos.
+        device: of the tensors.
+        storage: for the tables, which may be as large as photos.
+    """
+
+    def __init__(self, cameras: Sequence[Camera], device: torch.device, *, storage: PhotoStorage):
+        table_of = {camera: table for lens in by_lens(cameras).values() for camera, table in _tables(lens).items()}
+        tables = list(dict.fromkeys(table_of.values()))
+        begins = np.cumsum([0, *(table.width * table.height for table in tables)]).tolist()
+        values = storage.array((begins[-1], 3), np.float32)
+        valid = {
+            table: _fill(table, values[begin : begin + table.width * table.height], storage)
+            for table, begin in zip(tables, begins[:-1], strict=True)
+        }
+        first = dict(zip(tables, begins[:-1], strict=True))
+        offsets = {camera: _offset(camera, table) for camera, table in table_of.items()}
+        self._valid = {camera: _seen(valid[table], camera, offsets[camera]) for camera, table in table_of.items()}
+        self.values = torch.from_numpy(values).to(device)
+        self.first = torch.tensor([first[table_of[camera]] for camera in cameras], device=device)
+        moved = torch.tensor([offsets[camera] is not None for camera in cameras], device=device)
+        self.moved: Tensor | None = moved if bool(moved.any()) else None
+        shifts = np.array([offsets[camera] or (0.0, 0.0) for camera in cameras]).reshape(-1, 2)
+        whole = np.floor(shifts).astype(np.int64)
+        x, y = (shifts - whole).T
+        corners = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
+        self._whole = torch.from_numpy(whole).to(device)
+        self._corners = torch.from_numpy(corners.astype(np.float32)).to(device)
+        self._widths = torch.tensor([table_of[camera].width for camera in cameras], device=device)
+
+    def valid(self, camera: Camera) -> np.ndarray:
+        """Return which pixels of a camera have a bearing, (N,) bool."""
+        return self._valid[camera]
+
+    def interpolated(self, photos: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
+        """Return the bearings (N, 3) of valid pixels (N,) of photos (N,) that are `moved`; of others something."""
+        widths, (x, y) = self._widths[photos], self._whole[photos].unbind(-1)
+        begin = self.first[photos] + (rows + y) * widths + columns + x
+        places = torch.stack([begin, begin + 1, begin + widths, begin + widths + 1], dim=-1)
+        around = self.values[places.clamp_max(len(self.values) - 1)]  # (N, 4, 3)
+        return normalize((self._corners[photos][:, :, None] * around).sum(1), dim=-1)
+
+
+def by_lens(cameras: Sequence[Camera]) -> dict[Camera, list[Camera]]:
+    """Return the different cameras of each lens: cameras of a lens differ in the principal point alone.
+
+    The key is the lens's camera with the principal point in the middle.
+    """
+    lenses: dict[Camera, list[Camera]] = {}
+    for camera in dict.fromkeys(cameras):
+        lens = camera.with_principal_point(camera.width / 2, camera.height / 2)
+        lenses.setdefault(lens, []).append(camera)
+    return lenses
+
+
+def _tables(cameras: list[Camera]) -> dict[Camera, Camera]:
+    """Return the camera whose pixels are the table of each camera of a lens: a larger one for all, or its own."""
+    points = np.array([camera.principal_point for camera in cameras])
+    most = points.max(axis=0)
+    wider, higher = np.ceil(most - points.min(axis=0)).astype(int).tolist()
+    camera = cameras[0]
+    shared = replace(
+        camera.with_principal_point(*most.tolist()), width=camera.width + wider + 1, height=camera.height + higher + 1
+    )
+    if shared.width * shared.height >= len(cameras) * camera.width * camera.height:
+        return {camera: camera for camera in cameras}
+    return dict.fromkeys(cameras, shared)
+
+
+def _offset(camera: Camera, table: Camera) -> tuple[float, float] | None:
+    """Return where the first pixel of a camera is in its table; None if the table is the camera's own."""
+    if camera == table:
+        return None
+    (x, y), (table_x, table_y) = camera.principal_point, table.principal_point
+    return table_x - x, table_y - y
+
+
+def _fill(table: Camera, values: np.ndarray, storage: PhotoStorage) -> np.ndarray:
+    """Fill in a table's bearings block by block, and return which pixels have one, (height, width) bool."""
+    valid = np.empty(len(values), dtype=bool)
+    for begin in range(0, len(values), _PIXELS_AT_A_TIME):
+        part = slice(begin, min(begin + _PIXELS_AT_A_TIME, len(values)))
+        numbers = np.arange(part.start, part.stop)
+        centres = np.stack([numbers % table.width, numbers // table.width], axis=-1) + 0.5
+        values[part], valid[part] = table.bearings(centres)
+        storage.release_pages()
+    return valid.reshape(table.height, table.width)
+
+
+def _seen(valid: np.ndarray, camera: Camera, offset: tuple[float, float] | None) -> np.ndarray:
+    """Return which pixels of a camera have bearings in its table, (N,) bool: all four corners, if interpolated."""
+    if offset is None:
+        return valid.ravel()
+    x, y = int(offset[0]), int(offset[1])
+    part = valid[y : y + camera.height + 1, x : x + camera.width + 1]
+    return (part[:-1, :-1] & part[:-1, 1:] & part[1:, :-1] & part[1:, 1:]).ravel()
