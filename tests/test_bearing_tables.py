@@ -9,8 +9,8 @@ import torch
 from frame_rays import frame_rays
 from test_training_rays import BARREL, CPU, FISHEYE, SIMILARITY, numbered_photo, ring
 
-from nerfcli.cameras.camera import Camera
-from nerfcli.photos.bearings import BearingTables, by_lens
+from nerfcli.cameras.camera import Camera, by_lens
+from nerfcli.photos.bearings import BearingTables
 from nerfcli.photos.pool import PixelPool
 from nerfcli.photos.storage import IN_MEMORY, needs_of
 from nerfcli.runs.settings import TrainSettings

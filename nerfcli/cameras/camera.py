@@ -4,7 +4,7 @@ A model has COLMAP's name and COLMAP's order of parameters. The centre of the to
 picture spans [0, width] x [0, height]. Camera axes are OpenCV's: +x right, +y down, +z forward.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -290,6 +290,18 @@ def parameter_names(model: str) -> tuple[str, ...]:
     """Return the names of a model's parameters in COLMAP's order, such as ("f", "cx", "cy", "k")."""
     camera = pycolmap.Camera.create_from_model_name(1, model, 1.0, 2, 2)
     return tuple(name.strip() for name in camera.params_info.split(","))
+
+
+def by_lens(cameras: Sequence[Camera]) -> dict[Camera, list[Camera]]:
+    """Return the different cameras of each lens: cameras of a lens differ in the principal point alone.
+
+    The key is the lens's camera with the principal point in the middle.
+    """
+    lenses: dict[Camera, list[Camera]] = {}
+    for camera in dict.fromkeys(cameras):
+        lens = camera.with_principal_point(camera.width / 2, camera.height / 2)
+        lenses.setdefault(lens, []).append(camera)
+    return lenses
 
 
 def _complaint(model: str, values: dict[str, float]) -> str:

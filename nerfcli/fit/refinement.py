@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.camera import Camera, by_lens
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.lens_change import FOCAL, bearings_by_change, changeable, changed, pixels_by_change
 from nerfcli.cameras.rigid import from_parts, transform_from_twist, vector_from_rotation
@@ -20,7 +20,6 @@ from nerfcli.fit.gauge import relative_motions, without_mean
 from nerfcli.fit.newton import NewtonSteps
 from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.fit.whitening import WhitenedAdam, whitening
-from nerfcli.photos.bearings import by_lens
 from nerfcli.photos.pool import PixelBatch, Pool
 
 # Points that represent what a camera sees: this many pixels along each side, at these multiples of the camera's

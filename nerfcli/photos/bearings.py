@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.camera import Camera, by_lens
 from nerfcli.photos.storage import PhotoStorage
 
 # Bearings are computed in blocks: in float64, those of a whole large photo would take more memory than the photo.
@@ -68,18 +68,6 @@ class BearingTables:
         places = torch.stack([begin, begin + 1, begin + widths, begin + widths + 1], dim=-1)
         around = self.values[places.clamp_max(len(self.values) - 1)]  # (N, 4, 3)
         return normalize((self._corners[photos][:, :, None] * around).sum(1), dim=-1)
-
-
-def by_lens(cameras: Sequence[Camera]) -> dict[Camera, list[Camera]]:
-    """Return the different cameras of each lens: cameras of a lens differ in the principal point alone.
-
-    The key is the lens's camera with the principal point in the middle.
-    """
-    lenses: dict[Camera, list[Camera]] = {}
-    for camera in dict.fromkeys(cameras):
-        lens = camera.with_principal_point(camera.width / 2, camera.height / 2)
-        lenses.setdefault(lens, []).append(camera)
-    return lenses
 
 
 def _tables(cameras: list[Camera]) -> dict[Camera, Camera]:

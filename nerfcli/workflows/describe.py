@@ -81,17 +81,22 @@ def _describe_reconstruction(run: Path) -> dict[str, Any]:
 
 def _describe_scene(folder: Path) -> dict[str, Any]:
     from nerfcli import scene as scenes
+    from nerfcli.cameras.camera import by_lens
     from nerfcli.cameras.orientation import describe_rescaling
 
     scene = scenes.load(folder)
-    cameras = {frame.camera for frame in scene.frames}
+    lenses = by_lens([frame.camera for frame in scene.frames])
     return {
         "kind": scene.kind,
         "photos": len(scene.frames),
         "held_out": len(scene.test_frames),
         "missing": len(scene.missing),
-        "cameras": [f"{c.model} {c.width}x{c.height} focal {c.focal_px:.1f} px" for c in list(cameras)[:5]],
-        "camera_count": len(cameras),
+        "cameras": [
+            f"{lens.model} {lens.width}x{lens.height} focal {lens.focal_px:.1f} px"
+            + (f", {len(cameras)} principal points" if len(cameras) > 1 else "")
+            for lens, cameras in list(lenses.items())[:5]
+        ],
+        "camera_count": len(lenses),
         "rescaled": describe_rescaling(scene.rescaled),
         "points": len(scene.points),
         "unit": scene.unit,
