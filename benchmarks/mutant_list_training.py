@@ -372,7 +372,7 @@ TRAINING: tuple[Group, ...] = (
             Mutant("if fraction > HOLDING_FRACTIONS[0] else 0.0", "if fraction > 0.0 else 0.0"),
             Mutant("fraction, DAMPING_FRACTIONS, DAMPINGS", "fraction, DAMPING_FRACTIONS, DAMPINGS[::-1]"),
             Mutant("ranks.total(len(by_pose)) * by_pose", "by_pose"),
-            Mutant("self.values[index, names.index(FOCAL)] = log_focal", "pass"),
+            Mutant("self.values[self._lens_of[index], names.index(FOCAL)] = log_focal", "pass"),
             Mutant("LENS_RATE * rate)", "rate)"),
             Mutant("given = self._given if self.poses is None else self.poses.poses()", "given = self._given"),
         ),

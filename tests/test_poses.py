@@ -128,7 +128,7 @@ def test_the_scene_folder_holds_the_model_and_of_the_work_what_helps_the_next(so
 
 def test_the_report_file_has_the_promised_keys(solved: Solved):
     report = json.loads((solved.scene / "poses_report.json").read_text())
-    assert set(report["seconds"]) == {"extract", "motions", "match", "map", "check", "total"}
+    assert set(report["seconds"]) == {"extract", "motions", "match", "map", "check", "stabilisation", "total"}
     assert report["seconds"]["total"] >= sum(report["seconds"][stage] for stage in ("extract", "match", "map"))
     notes = {"name": "notes.jpg", "registered": False, "reason": solved.report.images[0].reason}
     assert report["images"][0] == notes | {"orientation": None, "pose_blur_px": None}
