@@ -9,6 +9,8 @@ import pytest
 
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.engine import worker
+from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.report import PosesReport
 
 
 @contextmanager
@@ -31,3 +33,15 @@ def worker_in_this_process() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(structure_from_motion, "run_worker", run_worker)
         yield
+
+
+def poses_in_this_process(photos: Path, scene: Path, settings: PoseSettings) -> PosesReport:
+    """Estimate poses without messages and progress."""
+    with worker_in_this_process():
+        return structure_from_motion.estimate_poses(
+            photos,
+            scene,
+            settings=settings,
+            notify=lambda note: None,
+            progress=lambda stage, done, total: None,
+        )

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 from corner import CENTRES, NAMES, cam_from_world, write_capture
-from in_this_process import worker_in_this_process
+from in_this_process import poses_in_this_process
 from test_poses import FAST, similarity
 
 from nerfcli import scene
@@ -16,7 +16,7 @@ from nerfcli.poses.engine.strict import fingerprint, held_out_last, training_par
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
-from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
+from nerfcli.poses.structure_from_motion import is_same_scene
 from nerfcli.runs.config import RunConfig
 
 HELD_OUT = 2  # in the middle, and stored upright
@@ -28,14 +28,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, PoseSe
     write_capture(folder / "photos")
     (folder / "test.txt").write_text(f"{NAMES[HELD_OUT]}\nwall.png\n")
     settings = replace(FAST, max_features=400, strict=True, holdout=str(folder / "test.txt"))
-    with worker_in_this_process():
-        report = estimate_poses(
-            folder / "photos",
-            folder / "scene",
-            settings=settings,
-            notify=lambda note: None,
-            progress=lambda stage, done, total: None,
-        )
+    report = poses_in_this_process(folder / "photos", folder / "scene", settings)
     return folder / "photos", folder / "scene", settings, report
 
 

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 import synthetic_captures as synthetic
 from corner import NAMES, write_capture
-from in_this_process import worker_in_this_process
+from in_this_process import poses_in_this_process
 from synthetic_captures import Lens
 from test_poses import FAST
 
@@ -26,7 +26,6 @@ from nerfcli.poses.model.principal_points import (
     with_own_cameras,
 )
 from nerfcli.poses.report import PosesReport, closing_notes
-from nerfcli.poses.structure_from_motion import estimate_poses
 
 PHOTOS = 12
 
@@ -174,6 +173,19 @@ def test_too_few_photos_are_no_evidence():
     assert choose_principal_points(model, seed=0, threads=1) == StabilisedModel(model, None, {})
 
 
+def test_points_in_two_photos_alone_are_no_evidence():
+    """Nothing can be held out where each point has two observations."""
+    model = capture(stabiliser(0))
+    surplus = [
+        (element.image_id, element.point2D_idx)
+        for point in model.points3D.values()
+        for element in list(point.track.elements)[2:]
+    ]
+    for observation in surplus:
+        model.delete_observation(*observation)
+    assert choose_principal_points(model, seed=0, threads=1) == StabilisedModel(model, None, {})
+
+
 def test_a_model_with_own_cameras_projects_as_before():
     model = capture(stabiliser(0))
     own = with_own_cameras(model)
@@ -195,10 +207,7 @@ def test_the_camera_of_a_lens_has_the_median_principal_point():
     model = with_own_cameras(capture(np.zeros((PHOTOS, 2))))
     for number, x in ((1, 500.0), (2, 510.0), (3, 532.0)):
         model.camera(model.image(number).camera_id).principal_point_x = x
-    found = camera_of_lens(model, [1, 2, 3, 99])
-    assert found is not None
-    assert found.principal_point_x == 510.0
-    assert camera_of_lens(model, [99]) is None
+    assert camera_of_lens(model, [1, 2, 3]).principal_point_x == 510.0
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -228,14 +237,7 @@ def stabilised(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarr
     write_capture(folder / "photos", shifts)
     (folder / "test.txt").write_text(f"{NAMES[2]}\n")
     settings = replace(FAST, threads=1, strict=True, holdout=str(folder / "test.txt"))
-    with worker_in_this_process():
-        report = estimate_poses(
-            folder / "photos",
-            folder / "scene",
-            settings=settings,
-            notify=lambda note: None,
-            progress=lambda stage, done, total: None,
-        )
+    report = poses_in_this_process(folder / "photos", folder / "scene", settings)
     return folder / "scene", shifts, report
 
 

@@ -245,6 +245,10 @@ class Camera:
         values = dict(zip(names, self.params, strict=True)) | {"cx": x, "cy": y}
         return replace(self, params=tuple(values[name] for name in names))
 
+    def centred(self) -> "Camera":
+        """Return the same lens with its principal point in the middle: equal for all cameras of one lens."""
+        return self.with_principal_point(self.width / 2, self.height / 2)
+
     def undistorted(self) -> "Camera":
         """Return a PINHOLE camera of the same size and focal length, for rendered views."""
         return Camera.pinhole(self.width, self.height, self.focal_px)
@@ -299,8 +303,7 @@ def by_lens(cameras: Sequence[Camera]) -> dict[Camera, list[Camera]]:
     """
     lenses: dict[Camera, list[Camera]] = {}
     for camera in dict.fromkeys(cameras):
-        lens = camera.with_principal_point(camera.width / 2, camera.height / 2)
-        lenses.setdefault(lens, []).append(camera)
+        lenses.setdefault(camera.centred(), []).append(camera)
     return lenses
 
 

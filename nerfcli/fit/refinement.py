@@ -317,10 +317,10 @@ class Refinement(nn.Module):
             held_out: further frames, of the same size as `training`.
             scale: units of the training frame per scene unit.
         """
-        photo_of = {frame.camera.with_principal_point(0.0, 0.0): index for index, frame in enumerate(training)}
+        photo_of = {frame.camera.centred(): index for index, frame in enumerate(training)}
 
         def refined(frame: Frame, pose: np.ndarray) -> Frame:
-            photo = photo_of.get(frame.camera.with_principal_point(0.0, 0.0))
+            photo = photo_of.get(frame.camera.centred())
             camera = frame.camera if photo is None else self._lens(photo, frame.camera)
             return replace(frame, camera=camera, world_from_cam=pose)
 

@@ -38,13 +38,13 @@ class BearingTables:
         tables = list(dict.fromkeys(table_of.values()))
         begins = np.cumsum([0, *(table.width * table.height for table in tables)]).tolist()
         values = storage.array((begins[-1], 3), np.float32)
-        valid = {
+        self._valid = {
             table: _fill(table, values[begin : begin + table.width * table.height], storage)
             for table, begin in zip(tables, begins[:-1], strict=True)
         }
         first = dict(zip(tables, begins[:-1], strict=True))
         offsets = {camera: _offset(camera, table) for camera, table in table_of.items()}
-        self._valid = {camera: _seen(valid[table], camera, offsets[camera]) for camera, table in table_of.items()}
+        self._table_of = table_of
         self.values = torch.from_numpy(values).to(device)
         self.first = torch.tensor([first[table_of[camera]] for camera in cameras], device=device)
         moved = torch.tensor([offsets[camera] is not None for camera in cameras], device=device)
@@ -58,8 +58,16 @@ class BearingTables:
         self._widths = torch.tensor([table_of[camera].width for camera in cameras], device=device)
 
     def valid(self, camera: Camera) -> np.ndarray:
-        """Return which pixels of a camera have a bearing, (N,) bool."""
-        return self._valid[camera]
+        """Return which pixels of a camera have a bearing, (N,) bool: all four around it, if it is interpolated."""
+        table = self._table_of[camera]
+        valid, offset = self._valid[table], _offset(camera, table)
+        if valid is None:
+            return np.ones(camera.width * camera.height, dtype=bool)
+        if offset is None:
+            return valid.ravel()
+        x, y = int(offset[0]), int(offset[1])
+        part = valid[y : y + camera.height + 1, x : x + camera.width + 1]
+        return (part[:-1, :-1] & part[:-1, 1:] & part[1:, :-1] & part[1:, 1:]).ravel()
 
     def interpolated(self, photos: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
         """Return the bearings (N, 3) of valid pixels (N,) of photos (N,) that are `moved`; of others something."""
@@ -92,8 +100,11 @@ def _offset(camera: Camera, table: Camera) -> tuple[float, float] | None:
     return table_x - x, table_y - y
 
 
-def _fill(table: Camera, values: np.ndarray, storage: PhotoStorage) -> np.ndarray:
-    """Fill in a table's bearings block by block, and return which pixels have one, (height, width) bool."""
+def _fill(table: Camera, values: np.ndarray, storage: PhotoStorage) -> np.ndarray | None:
+    """Fill in a table's bearings block by block, and return which pixels have one, (height, width) bool; None if all.
+
+    Most lenses have a bearing everywhere: then nothing more is kept in memory.
+    """
     valid = np.empty(len(values), dtype=bool)
     for begin in range(0, len(values), _PIXELS_AT_A_TIME):
         part = slice(begin, min(begin + _PIXELS_AT_A_TIME, len(values)))
@@ -101,13 +112,4 @@ def _fill(table: Camera, values: np.ndarray, storage: PhotoStorage) -> np.ndarra
         centres = np.stack([numbers % table.width, numbers // table.width], axis=-1) + 0.5
         values[part], valid[part] = table.bearings(centres)
         storage.release_pages()
-    return valid.reshape(table.height, table.width)
-
-
-def _seen(valid: np.ndarray, camera: Camera, offset: tuple[float, float] | None) -> np.ndarray:
-    """Return which pixels of a camera have bearings in its table, (N,) bool: all four corners, if interpolated."""
-    if offset is None:
-        return valid.ravel()
-    x, y = int(offset[0]), int(offset[1])
-    part = valid[y : y + camera.height + 1, x : x + camera.width + 1]
-    return (part[:-1, :-1] & part[:-1, 1:] & part[1:, :-1] & part[1:, 1:]).ravel()
+    return None if valid.all() else valid.reshape(table.height, table.width)

@@ -50,8 +50,7 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     """Estimate the memory of photos and field from their sizes; `rest` includes what is resident now."""
     sizes = [(frame.camera.width // factor) * (frame.camera.height // factor) for frame in frames]
     # Photos that differ in the principal point alone share bearings.
-    middles = (frame.camera.with_principal_point(0.0, 0.0) for frame in frames)
-    of_cameras = dict(zip(middles, sizes, strict=True))
+    of_cameras = {frame.camera.centred(): size for frame, size in zip(frames, sizes, strict=True)}
     may_have_alpha = any(
         frame.image is not None and frame.image.suffix.lower() not in (".jpg", ".jpeg") for frame in frames
     )

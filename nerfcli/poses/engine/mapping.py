@@ -41,7 +41,7 @@ def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
 def describe_cameras(
     model: pycolmap.Reconstruction,
     job: Job,
-    uncertainty: Mapping[str, dict[str, Any]] | None = None,
+    uncertainty: Mapping[str, dict[str, Any]],
     *,
     lens_of: Mapping[int, int],
 ) -> list[dict[str, Any]]:
@@ -53,6 +53,7 @@ def describe_cameras(
     photos: dict[int, list[int]] = {}
     for image_id in model.reg_image_ids():
         photos.setdefault(lens_of[image_id], []).append(image_id)
+    cameras = [(lens, camera_of_lens(model, taken), len(taken)) for lens, taken in sorted(photos.items())]
     return [
         {
             "model": camera.model.name,
@@ -60,11 +61,10 @@ def describe_cameras(
             "height": camera.height,
             "params": [float(value) for value in camera.params],
             "focal_from_exif": camera.has_prior_focal_length and lens not in job.given_cameras,
-            "images": len(taken),
-            "uncertainty": (uncertainty or {}).get(str(lens)),
+            "images": count,
+            "uncertainty": uncertainty.get(str(lens)),
         }
-        for lens, taken in sorted(photos.items())
-        if (camera := camera_of_lens(model, taken)) is not None
+        for lens, camera, count in cameras
     ]
 
 

@@ -120,7 +120,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
 
 
 def fingerprint(model: pycolmap.Reconstruction, *, without: frozenset[str] = frozenset()) -> str:
-    """Return a hash of every bit of cameras, points with tracks, and poses of the images that are not in `without`."""
+    """Return a hash of every bit of the points with tracks, and of the cameras and poses of images not in `without`."""
     others = {image.camera_id for image in model.images.values() if image.name not in without}
     cameras = [
         (number, camera.model.name, _bits(camera.params))
@@ -153,10 +153,11 @@ def _place(
 ) -> Placed | str:
     """Add one photo with its pose to the model, or return the reason why it has none."""
     group = next(group for group in job.groups if number in group.photos)
-    training = sorted(set(group.photos) - set(job.held_out))
-    camera = camera_of_lens(model, [job.image_ids[photo] for photo in training])
-    if camera is None:
+    training = [job.image_ids[photo] for photo in group.photos if photo not in job.held_out]
+    placed = [image_id for image_id in training if model.exists_image(image_id)]
+    if not placed:
         return NO_TRAINING_PHOTO
+    camera = camera_of_lens(model, placed)
     pixels, points = _seen_points(model, job, number, pairs)
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = _MOST_ERROR_PX

@@ -37,6 +37,7 @@ from nerfcli.poses.input.job import Job, Report, Tell, read_job
 from nerfcli.poses.input.plan import checking_seconds, limit_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.principal_points import StabilisedModel, choose_principal_points
 
 # The last stage's file, with the data for the report. The model is beside it, in sparse/0.
@@ -144,7 +145,7 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     }
     if model is not None:
         finishing = checks()
-        lens_of = {image_id: model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+        lens_of = lenses_of(model)
         uncertainty = examined.uncertainty
         if examined.verdict.accepted:
             with _timed(seconds, "stabilisation"):

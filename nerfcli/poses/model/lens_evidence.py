@@ -147,7 +147,7 @@ def lens_evidence(
         UndeterminedError: there are fewer observations than unknowns.
     """
     if lens_of is None:
-        lens_of = {image_id: model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+        lens_of = lenses_of(model)
     seen = _observations(model, lens_of, seed=seed)
     others = [c for c in seen.cameras if c != camera_id and c not in fixed][:_MOST_OTHERS]
     poses, points, lens, residuals = _jacobians(model, seen, camera_id, others=others)
@@ -184,6 +184,11 @@ def lens_evidence(
         noise_px=float(np.sqrt((residuals**2).sum() / np.mean(root_weights**2) / max(2 * rows - unknowns, 1))),
         border_px=_border_px(camera),
     )
+
+
+def lenses_of(model: pycolmap.Reconstruction) -> dict[int, int]:
+    """Return the camera id of each photo of a model whose photos share cameras, by image id."""
+    return {image_id: model.image(image_id).camera_id for image_id in model.reg_image_ids()}
 
 
 def parameters_of(camera: pycolmap.Camera) -> tuple[str, ...]:
