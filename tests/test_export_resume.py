@@ -7,7 +7,9 @@ import shutil
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, as_completed
 from dataclasses import replace
 from operator import methodcaller
 from pathlib import Path
@@ -22,6 +24,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import OUT_OF_MEMORY, UserError
+from nerfcli.export import threads
 from nerfcli.export.frames import RAYS_PER_PROCESS, Workers, automatic_workers, export_frames, export_part
 from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import Order
@@ -233,6 +236,26 @@ def test_an_error_in_a_thread_ends_the_others_and_keeps_what_is_complete(model, 
     assert 2 <= len(list(unfinished.rglob("done/**/*.json"))) <= 4
     assert not list(unfinished.rglob("*partial*"))
     assert threading.active_count() == before
+
+
+def test_threads_stop_before_the_main_thread_hears_of_an_error(model, tmp_path, monkeypatch):
+    """The main thread may wake late on a busy machine; the other thread must not render on until it does."""
+
+    def late(futures: list[Future[None]]) -> Iterator[Future[None]]:
+        for future in as_completed(futures):
+            time.sleep(1.0)
+            yield future
+
+    monkeypatch.setattr(threads, "as_completed", late)
+    with pytest.raises(KeyboardInterrupt):
+        export_frames(
+            *(model, order(8), tmp_path / "views"),
+            on_rays=stop_in_frame(1, KeyboardInterrupt()),
+            notify=lambda text: None,
+            workers=Workers(threads=2),
+        )
+    (unfinished,) = tmp_path.glob(".views.unfinished-*")
+    assert len(list(unfinished.rglob("done/**/*.json"))) <= 3
 
 
 def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in_one_go, monkeypatch):

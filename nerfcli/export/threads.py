@@ -44,7 +44,15 @@ def render_in_threads(
             on_rays(rays)
 
     def render(index: int) -> None:
-        render_frame(model, order, index, unfinished=unfinished, on_rays=count)
+        if stopped.is_set():
+            return
+        try:
+            render_frame(model, order, index, unfinished=unfinished, on_rays=count)
+        except CancelledError:
+            return  # because of another frame's exception, which is raised below
+        except BaseException:
+            stopped.set()  # here, since the main thread may hear of it only after the others have rendered more
+            raise
 
     each = max(1, threads // at_a_time)
     with ThreadPoolExecutor(at_a_time, initializer=torch.set_num_threads, initargs=(each,)) as pool:
@@ -52,7 +60,7 @@ def render_in_threads(
             for future in as_completed([pool.submit(render, index) for index in indices]):
                 future.result()
         except BaseException:
-            stopped.set()
+            stopped.set()  # Ctrl-C arrives in this thread
             pool.shutdown(wait=False, cancel_futures=True)
             raise
         finally:
