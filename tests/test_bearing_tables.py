@@ -54,11 +54,11 @@ def test_photos_of_other_lenses_keep_their_bits():
 def test_photos_share_one_table_of_their_lens():
     tables = BearingTables(stabilised(LENS), CPU, storage=IN_MEMORY)
     assert len(tables.values) == (160 + 7 + 1) * (120 + 9 + 1)
-    assert tables.moved is not None
-    assert tables.moved.all()
+    assert tables.grids is not None
+    assert (tables.grids.widths == torch.tensor([160, 168])).all()
     same = BearingTables([LENS, LENS], CPU, storage=IN_MEMORY)
     assert len(same.values) == 160 * 120
-    assert same.moved is None
+    assert same.grids is None
 
 
 def test_principal_points_far_apart_do_not_share():
@@ -66,14 +66,14 @@ def test_principal_points_far_apart_do_not_share():
     cameras = [LENS.with_principal_point(0.0, 60.0), LENS.with_principal_point(160.0, 60.0)]
     tables = BearingTables(cameras, CPU, storage=IN_MEMORY)
     assert len(tables.values) == 2 * 160 * 120
-    assert tables.moved is None
+    assert tables.grids is None
 
 
 def test_pixels_beyond_the_lens_are_left_out():
     """Where a lens turns back, a photo may lose the last ring of pixels, whose bearings would need one beyond."""
     cameras = [BARREL.with_principal_point(12.0 + x, 9.0 + y) for x, y in ((0.0, 0.0), (0.6, 0.3), (-0.4, 0.9))]
     tables = BearingTables(cameras, CPU, storage=IN_MEMORY)
-    assert tables.moved is not None
+    assert tables.grids is not None
     for camera in cameras:
         _, valid = camera.pixel_bearings()
         seen = tables.valid(camera)

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from nerfcli import kernels
-from nerfcli.kernels import HashGrid, March, PixelTable, Rays, numba_cpu, reference
+from nerfcli.kernels import BearingGrids, HashGrid, March, PixelTable, Rays, numba_cpu, reference
 from nerfcli.kernels.numba_cpu import visible
 from nerfcli.kernels.numba_cpu.exponential import exponential, sigmoid, sigmoid_slope
 from nerfcli.kernels.numba_cpu.threads import use_threads
@@ -457,13 +457,17 @@ def test_exponential_and_sigmoid_in_every_range():
 
 
 @pytest.mark.parametrize("count", SIZES)
-@pytest.mark.parametrize("channels", [3, 4])
-def test_pixel_rays(count, channels, generator):
+@pytest.mark.parametrize(("channels", "grids"), [(3, False), (4, False), (3, True)])
+def test_pixel_rays(count, channels, grids, generator):
     # Three photos of 5, 700 and 20 pixels, of which the first and the last share a camera's bearings.
     poses = torch.randn(3, 4, 4, generator=generator)
     bearings = torch.randn(720, 3, generator=generator)
     photos = torch.randint(256, (725, channels), generator=generator, dtype=torch.uint8)
     pixels = PixelTable(torch.tensor([0, 5, 705]), torch.tensor([700, 0, 700]), bearings, poses, photos)
+    if grids:  # the first photo between the bearings of a grid of 10 x 3, the last one on its own, the last of all
+        corners = torch.tensor([[0.25, 0.35, 0.15, 0.25], [0.5, 0.5, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]])
+        widths = BearingGrids(torch.tensor([[4, 10], [70, 71], [5, 5]]), corners)
+        pixels = pixels._replace(first_bearing=torch.tensor([3, 0, 700]), grids=widths)
     chosen = torch.randint(725, (count,), generator=generator)
     fast = numba_cpu.pixel_rays(chosen, pixels)
     exact = reference.pixel_rays(chosen, pixels._replace(bearings=bearings.double(), poses=poses.double()))

@@ -23,7 +23,7 @@ from torch import Tensor
 from triton.runtime import interpreter
 
 from nerfcli import kernels
-from nerfcli.kernels import Backend, HashGrid, March, PixelTable, Rays, Targets, reference, spherical_harmonics
+from nerfcli.kernels import Backend, BearingGrids, HashGrid, March, PixelTable, Rays, Targets, reference, spherical_harmonics
 from nerfcli.kernels.contraction import contract
 from nerfcli.kernels.triton_cuda import compositing, coordinates, depth, hash_grid, marching, networks, pixels, row_adam
 from nerfcli.kernels.triton_cuda import rays as along
@@ -453,14 +453,19 @@ def test_adam_rows(rows, decay, generator):
 
 
 @pytest.mark.parametrize("count", SIZES)
-@pytest.mark.parametrize(("photos", "channels"), [(1, 3), (5, 4)])
-def test_pixel_rays(count, photos, channels, generator):
+@pytest.mark.parametrize(("photos", "channels", "with_grids"), [(1, 3, False), (5, 4, False), (3, 3, True)])
+def test_pixel_rays(count, photos, channels, with_grids, generator):
     first = torch.arange(photos) * 12
-    bearings, poses = torch.randn(24, 3, generator=generator), torch.randn(photos, 4, 4, generator=generator)
+    bearings, poses = torch.randn(32, 3, generator=generator), torch.randn(photos, 4, 4, generator=generator)
     colours = torch.randint(256, (photos * 12, channels), generator=generator, dtype=torch.uint8)
     table = PixelTable(first, torch.arange(photos) % 2 * 12, bearings, poses, colours)
+    on_gpu = PixelTable(*on_device(*table[:5]))
+    if with_grids:  # photos of 4 x 3, two of them between the bearings of a grid of 5 x 4, the last one on its own
+        corners = torch.tensor([[0.25, 0.35, 0.15, 0.25], [0.1, 0.2, 0.3, 0.4], [1.0, 0.0, 0.0, 0.0]])
+        grids = BearingGrids(torch.tensor([[4, 5], [4, 5], [4, 4]]), corners)
+        table, on_gpu = table._replace(grids=grids), on_gpu._replace(grids=BearingGrids(*on_device(*grids)))
     chosen = torch.randint(photos * 12, (count,), generator=generator)
-    found = pixels.pixel_rays(chosen.to(DEVICE), PixelTable(*on_device(*table)))
+    found = pixels.pixel_rays(chosen.to(DEVICE), on_gpu)
     wanted = reference.pixel_rays(chosen, table)
     for name, a, b in zip(("origins", "directions", "colours"), found, wanted, strict=True):
         assert_close(a, b, name)

@@ -15,6 +15,7 @@ from nerfcli.kernels.contraction import CONTRACTIONS, contract, contract_to_cube
 from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import (
     Backend,
+    BearingGrids,
     HashGrid,
     Intervals,
     LightEnds,
@@ -32,6 +33,7 @@ from nerfcli.kernels.reference.backend import ReferenceBackend
 __all__ = [
     "CONTRACTIONS",
     "Backend",
+    "BearingGrids",
     "HashGrid",
     "Intervals",
     "LightEnds",

@@ -181,15 +181,29 @@ class Samples(NamedTuple):
     rays: Tensor | None = None
 
 
+class BearingGrids(NamedTuple):
+    """Grids of bearings that are larger than the photos of a lens, for photos whose pixels lie between those of the grid.
+
+    Args:
+        widths: (P, 2) int64, of each photo and of its grid.
+        corners: (P, 4) weights of the four bearings around a pixel: upper left, upper right, lower left, lower right.
+            Their sum is normalised. If the first is 1, that bearing is used as it is.
+    """
+
+    widths: Tensor
+    corners: Tensor
+
+
 class PixelTable(NamedTuple):
     """The pixels of P photos, numbered through all photos, row by row.
 
     Args:
         first_pixel: (P,) int64, the number of the first pixel of each photo, increasing from 0.
-        first_bearing: (P,) int64, index of the first bearing of each photo's camera.
+        first_bearing: (P,) int64, index of the first bearing of each photo.
         bearings: (B, 3) directions of pixels in the axes of their cameras.
         poses: (P, 4, 4) `world_from_cam`.
         colours: (M, C) uint8 values of all pixels.
+        grids: of the bearings; None if each photo has the bearings of its own pixels.
     """
 
     first_pixel: Tensor
@@ -197,6 +211,7 @@ class PixelTable(NamedTuple):
     bearings: Tensor
     poses: Tensor
     colours: Tensor
+    grids: BearingGrids | None = None
 
 
 # Called with a name, a tensor whose rows belong to samples, and the ray (N,) of each row.

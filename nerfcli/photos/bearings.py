@@ -9,10 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
-from torch.nn.functional import normalize
 
 from nerfcli.cameras.camera import Camera, by_lens
+from nerfcli.kernels import BearingGrids
 from nerfcli.photos.storage import PhotoStorage
 
 # Bearings are computed in blocks: in float64, those of a whole large photo would take more memory than the photo.
@@ -22,8 +21,8 @@ _PIXELS_AT_A_TIME = 2**18
 class BearingTables:
     """The bearings of the pixels of P photos.
 
-    `values` (B, 3) are those of all tables; those of a photo whose principal point is the table's begin at `first`
-    (P,) and have its pixels' order. `moved` (P,) tells which photos need `interpolated`; None if none does.
+    `values` (B, 3) are those of all tables, `first` (P,) the index of each photo's first bearing. `grids` tells how to
+    interpolate them, see `BearingGrids`; None if each photo has the principal point of its table.
 
     Accuracy: an interpolated bearing is off by a fraction of 1 / (8 f) of a pixel, f the focal length in pixels.
 
@@ -42,20 +41,23 @@ class BearingTables:
             table: _fill(table, values[begin : begin + table.width * table.height], storage)
             for table, begin in zip(tables, begins[:-1], strict=True)
         }
-        first = dict(zip(tables, begins[:-1], strict=True))
-        offsets = {camera: _offset(camera, table) for camera, table in table_of.items()}
         self._table_of = table_of
         self.values = torch.from_numpy(values).to(device)
-        self.first = torch.tensor([first[table_of[camera]] for camera in cameras], device=device)
-        moved = torch.tensor([offsets[camera] is not None for camera in cameras], device=device)
-        self.moved: Tensor | None = moved if bool(moved.any()) else None
-        shifts = np.array([offsets[camera] or (0.0, 0.0) for camera in cameras]).reshape(-1, 2)
+        offsets = [_offset(camera, table_of[camera]) for camera in cameras]
+        shifts = np.array([offset or (0.0, 0.0) for offset in offsets]).reshape(-1, 2)
         whole = np.floor(shifts).astype(np.int64)
-        x, y = (shifts - whole).T
-        corners = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
-        self._whole = torch.from_numpy(whole).to(device)
-        self._corners = torch.from_numpy(corners.astype(np.float32)).to(device)
-        self._widths = torch.tensor([table_of[camera].width for camera in cameras], device=device)
+        grid_widths = np.array([table_of[camera].width for camera in cameras])
+        begin = dict(zip(tables, begins[:-1], strict=True))
+        first = np.array([begin[table_of[camera]] for camera in cameras]) + whole[:, 1] * grid_widths + whole[:, 0]
+        self.first = torch.from_numpy(first).to(device)
+        self.grids: BearingGrids | None = None
+        if any(offset is not None for offset in offsets):
+            x, y = (shifts - whole).T
+            corners = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
+            widths = np.stack([[camera.width for camera in cameras], grid_widths], axis=-1)
+            self.grids = BearingGrids(
+                torch.from_numpy(widths).to(device), torch.from_numpy(corners.astype(np.float32)).to(device)
+            )
 
     def valid(self, camera: Camera) -> np.ndarray:
         """Return which pixels of a camera have a bearing, (N,) bool: all four around it, if it is interpolated."""
@@ -68,14 +70,6 @@ class BearingTables:
         x, y = int(offset[0]), int(offset[1])
         part = valid[y : y + camera.height + 1, x : x + camera.width + 1]
         return (part[:-1, :-1] & part[:-1, 1:] & part[1:, :-1] & part[1:, 1:]).ravel()
-
-    def interpolated(self, photos: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
-        """Return the bearings (N, 3) of valid pixels (N,) of photos (N,) that are `moved`; of others something."""
-        widths, (x, y) = self._widths[photos], self._whole[photos].unbind(-1)
-        begin = self.first[photos] + (rows + y) * widths + columns + x
-        places = torch.stack([begin, begin + 1, begin + widths, begin + widths + 1], dim=-1)
-        around = self.values[places.clamp_max(len(self.values) - 1)]  # (N, 4, 3)
-        return normalize((self._corners[photos][:, :, None] * around).sum(1), dim=-1)
 
 
 def _tables(cameras: list[Camera]) -> dict[Camera, Camera]:

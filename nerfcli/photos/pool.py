@@ -213,14 +213,10 @@ class PixelPool:
     def rays_of(self, numbers: Tensor) -> PixelBatch:
         """Return the rays and colours of pixels (N,), counted through all photos."""
         bearings = self._bearings
-        pixels = PixelTable(self.first_pixel, bearings.first, bearings.values, self.poses, self.colours)
+        pixels = PixelTable(
+            self.first_pixel, bearings.first, bearings.values, self.poses, self.colours, bearings.grids
+        )
         origins, directions, colours = self._backend.pixel_rays(numbers, pixels)
-        if bearings.moved is not None:
-            photos = self.photo_of(numbers)
-            places, widths = numbers - self.first_pixel[photos], self.sizes[photos, 1]
-            seen = bearings.interpolated(photos, places % widths, places // widths)
-            turned = (self.poses[photos, :3, :3] * seen[:, None, :]).sum(-1)
-            directions = torch.where(bearings.moved[photos][:, None], turned, directions)
         none = torch.zeros(0, device=numbers.device)
         return PixelBatch(origins, directions, colours, numbers, distances=none, trust=none, weights=none)
 

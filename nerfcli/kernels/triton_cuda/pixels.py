@@ -11,9 +11,33 @@ BLOCK = 128
 
 
 @jit
+def _bearing(bearings, at, valid):
+    x = tl.load(bearings + at * 3, mask=valid, other=0.0)
+    y = tl.load(bearings + at * 3 + 1, mask=valid, other=0.0)
+    z = tl.load(bearings + at * 3 + 2, mask=valid, other=0.0)
+    return x, y, z
+
+
+@jit
+def _weighted(bearings, at, below, corners, valid):
+    """Return the weighted sum of the bearings around a pixel, normalised; the first as it is if its weight is 1."""
+    first_x, first_y, first_z = _bearing(bearings, at, valid)
+    weight = tl.load(corners, mask=valid, other=1.0)
+    alone = weight == 1.0
+    x, y, z = weight * first_x, weight * first_y, weight * first_z
+    for corner in tl.static_range(1, 4):
+        other_x, other_y, other_z = _bearing(bearings, at + corner % 2 + corner // 2 * below, valid & ~alone)
+        factor = tl.load(corners + corner, mask=valid, other=0.0)
+        x, y, z = x + factor * other_x, y + factor * other_y, z + factor * other_z
+    norm = tl.sqrt(x * x + y * y + z * z)
+    norm = tl.where(norm > 0.0, norm, 1.0)
+    return tl.where(alone, first_x, x / norm), tl.where(alone, first_y, y / norm), tl.where(alone, first_z, z / norm)
+
+
+@jit
 def _pixels(
-    chosen, first_pixel, first_bearing, bearings, poses, colours, origins,
-    directions, out, photos, halvings, count, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
+    chosen, first_pixel, first_bearing, bearings, poses, colours, widths, corners, origins,
+    directions, out, photos, halvings, count, CHANNELS: tl.constexpr, GRIDS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     valid = i < count
@@ -25,12 +49,15 @@ def _pixels(
         middle = (low + high) // 2
         right = tl.load(first_pixel + middle, mask=valid, other=0) <= pixel
         low, high = tl.where(right, middle, low), tl.where(right, high, middle)
-    bearing = (
-        tl.load(first_bearing + low, mask=valid, other=0) + pixel - tl.load(first_pixel + low, mask=valid, other=0)
-    )
-    x = tl.load(bearings + bearing * 3, mask=valid, other=0.0)
-    y = tl.load(bearings + bearing * 3 + 1, mask=valid, other=0.0)
-    z = tl.load(bearings + bearing * 3 + 2, mask=valid, other=0.0)
+    place = pixel - tl.load(first_pixel + low, mask=valid, other=0)
+    at = tl.load(first_bearing + low, mask=valid, other=0)
+    if GRIDS:
+        width = tl.load(widths + low * 2, mask=valid, other=1)
+        below = tl.load(widths + low * 2 + 1, mask=valid, other=1)
+        at += place // width * below + place % width
+        x, y, z = _weighted(bearings, at, below, corners + low * 4, valid)
+    else:
+        x, y, z = _bearing(bearings, at + place, valid)
     for axis in tl.static_range(3):
         row = poses + low * 16 + axis * 4
         along = tl.load(row, mask=valid, other=0.0) * x + tl.load(row + 1, mask=valid, other=0.0) * y
@@ -48,9 +75,10 @@ def pixel_rays(chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tens
     device = chosen.device
     origins, directions = torch.empty(count, 3, device=device), torch.empty(count, 3, device=device)
     colours = torch.empty(count, channels, device=device)
+    widths, corners = pixels.grids or (pixels.first_pixel, pixels.bearings)  # not read without grids
     launch(
         _pixels, (blocks(count, BLOCK),), chosen.contiguous(), pixels.first_pixel, pixels.first_bearing,
-        pixels.bearings, pixels.poses.contiguous(), pixels.colours, origins, directions, colours, photos,
-        max(0, photos - 1).bit_length(), count, CHANNELS=channels, BLOCK=BLOCK,
+        pixels.bearings, pixels.poses.contiguous(), pixels.colours, widths, corners, origins, directions, colours,
+        photos, max(0, photos - 1).bit_length(), count, CHANNELS=channels, GRIDS=pixels.grids is not None, BLOCK=BLOCK,
     )  # fmt: skip
     return origins, directions, colours
