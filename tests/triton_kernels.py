@@ -23,7 +23,17 @@ from torch import Tensor
 from triton.runtime import interpreter
 
 from nerfcli import kernels
-from nerfcli.kernels import Backend, BearingGrids, HashGrid, March, PixelTable, Rays, Targets, reference, spherical_harmonics
+from nerfcli.kernels import (
+    Backend,
+    BearingGrids,
+    HashGrid,
+    March,
+    PixelTable,
+    Rays,
+    Targets,
+    reference,
+    spherical_harmonics,
+)
 from nerfcli.kernels.contraction import contract
 from nerfcli.kernels.triton_cuda import compositing, coordinates, depth, hash_grid, marching, networks, pixels, row_adam
 from nerfcli.kernels.triton_cuda import rays as along

@@ -182,7 +182,7 @@ class Samples(NamedTuple):
 
 
 class BearingGrids(NamedTuple):
-    """Grids of bearings that are larger than the photos of a lens, for photos whose pixels lie between those of the grid.
+    """Grids of bearings larger than the photos of a lens, for photos whose pixels are between those of the grid.
 
     Args:
         widths: (P, 2) int64, of each photo and of its grid.
