@@ -61,20 +61,23 @@ class PhotoCalibration:
 def calibrated(calibration: Calibration, pictures: Sequence[Picture]) -> tuple[PhotoCalibration, ...]:
     """Return the camera of each photo, turned and rescaled to its upright picture.
 
-    Photos are matched to the file's images by name, without folders. A photo that is not listed gets the only camera
-    of its size, upright or as stored, or else the only camera of its aspect ratio.
+    Photos are matched to the file's images by name, without folders unless several images have the same name. A photo
+    that is not listed gets the only camera of its size, upright or as stored, or else the only one of its aspect ratio.
 
     Raises:
         UserError: a photo has no camera in the file, or several, or another aspect ratio than its camera.
     """
-    numbers: dict[str, set[int]] = {}
+    listed: dict[str, dict[str, int]] = {}
     for name, number in calibration.of_image.items():
-        numbers.setdefault(_last_part(name), set()).add(number)
-    return tuple(_of_picture(calibration, picture, numbers) for picture in pictures)
+        listed.setdefault(_last_part(name), {})[name] = number
+    return tuple(_of_picture(calibration, picture, listed.get(picture.path.name, {})) for picture in pictures)
 
 
-def _of_picture(calibration: Calibration, picture: Picture, numbers: Mapping[str, set[int]]) -> PhotoCalibration:
-    listed = numbers.get(picture.path.name, set())
+def _of_picture(calibration: Calibration, picture: Picture, same_name: Mapping[str, int]) -> PhotoCalibration:
+    """Return the camera of a photo; `same_name` are the listed images of its name and the indices of their cameras."""
+    path = picture.path.as_posix()
+    same_folder = {number for name, number in same_name.items() if path.endswith(f"/{name}") and "/" in name}
+    listed = same_folder or set(same_name.values())
     if len(listed) > 1:
         raise UserError(
             f"{calibration.path} lists {len(listed)} images called {picture.path.name}, with different cameras",

@@ -39,6 +39,12 @@ IntrinsicsAs = Annotated[
     str | None,
     typer.Option(help="fixed: keep the given intrinsics; prior: use them as initial values.  [default: fixed]"),
 ]
+Subfolders = Annotated[
+    bool,
+    typer.Option(
+        "--subfolders", help="Use the photos in all subfolders, such as left/ and right/; each has its own camera."
+    ),
+]
 Quality = Annotated[str, typer.Option(help="fast, default or best: image size and number of features.")]
 
 
@@ -47,6 +53,7 @@ def poses(
     photos: Annotated[str, typer.Argument(help="Folder of photos or a video, or - to read paths from standard input.")],
     output: Output = None,
     frames: Frames = None,
+    subfolders: Subfolders = False,
     masks: Annotated[
         Path | None, typer.Option(help="Folder of masks named after the photos; black is ignored.")
     ] = None,
@@ -111,6 +118,7 @@ def poses(
       nerfcli poses kitchen.mp4 --frames 200
       nerfcli poses photos/kitchen --strict --holdout block:0.15
       nerfcli poses statue/ --masks statue-masks/
+      nerfcli poses stereo-rig/ --subfolders
       nerfcli poses photos/kitchen --intrinsics calibration/cameras.txt
       nerfcli poses photos/flat -o second-room --component 2
       ls -d captures/*/ | nerfcli poses - -o scenes/
@@ -153,6 +161,7 @@ def poses(
         strict=strict,
         component=component,
         accept_refused=accept_refused,
+        subfolders=subfolders,
     )
     limits = Limits(
         memory_bytes=memory_limit(memory),

@@ -30,7 +30,7 @@ from nerfcli.cli.options import (
     seconds_from_text,
     thread_count,
 )
-from nerfcli.cli.poses import Frames, Intrinsics, IntrinsicsAs, Quality, sizes_of, use_of
+from nerfcli.cli.poses import Frames, Intrinsics, IntrinsicsAs, Quality, Subfolders, sizes_of, use_of
 
 
 @command
@@ -38,6 +38,7 @@ def run(
     photos: Annotated[str, typer.Argument(help="Folder of photos or a video, or - to read paths from standard input.")],
     output: Output = None,
     frames: Frames = None,
+    subfolders: Subfolders = False,
     quality: Quality = "default",
     intrinsics: Intrinsics = None,
     intrinsics_as: IntrinsicsAs = None,
@@ -103,6 +104,7 @@ def run(
         threads=cores,
         holdout=rule or DEFAULT_HOLDOUT,
         strict=strict,
+        subfolders=subfolders,
     )
     train_settings = TrainSettings(
         budget_seconds=seconds_from_text(budget),

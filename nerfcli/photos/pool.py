@@ -213,9 +213,7 @@ class PixelPool:
     def rays_of(self, numbers: Tensor) -> PixelBatch:
         """Return the rays and colours of pixels (N,), counted through all photos."""
         bearings = self._bearings
-        pixels = PixelTable(
-            self.first_pixel, bearings.first, bearings.values, self.poses, self.colours, bearings.grids
-        )
+        pixels = PixelTable(self.first_pixel, bearings.first, bearings.values, self.poses, self.colours, bearings.grids)
         origins, directions, colours = self._backend.pixel_rays(numbers, pixels)
         none = torch.zeros(0, device=numbers.device)
         return PixelBatch(origins, directions, colours, numbers, distances=none, trust=none, weights=none)

@@ -17,7 +17,6 @@ from nerfcli import scene
 from nerfcli.atomic import write_json
 from nerfcli.errors import UserError
 from nerfcli.holdout import names_held_out
-from nerfcli.media.images import list_images
 from nerfcli.poses.engine.strict import held_out_last
 from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
 from nerfcli.poses.engine.turntable import MASKS, advised
@@ -25,7 +24,7 @@ from nerfcli.poses.input.job import Job, write_job
 from nerfcli.poses.input.masks import lay_out_masks
 from nerfcli.poses.input.pairs import Pairing, choose_pairs
 from nerfcli.poses.input.pairs_file import read_pairs
-from nerfcli.poses.input.photos import Photos, find_photos
+from nerfcli.poses.input.photos import Photos, find_photos, list_photos, name_in
 from nerfcli.poses.input.plan import Plan, make_plan
 from nerfcli.poses.input.settings import Limits, PoseSettings, check_settings
 from nerfcli.poses.input.stages import file_key
@@ -74,7 +73,7 @@ def estimate_poses(
     """
     start = time.perf_counter()
     photos, grouped, pairing, plan = plan_poses(photos_dir, settings=settings, progress=progress, given=given)
-    _check_destination(scene_dir, photos_dir)
+    _check_destination(scene_dir, photos_dir, subfolders=settings.subfolders)
     for note in photo_notes(photos, grouped):
         notify(note)
     planned(plan)
@@ -130,7 +129,7 @@ def plan_poses(
         ValueError, UserError: as for `estimate_poses`, if the cause can be found before the work.
     """
     check_settings(settings)
-    photos = find_photos(photos_dir, lambda done, total: progress("read", done, total))
+    photos = find_photos(photos_dir, lambda done, total: progress("read", done, total), subfolders=settings.subfolders)
     names_held_out(settings.holdout, photos.names, others=photos.unreadable)  # before the work rather than after it
     grouped = group_photos(photos, model=settings.camera_model) if given is None else group_by_given(photos, given)
     if settings.pairs_file is None:
@@ -162,7 +161,7 @@ def is_same_scene(
 def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: GivenIntrinsics | None) -> bool:
     report = _read_json(scene_dir / "poses_report.json")
     made = scene_dir.resolve() / _read_json(scene_dir / scene.SCENE_FILE)["image_folder"]
-    names = [path.name for path in list_images(photos_dir)]
+    names = [name_in(photos_dir, path) for path in list_photos(photos_dir, subfolders=settings.subfolders)]
     pairs_key = None if settings.pairs_file is None else file_key(Path(settings.pairs_file))
     holdout_key = file_key(Path(settings.holdout)) if Path(settings.holdout).is_file() else None
     earlier = report.get("intrinsics")
@@ -265,12 +264,16 @@ def _split(report: PosesReport, holdout: str) -> dict[str, str | None]:
     return {name: "test" if name in test else "train" for name in placed}
 
 
-def _check_destination(scene_dir: Path, photos_dir: Path) -> None:
+def _check_destination(scene_dir: Path, photos_dir: Path, *, subfolders: bool) -> None:
     """Refuse a destination that contains anything other than a scene, since the scene replaces it."""
     scene_path, photos_path = scene_dir.resolve(), photos_dir.resolve()
     hint = "choose another folder with -o"
     if photos_path.is_relative_to(scene_path):
         raise UserError(f"the scene {scene_dir} would overwrite the photos in {photos_dir}", hint)
+    if subfolders and scene_path.is_relative_to(photos_path):
+        raise UserError(
+            f"the pictures in {scene_dir} would count as photos, as it is a subfolder of {photos_dir}", hint
+        )
     if scene_dir.exists() and not scene_dir.is_dir():
         raise UserError(f"cannot write the scene {scene_dir}: a file with this name exists", hint)
     ours = (scene_dir / scene.SCENE_FILE).is_file() or is_under_construction(scene_dir)

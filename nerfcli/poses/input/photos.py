@@ -1,10 +1,10 @@
-"""Photos of a folder: readability, upright size, groups with a common camera."""
+"""Photos of a folder or of its subfolders: readability, upright size, groups with a common camera."""
 
 import math
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.media.focal_evidence import focal_evidence
@@ -21,7 +21,10 @@ _SAME_FOCAL = 0.02
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo that was decoded from beginning to end. width and height are those of the upright picture."""
+    """A photo that was decoded from beginning to end. width and height are those of the upright picture.
+
+    name: of the file; in a subfolder its path from the folder of photos, with forward slashes.
+    """
 
     name: str
     width: int
@@ -43,12 +46,24 @@ class Photos:
         return tuple(photo.name for photo in self.photos)
 
 
-def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None) -> Photos:
+def list_photos(folder: Path, *, subfolders: bool = False) -> list[Path]:
+    """Return the picture files directly in a folder and, on request, in all of its subfolders, sorted by name.
+
+    Raises:
+        UserError: see `list_images`.
+    """
+    return [path for each in _folders(folder, subfolders=subfolders) for path in list_images(each)]
+
+
+def find_photos(
+    folder: Path, progress: Callable[[int, int], None] | None = None, *, subfolders: bool = False
+) -> Photos:
     """Read every photo of `folder` once, so that a damaged one is found here and not by a solver an hour later.
 
     Args:
-        folder: a folder with photos; its sub-folders are not searched.
+        folder: a folder with photos.
         progress: receives (photos read, photos in all) after each photo.
+        subfolders: whether the photos in its subfolders are included.
 
     Raises:
         UserError: no such folder, a file instead of a folder, no photos in it, or fewer than `MIN_PHOTOS` readable.
@@ -57,17 +72,20 @@ def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None
         raise UserError(f"the folder {folder} does not exist", "give a folder of photos, or a video file")
     if not folder.is_dir():
         raise UserError(f"{folder} is a file, not a folder of photos", "give the folder that contains the photos")
-    paths, unsupported = list_images(folder), unsupported_photos(folder)
+    paths = list_photos(folder, subfolders=subfolders)
+    unsupported = [path for each in _folders(folder, subfolders=subfolders) for path in unsupported_photos(each)]
     if not paths and not unsupported:
         raise UserError(f"no photos in {folder}", _where_photos_may_be(folder))
     photos: list[Photo] = []
-    unreadable = {path.name: f"{path.suffix} files are not supported; convert them to JPEG" for path in unsupported}
+    unreadable = {
+        name_in(folder, path): f"{path.suffix} files are not supported; convert them to JPEG" for path in unsupported
+    }
     with ThreadPoolExecutor(_READERS) as readers:
-        for index, found in enumerate(readers.map(_examine, paths)):
+        for index, found in enumerate(readers.map(lambda path: _examine(path, name_in(folder, path)), paths)):
             if isinstance(found, Photo):
                 photos.append(found)
             else:
-                unreadable[paths[index].name] = found
+                unreadable[name_in(folder, paths[index])] = found
             if progress:
                 progress(index + 1, len(paths))
     if len(photos) < MIN_PHOTOS:
@@ -75,8 +93,13 @@ def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None
     return Photos(folder=folder, photos=tuple(photos), unreadable=unreadable)
 
 
+def name_in(folder: Path, path: Path) -> str:
+    """Return the name of a photo below a folder, see `Photo`."""
+    return path.relative_to(folder).as_posix()
+
+
 def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
-    """Group photos that may share intrinsics: same make, model, lens, focal length, upright size and crop.
+    """Group photos that may share intrinsics: same subfolder, make, model, lens, focal length, upright size and crop.
 
     Focal lengths within 2 % count as the same: autofocus changes them a little. Photos without EXIF are distinguished
     by their size alone. Groups and the names in them are in the order of `photos`.
@@ -89,7 +112,8 @@ def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
         crop = evidence.whole_px if evidence.doubt else None
         # The 35 mm equivalent also tells digital zoom, which leaves the focal length in millimetres as it is.
         optics = (exif.make, exif.model, exif.lens, _same_as(exif.focal_mm, focals), _same_as(exif.focal_35mm, focals))
-        groups.setdefault((*optics, crop, photo.width, photo.height), []).append(photo.name)
+        key = (PurePosixPath(photo.name).parent, *optics, crop, photo.width, photo.height)
+        groups.setdefault(key, []).append(photo.name)
     return tuple(tuple(names) for names in groups.values())
 
 
@@ -104,11 +128,22 @@ def _same_as(focal: float | None, focals: list[float]) -> float | None:
     return focal
 
 
-def _examine(path: Path) -> Photo | str:
+def _folders(folder: Path, *, subfolders: bool) -> list[Path]:
+    """Return a folder and, on request, all of its subfolders, sorted by name; hidden ones are left out."""
+    if not subfolders:
+        return [folder]
+    below = (path for path in folder.rglob("*") if path.is_dir())
+    return [
+        folder,
+        *sorted(path for path in below if not any(p.startswith(".") for p in path.relative_to(folder).parts)),
+    ]
+
+
+def _examine(path: Path, name: str) -> Photo | str:
     """Return the photo, or why it cannot be read."""
     try:
         height, width = read_image(path).shape[:2]
-        return Photo(name=path.name, width=width, height=height, exif=read_exif(path))
+        return Photo(name=name, width=width, height=height, exif=read_exif(path))
     except UserError as error:
         return error.message.replace(str(path), "").removeprefix(" is ").strip(" :")
 
@@ -131,7 +166,10 @@ def _more_photos_hint(unreadable: dict[str, str]) -> str:
 
 
 def _where_photos_may_be(folder: Path) -> str:
-    for child in sorted(folder.iterdir()):
-        if child.is_dir() and list_images(child):
-            return f"there are photos in {child}; give that folder"
+    with_photos = [child for child in sorted(folder.iterdir()) if child.is_dir() and list_images(child)]
+    if len(with_photos) == 1:
+        return f"there are photos in {with_photos[0]}; give that folder"
+    if with_photos:
+        more = f" and {len(with_photos) - 1} more folders" if len(with_photos) > 2 else f" and {with_photos[1]}"
+        return f"there are photos in {with_photos[0]}{more}; give one of them, or use all with --subfolders"
     return f"expected files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"

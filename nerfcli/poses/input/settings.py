@@ -37,6 +37,7 @@ class PoseSettings:
     holdout: the rule by which photos are held out, see `nerfcli.holdout`. strict: whether held-out photos are placed
     afterwards, with the result of the other photos fixed, see `strict`. component: which of the separate models becomes
     the scene, 1 for the largest. accept_refused: whether a model that the checks refuse becomes the scene anyway.
+    subfolders: whether photos in subfolders are used, those of each as of a camera of their own.
     """
 
     max_image_size: int = QUALITIES["default"][0]
@@ -52,6 +53,7 @@ class PoseSettings:
     strict: bool = False
     component: int = 1
     accept_refused: bool = False
+    subfolders: bool = False
 
 
 @dataclass(frozen=True)

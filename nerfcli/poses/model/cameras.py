@@ -68,7 +68,8 @@ def group_photos(photos: Photos, *, model: str) -> PhotoGroups:
     notes = _doubts(doubted)
     if len(groups) == 1:
         return PhotoGroups(tuple(groups), notes)
-    return PhotoGroups(tuple(groups), (f"{len(groups)} cameras, by EXIF and size: {_summary(groups)}", *notes))
+    by = "folder, EXIF and size" if any("/" in name for name in photos.names) else "EXIF and size"
+    return PhotoGroups(tuple(groups), (f"{len(groups)} cameras, by {by}: {_summary(groups)}", *notes))
 
 
 def group_by_given(photos: Photos, given: GivenIntrinsics) -> PhotoGroups:
