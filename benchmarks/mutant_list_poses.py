@@ -62,4 +62,38 @@ POSES: tuple[Group, ...] = (
             ),
         ),
     ),
+    Group(
+        "poses/engine/features.py",
+        ("tests/test_faint_photos.py",),
+        "",
+        (),
+        (
+            Mutant('_Search("faint", below=1 / 8', '_Search("faint", below=0.0'),
+            Mutant("first_octave=0, contrast=_CONTRAST / 4", "first_octave=0, contrast=_CONTRAST"),
+            Mutant("if last[n] == index - 1 and counts", "if counts"),
+            Mutant("counts[n] < search.below * job.max_features", "True"),
+            Mutant("            forget_features(job, [job.image_ids[number] for number in poor])\n", ""),
+            Mutant("                last[number] = index\n", "                pass\n"),
+            Mutant("kept[i][1] if kept", "0 if kept"),
+        ),
+    ),
+    Group(
+        "poses/input/photos.py",
+        ("tests/test_pose_subfolders.py",),
+        "",
+        (),
+        (
+            Mutant("PurePosixPath(photo.name).parent, ", ""),
+            Mutant("if not subfolders:", "if True:"),
+            Mutant('any(p.startswith(".") for p in', "any(False for p in"),
+            Mutant("return path.relative_to(folder).as_posix()", "return path.name"),
+        ),
+    ),
+    Group(
+        "cameras/calibration.py",
+        ("tests/test_pose_subfolders.py", "tests/test_pose_intrinsics.py"),
+        "",
+        (),
+        (Mutant("same_folder or set(same_name.values())", "set(same_name.values())"),),
+    ),
 )

@@ -299,9 +299,13 @@ def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_fro
     now = 22.0
     fraction, left = outlook.update("enlarge", 4, 5)
     assert (fraction, left) == (pytest.approx(22.0 / 35.0), pytest.approx(3.0 + 10.0))
-    # Later stages scale with the speed of the machine, not with the number of photos that were searched twice.
+    # Two photos are searched once more, each as long as the first time.
     now = 25.0
     outlook.update("enlarge", 5, 5)
+    assert outlook.update("faint", 0, 2)[1] == pytest.approx(2.0 + 10.0)
+    # Later stages scale with the speed of the machine, not with the number of photos that were searched twice.
+    now = 27.0
+    outlook.update("faint", 2, 2)
     assert outlook.update("match", 0, 45)[1] == pytest.approx(10.0)
 
 

@@ -148,10 +148,12 @@ def test_a_blank_photo_costs_no_second_attempt(solved: Solved):
 
 def test_progress_goes_through_all_stages(solved: Solved):
     stages = list(dict.fromkeys(stage for stage, _, _ in solved.stages))
-    assert stages == ["read", "extract", "enlarge", "features", "match", "map", "check"]
+    searches = ["extract", "enlarge", "faint", "faint-enlarged"]
+    assert stages == ["read", *searches, "features", "match", "map", "check"]
     last = {stage: (done, total) for stage, done, total in solved.stages}
     assert last["extract"] == (8, 8)
     assert last["enlarge"][0] == last["enlarge"][1] > 0
+    assert last["faint"] == last["faint-enlarged"] == (1, 1)  # the blank photo
     assert last["match"] == (28, 28)
 
 

@@ -58,9 +58,9 @@ def estimate_poses(
         settings: see `PoseSettings`.
         notify: receives messages for the user, one sentence at a time.
         progress: receives (stage, done, total); the stages are "read", "extract", "enlarge" where photos have few
-            features, "features" (per photo, of those requested), "pair" where look-alikes are searched for, "match",
-            "map", "merge" where the mapper leaves several models, "locate" where single photos are left, and
-            "check", in this order.
+            features, "faint" and "faint-enlarged" where these still have very few, "features" (per photo, of those
+            requested), "pair" where look-alikes are searched for, "match", "map", "merge" where the mapper leaves
+            several models, "locate" where single photos are left, and "check", in this order.
         limits: see `Limits`.
         planned: receives the plan before the long work starts.
         given: known intrinsics, if any.

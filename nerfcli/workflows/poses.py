@@ -18,6 +18,8 @@ _STAGES = {
     "read": "photos read",
     "extract": "photos, extracting features",
     "enlarge": "photos, extracting finer features",
+    "faint": "photos, extracting faint features",
+    "faint-enlarged": "photos, extracting faint, finer features",
     "features": "features per photo",
     "pair": "photos, finding similar ones",
     "match": "pairs compared",

@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
 
@@ -15,8 +16,6 @@ from nerfcli.poses.input.job import Job, Report, WorkMask
 from nerfcli.poses.input.plan import duration, limit_seconds, matching_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
-# A photo with this fraction of the requested features has enough; measured poses are no better with more.
-_RICH_FRACTION = 0.5
 # Largest factor by which a mask raises the feature limit: more would only add fine features at noise level.
 _MOST_FEATURES_FOR_MASK = 8
 # Matches are written after each block, so that progress is visible and kept.
@@ -25,8 +24,39 @@ _PAIRS_PER_BLOCK = 128
 _PAIRS_PER_CALL = 8 * _PAIRS_PER_BLOCK
 _LEAST_LIMIT_SECONDS = 300
 # Change these whenever this module would find other features in the same photo, or other matches of the same features.
-_FEATURES_VERSION = "octaves 0, then -1 below half"
+_FEATURES_VERSION = "octaves 0, then -1 below half, then 0 and -1 with a quarter of the contrast below an eighth"
 _MATCHES_VERSION = "ratio 0.8, cross-checked"
+
+
+# Contrast that a feature needs, of 1 between black and white; pycolmap's default.
+_CONTRAST = 0.02 / 3
+
+
+@dataclass(frozen=True)
+class _Search:
+    """One search of photos for features.
+
+    stage: its name in reports of progress. below: a photo is searched if its number of features so far is below this
+    fraction of the requested ones. first_octave: of SIFT, 0 for the picture as it is, -1 for the enlarged one.
+    contrast: that a feature needs.
+    """
+
+    stage: str
+    below: float
+    first_octave: int
+    contrast: float
+
+
+# Searching the enlarged picture, pycolmap's default, takes three times as long. Photos with many features gain nothing
+# from it, since pycolmap keeps the coarsest, and measured poses are no better with more than half of those requested.
+# Photos of dark, blurred or uniform surfaces have hardly any feature with the usual contrast. 108 photos of a sea floor
+# under a lamp: median 175 features, 24 of 54 stereo pairs verified; with a quarter of the contrast, 4,842 and all 54.
+_SEARCHES = (
+    _Search("extract", below=math.inf, first_octave=0, contrast=_CONTRAST),
+    _Search("enlarge", below=1 / 2, first_octave=-1, contrast=_CONTRAST),
+    _Search("faint", below=1 / 8, first_octave=0, contrast=_CONTRAST / 4),
+    _Search("faint-enlarged", below=1 / 8, first_octave=-1, contrast=_CONTRAST / 4),
+)
 
 
 def feature_keys(job: Job) -> dict[str, str]:
@@ -39,8 +69,7 @@ def feature_keys(job: Job) -> dict[str, str]:
 def extract(job: Job, report: Report) -> None:
     """Extract SIFT features of every photo that has none yet, with one camera per group.
 
-    Searching the enlarged picture too (SIFT's octave -1, pycolmap's default) takes three times as long. Photos with
-    many features gain nothing, since pycolmap keeps the coarsest; so only those with few are searched in a second pass.
+    All photos are searched once, those with few features again as `_SEARCHES` says.
     """
     register_photos(job)
     keys, stage_path = feature_keys(job), _stage_file(job, "features")
@@ -48,19 +77,23 @@ def extract(job: Job, report: Report) -> None:
     forget_features(job, [int(image_id) for image_id, key in keys.items() if there.get(image_id) != key])
     # From here on, all features in the database are those of `keys`.
     write_stage(stage_path, _FEATURES_VERSION, keys)
-    passes = _stage_file(job, "enlarged")
-    enlarged = {i: key for i, key in (read_stage(passes, _FEATURES_VERSION) or {}).items() if keys.get(i) == key}
-    first = [number for number, image_id in enumerate(job.image_ids) if str(image_id) not in enlarged]
-    _extract_octaves(job, first, watched=range(len(job.image_ids)), first_octave=0, report=report)
-    counts = feature_counts(job)
-    poor = [number for number in first if counts[number] < _RICH_FRACTION * job.max_features]
-    # Features are removed before photos are listed for the second pass: a listed photo with features has had it.
-    forget_features(job, [job.image_ids[number] for number in poor])
-    enlarged |= {str(job.image_ids[number]): keys[str(job.image_ids[number])] for number in poor}
-    write_stage(passes, _FEATURES_VERSION, enlarged)
-    due = [number for number, image_id in enumerate(job.image_ids) if str(image_id) in enlarged]
-    if due:
-        _extract_octaves(job, due, watched=due, first_octave=-1, report=report)
+    last_file = _stage_file(job, "searches")
+    kept = read_stage(last_file, _FEATURES_VERSION) or {}
+    # The index of the last search of each photo, by number.
+    last = [kept[i][1] if kept.get(i, [""])[0] == keys[i] else 0 for i in map(str, job.image_ids)]
+    for index, search in enumerate(_SEARCHES):
+        if index > 0:
+            counts = feature_counts(job)
+            poor = [n for n in range(len(last)) if last[n] == index - 1 and counts[n] < search.below * job.max_features]
+            # Features are removed before photos are listed for a search: a listed photo with features has had it.
+            forget_features(job, [job.image_ids[number] for number in poor])
+            for number in poor:
+                last[number] = index
+            searched = zip(map(str, job.image_ids), last, strict=True)
+            write_stage(last_file, _FEATURES_VERSION, {i: [keys[i], number] for i, number in searched})
+        due = [number for number, found in enumerate(last) if found == index]
+        if due or index == 0:
+            _extract(job, due, search, watched=due if index > 0 else range(len(last)), report=report)
 
 
 def start_matching(job: Job, pairs: Sequence[tuple[int, int]]) -> None:
@@ -129,15 +162,14 @@ def feature_counts(job: Job) -> list[int]:
         return [database.num_keypoints_for_image(image_id) for image_id in job.image_ids]
 
 
-def _extract_octaves(
-    job: Job, numbers: Iterable[int], *, watched: Sequence[int], first_octave: int, report: Report
-) -> None:
+def _extract(job: Job, numbers: Iterable[int], search: _Search, *, watched: Sequence[int], report: Report) -> None:
     """Extract features of photos that have none, and report how many of the photos `watched` have some."""
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = job.max_image_size
     options.num_threads = job.threads
     options.use_gpu = False
-    options.sift.first_octave = first_octave
+    options.sift.first_octave = search.first_octave
+    options.sift.peak_threshold = search.contrast
     reader = pycolmap.ImageReaderOptions()
     reader.mask_path = str(job.mask_folder) if job.masks else ""
     with closing(pycolmap.Database.open(str(job.database))) as database:
@@ -147,7 +179,7 @@ def _extract_octaves(
             pending.difference_update([image_id for image_id in pending if database.exists_descriptors(image_id)])
             return len(watched) - len(pending)
 
-        with _watched("extract" if first_octave == 0 else "enlarge", done, len(watched), report):
+        with _watched(search.stage, done, len(watched), report):
             for limit, members in _by_limit(job, numbers).items():
                 options.sift.max_num_features = limit
                 pycolmap.extract_features(

@@ -22,6 +22,8 @@ from nerfcli.poses.judge.checks import UNDERWAY
 _STAGES = {
     "extract": "finding features",
     "enlarge": "extracting finer features",
+    "faint": "extracting faint features",
+    "faint-enlarged": "extracting faint, finer features",
     "features": "counting features",
     "pair": "choosing pairs",
     "match": "matching photos",

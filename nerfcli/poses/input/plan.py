@@ -10,8 +10,8 @@ from nerfcli.poses.input.pairs import Pairing, retrieval_feature_count
 from nerfcli.poses.input.photos import Photos
 from nerfcli.poses.input.settings import PoseSettings
 
-# Time of the second search for features, in the enlarged picture, relative to the first, see `features.extract`.
-_ENLARGED_FACTOR = 3.0
+# Time of the further searches for features, relative to the first, see `engine.features`.
+_SEARCH_FACTORS = {"enlarge": 3.0, "faint": 1.0, "faint-enlarged": 3.0}
 # CPU seconds, measured on one core of a 2-core server; within a factor of two on others.
 _SECONDS_PER_MEGAPIXEL = 0.4
 _SECONDS_PER_PAIR = 0.045
@@ -151,8 +151,8 @@ class TimeEstimate:
     The planned seconds of the current stage are scaled by the time it has taken so far, after its beginning; those of
     later stages by the smallest scale of any stage. A slow machine slows all stages, whereas a single slow stage has
     its own cause (matches of shiny things, poses of a dense walk). Work that an earlier call has done does not count.
-    Which photos are searched enlarged is known only after the first search for features, how many features the matcher
-    compares only after the second, and whether there are sub-models to merge or single photos to locate only after
+    Which photos are searched again is known only after the first search for features, how many features the matcher
+    compares only after the last, and whether there are sub-models to merge or single photos to locate only after
     mapping; if that adds work, the fraction done stays constant until it is correct again.
 
     Args:
@@ -180,8 +180,8 @@ class TimeEstimate:
             self._plan_matching(done)
             stage, done, total = self._at
         self._at = (stage, done, total)
-        if stage == "enlarge":
-            self._plan_enlarging(total)
+        if stage in _SEARCH_FACTORS:
+            self._plan_search(stage, total)
         if stage == "merge":
             self._plan_before_checks(stage, _MERGE_FRACTION * self._plan.seconds.get("map", 0.0))
         if stage == "locate":
@@ -226,12 +226,13 @@ class TimeEstimate:
         fraction = features / max(self._plan.features, 1)
         self._seconds = {name: s * (fraction if name == "match" else 1.0) for name, s in self._seconds.items()}
 
-    def _plan_enlarging(self, photos: int) -> None:
-        """Insert the second search for features after the first."""
-        extract = self._plan.seconds.get("extract", 0.0)
-        enlarge = _ENLARGED_FACTOR * extract * photos / max(self._plan.photos, 1)
-        later = {stage: seconds for stage, seconds in self._plan.seconds.items() if stage != "extract"}
-        self._seconds = {"extract": extract, "enlarge": enlarge, **later}
+    def _plan_search(self, stage: str, photos: int) -> None:
+        """Insert another search for features after the earlier ones."""
+        first = self._plan.seconds.get("extract", 0.0)
+        searches = {name: self._seconds[name] for name in _SEARCH_FACTORS if name in self._seconds and name != stage}
+        searches[stage] = _SEARCH_FACTORS[stage] * first * photos / max(self._plan.photos, 1)
+        later = {name: seconds for name, seconds in self._plan.seconds.items() if name != "extract"}
+        self._seconds = {"extract": first, **searches, **later}
 
     def _plan_before_checks(self, stage: str, seconds: float) -> None:
         """Insert a stage that was not planned before the checks."""

@@ -1,0 +1,113 @@
+"""Photos with hardly any contrast: the room corner of `corner` in the dark."""
+
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from corner import CENTRES, HEIGHT, WIDTH, render
+from in_this_process import worker_in_this_process
+from PIL import Image
+from test_poses import similarity
+
+from nerfcli.poses.engine.features import extract, feature_counts
+from nerfcli.poses.input.job import CameraGroup, Job
+from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.structure_from_motion import estimate_poses
+
+SETTINGS = PoseSettings(max_features=600, threads=1)
+# A tenth of a picture's contrast leaves 8 to 12 features in it that SIFT's usual threshold accepts, this none.
+CONTRAST = 0.06
+
+
+def dark(centre: np.ndarray) -> Image.Image:
+    picture = render(centre, 1.0, np.zeros(2)).astype(float)
+    return Image.fromarray(np.round(40 + CONTRAST * (picture - 128)).astype(np.uint8))
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for index, centre in enumerate(CENTRES):
+        dark(centre).save(folder / f"{index}.png")
+    return folder
+
+
+def test_poses_of_dark_photos_agree_with_the_truth(photos: Path, tmp_path: Path):
+    """Without the third search, none of the photos has a feature."""
+    reported: dict[str, tuple[int, int]] = {}
+    with worker_in_this_process():
+        report = estimate_poses(
+            photos,
+            tmp_path / "scene",
+            settings=SETTINGS,
+            notify=lambda note: None,
+            progress=lambda stage, done, total: reported.update({stage: (done, total)}),
+        )
+    assert report.registered == 7
+    assert reported["faint"] == (7, 7)
+    model = pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse/0"))
+    centres = np.array([model.find_image_with_name(f"{i}.png").projection_center() for i in range(7)])
+    scale, rotation, translation = similarity(centres, CENTRES)
+    assert np.linalg.norm(scale * centres @ rotation.T + translation - CENTRES, axis=1).max() < 0.03
+
+
+def job_of(photos: Path, work: Path) -> Job:
+    files = tuple(sorted(path.name for path in photos.iterdir()))
+    (work / "photos").mkdir(parents=True)
+    for number, file in enumerate(files):
+        (work / "photos" / f"{number:05d}.png").symlink_to(photos / file)
+    return Job(
+        folder=str(work),
+        files=tuple(f"{number:05d}.png" for number in range(len(files))),
+        originals=str(photos),
+        names=files,
+        keys=files,
+        groups=(CameraGroup(tuple(range(len(files))), "SIMPLE_RADIAL", WIDTH, HEIGHT),),
+        pairs=(),
+        neighbours=0,
+        max_image_size=1600,
+        max_features=600,
+        seed=0,
+        threads=1,
+    )
+
+
+def features(job: Job) -> list[np.ndarray]:
+    """Return positions and shapes of the features of each photo."""
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        return [database.read_keypoints(image_id) for image_id in job.image_ids]
+
+
+def test_only_photos_with_very_few_features_are_searched_for_faint_ones(photos: Path, tmp_path: Path):
+    """A photo with contrast keeps its features whatever the others need, and a second call changes nothing."""
+    Image.fromarray(render(CENTRES[0], 1.0, np.zeros(2))).save(photos / "0.png")
+    job = job_of(photos, tmp_path / "work" / "inner")
+    stages: dict[str, int] = {}
+    extract(job, lambda stage, done, total: stages.update({stage: total}))
+    assert stages == {"extract": 7, "enlarge": 6, "faint": 6}
+    assert min(feature_counts(job)) > 500
+    before = features(job)
+    extract(job, lambda stage, done, total: None)
+    for again, found in zip(features(job), before, strict=True):
+        np.testing.assert_array_equal(again, found)
+
+
+def test_an_interrupted_search_for_faint_features_goes_on(photos: Path, tmp_path: Path):
+    """Photos that were listed for the last search and have no features yet get what an undisturbed call gives."""
+    whole = job_of(photos, tmp_path / "whole" / "inner")
+    extract(whole, lambda stage, done, total: None)
+
+    def stop(stage: str, done: int, total: int) -> None:
+        if stage == "faint":
+            raise KeyboardInterrupt
+
+    job = job_of(photos, tmp_path / "work" / "inner")
+    with pytest.raises(KeyboardInterrupt):
+        extract(job, stop)
+    assert feature_counts(job) == [0] * 7
+    extract(job, lambda stage, done, total: None)
+    for resumed, undisturbed in zip(features(job), features(whole), strict=True):
+        np.testing.assert_array_equal(resumed, undisturbed)
