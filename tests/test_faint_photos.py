@@ -1,6 +1,7 @@
 """Photos with hardly any contrast: the room corner of `corner` in the dark."""
 
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from in_this_process import worker_in_this_process
 from PIL import Image
 from test_poses import similarity
 
+from nerfcli.poses.engine import features as searching
 from nerfcli.poses.engine.features import extract, feature_counts
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.settings import PoseSettings
@@ -81,16 +83,24 @@ def features(job: Job) -> list[np.ndarray]:
         return [database.read_keypoints(image_id) for image_id in job.image_ids]
 
 
-def test_only_photos_with_very_few_features_are_searched_for_faint_ones(photos: Path, tmp_path: Path):
-    """A photo with contrast keeps its features whatever the others need, and a second call changes nothing."""
+def test_only_photos_with_very_few_features_are_searched_for_faint_ones(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A photo with contrast keeps its features whatever the others need; a second call searches nothing again, though
+    some photos still have few features.
+    """
     Image.fromarray(render(CENTRES[0], 1.0, np.zeros(2))).save(photos / "0.png")
-    job = job_of(photos, tmp_path / "work" / "inner")
+    job = replace(job_of(photos, tmp_path / "work" / "inner"), max_features=2400)
     stages: dict[str, int] = {}
     extract(job, lambda stage, done, total: stages.update({stage: total}))
-    assert stages == {"extract": 7, "enlarge": 6, "faint": 6}
-    assert min(feature_counts(job)) > 500
-    before = features(job)
+    assert stages == {"extract": 7, "enlarge": 7, "faint": 6}
+    counts = feature_counts(job)
+    assert counts[0] > 1200 > max(counts[1:])
+    assert min(counts) > 300
+    before, forgotten = features(job), []
+    monkeypatch.setattr(searching, "forget_features", lambda job, image_ids: forgotten.extend(image_ids))
     extract(job, lambda stage, done, total: None)
+    assert forgotten == []
     for again, found in zip(features(job), before, strict=True):
         np.testing.assert_array_equal(again, found)
 
