@@ -127,7 +127,7 @@ def test_a_folder_without_masks_is_told(photos, masks, tmp_path):
     assert "p 0.png.png or p 0.png" in error.value.hint
     with pytest.raises(UserError, match="the mask folder"):
         laid_out(photos, tmp_path / "absent", tmp_path / "work")
-    with pytest.raises(UserError, match="contains the photos themselves"):
+    with pytest.raises(UserError, match="contains photos, such as"):
         laid_out(photos, photos.folder, tmp_path / "work")
 
 

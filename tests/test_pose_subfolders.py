@@ -104,7 +104,7 @@ def test_subfolders_are_searched_at_any_depth_but_not_hidden_ones(tmp_path: Path
         write_photos(tmp_path / folder, 1)
     (tmp_path / "b" / "raw.heic").write_bytes(b"")
     found = [path.relative_to(tmp_path).as_posix() for path in list_photos(tmp_path, subfolders=True)]
-    assert [name.rpartition("/")[0] for name in found] == ["", "a/deep", "b"]
+    assert found == ["0.png", "a/deep/0.png", "b/0.png"]
     write_photos(tmp_path / "b", 3)
     photos = find_photos(tmp_path, subfolders=True)
     assert set(photos.unreadable) == {"b/raw.heic"}
@@ -143,6 +143,15 @@ def test_masks_are_in_subfolders_too(tmp_path: Path):
     write_photos(tmp_path / "right", 2)
     assert find_mask("right/1.jpg", tmp_path) == tmp_path / "right" / "1.png"
     assert find_mask("left/1.jpg", tmp_path) is None
+
+
+def test_masks_among_the_photos_are_refused(rig: Path, tmp_path: Path):
+    """They would be used as photos, too."""
+    copied = shutil.copytree(rig, tmp_path / "rig")
+    shutil.copytree(rig, copied / "masks")
+    result = nerfcli("poses", copied, "-o", tmp_path / "scene", "--subfolders", "--masks", copied / "masks")
+    assert result.exit_code == BAD_INPUT
+    assert error_of(result)[0] == f"Error: {copied / 'masks'} contains photos, such as masks/left/0.png"
 
 
 @pytest.mark.parametrize("listed", [lambda name: name, lambda name: f"images/{name}"])

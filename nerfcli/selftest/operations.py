@@ -304,9 +304,7 @@ def pixel_inputs(precision: Precision) -> Inputs:
 
 def pixel_rays(module: ModuleType, given: Inputs) -> Outcome:
     """Compute the rays and colours of chosen pixels."""
-    table = PixelTable(
-        given["first_pixel"], given["first_bearing"], given["bearings"], given["poses"], colours=given["photos"]
-    )
+    table = PixelTable(given["first_pixel"], given["first_bearing"], given["bearings"], given["poses"], given["photos"])
     origins, directions, colours = module.pixel_rays(given["chosen"], table)
     return Outcome((origins, directions, colours), value_sizes=(origins, torch.ones_like(directions), colours))
 

@@ -81,8 +81,12 @@ def write_no_mask(path: Path, size: tuple[int, int]) -> WorkMask:
 def _check_folder(photos: Photos, masks: Path) -> None:
     if not masks.is_dir():
         raise UserError(f"the mask folder {masks} does not exist", "give a folder with a mask for each photo")
-    if masks.resolve() == photos.folder.resolve():
-        raise UserError(f"{masks} contains the photos themselves", "put the masks into a separate folder")
+    inside = next((n for n in photos.names if (photos.folder / n).absolute().is_relative_to(masks.absolute())), None)
+    if masks.resolve() == photos.folder.resolve() or inside is not None:
+        raise UserError(
+            f"{masks} contains photos, such as {inside or photos.names[0]}",
+            "put the masks into a separate folder, outside of that of the photos",
+        )
 
 
 def _some(texts: Sequence[str], separator: str = ", ") -> str:

@@ -47,12 +47,13 @@ class Photos:
 
 
 def list_photos(folder: Path, *, subfolders: bool = False) -> list[Path]:
-    """Return the picture files directly in a folder and, on request, in all of its subfolders, sorted by name.
+    """Return the picture files directly in a folder and, on request, in all of its subfolders, sorted by `name_in`.
 
     Raises:
         UserError: see `list_images`.
     """
-    return [path for each in _folders(folder, subfolders=subfolders) for path in list_images(each)]
+    paths = [path for each in _folders(folder, subfolders=subfolders) for path in list_images(each)]
+    return sorted(paths, key=lambda path: name_in(folder, path))
 
 
 def find_photos(
@@ -129,14 +130,11 @@ def _same_as(focal: float | None, focals: list[float]) -> float | None:
 
 
 def _folders(folder: Path, *, subfolders: bool) -> list[Path]:
-    """Return a folder and, on request, all of its subfolders, sorted by name; hidden ones are left out."""
+    """Return a folder and, on request, all of its subfolders; hidden ones are left out."""
     if not subfolders:
         return [folder]
     below = (path for path in folder.rglob("*") if path.is_dir())
-    return [
-        folder,
-        *sorted(path for path in below if not any(p.startswith(".") for p in path.relative_to(folder).parts)),
-    ]
+    return [folder, *(path for path in below if not any(p.startswith(".") for p in path.relative_to(folder).parts))]
 
 
 def _examine(path: Path, name: str) -> Photo | str:
