@@ -195,6 +195,8 @@ GROUPS: tuple[Group, ...] = (
         (
             Mutant("right=True) - 1", "right=False) - 1"),
             Mutant("/ 255.0", "/ 256.0"),
+            Mutant("place // width * grid_width", "place // width * width"),
+            Mutant("weights[:, 0] == 1", "weights[:, 0] == 2"),
         ),
     ),
     Group(
@@ -458,7 +460,10 @@ GROUPS: tuple[Group, ...] = (
         (
             Mutant('side="right") - 1', 'side="left") - 1'),
             Mutant("np.float32(255)", "np.float32(256)"),
-            Mutant("row[2] * bearing[2]", "row[2] * bearing[1]"),
+            Mutant("row[2] * z", "row[2] * y"),
+            Mutant("if weight[0] == np.float32(1):", "if False:"),
+            Mutant("(corner >> 1) * below", "(corner >> 1) * width"),
+            Mutant("return x * scale, y * scale, z * scale", "return x, y, z"),
         ),
     ),
     Group(

@@ -464,10 +464,11 @@ def test_pixel_rays(count, channels, grids, generator):
     bearings = torch.randn(720, 3, generator=generator)
     photos = torch.randint(256, (725, channels), generator=generator, dtype=torch.uint8)
     pixels = PixelTable(torch.tensor([0, 5, 705]), torch.tensor([700, 0, 700]), bearings, poses, photos)
-    if grids:  # the first photo between the bearings of a grid of 10 x 3, the last one on its own, the last of all
+    if grids:  # the first two photos between the bearings of grids of 10 x 3 and 71 x 11, the last one on its own
         corners = torch.tensor([[0.25, 0.35, 0.15, 0.25], [0.5, 0.5, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]])
-        widths = BearingGrids(torch.tensor([[4, 10], [70, 71], [5, 5]]), corners)
-        pixels = pixels._replace(first_bearing=torch.tensor([3, 0, 700]), grids=widths)
+        bearings = torch.randn(801, 3, generator=generator)
+        between = BearingGrids(torch.tensor([[4, 10], [70, 71], [5, 5]]), corners)
+        pixels = pixels._replace(first_bearing=torch.tensor([3, 0, 781]), bearings=bearings, grids=between)
     chosen = torch.randint(725, (count,), generator=generator)
     fast = numba_cpu.pixel_rays(chosen, pixels)
     exact = reference.pixel_rays(chosen, pixels._replace(bearings=bearings.double(), poses=poses.double()))

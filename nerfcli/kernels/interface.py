@@ -187,7 +187,7 @@ class BearingGrids(NamedTuple):
     Args:
         widths: (P, 2) int64, of each photo and of its grid.
         corners: (P, 4) weights of the four bearings around a pixel: upper left, upper right, lower left, lower right.
-            Their sum is normalised. If the first is 1, that bearing is used as it is.
+            Their sum is normalised. If the first is 1, that bearing is used as it is; else all four have to exist.
     """
 
     widths: Tensor
