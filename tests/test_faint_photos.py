@@ -10,11 +10,14 @@ import pytest
 from corner import CENTRES, HEIGHT, WIDTH, render
 from in_this_process import worker_in_this_process
 from PIL import Image
+from test_masks import job_for
 from test_poses import similarity
 
+from nerfcli.media.images import read_exif
 from nerfcli.poses.engine import features as searching
 from nerfcli.poses.engine.features import extract, feature_counts
-from nerfcli.poses.input.job import CameraGroup, Job
+from nerfcli.poses.input.job import Job
+from nerfcli.poses.input.photos import Photo, Photos
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import estimate_poses
 
@@ -60,25 +63,10 @@ def test_poses_of_dark_photos_agree_with_the_truth(tmp_path: Path):
     assert np.linalg.norm(scale * centres @ rotation.T + translation - CENTRES, axis=1).max() < 0.03
 
 
-def job_of(photos: Path, work: Path) -> Job:
-    files = tuple(sorted(path.name for path in photos.iterdir()))
-    (work / "photos").mkdir(parents=True)
-    for number, file in enumerate(files):
-        (work / "photos" / f"{number:05d}.png").symlink_to(photos / file)
-    return Job(
-        folder=str(work),
-        files=tuple(f"{number:05d}.png" for number in range(len(files))),
-        originals=str(photos),
-        names=files,
-        keys=files,
-        groups=(CameraGroup(tuple(range(len(files))), "SIMPLE_RADIAL", WIDTH, HEIGHT),),
-        pairs=(),
-        neighbours=0,
-        max_image_size=1600,
-        max_features=600,
-        seed=0,
-        threads=1,
-    )
+def job_of(folder: Path, work: Path) -> Job:
+    pictures = sorted(folder.iterdir())
+    photos = tuple(Photo(path.name, WIDTH, HEIGHT, read_exif(path)) for path in pictures)
+    return replace(job_for(Photos(folder, photos, {}), (), work), max_features=600)
 
 
 def features(job: Job) -> list[np.ndarray]:

@@ -131,6 +131,12 @@ def test_a_folder_without_masks_is_told(photos, masks, tmp_path):
         laid_out(photos, photos.folder, tmp_path / "work")
 
 
+def test_masks_may_be_in_the_folder_above_the_photos(photos, masks, tmp_path):
+    write_png(photos.folder.parent / "p 0.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    found, _ = laid_out(photos, photos.folder.parent, tmp_path / "work")
+    assert found[0].used_fraction == 0
+
+
 def job_for(photos: Photos, masks: tuple[WorkMask, ...], folder: Path) -> Job:
     files = tuple(f"{number:05d}.png" for number in range(len(photos.names)))
     (folder / "photos").mkdir(parents=True)

@@ -19,7 +19,7 @@ _STAGES = {
     "extract": "photos, extracting features",
     "enlarge": "photos, extracting finer features",
     "faint": "photos, extracting faint features",
-    "faint-enlarged": "photos, extracting faint, finer features",
+    "faint-enlarged": "photos, extracting faint features at double size",
     "features": "features per photo",
     "pair": "photos, finding similar ones",
     "match": "pairs compared",

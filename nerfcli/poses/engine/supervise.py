@@ -23,7 +23,7 @@ _STAGES = {
     "extract": "finding features",
     "enlarge": "extracting finer features",
     "faint": "extracting faint features",
-    "faint-enlarged": "extracting faint, finer features",
+    "faint-enlarged": "extracting faint features at double size",
     "features": "counting features",
     "pair": "choosing pairs",
     "match": "matching photos",

@@ -81,10 +81,11 @@ def write_no_mask(path: Path, size: tuple[int, int]) -> WorkMask:
 def _check_folder(photos: Photos, masks: Path) -> None:
     if not masks.is_dir():
         raise UserError(f"the mask folder {masks} does not exist", "give a folder with a mask for each photo")
-    inside = next((n for n in photos.names if (photos.folder / n).absolute().is_relative_to(masks.absolute())), None)
-    if masks.resolve() == photos.folder.resolve() or inside is not None:
+    folder = photos.folder.resolve()
+    inside = [name for name in photos.names if (folder / name).is_relative_to(masks.resolve())]
+    if inside and masks.resolve().is_relative_to(folder):  # a folder above that of the photos may have the masks
         raise UserError(
-            f"{masks} contains photos, such as {inside or photos.names[0]}",
+            f"{masks} contains photos, such as {inside[0]}",
             "put the masks into a separate folder, outside of that of the photos",
         )
 
