@@ -25,7 +25,8 @@ from nerfcli.cameras.formats.transforms import read_transforms
 from nerfcli.cameras.frame import Capture, Frame, Size
 from nerfcli.errors import UserError
 from nerfcli.holdout import names_held_out
-from nerfcli.media.images import image_size, list_images, read_exif
+from nerfcli.media.exif import read_exif
+from nerfcli.media.images import image_size, list_images
 from nerfcli.media.masks import find_mask
 
 MODEL_FOLDER = "sparse/0"

@@ -62,7 +62,7 @@ def check_that_it_parses(line: str) -> None:
         if not words or words[0] != "nerfcli":
             continue
         if words[1:] not in (["--help"], ["--version"]) and "--help" not in words:
-            group: Any = typer.main.get_command(cli.app)
+            group: Any = typer.testing._get_command(cli.app)
             group.commands[words[1]].make_context(words[1], words[2:])
 
 

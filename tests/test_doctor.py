@@ -28,7 +28,7 @@ from nerfcli.doctor.photo_list import ExaminedCapture, find_subject
 from nerfcli.doctor.sharpness import measure
 from nerfcli.errors import UserError
 from nerfcli.findings import BAD, GOOD, LOOK, Finding
-from nerfcli.media.images import Exif
+from nerfcli.media.exif import Exif
 from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.scene import Scene

@@ -9,7 +9,7 @@ from PIL import Image
 
 from nerfcli.doctor.photo_list import find_subject
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
-from nerfcli.media.images import Exif
+from nerfcli.media.exif import Exif
 from nerfcli.poses.input.photos import Photo, camera_groups, find_photos
 from nerfcli.poses.model.reasons import NO_TRAINING_PHOTO, Evidence, dominant, reason
 
@@ -73,23 +73,23 @@ def test_text_and_truncated_files_are_left_out_with_their_reason(folder: Path):
 
 def test_photos_in_formats_that_are_not_read_are_named_and_not_passed_over(folder: Path):
     """A raw file beside its JPEG is not mentioned."""
-    for name in ("f.HEIC", "g.dng", "a.CR2", "notes.txt"):
+    for name in ("f.NEF", "g.dng", "a.CR2", "notes.txt"):
         (folder / name).write_bytes(b"not for Pillow")
     photos = find_photos(folder)
     assert photos.names == ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg")
     assert photos.unreadable == {
-        "f.HEIC": ".HEIC files are not supported; convert them to JPEG",
+        "f.NEF": ".NEF files are not supported; convert them to JPEG",
         "g.dng": ".dng files are not supported; convert them to JPEG",
     }
 
 
 def test_a_folder_of_nothing_but_such_photos_says_so(tmp_path: Path):
     for number in range(4):
-        (tmp_path / f"IMG_{number}.HEIC").write_bytes(b"not for Pillow")
-    with pytest.raises(UserError, match=r"none of 4 photos in .* can be read.*IMG_0.HEIC: .HEIC files") as caught:
+        (tmp_path / f"IMG_{number}.DNG").write_bytes(b"not for Pillow")
+    with pytest.raises(UserError, match=r"none of 4 photos in .* can be read.*IMG_0.DNG: .DNG files") as caught:
         find_photos(tmp_path)
     assert caught.value.hint.startswith("convert these files to JPEG")
-    assert [source.name for source in find_subject(tmp_path).sources] == [f"IMG_{number}.HEIC" for number in range(4)]
+    assert [source.name for source in find_subject(tmp_path).sources] == [f"IMG_{number}.DNG" for number in range(4)]
 
 
 def test_a_missing_folder_is_bad_input(tmp_path: Path):

@@ -102,12 +102,12 @@ def test_pictures_of_such_photos_go_to_subfolders(scene: Path, tmp_path: Path):
 def test_subfolders_are_searched_at_any_depth_but_not_hidden_ones(tmp_path: Path):
     for folder in (".", "b", "a/deep", ".thumbnails", "b/.cache"):
         write_photos(tmp_path / folder, 1)
-    (tmp_path / "b" / "raw.heic").write_bytes(b"")
+    (tmp_path / "b" / "raw.dng").write_bytes(b"")
     found = [path.relative_to(tmp_path).as_posix() for path in list_photos(tmp_path, subfolders=True)]
     assert found == ["0.png", "a/deep/0.png", "b/0.png"]
     write_photos(tmp_path / "b", 3)
     photos = find_photos(tmp_path, subfolders=True)
-    assert set(photos.unreadable) == {"b/raw.heic"}
+    assert set(photos.unreadable) == {"b/raw.dng"}
     assert len(photos.names) == 5
     assert [len(group) for group in camera_groups(photos.photos)] == [1, 1, 3]
     assert list_photos(tmp_path) == [tmp_path / "0.png"]

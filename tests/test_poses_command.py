@@ -77,9 +77,9 @@ def test_the_plan_can_be_read(tmp_path: Path):
 
 def test_the_plan_names_the_files_that_are_skipped(tmp_path: Path):
     photos = write_photos(tmp_path / "photos", 5)
-    (photos / "IMG_1.heic").write_bytes(b"heic")
+    (photos / "IMG_1.cr3").write_bytes(b"raw")
     result = nerfcli("poses", photos, "--dry-run")
-    assert "IMG_1.heic is skipped: .heic files are not supported" in result.stderr
+    assert "IMG_1.cr3 is skipped: .cr3 files are not supported" in result.stderr
     assert result.stdout.startswith(f"{photos}: 5 photos, ")
 
 

@@ -22,7 +22,8 @@ from nerfcli.cameras.orientation import (
     turned_pixels,
 )
 from nerfcli.errors import UserError
-from nerfcli.media.images import image_size, read_exif
+from nerfcli.media.exif import read_exif
+from nerfcli.media.images import image_size
 
 STORED, UPRIGHT = "stored", "upright"
 

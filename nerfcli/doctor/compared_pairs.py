@@ -11,8 +11,8 @@ import numpy as np
 from nerfcli.doctor import camera_motion
 from nerfcli.doctor.moving import Patch, moving_patches
 from nerfcli.doctor.photo_facts import PhotoFacts, PhotoFeatures
+from nerfcli.media.exif import Exif
 from nerfcli.media.focal_evidence import focal_evidence
-from nerfcli.media.images import Exif
 from nerfcli.multiview.epipolar import fundamental_matrix
 from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.stationary import Motions, in_place, motions

@@ -11,7 +11,8 @@ import numpy as np
 
 from nerfcli.doctor import brightness, sharpness
 from nerfcli.errors import UserError
-from nerfcli.media.images import Exif, downscale, read_exif, read_image
+from nerfcli.media.exif import Exif, read_exif
+from nerfcli.media.images import downscale, read_image
 from nerfcli.multiview.features import find_features
 
 # Longer side of the pictures in which features are detected; all thresholds in pixels refer to this size.

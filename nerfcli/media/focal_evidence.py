@@ -8,7 +8,7 @@ makes it longer by an unknown factor, unless one side shows that the crop was no
 import math
 from dataclasses import dataclass
 
-from nerfcli.media.images import Exif
+from nerfcli.media.exif import Exif
 
 # Diagonal of 36 x 24 mm film. CIPA DCG-001 defines the 35 mm equivalent by the diagonal; for a picture of 3:2 that is
 # the same as by the width.

@@ -1,30 +1,31 @@
-"""Photos and rendered pictures: listing of folders, 8-bit sRGB pixels, EXIF, exact downscaling, PNG.
+"""Photos and rendered pictures: listing of folders, 8-bit sRGB pixels, exact downscaling, PNG.
 
 The EXIF orientation is applied once, here, so that sizes, pixels and cameras all refer to the upright picture.
 """
 
 import io
-import math
 import struct
 import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from datetime import UTC, datetime
-from numbers import Rational
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pi_heif
 from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 from PIL.PngImagePlugin import PngInfo
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
+HEIC_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}) | HEIC_SUFFIXES
+
+# Pillow now opens HEIC, too: upright, as the file itself says, and with an EXIF orientation of 1.
+pi_heif.register_heif_opener()
 
 # By default Pillow refuses more than 179 megapixels as an attack, but phones take photos of 200. The limit is now 537.
 Image.MAX_IMAGE_PIXELS = 2**28
@@ -43,9 +44,7 @@ _DAMAGED = (
     *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError),
     *(struct.error, zlib.error, Image.DecompressionBombError),
 )
-# Values of EXIF's FocalPlaneResolutionUnit; 4 and 5 are not standard, but some cameras write them.
-_RESOLUTION_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_FORMATS = "JPEG, PNG, TIFF, WebP or BMP"
+_FORMATS = "JPEG, HEIC, PNG, TIFF, WebP or BMP"
 _SRGB = ImageCms.createProfile("sRGB")
 # Two colour spaces that agree within this many of 255 levels on a grid of colours count as the same.
 _SAME_COLOUR_LEVELS = 2
@@ -54,36 +53,10 @@ _PNG_LEVEL, _PNG_UP = 4, 2
 _PNG_COLOURS = {1: 0, 3: 2, 4: 6}  # PNG's colour types by number of channels
 
 
-@dataclass(frozen=True)
-class Exif:
-    """EXIF data of a photo; entries that are missing or implausible are None.
-
-    focal_35mm is the equivalent focal length on 36 x 24 mm film. orientation is 1...8, 1 where absent.
-    width and height are those of the upright picture. gps is (latitude_deg, longitude_deg, altitude in metres
-    or None), north and east positive. taken is the time of the shot in seconds of the camera's own clock, comparable
-    between photos of one camera. taken_px is the (width, height) that EXIF records for the picture, as the camera
-    stored it; sensor_px_per_mm is the number of its pixels per millimetre of the sensor.
-    """
-
-    make: str | None
-    model: str | None
-    lens: str | None
-    focal_mm: float | None
-    focal_35mm: float | None
-    orientation: int
-    width: int
-    height: int
-    exposure_seconds: float | None
-    iso: float | None
-    gps: tuple[float, float, float | None] | None
-    taken: float | None = None
-    f_number: float | None = None
-    taken_px: tuple[int, int] | None = None
-    sensor_px_per_mm: float | None = None
-
-
 def list_images(folder: Path) -> list[Path]:
     """Return the picture files directly in a folder, sorted by name; hidden files and subfolders are left out.
+
+    A HEIC file is left out if a picture with its name in another format is beside it: the same photo, converted.
 
     Raises:
         UserError: the folder does not exist or cannot be listed.
@@ -93,7 +66,10 @@ def list_images(folder: Path) -> list[Path]:
     except OSError as error:
         reason = error.strerror or str(error)
         raise UserError(f"cannot list the photos in {folder}: {reason}", "give a folder of photos") from error
-    return sorted((p for p in files if not p.name.startswith(".") and p.is_file()), key=lambda p: p.name)
+    pictures = [path for path in files if not path.name.startswith(".") and path.is_file()]
+    others = {path.stem for path in pictures if path.suffix.lower() not in HEIC_SUFFIXES}
+    kept = (path for path in pictures if path.suffix.lower() not in HEIC_SUFFIXES or path.stem not in others)
+    return sorted(kept, key=lambda path: path.name)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -102,8 +78,8 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         UserError: see `read_image`; damage after the header is not detected.
     """
-    with _opened(path) as image:
-        return _upright_size(image)
+    with opened(path) as image:
+        return upright_size(image)
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -119,10 +95,10 @@ def read_image(path: Path) -> np.ndarray:
     Raises:
         UserError: the file is missing, empty, truncated, damaged, not a picture, or has float or 32-bit pixels.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         image.load()
         # Read after loading: Pillow turns TIFF files upright while it loads them, and then reports orientation 1.
-        orientation = _orientation(image)
+        orientation = orientation_of(image)
         srgb = _to_srgb(image, path)
         if orientation != 1:
             srgb = srgb.transpose(_UPRIGHT_FROM_STORED[orientation])
@@ -171,37 +147,6 @@ def downscale(image: np.ndarray, factor: float) -> np.ndarray:
     return np.rint(small).clip(0, 255).astype(np.uint8)
 
 
-def read_exif(path: Path) -> Exif:
-    """Read the EXIF entries that describe the camera. Odd or damaged entries count as absent.
-
-    Raises:
-        UserError: see `read_image`; damage after the header is not detected.
-    """
-    with _opened(path) as image:
-        width, height = _upright_size(image)
-        main = _ifd(image, None)
-        camera = _ifd(image, ExifTags.IFD.Exif)
-        gps = _ifd(image, ExifTags.IFD.GPSInfo)
-        orientation = _orientation(image)
-    return Exif(
-        make=_text(main.get(ExifTags.Base.Make)),
-        model=_text(main.get(ExifTags.Base.Model)),
-        lens=_text(camera.get(ExifTags.Base.LensModel)),
-        focal_mm=_positive(camera.get(ExifTags.Base.FocalLength)),
-        focal_35mm=_positive(camera.get(ExifTags.Base.FocalLengthIn35mmFilm)),
-        orientation=orientation,
-        width=width,
-        height=height,
-        exposure_seconds=_positive(camera.get(ExifTags.Base.ExposureTime)),
-        iso=_positive(camera.get(ExifTags.Base.ISOSpeedRatings)),
-        gps=_position(gps),
-        taken=_clock(camera.get(ExifTags.Base.DateTimeOriginal), camera.get(ExifTags.Base.SubsecTimeOriginal)),
-        f_number=_positive(camera.get(ExifTags.Base.FNumber)),
-        taken_px=_recorded_size(camera),
-        sensor_px_per_mm=_sensor_resolution(camera),
-    )
-
-
 def write_png(path: Path, image: np.ndarray, *, metadata: dict[str, str] | None = None) -> None:
     """Write a picture as PNG, atomically, with `metadata` as its text chunks (any Unicode; keys in Latin-1).
 
@@ -242,8 +187,8 @@ def _check_pixels(image: np.ndarray) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
-    """Open the file as a lazy Pillow image; errors of the file inside the block become a UserError."""
+def opened(path: Path) -> Iterator[Image.Image]:
+    """Open a file as a lazy Pillow image; errors of the file inside the block become a UserError."""
     try:
         if path.stat().st_size == 0:
             raise UserError(f"{path} is empty (0 bytes)", "copy the photo again, or remove the file")
@@ -255,7 +200,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     except UnidentifiedImageError as error:
         raise UserError(
             f"{path} is not a readable picture",
-            f"supported are {_FORMATS}; convert it (HEIC and raw files, too), or remove it from the folder",
+            f"supported are {_FORMATS}; convert it (raw files, too), or remove it from the folder",
         ) from error
     except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
         raise UserError(f"cannot read {path}: {error.strerror}", f"expected a {_FORMATS} file") from error
@@ -308,93 +253,23 @@ def _from_profile(image: Image.Image, profile: bytes) -> Image.Image:
     return converted
 
 
-def _upright_size(image: Image.Image) -> tuple[int, int]:
+def upright_size(image: Image.Image) -> tuple[int, int]:
+    """Return the (width, height) of an opened picture, shown upright."""
     # Pillow swaps width and height of a TIFF on opening, although the tag still has the orientation as stored.
     width, height = image.size
-    return (height, width) if image.format != "TIFF" and _orientation(image) >= 5 else (width, height)
+    return (height, width) if image.format != "TIFF" and orientation_of(image) >= 5 else (width, height)
 
 
-def _orientation(image: Image.Image) -> int:
-    value = _ifd(image, None).get(ExifTags.Base.Orientation)
+def orientation_of(image: Image.Image) -> int:
+    """Return the EXIF orientation of an opened picture, 1...8; 1 if it has none or an invalid one."""
+    value = exif_entries(image, None).get(ExifTags.Base.Orientation)
     return value if isinstance(value, int) and value in _UPRIGHT_FROM_STORED else 1
 
 
-def _ifd(image: Image.Image, which: int | None) -> dict[int, Any]:
+def exif_entries(image: Image.Image, which: int | None) -> dict[int, Any]:
     """Return one directory of EXIF entries, the main one for None; empty if it cannot be parsed."""
     try:
         exif = image.getexif()
         return dict(exif) if which is None else dict(exif.get_ifd(which))
     except _DAMAGED:
         return {}
-
-
-def _text(value: Any) -> str | None:
-    if isinstance(value, bytes):
-        value = value.decode("utf-8", errors="replace")
-    return (value.replace("\0", " ").strip() or None) if isinstance(value, str) else None
-
-
-def _number(value: Any) -> float | None:
-    """Return a finite number from a number or rational, or from the first of several; None if there is none."""
-    if isinstance(value, tuple) and value:
-        return _number(value[0])
-    if not isinstance(value, (int, float, Rational)):
-        return None
-    try:
-        number = float(value)
-    except ArithmeticError:  # a zero denominator, or too large
-        return None
-    return number if math.isfinite(number) else None
-
-
-def _positive(value: Any) -> float | None:
-    number = _number(value)
-    return number if number is not None and number > 0 else None
-
-
-def _recorded_size(camera: dict[int, Any]) -> tuple[int, int] | None:
-    width = _positive(camera.get(ExifTags.Base.ExifImageWidth))
-    height = _positive(camera.get(ExifTags.Base.ExifImageHeight))
-    if width is None or height is None or min(width, height) < 1:
-        return None
-    return int(width), int(height)
-
-
-def _sensor_resolution(camera: dict[int, Any]) -> float | None:
-    resolution = _positive(camera.get(ExifTags.Base.FocalPlaneXResolution))
-    unit_mm = _RESOLUTION_UNITS_MM.get(camera.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
-    return resolution / unit_mm if resolution and unit_mm else None
-
-
-def _clock(value: Any, fraction: Any) -> float | None:
-    """Return seconds of the camera's clock from its local time, ignoring its time zone, and the decimal digits."""
-    digits = _text(fraction)
-    try:
-        local = datetime.strptime(_text(value) or "", "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
-    except ValueError:
-        return None
-    return local.timestamp() + (float(f"0.{digits}") if digits and digits.isdecimal() and digits.isascii() else 0.0)
-
-
-def _position(gps: dict[int, Any]) -> tuple[float, float, float | None] | None:
-    latitude = _degrees(gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef), limit=90)
-    longitude = _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef), limit=180)
-    if latitude is None or longitude is None:
-        return None
-    altitude = _number(gps.get(ExifTags.GPS.GPSAltitude))
-    if altitude is not None and gps.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01"):
-        altitude = -altitude  # below sea level
-    return latitude, longitude, altitude
-
-
-def _degrees(value: Any, hemisphere: Any, *, limit: float) -> float | None:
-    """Return degrees from (degrees, minutes, seconds) and the letter of the hemisphere."""
-    if not isinstance(value, tuple) or len(value) != 3:
-        return None
-    parts = [_number(part) for part in value]
-    if None in parts:
-        return None
-    magnitude = sum(part / unit for part, unit in zip(parts, (1, 60, 3600), strict=True) if part is not None)
-    if not 0 <= magnitude <= limit:
-        return None
-    return -magnitude if _text(hemisphere) in ("S", "W") else magnitude

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.errors import UserError
-from nerfcli.media.images import IMAGE_SUFFIXES, read_exif, read_image, upright
+from nerfcli.media.exif import read_exif
+from nerfcli.media.images import HEIC_SUFFIXES, IMAGE_SUFFIXES, read_image, upright
 
 # Formats whose compression leaves artefacts around an edge, in both the black and the white areas.
-_LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg", ".webp"})
+_LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg", ".webp"}) | HEIC_SUFFIXES
 _MIDDLE = 128
 _HINT = "a mask must have the size of its photo; black pixels are ignored"
 

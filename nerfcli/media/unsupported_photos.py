@@ -4,14 +4,12 @@ from pathlib import Path
 
 from nerfcli.media.images import list_images
 
-# Formats of phones and cameras that Pillow does not read.
-_UNSUPPORTED_SUFFIXES = frozenset(
-    {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
-)
+# Formats of phones and cameras that are not read.
+_UNSUPPORTED_SUFFIXES = frozenset({".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"})
 
 
 def unsupported_photos(folder: Path) -> list[Path]:
-    """Return the photos directly in a folder whose formats cannot be read (HEIC, raw), sorted by name.
+    """Return the photos directly in a folder whose formats cannot be read (raw, JPEG XL), sorted by name.
 
     A file is left out if a readable picture of the same name, apart from the suffix, is beside it.
     """

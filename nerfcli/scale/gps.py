@@ -15,8 +15,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
+from nerfcli.media.exif import read_exif
 from nerfcli.media.geodesy import Position, east_north_up
-from nerfcli.media.images import read_exif
 from nerfcli.scale.estimate import ScaleEstimate
 
 # Least ratio of the photos' spread to the GPS noise; pure noise, part of which a similarity fits, reaches 1.7 with 6

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
+from nerfcli.media.exif import Exif, read_exif
 from nerfcli.media.focal_evidence import focal_evidence
-from nerfcli.media.images import IMAGE_SUFFIXES, Exif, list_images, read_exif, read_image
+from nerfcli.media.images import IMAGE_SUFFIXES, list_images, read_image
 from nerfcli.media.unsupported_photos import unsupported_photos
 
 # Three views determine a scene up to scale, but leave nothing to check them with; four are the fewest that do.

@@ -8,8 +8,8 @@ from typing import Any
 from nerfcli.cameras.calibration import Calibration, PhotoCalibration, Picture, calibrated
 from nerfcli.cameras.orientation import counted, describe_rescaling, rescaling
 from nerfcli.errors import UserError
+from nerfcli.media.exif import Exif
 from nerfcli.media.focal_evidence import focal_evidence
-from nerfcli.media.images import Exif
 from nerfcli.poses.input.job import CameraGroup
 from nerfcli.poses.input.photos import Photos, camera_groups
 from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL

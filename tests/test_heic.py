@@ -1,0 +1,181 @@
+"""HEIC photos, as phones take them: pixels, orientation, colours, EXIF, damage, and their way into `nerfcli poses`.
+
+The files are written by pillow-heif, another library than the one that reads them. Lossless ones read back exactly.
+"""
+
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pillow_heif
+import pytest
+from commands import nerfcli
+from PIL import ExifTags, Image, ImageOps
+from test_images import exif_with, icc_profile, noise
+
+from nerfcli.errors import UserError
+from nerfcli.media.exif import read_exif
+from nerfcli.media.images import image_size, list_images, read_image
+from nerfcli.media.masks import read_mask
+from nerfcli.poses.input.photos import find_photos
+from nerfcli.poses.input.work_photos import lay_out
+from nerfcli.scene import load
+
+WIDTH, HEIGHT = 96, 64
+# Display P3's primaries, adapted to D50, as phones embed them (columns of the matrix to XYZ).
+DISPLAY_P3 = ((0.5151, 0.2412, -0.0011), (0.2919, 0.6922, 0.0419), (0.1571, 0.0666, 0.7841))
+
+
+def write_heic(path: Path, pixels: np.ndarray | Image.Image, *, exact: bool = True, **options: Any) -> Path:
+    """Write a HEIC file; losslessly, as RGB without a change of colour space, if it has to be exact."""
+    image = pixels if isinstance(pixels, Image.Image) else Image.fromarray(pixels)
+    how = {"quality": -1, "chroma": 444, "matrix_coefficients": 0} if exact else {"quality": 40}
+    pillow_heif.from_pillow(image).save(path, **how, **options)
+    return path
+
+
+@pytest.mark.parametrize("tile_size", [None, 64])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_picture_is_turned_once(tmp_path: Path, orientation: int, tile_size: int | None):
+    """A file says twice how it is turned, by a property of HEIF and in EXIF; phones store it in tiles."""
+    pixels, exif = noise(HEIGHT, WIDTH, 3), exif_with({ExifTags.Base.Orientation: orientation})
+    path = write_heic(tmp_path / "a.heic", pixels, exif=exif.tobytes(), tile_size=tile_size)
+    same = tmp_path / "same.png"
+    Image.fromarray(pixels).save(same, exif=exif)
+    with Image.open(same) as stored:
+        expected = np.asarray(ImageOps.exif_transpose(stored))
+    np.testing.assert_array_equal(read_image(path), expected)
+    size = (expected.shape[1], expected.shape[0])
+    found = read_exif(path)
+    assert image_size(path) == (found.width, found.height) == size
+    assert found.orientation == 1
+
+
+def test_its_exif_is_that_of_a_jpeg(tmp_path: Path):
+    exif = exif_with({ExifTags.Base.Make: "Apple", ExifTags.Base.Model: "iPhone 13 Pro Max"})
+    exif.get_ifd(ExifTags.IFD.Exif).update(
+        {
+            ExifTags.Base.FocalLength: 5.7,
+            ExifTags.Base.FocalLengthIn35mmFilm: 26,
+            ExifTags.Base.ExposureTime: 1 / 100,
+            ExifTags.Base.ISOSpeedRatings: 80,
+            ExifTags.Base.DateTimeOriginal: "2026:11:27 10:00:00",
+            ExifTags.Base.ExifImageWidth: WIDTH,
+            ExifTags.Base.ExifImageHeight: HEIGHT,
+        }
+    )
+    exif.get_ifd(ExifTags.IFD.GPSInfo).update(
+        {
+            ExifTags.GPS.GPSLatitudeRef: "N",
+            ExifTags.GPS.GPSLatitude: (43.0, 39.0, 0.0),
+            ExifTags.GPS.GPSLongitudeRef: "W",
+            ExifTags.GPS.GPSLongitude: (79.0, 23.0, 0.0),
+        }
+    )
+    pixels = noise(HEIGHT, WIDTH, 3)
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", exif=exif)
+    found = read_exif(write_heic(tmp_path / "b.heic", pixels, exif=exif.tobytes()))
+    assert found == read_exif(tmp_path / "a.jpg")
+    assert (found.focal_35mm, found.gps and round(found.gps[1], 2)) == (26, -79.38)
+
+
+def test_colours_of_display_p3_become_those_of_srgb(tmp_path: Path):
+    """As for a PNG file with the same profile; without a change, saturated colours would differ by 30 levels."""
+    profile = icc_profile(DISPLAY_P3, lambda x: np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4))
+    pixels = noise(HEIGHT, WIDTH, 3)
+    image = Image.fromarray(pixels)
+    image.save(tmp_path / "a.png", icc_profile=profile)
+    image.info["icc_profile"] = profile
+    converted = read_image(write_heic(tmp_path / "b.heic", image))
+    np.testing.assert_array_equal(converted, read_image(tmp_path / "a.png"))
+    assert np.abs(converted.astype(int) - pixels).max() > 30
+
+
+def test_transparency_is_kept(tmp_path: Path):
+    pixels = noise(HEIGHT, WIDTH, 4)
+    np.testing.assert_array_equal(read_image(write_heic(tmp_path / "a.heic", pixels)), pixels)
+
+
+@pytest.mark.parametrize("cut", [0.0, 0.001, 0.01, 0.2, 0.5, 0.9, 0.999])
+def test_a_truncated_file_is_named(tmp_path: Path, cut: float):
+    path = write_heic(tmp_path / "a.heic", noise(HEIGHT, WIDTH, 3))
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * cut)])
+    with pytest.raises(UserError, match=r"a\.heic is (empty|damaged or truncated|not a readable picture)"):
+        read_image(path)
+
+
+def test_sixty_corruptions_are_read_or_named(tmp_path: Path):
+    path, draw = (
+        write_heic(tmp_path / "a.heic", noise(HEIGHT, WIDTH, 3), exif=exif_with({}).tobytes()),
+        random.Random(0),
+    )
+    whole = path.read_bytes()
+    named = 0
+    for _ in range(60):
+        damaged = bytearray(whole)
+        for _ in range(draw.randint(1, 8)):
+            damaged[draw.randrange(600)] = draw.randrange(256)  # most of what is not pixels stands there
+        path.write_bytes(damaged)
+        for reader in (read_image, image_size, read_exif):
+            try:
+                reader(path)
+            except UserError:
+                named += 1
+    assert named > 30
+
+
+def test_a_converted_copy_is_used_instead(tmp_path: Path):
+    """A photo that is there twice would be held out and trained on at once."""
+    for name in ("IMG_1.HEIC", "IMG_2.heic", "IMG_3.hif"):
+        write_heic(tmp_path / name, noise(HEIGHT, WIDTH, 3))
+    for name in ("IMG_1.jpg", "IMG_3.PNG"):
+        Image.fromarray(noise(HEIGHT, WIDTH, 3)).save(tmp_path / name)
+    (tmp_path / "IMG_2.MOV").write_bytes(b"the video of a live photo")
+    assert [path.name for path in list_images(tmp_path)] == ["IMG_1.jpg", "IMG_2.heic", "IMG_3.PNG"]
+
+
+def test_a_mask_in_heic_has_no_grey_edge(tmp_path: Path):
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    levels = np.where((x - 40) ** 2 + (y - 30) ** 2 < 500, np.uint8(255), np.uint8(0))
+    mask = write_heic(tmp_path / "a.heic", np.repeat(levels[..., None], 3, axis=2), exact=False)
+    Image.fromarray(noise(HEIGHT, WIDTH, 3)).save(tmp_path / "photo.png")
+    assert np.abs(read_image(mask)[..., 0].astype(int) - levels).max() > 0
+    np.testing.assert_array_equal(read_mask(mask, tmp_path / "photo.png"), levels)
+
+
+def test_structure_from_motion_gets_upright_jpegs(tmp_path: Path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    exif = exif_with({ExifTags.Base.Orientation: 6}).tobytes()
+    smooth = np.linspace(0, 255, WIDTH * HEIGHT * 3).astype(np.uint8).reshape(HEIGHT, WIDTH, 3)
+    for number in range(4):
+        write_heic(photos / f"IMG_{number}.HEIC", smooth, exif=exif)
+    found = find_photos(photos)
+    assert found.names == tuple(f"IMG_{number}.HEIC" for number in range(4))
+    assert {(photo.width, photo.height) for photo in found.photos} == {(HEIGHT, WIDTH)}
+    for laid_out in lay_out(found, tmp_path / "work"):
+        with Image.open(tmp_path / "work" / "photos" / laid_out.file) as copy:
+            assert (copy.format, copy.size) == ("JPEG", (HEIGHT, WIDTH))
+            assert np.abs(np.asarray(copy).astype(int) - read_image(photos / "IMG_0.HEIC")).mean() < 3
+
+
+def test_a_capture_of_heic_photos_is_trained_and_evaluated(capture: Path, tmp_path: Path):
+    """The spheres, whose photos become HEIC files: what is rendered is compared with their pixels."""
+    for path in [*capture.rglob("*.png")]:
+        write_heic(path.with_suffix(".heic"), read_image(path))
+        path.unlink()
+    for path in capture.glob("transforms_*.json"):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            frame["file_path"] += ".heic"
+        path.write_text(json.dumps(content))
+    loaded = load(capture)
+    assert {frame.image.suffix for frame in loaded.frames if frame.image} == {".heic"}
+    run = tmp_path / "run"
+    assert nerfcli("train", capture, "--steps", "3", "--model", "default", "-o", run).exit_code == 0
+    assert nerfcli("evaluate", run).exit_code == 0
+    (measured,) = json.loads((run / "metrics.json").read_text())["images"]
+    assert measured["pixels"] == 96 * 72
