@@ -161,6 +161,23 @@ def test_mixed_lenses_and_zooms_are_told_but_not_a_phone_on_its_side(clean):
         assert (found.verdict, found.names) == (LOOK, ("00.jpg",)), odd
 
 
+def test_each_folder_has_a_camera_of_its_own(clean):
+    exif = replace(clean.facts[0].exif, make="Maker", model="One", focal_mm=4.0, focal_35mm=28.0)
+    other = replace(exif, model="Two")
+
+    def cameras(*exifs: Exif) -> Finding:
+        names = ("left/0.jpg", "left/1.jpg", "left/2.jpg", "right/0.jpg", "right/1.jpg", "right/2.jpg")
+        return inventory.cameras([replace(clean.facts[0], name=n, exif=e) for n, e in zip(names, exifs, strict=True)])
+
+    found = cameras(exif, exif, exif, other, other, other)
+    assert (found.verdict, found.number, found.names) == (GOOD, 1, ())
+    assert found.summary.startswith("one camera in each of 2 folders: Maker One, 4 mm")
+    assert "; Maker Two, 4 mm" in found.summary
+    found = cameras(exif, exif, exif, other, exif, other)
+    assert (found.verdict, found.number, found.names) == (LOOK, 2, ("right/1.jpg",))
+    assert found.summary.startswith("up to 2 different combinations of camera, lens, zoom and image size in each of 2")
+
+
 def test_exif_of_another_picture_is_named(clean):
     """EXIF records 4032x2268, another shape than the file's; 4032x3024 has the same shape: only downscaled."""
     exif = replace(clean.facts[0].exif, make="Maker", model="One", focal_mm=4.0, focal_35mm=28.0)

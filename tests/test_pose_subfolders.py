@@ -18,7 +18,8 @@ from nerfcli.cameras.calibration import Calibration, Picture, calibrated
 from nerfcli.cameras.camera import Camera
 from nerfcli.errors import BAD_INPUT
 from nerfcli.media.masks import find_mask
-from nerfcli.poses.input.photos import camera_groups, find_photos, list_photos
+from nerfcli.media.photo_folders import list_photos
+from nerfcli.poses.input.photos import camera_groups, find_photos
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import is_same_scene
 
@@ -167,3 +168,16 @@ def test_a_moved_rig_keeps_its_scene(rig: Path, scene: Path, tmp_path: Path):
     """Names are relative to the folder of photos, so only the folder decides."""
     copied = shutil.copytree(rig, tmp_path / "rig")
     assert not is_same_scene(scene, copied, RIG)
+
+
+def test_doctor_examines_the_photos_of_all_subfolders(rig: Path, scene: Path, tmp_path: Path):
+    refused = nerfcli("doctor", rig)
+    assert refused.exit_code == BAD_INPUT
+    assert "use all with --subfolders" in error_of(refused)[1]
+    done = nerfcli("doctor", rig, "--subfolders", "--json", "-o", tmp_path / "page.html")
+    assert done.exit_code == 0, done.stderr
+    content = json.loads(done.stdout)
+    assert [photo["name"] for photo in content["photos"][::7]] == ["left/0.png", "right/0.png"]
+    (cameras,) = (finding for finding in content["findings"] if finding["check"] == "cameras")
+    assert cameras["summary"].startswith("one camera in each of 2 folders")
+    assert nerfcli("doctor", scene, "--subfolders").exit_code == BAD_INPUT

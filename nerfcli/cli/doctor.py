@@ -8,7 +8,7 @@ import typer
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads, one_of, thread_count
-from nerfcli.cli.poses import Intrinsics
+from nerfcli.cli.poses import Intrinsics, Subfolders
 from nerfcli.errors import GATE_NOT_MET, UserError
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ def doctor(
     ],
     output: Output = None,
     intrinsics: Intrinsics = None,
+    subfolders: Subfolders = False,
     require: Annotated[
         str | None, typer.Option(help="good or look: exit code 7 if any finding is worse.", show_default=False)
     ] = None,
@@ -54,6 +55,7 @@ def doctor(
       nerfcli doctor photos/kitchen --json -o kitchen.html | jq .verdict
       nerfcli doctor photos/kitchen --intrinsics calibration/cameras.txt
       nerfcli doctor photos/kitchen --require look
+      nerfcli doctor stereo-rig/ --subfolders
       nerfcli doctor photos-scene-run --views 8
       nerfcli render photos-scene-run --cameras photos-scene-run-next-views/cameras.json
       ls -d captures/*/ | nerfcli doctor - -o pages/
@@ -68,17 +70,20 @@ def doctor(
 
     def work(path: Path, one_of_many: bool) -> None:
         if find_run(path) is not None:
-            if intrinsics is not None or require is not None:
+            if intrinsics is not None or require is not None or subfolders:
                 raise UserError(
-                    f"{path}: --intrinsics and --require are for photos, and this is a run", "leave them out"
+                    f"{path}: --intrinsics, --require and --subfolders are for photos, and this is a run",
+                    "leave them out",
                 )
             folder = result_path(path, suffix="-next-views", output=output, one_of_many=one_of_many)
             _examine_run(path, folder, console, count=views, threads=threads, overwrite=overwrite)
             return
         page = result_path(path, suffix="-doctor.html", output=output, one_of_many=one_of_many)
         if recognise(path) is not None:
-            if intrinsics is not None:
-                raise UserError(f"{path}: --intrinsics is for photos, and this is a scan", "leave --intrinsics out")
+            if intrinsics is not None or subfolders:
+                raise UserError(
+                    f"{path}: --intrinsics and --subfolders are for photos, and this is a scan", "leave them out"
+                )
             _examine_scan(path, page, console, overwrite=overwrite, require=require)
             return
         with console.progress(f"doctor {path.name}") as update:
@@ -88,6 +93,7 @@ def doctor(
                 threads=thread_count(threads),
                 overwrite=overwrite,
                 intrinsics=intrinsics,
+                subfolders=subfolders,
                 notify=console.note,
                 progress=update,
             )

@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from pathlib import PurePosixPath
 
 import numpy as np
 
@@ -79,22 +80,30 @@ def size(photos: Sequence[PhotoFacts]) -> Finding:
 
 
 def cameras(photos: Sequence[PhotoFacts]) -> Finding:
-    """Check whether one camera with one lens and zoom took all photos, as far as EXIF shows."""
-    groups = _camera_groups(photos)
-    largest = max(groups.values(), key=len)
-    others = [(name, optics) for optics, names in groups.items() if names is not largest for name in names]
-    verdict = GOOD if len(groups) == 1 else BAD if len(groups) > max(2, len(photos) / 4) else LOOK
-    main = next(optics for optics, names in groups.items() if names is largest)
-    summary = (
-        f"one camera: {main}"
-        if len(groups) == 1
-        else f"{len(groups)} different combinations of camera, lens, zoom and image size"
-    )
+    """Check whether one camera with one lens and zoom took all photos of each folder, as far as EXIF shows."""
+    folders: dict[PurePosixPath, list[PhotoFacts]] = {}
+    for photo in photos:
+        folders.setdefault(PurePosixPath(photo.name).parent, []).append(photo)
+    groups = [_camera_groups(members) for members in folders.values()]
+    main = [max(found, key=lambda optics: len(found[optics])) for found in groups]
+    others = [
+        (name, optics)
+        for found, usual in zip(groups, main, strict=True)
+        for optics, names in found.items()
+        if optics != usual
+        for name in names
+    ]
+    most = max(len(found) for found in groups)
+    many = any(len(g) > max(2, len(members) / 4) for g, members in zip(groups, folders.values(), strict=True))
+    verdict = GOOD if most == 1 else BAD if many else LOOK
+    where = "" if len(folders) == 1 else f" in each of {len(folders)} folders"
+    cameras = "one camera" if most == 1 else f"up to {most} different combinations of camera, lens, zoom and image size"
+    counted = cameras if where else cameras.removeprefix("up to ")
     return Finding(
         "cameras",
         verdict,
-        summary if len(groups) == 1 else f"{summary}; most photos: {main}",
-        len(groups),
+        f"{counted}{where}{'; most photos' if most > 1 else ''}: {'; '.join(dict.fromkeys(main))}",
+        most,
         "combinations: look from 2, bad from one per four photos",
         ""
         if verdict == GOOD

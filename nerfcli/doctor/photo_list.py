@@ -6,8 +6,7 @@ from pathlib import Path
 from nerfcli import scene as scenes
 from nerfcli.doctor.photo_facts import Source
 from nerfcli.errors import UserError
-from nerfcli.media.images import IMAGE_SUFFIXES, list_images
-from nerfcli.media.unsupported_photos import unsupported_photos
+from nerfcli.media.photo_folders import list_photos, list_unsupported, name_in, where_photos_may_be
 
 
 @dataclass(frozen=True)
@@ -30,25 +29,24 @@ class ExaminedCapture:
         return "photos" if self.scene is None else "scene"
 
 
-def find_subject(path: Path) -> ExaminedCapture:
-    """Find the photos in a folder, or those of a scene.
+def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
+    """Find the photos in a folder, with those in its subfolders on request, or the photos of a scene.
 
     A folder with photos and the files of a scene counts as a scene.
 
     Raises:
-        UserError: the path does not exist, has no photos, or is a scene with malformed files.
+        UserError: the path does not exist, has no photos, or is a scene with malformed files, or one with `subfolders`.
     """
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a folder of photos, or a scene folder")
     if path.is_file() or scenes.is_scene(path):
+        if subfolders:
+            raise UserError(f"{path}: --subfolders is for photos, and this is a scene", "leave --subfolders out")
         return _of_scene(path)
-    photos = [*list_images(path), *unsupported_photos(path)]
+    photos = [*list_photos(path, subfolders=subfolders), *list_unsupported(path, subfolders=subfolders)]
     if not photos:
-        below = next((child for child in sorted(path.iterdir()) if child.is_dir() and list_images(child)), None)
-        where = f"there are photos in {below}; give that folder" if below else ""
-        hint = where or f"expected a scene, or files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"
-        raise UserError(f"no photos and no scene in {path}", hint)
-    return ExaminedCapture(path, tuple(Source(photo.name, photo) for photo in photos), None)
+        raise UserError(f"no photos and no scene in {path}", where_photos_may_be(path))
+    return ExaminedCapture(path, tuple(Source(name_in(path, photo), photo) for photo in photos), None)
 
 
 def _of_scene(path: Path) -> ExaminedCapture:

@@ -17,6 +17,7 @@ from nerfcli import scene
 from nerfcli.atomic import write_json
 from nerfcli.errors import UserError
 from nerfcli.holdout import names_held_out
+from nerfcli.media.photo_folders import list_photos, name_in
 from nerfcli.poses.engine.strict import held_out_last
 from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
 from nerfcli.poses.engine.turntable import MASKS, advised
@@ -24,7 +25,7 @@ from nerfcli.poses.input.job import Job, write_job
 from nerfcli.poses.input.masks import lay_out_masks
 from nerfcli.poses.input.pairs import Pairing, choose_pairs
 from nerfcli.poses.input.pairs_file import read_pairs
-from nerfcli.poses.input.photos import Photos, find_photos, list_photos, name_in
+from nerfcli.poses.input.photos import Photos, find_photos
 from nerfcli.poses.input.plan import Plan, make_plan
 from nerfcli.poses.input.settings import Limits, PoseSettings, check_settings
 from nerfcli.poses.input.stages import file_key

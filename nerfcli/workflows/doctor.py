@@ -20,6 +20,7 @@ def examine_capture(
     threads: int,
     overwrite: bool = False,
     intrinsics: Path | None = None,
+    subfolders: bool = False,
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> Diagnosis:
@@ -31,13 +32,14 @@ def examine_capture(
         threads: number of CPU threads.
         overwrite: replace any existing file at `page`.
         intrinsics: a file with the intrinsics of the cameras, if they are known.
+        subfolders: whether photos in subfolders are examined, too.
         notify: called with lines for the user.
         progress: called with the fraction done and a short text.
 
     Raises:
         UserError: see `find_subject`, `read_calibration` and `refuse_foreign`; or the page cannot be written.
     """
-    subject = find_subject(path)
+    subject = find_subject(path, subfolders=subfolders)
     calibration = None if intrinsics is None else read_calibration(intrinsics, images=path)
     if page.is_dir():
         raise UserError(f"{page} is a folder", "give a file name for the page with -o")

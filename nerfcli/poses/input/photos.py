@@ -1,4 +1,4 @@
-"""Photos of a folder or of its subfolders: readability, upright size, groups with a common camera."""
+"""The photos that poses are estimated from: readability, upright size, groups with a common camera."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -9,8 +9,8 @@ from pathlib import Path, PurePosixPath
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.media.exif import Exif, read_exif
 from nerfcli.media.focal_evidence import focal_evidence
-from nerfcli.media.images import IMAGE_SUFFIXES, list_images, read_image
-from nerfcli.media.unsupported_photos import unsupported_photos
+from nerfcli.media.images import read_image
+from nerfcli.media.photo_folders import list_photos, list_unsupported, name_in, where_photos_may_be
 
 # Three views determine a scene up to scale, but leave nothing to check them with; four are the fewest that do.
 MIN_PHOTOS = 4
@@ -47,16 +47,6 @@ class Photos:
         return tuple(photo.name for photo in self.photos)
 
 
-def list_photos(folder: Path, *, subfolders: bool = False) -> list[Path]:
-    """Return the picture files directly in a folder and, on request, in all of its subfolders, sorted by `name_in`.
-
-    Raises:
-        UserError: see `list_images`.
-    """
-    paths = [path for each in _folders(folder, subfolders=subfolders) for path in list_images(each)]
-    return sorted(paths, key=lambda path: name_in(folder, path))
-
-
 def find_photos(
     folder: Path, progress: Callable[[int, int], None] | None = None, *, subfolders: bool = False
 ) -> Photos:
@@ -75,9 +65,9 @@ def find_photos(
     if not folder.is_dir():
         raise UserError(f"{folder} is a file, not a folder of photos", "give the folder that contains the photos")
     paths = list_photos(folder, subfolders=subfolders)
-    unsupported = [path for each in _folders(folder, subfolders=subfolders) for path in unsupported_photos(each)]
+    unsupported = list_unsupported(folder, subfolders=subfolders)
     if not paths and not unsupported:
-        raise UserError(f"no photos in {folder}", _where_photos_may_be(folder))
+        raise UserError(f"no photos in {folder}", where_photos_may_be(folder))
     photos: list[Photo] = []
     unreadable = {
         name_in(folder, path): f"{path.suffix} files are not supported; convert them to JPEG" for path in unsupported
@@ -93,11 +83,6 @@ def find_photos(
     if len(photos) < MIN_PHOTOS:
         raise UserError(_too_few(folder, photos, unreadable), _more_photos_hint(unreadable), TOO_FEW_PHOTOS)
     return Photos(folder=folder, photos=tuple(photos), unreadable=unreadable)
-
-
-def name_in(folder: Path, path: Path) -> str:
-    """Return the name of a photo below a folder, see `Photo`."""
-    return path.relative_to(folder).as_posix()
 
 
 def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
@@ -130,14 +115,6 @@ def _same_as(focal: float | None, focals: list[float]) -> float | None:
     return focal
 
 
-def _folders(folder: Path, *, subfolders: bool) -> list[Path]:
-    """Return a folder and, on request, all of its subfolders; hidden ones are left out."""
-    if not subfolders:
-        return [folder]
-    below = (path for path in folder.rglob("*") if path.is_dir())
-    return [folder, *(path for path in below if not any(p.startswith(".") for p in path.relative_to(folder).parts))]
-
-
 def _examine(path: Path, name: str) -> Photo | str:
     """Return the photo, or why it cannot be read."""
     try:
@@ -162,13 +139,3 @@ def _more_photos_hint(unreadable: dict[str, str]) -> str:
     if unreadable:
         return f"convert these files to JPEG or copy them again, or add photos; {add}"
     return f"add photos from other viewpoints; {add}"
-
-
-def _where_photos_may_be(folder: Path) -> str:
-    with_photos = [child for child in sorted(folder.iterdir()) if child.is_dir() and list_images(child)]
-    if len(with_photos) == 1:
-        return f"there are photos in {with_photos[0]}; give that folder"
-    if with_photos:
-        more = f" and {len(with_photos) - 1} more folders" if len(with_photos) > 2 else f" and {with_photos[1]}"
-        return f"there are photos in {with_photos[0]}{more}; give one of them, or use all with --subfolders"
-    return f"expected files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"
