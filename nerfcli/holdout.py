@@ -3,16 +3,22 @@
 every:8       index 0, 8, 16, ... of the sorted names: each has training neighbours on both sides
 block:0.15    the middle 15 % of the sorted names: a gap in the capture without training neighbours inside
 FILE          the names in a text file, one per line
+
+Photos with the same file name in different folders, such as left/0001.png and right/0001.png, were taken at the same
+time by the cameras of a rig. The first two rules count them as one, so that no photo is held out whose neighbour on the
+rig is used for training.
 """
 
 import re
 from collections.abc import Iterable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from nerfcli.errors import UserError
 
 DEFAULT_HOLDOUT = "every:8"
 _NAMES_SHOWN = 3
+# Folders of Blender's captures, whose pictures of the same name have nothing in common.
+_SPLIT_FOLDERS = frozenset({"train", "test", "val"})
 
 
 def check_holdout(text: str) -> str:
@@ -48,11 +54,12 @@ def names_held_out(rule: str, names: Iterable[str], *, others: Iterable[str] = (
     present = sorted(names)
     kind, _, value = rule.partition(":")
     if kind == "every":
-        held_out = frozenset(present[:: int(value)])
+        held_out = frozenset(name for moment in moments(present)[:: int(value)] for name in moment)
     elif kind == "block":
-        count = max(1, round(float(value) * len(present)))
-        first = (len(present) - count) // 2
-        held_out = frozenset(sorted(present, key=_in_order)[first : first + count])
+        in_order = sorted(moments(present), key=lambda moment: _in_order(moment[0]))
+        count = max(1, round(float(value) * len(in_order)))
+        first = (len(in_order) - count) // 2
+        held_out = frozenset(name for moment in in_order[first : first + count] for name in moment)
     else:
         held_out = _listed(Path(rule), frozenset(present), frozenset(others))
     if not held_out or len(held_out) == len(present):
@@ -61,6 +68,22 @@ def names_held_out(rule: str, names: Iterable[str], *, others: Iterable[str] = (
             "some photos are needed for training and some for evaluation",
         )
     return held_out
+
+
+def moments(names: Iterable[str]) -> list[list[str]]:
+    """Group the names of photos that were taken at the same time, see the module; in order of each group's first name.
+
+    Where a moment has as many photos as there are moments, or more, they are views from all around rather than
+    neighbours on a rig, and each photo stays on its own. So it does in folders that are named after splits.
+    """
+    present = sorted(names)
+    taken: dict[str, list[str]] = {}
+    for name in present:
+        taken.setdefault(PurePosixPath(name).name, []).append(name)
+    folders = {str(PurePosixPath(name).parent) for name in present}
+    if folders <= _SPLIT_FOLDERS or max(map(len, taken.values()), default=0) >= len(taken):
+        return [[name] for name in present]
+    return list(taken.values())
 
 
 def _in_order(name: str) -> list[tuple[int, int, str]]:

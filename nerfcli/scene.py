@@ -24,7 +24,7 @@ from nerfcli.cameras.formats.scene_json import SCENE_FILE, SCENE_VERSION, UNITS,
 from nerfcli.cameras.formats.transforms import read_transforms
 from nerfcli.cameras.frame import Capture, Frame, Size
 from nerfcli.errors import UserError
-from nerfcli.holdout import names_held_out
+from nerfcli.holdout import moments, names_held_out
 from nerfcli.media.exif import read_exif
 from nerfcli.media.images import image_size, list_images
 from nerfcli.media.masks import find_mask
@@ -193,8 +193,8 @@ def save(
 
 
 def default_split(names: Iterable[str]) -> frozenset[str]:
-    """Return the held-out names: every 8th of the sorted names, including the first."""
-    return frozenset(sorted(names)[::HELD_OUT_EVERY])
+    """Return the held-out names: every 8th of the sorted names, including the first, as `holdout` counts them."""
+    return frozenset(name for moment in moments(names)[::HELD_OUT_EVERY] for name in moment)
 
 
 def fingerprint(scene: Scene) -> str:

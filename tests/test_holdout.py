@@ -1,5 +1,7 @@
 """Which photos are held out: rules in closed form, and invalid rules."""
 
+from pathlib import PurePosixPath
+
 import pytest
 
 from nerfcli import scene as scenes
@@ -21,6 +23,34 @@ def test_a_block_is_the_middle_of_the_capture_with_numbers_counted():
     # 15 % of 20 are 3; in alphabetical order, frame_10 would be before frame_2.
     assert names_held_out("block:0.15", NAMES) == {"frame_9.png", "frame_10.png", "frame_11.png"}
     assert len(names_held_out("block:0.001", NAMES)) == 1
+
+
+RIG = [f"{camera}/{index:04d}.png" for camera in ("left", "right") for index in range(20)]
+
+
+def test_photos_of_a_rig_are_held_out_together():
+    """The camera beside a held-out one would show nearly the same picture."""
+    expected = {f"{camera}/{index:04d}.png" for camera in ("left", "right") for index in (0, 8, 16)}
+    assert names_held_out(DEFAULT_HOLDOUT, RIG) == expected == scenes.default_split(RIG)
+    assert names_held_out("block:0.15", RIG) == {
+        f"{camera}/{index:04d}.png" for camera in ("left", "right") for index in (8, 9, 10)
+    }
+
+
+def test_photos_of_a_rig_without_their_neighbours_count_like_the_others():
+    """Photos that could not be placed are missing on one side."""
+    names = sorted({*RIG} - {"left/0003.png", "right/0000.png", "right/0008.png"})
+    held_out = names_held_out(DEFAULT_HOLDOUT, names)
+    assert {"left/0000.png", "left/0009.png", "right/0009.png"} <= held_out
+    assert not {PurePosixPath(name).name for name in held_out} & {PurePosixPath(n).name for n in {*names} - held_out}
+
+
+def test_cameras_around_a_scene_are_held_out_one_by_one():
+    """A dome takes all its photos at once: none would be left for training."""
+    names = [f"cam{index:02d}/frame.png" for index in range(20)]
+    assert names_held_out(DEFAULT_HOLDOUT, names) == {f"cam{index:02d}/frame.png" for index in (0, 8, 16)}
+    three = [f"cam{index:02d}/{frame}.png" for index in range(20) for frame in range(3)]
+    assert names_held_out(DEFAULT_HOLDOUT, three) == set(sorted(three)[::8])
 
 
 def test_a_file_lists_names(tmp_path):
