@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from mutant_list import GROUPS
+from mutant_list_poses import POSES
 from mutant_list_training import TRAINING
 from mutant_list_triton import TRITON
 
@@ -13,7 +14,7 @@ import nerfcli
 ROOT = Path(nerfcli.__file__).parent
 
 
-@pytest.mark.parametrize("group", [*GROUPS, *TRAINING, *TRITON], ids=lambda group: group.file)
+@pytest.mark.parametrize("group", [*GROUPS, *TRAINING, *POSES, *TRITON], ids=lambda group: group.file)
 def test_every_mutant_breaks_one_place(group):
     text = (ROOT / group.file).read_text(encoding="utf-8")
     assert [mutant.old for mutant in group.mutants if text.count(mutant.old) != 1] == []

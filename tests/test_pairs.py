@@ -330,6 +330,29 @@ def test_merging_and_locating_add_to_what_is_left_and_take_nothing_from_the_shar
     assert outlook.update("check", 0, 4) == (pytest.approx(134.0 / 154.0), pytest.approx(20.0))
 
 
+def test_principal_points_of_the_photos_add_to_what_is_left_and_take_nothing_from_the_share():
+    """A trial of them is planned; going on with them takes five times as long on a machine as fast as planned."""
+    now = 0.0
+    outlook = TimeEstimate(
+        Plan(10, 1600, 4096, "exhaustive", 45, {"map": 10.0, "check": 20.0, "stabilise": 4.0}), clock=lambda: now
+    )
+    outlook.update("map", 0, 10)
+    now = 10.0
+    outlook.update("map", 10, 10)
+    outlook.update("check", 0, 4)
+    now = 30.0
+    assert outlook.update("check", 4, 4) == (pytest.approx(30.0 / 34.0), pytest.approx(4.0))
+    outlook.update("stabilise", 0, 2)
+    now = 32.0
+    assert outlook.update("stabilise", 1, 2) == (pytest.approx(32.0 / 34.0), pytest.approx(2.0))
+    now = 34.0
+    assert outlook.update("settle", 0, 4) == (pytest.approx(32.0 / 34.0), pytest.approx(20.0))
+    now = 44.0
+    assert outlook.update("settle", 2, 4)[1] == pytest.approx(10.0)
+    now = 54.0
+    assert outlook.update("settle", 4, 4) == (1.0, 0.0)
+
+
 @pytest.mark.parametrize("checked", [(0.0, 0.03, 0.46, 0.8, 1.0), (0.0, 0.02, 0.54, 0.82, 1.0)])
 @pytest.mark.parametrize(
     ("planned", "taken"),

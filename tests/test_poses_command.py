@@ -64,7 +64,7 @@ def test_a_dry_run_tells_the_plan_and_writes_nothing(
     assert plan["path"] == str(photos)
     assert (plan["photos"], plan["rule"], plan["pairs"]) == (5, "exhaustive", 10)
     assert (plan["max_image_size"], plan["max_features"]) == (size, features)
-    assert set(plan["seconds"]) == {"extract", "match", "map", "check"}
+    assert set(plan["seconds"]) == {"extract", "match", "map", "check", "stabilise"}
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 

@@ -57,8 +57,19 @@ def stabiliser(seed: int, *, px: float = 12.0) -> np.ndarray:
 def chosen(
     model: pycolmap.Reconstruction,
 ) -> tuple[pycolmap.Reconstruction, PrincipalPoints, dict[int, dict[str, Any]]]:
-    found = choose_principal_points(model, seed=0, threads=1)
+    reports: list[tuple[str, int, int]] = []
+
+    def report(stage: str, done: int, total: int) -> None:
+        reports.append((stage, done, total))
+
+    found = choose_principal_points(model, seed=0, threads=1, report=report)
     assert found.evidence is not None
+    settling = [("settle", done, 4) for done in range(5)]
+    assert reports == [
+        ("stabilise", 0, 2),
+        ("stabilise", 1, 2),
+        *(settling if found.evidence.kept else [("stabilise", 2, 2)]),
+    ]
     return found.model, found.evidence, found.uncertainty
 
 

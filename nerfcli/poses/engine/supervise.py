@@ -31,6 +31,8 @@ _STAGES = {
     "merge": "merging sub-models",
     "locate": "locating single photos",
     "check": "checking the poses",
+    "stabilise": "trying a principal point for each photo",
+    "settle": "adjusting with a principal point for each photo",
 }
 _GO_ON = "completed work is kept; run the same command again to continue"
 _LESS_MEMORY = "use smaller photos (--max-size), fewer features (--max-features) or fewer threads (--threads)"

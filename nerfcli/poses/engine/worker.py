@@ -149,7 +149,7 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
         uncertainty = examined.uncertainty
         if examined.verdict.accepted:
             with _timed(seconds, "stabilisation"):
-                found = _stabilised(model, job, finishing)
+                found = _stabilised(model, job, finishing, report)
             model, result["principal_points"] = found.model, found.evidence and asdict(found.evidence)
             uncertainty = uncertainty | {str(lens): certain for lens, certain in found.uncertainty.items()}
         result["cameras"] = describe_cameras(model, job, uncertainty, lens_of=lens_of)
@@ -198,10 +198,12 @@ def _checks(job: Job) -> Checks:
     return Checks(Path(job.folder), skip=dict(job.skipped_checks), seconds=most)
 
 
-def _stabilised(model: pycolmap.Reconstruction, job: Job, checks: Checks) -> StabilisedModel:
+def _stabilised(model: pycolmap.Reconstruction, job: Job, checks: Checks, report: Report) -> StabilisedModel:
     return checks.run(
         "principal points",
-        lambda: choose_principal_points(model, seed=job.seed, threads=job.threads, fixed=job.fixed_cameras),
+        lambda: choose_principal_points(
+            model, seed=job.seed, threads=job.threads, fixed=job.fixed_cameras, report=report
+        ),
         otherwise=StabilisedModel(model, None, {}),
     )
 

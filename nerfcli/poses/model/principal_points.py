@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from nerfcli.cameras.rigid import transform_from_twist
+from nerfcli.poses.input.job import Report
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.intrinsics import MOST_DESCRIBED
 from nerfcli.poses.model.lens_evidence import lenses_of
@@ -68,7 +69,12 @@ class StabilisedModel:
 
 
 def choose_principal_points(
-    model: pycolmap.Reconstruction, *, seed: int, threads: int, fixed: Sequence[int] = ()
+    model: pycolmap.Reconstruction,
+    *,
+    seed: int,
+    threads: int,
+    fixed: Sequence[int] = (),
+    report: Report = lambda stage, done, total: None,
 ) -> StabilisedModel:
     """Return the model with a camera for each photo if their principal points differ, else the model as it is.
 
@@ -79,13 +85,17 @@ def choose_principal_points(
         seed: of the choice of observations to hold out.
         threads: of the adjustments, -1 for all.
         fixed: ids of cameras whose intrinsics are kept fixed.
+        report: called with ("stabilise", done, total), then with ("settle", done, total) if principal points differ.
     """
+    report("stabilise", 0, 2)
     shared, held = held_out.split(model, seed=seed)
     free = _free_photos(shared, fixed)
     if len(free) < _LEAST_PHOTOS or len(held.points) == 0:
+        report("stabilise", 2, 2)
         return StabilisedModel(model, None, {})
     scale_px = held_out.loss_scale_px(held_out.observation_errors_px(shared))
     _adjust(shared, set(), threads=threads, robust_px=scale_px)
+    report("stabilise", 1, 2)
     own = with_own_cameras(shared)
     _adjust(own, free, threads=threads, robust_px=scale_px)
     before, after = held_out.errors_px(shared, held), held_out.errors_px(own, held)
@@ -95,8 +105,9 @@ def choose_principal_points(
     kept = gain > _GAIN_DEVIATIONS and after.mean() < (1 - _GAIN_FRACTION) * before.mean()
     evidence = PrincipalPoints(float(before.mean()), float(after.mean()), gain, len(free), bool(kept))
     if not kept:
+        report("stabilise", 2, 2)
         return StabilisedModel(model, evidence, {})
-    return _settled(model, evidence, seed=seed, threads=threads, fixed=fixed)
+    return _settled(model, evidence, seed=seed, threads=threads, fixed=fixed, report=report)
 
 
 def with_own_cameras(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -154,19 +165,28 @@ def refine_with_principal_point(
 
 
 def _settled(
-    model: pycolmap.Reconstruction, evidence: PrincipalPoints, *, seed: int, threads: int, fixed: Sequence[int]
+    model: pycolmap.Reconstruction,
+    evidence: PrincipalPoints,
+    *,
+    seed: int,
+    threads: int,
+    fixed: Sequence[int],
+    report: Report,
 ) -> StabilisedModel:
     """Adjust the model with own principal points, and drop the observations that no longer fit."""
+    report("settle", 0, 1 + _ROUNDS)
     own, lens_of = with_own_cameras(model), lenses_of(model)
     free, held = _free_photos(model, fixed), set[int]()
     _adjust(own, free, threads=threads, robust_px=held_out.loss_scale_px(held_out.observation_errors_px(own)))
     for number in range(_ROUNDS):
+        report("settle", 1 + number, 1 + _ROUNDS)
         # Before cameras move: poses and points have not followed yet.
         scale_px = held_out.loss_scale_px(held_out.observation_errors_px(own))
         held = _anchored(own, model, free)
         if number > 0:
             _move_lenses(own, lens_of, shifting=free - held, seed=seed, fixed=fixed)
         _adjust(own, free - held, threads=threads, robust_px=scale_px)
+    report("settle", 1 + _ROUNDS, 1 + _ROUNDS)
     held_out.drop_misfits(own)
     certain = {
         lens: uncertainty(
