@@ -327,7 +327,11 @@ def test_merging_and_locating_add_to_what_is_left_and_take_nothing_from_the_shar
     assert outlook.update("locate", 0, 20) == (pytest.approx(120.0 / 140.0), pytest.approx(14.0 + 20.0))
     now = 134.0
     outlook.update("locate", 20, 20)
-    assert outlook.update("check", 0, 4) == (pytest.approx(134.0 / 154.0), pytest.approx(20.0))
+    # Ten more trials after another attempt to merge.
+    assert outlook.update("locate", 0, 10)[1] == pytest.approx(7.0 + 20.0)
+    now = 141.0
+    outlook.update("locate", 10, 10)
+    assert outlook.update("check", 0, 4) == (pytest.approx(141.0 / 161.0), pytest.approx(20.0))
 
 
 def test_principal_points_of_the_photos_add_to_what_is_left_and_take_nothing_from_the_share():
