@@ -96,13 +96,15 @@ def cameras(photos: Sequence[PhotoFacts]) -> Finding:
     most = max(len(found) for found in groups)
     many = any(len(g) > max(2, len(members) / 4) for g, members in zip(groups, folders.values(), strict=True))
     verdict = GOOD if most == 1 else BAD if many else LOOK
-    where = "" if len(folders) == 1 else f" in each of {len(folders)} folders"
-    cameras = "one camera" if most == 1 else f"up to {most} different combinations of camera, lens, zoom and image size"
-    counted = cameras if where else cameras.removeprefix("up to ")
+    kinds = f"{most} different combinations of camera, lens, zoom and image size"
+    if len(folders) > 1:
+        kinds = f"up to {kinds} in each of {len(folders)} folders"
+    if most == 1:
+        kinds = "one camera" if len(folders) == 1 else f"one camera in each of {len(folders)} folders"
     return Finding(
         "cameras",
         verdict,
-        f"{counted}{where}{'; most photos' if most > 1 else ''}: {'; '.join(dict.fromkeys(main))}",
+        f"{kinds}{'; most photos' if most > 1 else ''}: {'; '.join(dict.fromkeys(main))}",
         most,
         "combinations: look from 2, bad from one per four photos",
         ""
