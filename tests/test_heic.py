@@ -162,7 +162,7 @@ def test_structure_from_motion_gets_upright_jpegs(tmp_path: Path):
             assert np.abs(np.asarray(copy).astype(int) - read_image(photos / "IMG_0.HEIC")).mean() < 3
 
 
-def test_a_capture_of_heic_photos_is_trained_and_evaluated(capture: Path, tmp_path: Path):
+def test_a_capture_of_heic_photos_is_trained_evaluated_and_converted(capture: Path, tmp_path: Path):
     """The spheres, whose photos become HEIC files: what is rendered is compared with their pixels."""
     for path in [*capture.rglob("*.png")]:
         write_heic(path.with_suffix(".heic"), read_image(path))
@@ -177,5 +177,9 @@ def test_a_capture_of_heic_photos_is_trained_and_evaluated(capture: Path, tmp_pa
     run = tmp_path / "run"
     assert nerfcli("train", capture, "--steps", "3", "--model", "default", "-o", run).exit_code == 0
     assert nerfcli("evaluate", run).exit_code == 0
+    converted = nerfcli("convert", capture, tmp_path / "colmap", "--to", "colmap", "--allow-loss")
+    assert converted.exit_code == 0, converted.stderr
+    assert "the photos are HEIC, which many other programs cannot read" in converted.stderr
+    assert "HEIC" not in nerfcli("convert", capture, tmp_path / "scene", "--to", "nerfcli").stderr
     (measured,) = json.loads((run / "metrics.json").read_text())["images"]
     assert measured["pixels"] == 96 * 72

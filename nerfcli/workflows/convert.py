@@ -11,6 +11,7 @@ from nerfcli.convert.conversion import ConventionOverrides, Conversion, TargetOp
 from nerfcli.convert.formats import Format, UserInputs, recording
 from nerfcli.convert.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.convert.world_frame import WorldFrame, in_world_frame
+from nerfcli.media.images import HEIC_SUFFIXES
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
 
@@ -65,6 +66,8 @@ def convert_capture(
     done = convert(capture, target, source_format=form.name, wanted=wanted)
     for text in done.notes:
         notify(text)
+    if to != "nerfcli" and any(f.image is not None and f.image.suffix.lower() in HEIC_SUFFIXES for f in capture.frames):
+        notify("the photos are HEIC, which many other programs cannot read")
     for loss in done.losses:
         warn(f"{to} cannot hold {loss}")
     if done.loss_px > wanted.tolerance_px:
