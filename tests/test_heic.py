@@ -98,12 +98,19 @@ def test_transparency_is_kept(tmp_path: Path):
     np.testing.assert_array_equal(read_image(write_heic(tmp_path / "a.heic", pixels)), pixels)
 
 
-@pytest.mark.parametrize("cut", [0.0, 0.001, 0.01, 0.2, 0.5, 0.9, 0.999])
-def test_a_truncated_file_is_named(tmp_path: Path, cut: float):
+@pytest.mark.parametrize(
+    ("cut", "what"),
+    [
+        (0.0, "empty"),
+        (0.0001, "not a readable picture"),
+        *((cut, "damaged or truncated") for cut in (0.01, 0.5, 0.999)),
+    ],
+)
+def test_a_truncated_file_is_named(tmp_path: Path, cut: float, what: str):
     path = write_heic(tmp_path / "a.heic", noise(HEIGHT, WIDTH, 3))
     whole = path.read_bytes()
     path.write_bytes(whole[: int(len(whole) * cut)])
-    with pytest.raises(UserError, match=r"a\.heic is (empty|damaged or truncated|not a readable picture)"):
+    with pytest.raises(UserError, match=rf"a\.heic is {what}"):
         read_image(path)
 
 

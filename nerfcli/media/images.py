@@ -44,6 +44,7 @@ _DAMAGED = (
     *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError),
     *(struct.error, zlib.error, Image.DecompressionBombError),
 )
+_DAMAGED_HINT = "copy the photo again, or remove it from the folder"
 _FORMATS = "JPEG, HEIC, PNG, TIFF, WebP or BMP"
 _SRGB = ImageCms.createProfile("sRGB")
 # Two colour spaces that agree within this many of 255 levels on a grid of colours count as the same.
@@ -198,6 +199,8 @@ def opened(path: Path) -> Iterator[Image.Image]:
             with Image.open(path) as image:
                 yield image
     except UnidentifiedImageError as error:
+        if path.suffix.lower() in HEIC_SUFFIXES and pi_heif.is_supported(path):  # it begins like one
+            raise UserError(f"{path} is damaged or truncated", _DAMAGED_HINT) from error
         raise UserError(
             f"{path} is not a readable picture",
             f"supported are {_FORMATS}; convert it (raw files, too), or remove it from the folder",
@@ -205,10 +208,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
     except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
         raise UserError(f"cannot read {path}: {error.strerror}", f"expected a {_FORMATS} file") from error
     except _DAMAGED as error:
-        raise UserError(
-            f"{path} is damaged or truncated: {error}",
-            "copy the photo again, or remove it from the folder",
-        ) from error
+        raise UserError(f"{path} is damaged or truncated: {error}", _DAMAGED_HINT) from error
 
 
 def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
