@@ -115,12 +115,8 @@ def test_a_truncated_file_is_named(tmp_path: Path, cut: float, what: str):
 
 
 def test_sixty_corruptions_are_read_or_named(tmp_path: Path):
-    path, draw = (
-        write_heic(tmp_path / "a.heic", noise(HEIGHT, WIDTH, 3), exif=exif_with({}).tobytes()),
-        random.Random(0),
-    )
-    whole = path.read_bytes()
-    named = 0
+    path = write_heic(tmp_path / "a.heic", noise(HEIGHT, WIDTH, 3), exif=exif_with({}).tobytes())
+    whole, draw, named = path.read_bytes(), random.Random(0), 0
     for _ in range(60):
         damaged = bytearray(whole)
         for _ in range(draw.randint(1, 8)):

@@ -72,8 +72,8 @@ def test_text_and_truncated_files_are_left_out_with_their_reason(folder: Path):
 
 
 def test_photos_in_formats_that_are_not_read_are_named_and_not_passed_over(folder: Path):
-    """A raw file beside its JPEG is not mentioned."""
-    for name in ("f.NEF", "g.dng", "a.CR2", "notes.txt"):
+    """A raw file beside its JPEG is not mentioned, nor is what macOS leaves beside files on other disks."""
+    for name in ("f.NEF", "g.dng", "a.CR2", "notes.txt", "._h.dng"):
         (folder / name).write_bytes(b"not for Pillow")
     photos = find_photos(folder)
     assert photos.names == ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg")

@@ -53,4 +53,5 @@ def _folders(folder: Path, *, subfolders: bool) -> list[Path]:
 
 def _unsupported(folder: Path) -> list[Path]:
     read = {path.stem for path in list_images(folder)}
-    return [p for p in folder.iterdir() if p.suffix.lower() in _UNSUPPORTED_SUFFIXES and p.stem not in read]
+    files = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return [path for path in files if path.suffix.lower() in _UNSUPPORTED_SUFFIXES and path.stem not in read]
