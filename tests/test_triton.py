@@ -143,8 +143,8 @@ def test_kernels_compile_within_the_limits_of_each_generation(interpreted, kerne
 
 
 def each(variants: list[Variant]) -> list[Variant]:
-    """Return one variant of every kernel, and all of the hottest ones."""
-    first = {variant.kernel: variant for variant in reversed(variants)}
+    """Return one variant of every kernel, another one for colours without directions, and all of the hottest ones."""
+    first = {(variant.kernel, dict(variant.constants).get("DEGREE") == 0): variant for variant in reversed(variants)}
     return [*first.values(), *(variant for variant in hottest(variants) if variant not in first.values())]
 
 

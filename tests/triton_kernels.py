@@ -152,7 +152,7 @@ def layers_of(hidden: int, generator: torch.Generator) -> list[Tensor]:
 
 
 @pytest.mark.parametrize("samples", SIZES)
-@pytest.mark.parametrize(("hidden", "degree"), [(32, 3), (64, 1)])
+@pytest.mark.parametrize(("hidden", "degree"), [(32, 3), (64, 1), (32, 0)])
 def test_networks(samples, hidden, degree, generator):
     layers = layers_of(hidden, generator)
     code = torch.randn(samples, 32, generator=generator).half()

@@ -8,7 +8,7 @@ from nerfcli.kernels.triton_cuda.launch import jit
 @jit
 def harmonics(x, y, z, column, DEGREE: tl.constexpr):
     """Return harmonics (BLOCK, 16), 0 above DEGREE, of directions (BLOCK, 1); `column` (1, 16) counts from 0."""
-    out = tl.where(column == 0, 0.28209479177387814, 0.0)
+    out = tl.broadcast_to(tl.where(column == 0, 0.28209479177387814, 0.0), (x.shape[0], 16))
     if DEGREE > 0:
         out = tl.where(column == 1, 0.4886025119029199 * y, out)
         out = tl.where(column == 2, 0.4886025119029199 * z, out)
