@@ -63,7 +63,7 @@ class Capture:
         capture = scene.load(folder)
         self.name = folder.name
         first = capture.train_frames[0].camera
-        factor = automatic_downscale(first.width, first.height)
+        factor = automatic_downscale(first)
         photos = load_photos(capture.train_frames, factor=factor, threads=threads)
         fills_frame = any(photo.pixels.shape[-1] == 3 for photo in photos)
         settings = TrainSettings(threads=threads)

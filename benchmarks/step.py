@@ -30,7 +30,7 @@ def trained(folder: Path, seconds: float, threads: int) -> Fitting:
     """Return a training that has run for some seconds."""
     capture = scene.load(folder)
     first = capture.train_frames[0].camera
-    factor = automatic_downscale(first.width, first.height)
+    factor = automatic_downscale(first)
     photos = load_photos(capture.train_frames, factor=factor, threads=threads)
     settings = TrainSettings(
         budget_seconds=seconds, threads=threads, first_samples_per_step=TrainSettings.samples_per_step

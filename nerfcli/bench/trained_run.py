@@ -124,5 +124,4 @@ def _scene_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun
 
 
 def _factor(scene: Scene) -> int:
-    camera = (scene.train_frames or scene.frames)[0].camera
-    return automatic_downscale(camera.width, camera.height)
+    return automatic_downscale((scene.train_frames or scene.frames)[0].camera)

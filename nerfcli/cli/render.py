@@ -1,5 +1,6 @@
 """nerfcli render: render pictures, depth maps and videos of a run."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -227,10 +228,10 @@ def render(
     from nerfcli.media.colour_maps import COLOUR_MAPS
     from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
     from nerfcli.render.pictures import Quality
-    from nerfcli.runs.run import Run
+    from nerfcli.runs.run import Run, load_run
     from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.render import RENDERS, folder_name, render_run
-    from nerfcli.workflows.views import Views, chosen_frames, file_fps, write_frames
+    from nerfcli.workflows.views import Views, chosen_frames, file_fps, usual_axis, write_frames
 
     console = Console(quiet=quiet, json_lines=json)
 
@@ -269,7 +270,7 @@ def render(
         raise typer.BadParameter("it removes depth; add depth to --outputs", param_hint=hint)
     request = DepthRequest(
         convention=depth,
-        axis=depth_axis or ("ray" if lens == "equirectangular" else "z"),
+        axis=depth_axis or "z",
         min_opacity=min_opacity,
         background_distance=background_distance,
         min_views=min_views,
@@ -288,7 +289,7 @@ def render(
         videos = video_settings(
             video_format or "mp4", layout=video_layout, direction=direction, fps=fps, crf=crf, loop=loop
         )
-    settings = ExportSettings(
+    usual = ExportSettings(
         outputs=chosen,
         depth=request,
         formats=formats,
@@ -311,6 +312,8 @@ def render(
                 raise UserError(f"{folder} is a reconstruction of a scan; --dry-run is for photos", "remove --dry-run")
             render_one_scan(folder, one_of_many)
             return
+        axis = depth_axis or usual_axis(load_run(folder), look)
+        settings = replace(usual, depth=replace(request, axis=axis))
         name = f"{views.name}-cameras" if cameras_only else folder_name(views, settings)
         target = folder / RENDERS / name
         if output is not None:

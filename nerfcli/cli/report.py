@@ -19,7 +19,10 @@ def report(
         int, typer.Option(help="Maximum number of held-out photos to show, from the worst to the best.", min=0)
     ] = 8,
     depth: Annotated[str, typer.Option(help="Definition of depth, as in render.")] = "conditional",
-    depth_axis: Annotated[str, typer.Option(help="z: along the optical axis; ray: along the ray.")] = "z",
+    depth_axis: Annotated[
+        str | None,
+        typer.Option(help="z: along the optical axis; ray: along the ray.  [default: z, ray for panoramas]"),
+    ] = None,
     output: Output = None,
     device: Device = "auto",
     threads: Threads = 0,
@@ -40,7 +43,9 @@ def report(
       ls -d *-run/ | nerfcli report - --views 4 -o all.html
     """
     from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
+    from nerfcli.runs.run import load_run
     from nerfcli.workflows.report import report_runs
+    from nerfcli.workflows.views import usual_axis
 
     if not is_convention(depth) or depth == "background":
         choices = ", ".join(name for name in CONVENTIONS if name != "background")
@@ -55,7 +60,7 @@ def report(
             paths,
             output,
             views=views,
-            depth=DepthRequest(convention=depth, axis=depth_axis),
+            depth=DepthRequest(convention=depth, axis=depth_axis or usual_axis(load_run(paths[0]))),
             device=device_name(device),
             threads=thread_count(threads),
             overwrite=overwrite,

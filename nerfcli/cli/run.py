@@ -84,13 +84,14 @@ def run(
     from nerfcli.poses.input.settings import Limits, PoseSettings
     from nerfcli.render.pictures import DepthRequest
     from nerfcli.runs.components import Components, choose
+    from nerfcli.runs.run import load_run
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run
     from nerfcli.workflows.poses import estimate_poses, folder_of_photos, given_intrinsics, without_suffix
     from nerfcli.workflows.render import render_run
     from nerfcli.workflows.report import report_runs
     from nerfcli.workflows.train import train_scene, was_interrupted
-    from nerfcli.workflows.views import Views
+    from nerfcli.workflows.views import Views, usual_axis
 
     console = Console(quiet=quiet, json_lines=json)
     requirements, rule = requirements_of(require), holdout_rule(holdout)
@@ -117,7 +118,6 @@ def run(
         fixed=named_components(include, exclude),
         **sizes_for(torch_device),
     )
-    depth = DepthRequest(convention="conditional", axis="z")
 
     def work(source: Path, one_of_many: bool) -> None:
         scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
@@ -159,6 +159,7 @@ def run(
         console.result(scene)
         console.result(field)
         console.result(evaluation.path, evaluation.metrics)
+        depth = DepthRequest(convention="conditional", axis=usual_axis(load_run(field)))
         for cameras, video in (("test", False), ("orbit", True)):
             settings = ExportSettings(
                 outputs=OUTPUTS[: 2 if video else 3], depth=depth, video=VideoSettings() if video else None
@@ -171,7 +172,7 @@ def run(
             for path in written:
                 console.result(path)
         with console.progress("report") as update:
-            page = report_runs([field], keep=True, **where, notify=console.note, progress=update)
+            page = report_runs([field], depth=depth, keep=True, **where, notify=console.note, progress=update)
         console.note(f"report with all results: {page}")
         console.result(page)
         check_requirements(trained, evaluation.metrics, requirements)

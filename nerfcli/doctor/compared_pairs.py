@@ -16,6 +16,7 @@ from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.multiview.epipolar import fundamental_matrix
 from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.stationary import Motions, in_place, motions
+from nerfcli.poses.model.two_views import panorama_inliers
 
 # Features of each photo that are compared at first; all of them if these do not connect the photo to the rest.
 QUICK_FEATURES = 1000
@@ -84,7 +85,11 @@ def compare(
     one, other = (photo.features for photo in photos)
     a, b = mutual_matches(one.descriptors[:most_features], other.descriptors[:most_features], ratio=LOOSE_RATIO)
     x, y = one.pixels[a], other.pixels[b]
-    _, agree = fundamental_matrix(x, y, within_px=EPIPOLAR_PX)
+    panoramas = all(photo.is_panorama for photo in photos)
+    if panoramas:
+        agree = panorama_inliers(x, y, (one.size, other.size), within_px=EPIPOLAR_PX)
+    else:
+        _, agree = fundamental_matrix(x, y, within_px=EPIPOLAR_PX)
     count = int(agree.sum())
     if count < LEAST_MATCHES:
         unknown = float("nan")
@@ -94,9 +99,9 @@ def compare(
     lighter, redder = (other.light[b[agree]] - one.light[a[agree]]).T
     stops = _median(lighter)
     views, patches, still = None, (), None
-    if one.size == other.size and in_place(x, y, one.size)[0].any():
+    if not panoramas and one.size == other.size and in_place(x, y, one.size)[0].any():
         still = motions(x, y, one.size)
-    if count >= _LEAST_FOR_GEOMETRY:
+    if not panoramas and count >= _LEAST_FOR_GEOMETRY:
         centres = [np.array(features.size) / 2 for features in (one, other)]
         views = camera_motion.estimate(x[agree] - centres[0], y[agree] - centres[1], focals_px)
         patches = moving_patches(x, y, agree, within_px=EPIPOLAR_PX)

@@ -155,10 +155,14 @@ def judged(
     ]
     not_checked: list[tuple[str, str]] = []
     few = "too few pairs have enough matches"
+    panoramas = [photo for photo in photos if photo.is_panorama]
     if len(photos) > 1:
         turning = checks.run("turning object", lambda: turntable.turning_object(pairs), otherwise=None)
         planned.append(("connectivity", lambda: connectivity.connectivity(photos, pairs)))
-        if turning is None:
+        if len(panoramas) == len(photos):
+            reason = "the photos show the whole sphere: nerfcli poses measures their movement"
+            not_checked.append(("moving content, movement, depth relief", reason))
+        elif turning is None:
             planned += [
                 ("moving content", lambda: geometry.moving_content(photos, pairs)),
                 ("movement", lambda: _or_not_checked("movement", geometry.movement(photos, pairs), few, not_checked)),

@@ -116,7 +116,7 @@ def cameras(photos: Sequence[PhotoFacts]) -> Finding:
 
 def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
     """Check whether the focal lengths in EXIF fit the files; they do not after cropping."""
-    found = [(photo, focal_evidence(photo.exif)) for photo in photos]
+    found = [(photo, focal_evidence(photo.exif)) for photo in photos if not photo.is_panorama]
     doubtful = [(photo.name, evidence.doubt) for photo, evidence in found if evidence.doubt]
     fractions = [
         evidence.focal_px / evidence.whole_px[0]
@@ -125,6 +125,8 @@ def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
     ]
     if doubtful:
         summary = f"EXIF does not match {several(len(doubtful), 'file')}: {doubtful[0][1]}"
+    elif not found:
+        summary = "panoramas of the whole sphere need none"
     elif fractions:
         summary = f"{np.median(fractions):.2f} times the longer side, from EXIF ({several(len(fractions), 'photo')})"
     else:

@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +13,7 @@ from nerfcli.doctor import brightness, sharpness
 from nerfcli.errors import UserError
 from nerfcli.media.exif import Exif, read_exif
 from nerfcli.media.images import downscale, read_image
+from nerfcli.media.panoramas import MOST_OF_A_CAMERA, is_panorama
 from nerfcli.multiview.features import find_features
 
 # Longer side of the pictures in which features are detected; all thresholds in pixels refer to this size.
@@ -59,6 +60,7 @@ class PhotoFacts:
         digest: SHA-256 of the file.
         thumbnail: a small JPEG.
         tiny: (32, 32) float32 grey picture with mean 0 and norm 1; all 0 for a uniform one.
+        is_panorama: whether it shows the whole sphere.
     """
 
     name: str
@@ -69,6 +71,7 @@ class PhotoFacts:
     sharpness: sharpness.Sharpness
     exposure: brightness.Brightness
     features: PhotoFeatures
+    is_panorama: bool = False
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,8 @@ def read_all(
             else:
                 unreadable[sources[index].name] = found
             progress(index + 1)
+    if sum(photo.is_panorama for photo in facts) > MOST_OF_A_CAMERA * len(facts):
+        facts = [replace(photo, is_panorama=photo.exif.width == 2 * photo.exif.height) for photo in facts]
     return facts, unreadable
 
 
@@ -111,6 +116,7 @@ def read_photo(source: Source, most_features: int) -> PhotoFacts:
     image = read_image(source.path)
     exif = read_exif(source.path)
     digest = hashlib.sha256(source.path.read_bytes()).hexdigest()
+    panorama = is_panorama(source.path, image)
     large = _shrunk(image, sharpness.LONGER_SIDE_PX)
     del image
     rgb, used = _opaque(large)
@@ -131,6 +137,7 @@ def read_photo(source: Source, most_features: int) -> PhotoFacts:
         sharpness=sharp,
         exposure=brightness.measure(rgb, used),
         features=_features(small, seen, local_detail=local_detail, most_features=most_features),
+        is_panorama=panorama,
     )
 
 

@@ -27,7 +27,7 @@ from nerfcli.poses.input.pairs import Pairing, choose_pairs
 from nerfcli.poses.input.pairs_file import read_pairs
 from nerfcli.poses.input.photos import Photos, find_photos
 from nerfcli.poses.input.plan import Plan, make_plan
-from nerfcli.poses.input.settings import Limits, PoseSettings, check_settings
+from nerfcli.poses.input.settings import Limits, PoseSettings, check_settings, for_panoramas
 from nerfcli.poses.input.stages import file_key
 from nerfcli.poses.input.work_photos import lay_out
 from nerfcli.poses.judge.checks import UNDERWAY
@@ -81,7 +81,7 @@ def estimate_poses(
     planned(plan)
     with workspace(scene_dir) as space:
         work = space.folder
-        job = _prepare(photos, settings, grouped=grouped, pairing=pairing, work=work, notify=notify)
+        job = _prepare(photos, _searched(settings, grouped), grouped=grouped, pairing=pairing, work=work, notify=notify)
         _work(job, work, limits=limits, lock=space.lock, progress=progress, notify=notify)
         result = _read_json(work / "result.json")["content"]  # written by the worker, or complete from before
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
@@ -139,7 +139,11 @@ def plan_poses(
     else:
         pairing = read_pairs(Path(settings.pairs_file), photos)
     threads = settings.threads if settings.threads > 0 else os.cpu_count() or 1
-    return photos, grouped, pairing, make_plan(photos, pairing, settings, threads=threads)
+    return photos, grouped, pairing, make_plan(photos, pairing, _searched(settings, grouped), threads=threads)
+
+
+def _searched(settings: PoseSettings, grouped: PhotoGroups) -> PoseSettings:
+    return for_panoramas(settings) if any(group.is_panorama for group in grouped.groups) else settings
 
 
 def photo_notes(photos: Photos, grouped: PhotoGroups) -> list[str]:

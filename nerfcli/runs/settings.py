@@ -6,6 +6,7 @@ from bisect import bisect
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from nerfcli.cameras.camera import Camera
 from nerfcli.errors import UserError
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import KINDS
@@ -180,9 +181,12 @@ def sizes_for(device: str) -> dict[str, Any]:
     return GPU_SIZES if device.startswith("cuda") else {}
 
 
-def automatic_downscale(width: int, height: int) -> int:
-    """Return the smallest downscale that brings the longer side to `AUTO_LONGER_SIDE_PX` or below."""
+def automatic_downscale(camera: Camera) -> int:
+    """Return the smallest downscale that brings the longer side to `AUTO_LONGER_SIDE_PX` or below; twice that for
+    panoramas, which show more with as many pixels.
+    """
+    most = 2 * AUTO_LONGER_SIDE_PX if camera.is_spherical else AUTO_LONGER_SIDE_PX
     for factor in DOWNSCALES:
-        if max(width, height) / factor <= AUTO_LONGER_SIDE_PX:
+        if max(camera.width, camera.height) / factor <= most:
             return factor
     return DOWNSCALES[-1]

@@ -134,7 +134,7 @@ def load_training_photos(
     """
     refuse_without_training_photos(scene)
     first = scene.train_frames[0].camera
-    factor = settings.downscale or automatic_downscale(first.width, first.height)
+    factor = settings.downscale or automatic_downscale(first)
     needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
     device = torch.device(settings.device)
     if device.type == "cuda":

@@ -70,7 +70,7 @@ def plan_training(
     loaded = scene_for(settings, Path(scene), holdout=holdout)
     scenes.refuse_without_training_photos(loaded)
     first = loaded.train_frames[0].camera
-    factor = settings.downscale or automatic_downscale(first.width, first.height)
+    factor = settings.downscale or automatic_downscale(first)
     needs = needs_of((*loaded.train_frames, *loaded.test_frames), factor, settings=settings)
     storage, _ = storage_for(needs, memory_bytes, folder=Path(tempfile.gettempdir()))
     in_files = needs.photos if isinstance(storage, InFiles) else 0

@@ -146,6 +146,13 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
     return [replace(frame, camera=look(frame.camera)) for frame in chosen]
 
 
+def usual_axis(run: Run, look: PictureOptions = PictureOptions()) -> str:
+    """Return the usual axis of depth: "z", but "ray" for pictures of all directions, half of which have no z."""
+    lens, cameras = look.lens, run.cameras
+    spherical = any(frame.camera.is_spherical for frame in (*cameras.train, *cameras.test))
+    return "ray" if lens == "equirectangular" or (lens is None and spherical) else "z"
+
+
 def refuse_z_depth_for_equirectangular(frames: Sequence[Frame], *, notify: Notify) -> None:
     """Refuse depth along the optical axis, z, for pictures of all directions: half of them is behind the camera.
 

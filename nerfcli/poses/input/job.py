@@ -7,6 +7,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from nerfcli.media.panoramas import PANORAMA
+
 # Called with (stage, done, total) as the work proceeds.
 Report = Callable[[str, int, int], None]
 # Called with messages for the user, one sentence at a time.
@@ -33,6 +35,11 @@ class CameraGroup:
     focal_px: float | None = None
     focal_is_prior: bool = False
     estimated_focal_px: float | None = None
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether the photos show the whole sphere; their size then determines the camera."""
+        return self.model == PANORAMA
 
     def without_exif(self) -> "CameraGroup":
         """Return the same group without EXIF's focal length."""

@@ -10,6 +10,7 @@ from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.media.exif import Exif, read_exif
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import read_image
+from nerfcli.media.panoramas import is_panorama
 from nerfcli.media.photo_folders import list_photos, list_unsupported, name_in, where_photos_may_be
 
 # Three views determine a scene up to scale, but leave nothing to check them with; four are the fewest that do.
@@ -24,13 +25,15 @@ _SAME_FOCAL = 0.02
 class Photo:
     """A photo that was decoded from beginning to end. width and height are those of the upright picture.
 
-    name: of the file; in a subfolder its path from the folder of photos, with forward slashes.
+    name: of the file; in a subfolder its path from the folder of photos, with forward slashes. is_panorama: whether it
+    looks like a picture of the whole sphere, or says so.
     """
 
     name: str
     width: int
     height: int
     exif: Exif
+    is_panorama: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,8 +121,9 @@ def _same_as(focal: float | None, focals: list[float]) -> float | None:
 def _examine(path: Path, name: str) -> Photo | str:
     """Return the photo, or why it cannot be read."""
     try:
-        height, width = read_image(path).shape[:2]
-        return Photo(name=name, width=width, height=height, exif=read_exif(path))
+        picture = read_image(path)
+        height, width = picture.shape[:2]
+        return Photo(name, width, height, exif=read_exif(path), is_panorama=is_panorama(path, picture))
     except UserError as error:
         return error.message.replace(str(path), "").removeprefix(" is ").strip(" :")
 

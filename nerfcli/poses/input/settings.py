@@ -1,6 +1,6 @@
 """Settings and limits of structure from motion."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from nerfcli.holdout import DEFAULT_HOLDOUT
 from nerfcli.poses.input.pairs import PAIRINGS
@@ -17,6 +17,7 @@ CAMERA_MODELS = (
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
     "OPENCV_FISHEYE",
+    "EQUIRECTANGULAR",
 )
 
 # More than the longer side of any photo, so that features are extracted at full size.
@@ -30,7 +31,8 @@ QUALITIES = {"fast": (1000, 2048), "default": (1600, 4096), "best": (FULL_SIZE, 
 class PoseSettings:
     """Settings that the result depends on.
 
-    max_image_size: longer side of the pictures that are searched for features, pixels. max_features: per photo.
+    max_image_size: longer side of the pictures that are searched for features, pixels. max_features: per photo. Both
+    are doubled for panoramas, see `for_panoramas`.
     threads: -1 for all; with 1 thread the same seed gives the same poses. camera_model: one of `CAMERA_MODELS`.
     min_registered: the fraction of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a
     text file with two names per line, only these pairs are matched. masks: a folder of masks, see `media.masks`.
@@ -54,6 +56,11 @@ class PoseSettings:
     component: int = 1
     accept_refused: bool = False
     subfolders: bool = False
+
+
+def for_panoramas(settings: PoseSettings) -> PoseSettings:
+    """Return the settings with features of panoramas: they show six times as much as photos, each thing smaller."""
+    return replace(settings, max_image_size=2 * settings.max_image_size, max_features=2 * settings.max_features)
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,7 @@ def judge(
     total = sum(a.matches for a in found)
     fraction = sum(c.matches for c in contradictions) / total if total else 0.0
     geometry = run("geometry of points and cameras", lambda: _geometry(model), otherwise=_UNKNOWN_GEOMETRY)
-    focal = [_focal_measure(camera) for camera in _cameras_in_use(model)]
+    focal = [_focal_measure(camera) for camera in _cameras_in_use(model) if not camera.is_spherical()]
     unused = run(
         "unused observations",
         lambda: _held_out_measure(model, seed=seed, threads=threads, fixed=fixed),
@@ -157,7 +157,7 @@ def _geometry(model: pycolmap.Reconstruction) -> dict[str, Any]:
     centres = {photo: np.asarray(model.image(photo).projection_center()) for photo in photos}
     angles, distances, in_front, observations = [], [], 0, 0
     forward = {photo: np.asarray(model.image(photo).viewing_direction()) for photo in photos}
-    wide = {photo: model.camera(model.image(photo).camera_id).is_perspective_fisheye() for photo in photos}
+    wide = {photo: _sees_behind(model.camera(model.image(photo).camera_id)) for photo in photos}
     for point in model.points3D.values():
         seen = list({element.image_id for element in point.track.elements})
         to = np.array([point.xyz - centres[photo] for photo in seen])
@@ -184,6 +184,10 @@ def _cameras_in_use(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
     return [model.cameras[camera_id] for camera_id in ids]
 
 
+def _sees_behind(camera: pycolmap.Camera) -> bool:
+    return camera.is_perspective_fisheye() or camera.is_spherical()
+
+
 def _focal_measure(camera: pycolmap.Camera) -> float:
     return camera.mean_focal_length() / max(camera.width, camera.height)
 
@@ -196,7 +200,7 @@ def _held_out_measure(
     # The lens was chosen before; a principal point that was freed is not moved again.
     held_out.adjust(training, threads=threads, fixed=fixed)
     errors = held_out.errors_px(training, held)
-    centred = all(is_centred(camera) for camera in cameras)
+    centred = all(camera.is_spherical() or is_centred(camera) for camera in cameras)
     if not len(errors):
         return {"observations": 0, "median_px": None, "share_above_8_px": None, "principal_points_central": centred}
     return {
@@ -312,7 +316,7 @@ def _implausible(
     focals = {
         camera.camera_id: _focal_measure(camera)
         for camera in _cameras_in_use(model)
-        if camera.camera_id not in given and not camera.is_perspective_fisheye()
+        if camera.camera_id not in given and not _sees_behind(camera)
     }
     low, high = _FOCAL_RANGE
     photos = Counter(model.image(photo).camera_id for photo in model.reg_image_ids())

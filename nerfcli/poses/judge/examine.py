@@ -1,7 +1,7 @@
 """Examine a model after mapping: lens model, contradictions, acceptance, uncertainty."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -13,7 +13,7 @@ from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict, judge, nothing_placed
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
-from nerfcli.poses.judge.parallax import best_rotation_fit
+from nerfcli.poses.judge.parallax import RotationFit, best_rotation_fit, panorama_rotation_fit
 from nerfcli.poses.judge.uncertainty import pose_blur_px
 from nerfcli.poses.model.intrinsics import ModelLenses, choose_lenses
 from nerfcli.poses.model.localise import shared_pairs
@@ -64,7 +64,7 @@ def examine(
         pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
     sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}
     strong = [pair for pair in pairs if pair.matches >= FEW_MATCHES]
-    turn = checks.run("parallax", lambda: best_rotation_fit(strong, sizes), otherwise=None)
+    turn = checks.run("parallax", lambda: _rotation_fit(strong, job, sizes), otherwise=None)
     joined = connected_groups(job.image_ids, [(pair.one, pair.other) for pair in strong])
     details: dict[str, Any] = {"parts": [len(part) for part in joined if len(part) > 1]}
     if not models:
@@ -113,6 +113,14 @@ def examine(
     return ExaminedModel(
         model, verdict, reasons, {numbers[image_id]: px for image_id, px in blur.items()}, details, uncertainty
     )
+
+
+def _rotation_fit(pairs: Sequence[VerifiedPair], job: Job, sizes: Mapping[int, tuple[int, int]]) -> RotationFit | None:
+    """Return how well rotations explain the matches: of panoramas if all photos are, else of the other photos."""
+    panoramas = {job.image_ids[photo] for group in job.groups if group.is_panorama for photo in group.photos}
+    if len(panoramas) == len(job.files):
+        return panorama_rotation_fit(pairs, sizes)
+    return best_rotation_fit([pair for pair in pairs if not {pair.one, pair.other} & panoramas], sizes)
 
 
 def with_pose_only(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:

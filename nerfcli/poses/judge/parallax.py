@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from nerfcli.poses.model.two_views import VerifiedPair
+from nerfcli.poses.model.projection import panorama_camera, px_per_radian
+from nerfcli.poses.model.two_views import VerifiedPair, rays
 
 Array = NDArray[np.float64]
 
@@ -34,7 +35,7 @@ class RotationFit:
     """The best explanation of all matches by rotations of the camera alone.
 
     parallax_px: the remaining error that three pairs in four do not exceed (median over the matches of each). focal_px:
-    as a pinhole in the largest picture.
+    as a pinhole in the largest picture; of panoramas, the pixels per radian.
     """
 
     parallax_px: float
@@ -74,6 +75,27 @@ def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[i
     options = {"maxiter": _STEPS, "initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2}
     found = minimize(left_over, simplex[0], method="Nelder-Mead", options=options)
     return RotationFit(float(found.fun), float(np.exp(found.x[0]) * longest))
+
+
+def panorama_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]]) -> RotationFit | None:
+    """Find how well rotations explain the matches between panoramas, whose rays are known; None without a pair.
+
+    Args:
+        pairs: verified pairs of panoramas; if there are many, an even selection is used.
+        sizes: width and height of every panorama, pixels, by image id.
+    """
+    if not pairs:
+        return None
+    chosen = pairs[:: -(-len(pairs) // _MOST_PAIRS)]
+    photos = {photo for pair in chosen for photo in (pair.one, pair.other)}
+    cameras = {photo: panorama_camera(sizes[photo]) for photo in photos}
+    counts = np.array([min(pair.matches, _MOST_MATCHES) for pair in chosen])
+    one, other = np.zeros((2, len(chosen), counts.max(), 3))
+    for place, (count, pair) in enumerate(zip(counts, chosen, strict=True)):
+        one[place, :count] = rays(cameras[pair.one], pair.pixels_one[:count])
+        other[place, :count] = rays(cameras[pair.other], pair.pixels_other[:count])
+    focal_px = max(px_per_radian(camera) for camera in cameras.values())
+    return RotationFit(float(np.quantile(_rest(one, other, counts), _QUANTILE) * focal_px), focal_px)
 
 
 def _from_middle(photos: Sequence[tuple[Array, tuple[int, int]]], counts: NDArray[np.int64]) -> Array:

@@ -10,8 +10,9 @@ from nerfcli.cameras.orientation import counted, describe_rescaling, rescaling
 from nerfcli.errors import UserError
 from nerfcli.media.exif import Exif
 from nerfcli.media.focal_evidence import focal_evidence
+from nerfcli.media.panoramas import MOST_OF_A_CAMERA, PANORAMA
 from nerfcli.poses.input.job import CameraGroup
-from nerfcli.poses.input.photos import Photos, camera_groups
+from nerfcli.poses.input.photos import Photo, Photos, camera_groups
 from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL
 
 # Uses of given intrinsics: kept fixed, or as the start of the adjustment.
@@ -45,12 +46,19 @@ def group_photos(photos: Photos, *, model: str) -> PhotoGroups:
     """Group photos by EXIF and upright size; model: COLMAP's name, or "auto" to start from the one that EXIF suggests.
 
     If EXIF describes another picture than the file, its focal length is only the start of the adjustment, not a prior.
+
+    Raises:
+        UserError: a photo that is to be a panorama is not twice as wide as high.
     """
     numbers = {name: number for number, name in enumerate(photos.names)}
     groups: list[CameraGroup] = []
     doubted: dict[str, list[str]] = {}
     for names in camera_groups(photos.photos):
         first = photos.photos[numbers[names[0]]]
+        members = [photos.photos[numbers[name]] for name in names]
+        if model == PANORAMA or (model == "auto" and _are_panoramas(members)):
+            groups.append(_panoramas(tuple(numbers[name] for name in names), first))
+            continue
         evidence = focal_evidence(first.exif)
         if evidence.doubt and (first.exif.focal_mm or first.exif.focal_35mm):
             doubted.setdefault(evidence.doubt, []).extend(names)
@@ -65,18 +73,34 @@ def group_photos(photos: Photos, *, model: str) -> PhotoGroups:
                 focal_is_prior=evidence.focal_px is not None and evidence.holds,
             )
         )
-    notes = _doubts(doubted)
+    notes = (*_panorama_notes(groups, chosen=model != "auto"), *_doubts(doubted))
     if len(groups) == 1:
         return PhotoGroups(tuple(groups), notes)
     by = "folder, EXIF and size" if any("/" in name for name in photos.names) else "EXIF and size"
     return PhotoGroups(tuple(groups), (f"{len(groups)} cameras, by {by}: {_summary(groups)}", *notes))
 
 
+def _are_panoramas(photos: Sequence[Photo]) -> bool:
+    """Return whether photos of one camera are panoramas; a single one may show what looks otherwise."""
+    return sum(photo.is_panorama for photo in photos) > MOST_OF_A_CAMERA * len(photos)
+
+
+def _panoramas(photos: tuple[int, ...], first: Photo) -> CameraGroup:
+    """Return the group of photos that show the whole sphere: their size determines the camera."""
+    if first.width != 2 * first.height:
+        raise UserError(
+            f"{first.name} is no panorama of the whole sphere: {first.width}x{first.height} pixels",
+            "equirectangular pictures are twice as wide as high; choose another --camera-model for other photos",
+        )
+    size = (float(first.width), float(first.height))
+    return CameraGroup(photos, PANORAMA, first.width, first.height, params=size, fixed=True)
+
+
 def group_by_given(photos: Photos, given: GivenIntrinsics) -> PhotoGroups:
     """Group photos by the cameras of a file. Photos that it does not list share a camera only if their EXIF agrees.
 
     Raises:
-        UserError: a photo has no camera in the file, or one that structure from motion cannot use.
+        UserError: a photo has no camera in the file, or one that cannot be.
     """
     pictures = [
         Picture(photos.folder / photo.name, photo.width, photo.height, photo.exif.orientation or 1)
@@ -84,11 +108,12 @@ def group_by_given(photos: Photos, given: GivenIntrinsics) -> PhotoGroups:
     ]
     calibration = given.calibration
     found = calibrated(calibration, pictures)
-    if any(one.camera.is_spherical for one in found):
-        raise UserError(
-            f"{calibration.path} has a spherical camera (EQUIRECTANGULAR)",
-            "structure from motion needs perspective or fisheye pictures; convert the panoramas first",
-        )
+    for one in found:
+        if one.camera.is_spherical and one.camera.width != 2 * one.camera.height:
+            raise UserError(
+                f"{calibration.path} has a spherical camera of {one.camera.width}x{one.camera.height} pixels",
+                "panoramas of the whole sphere are twice as wide as high",
+            )
     optics = {name: number for number, names in enumerate(camera_groups(photos.photos)) for name in names}
     members: dict[tuple[Any, ...], list[int]] = {}
     for number, (name, one) in enumerate(zip(photos.names, found, strict=True)):
@@ -101,7 +126,7 @@ def group_by_given(photos: Photos, given: GivenIntrinsics) -> PhotoGroups:
             width=camera.width,
             height=camera.height,
             params=camera.params,
-            fixed=given.use == "fixed",
+            fixed=given.use == "fixed" or camera.is_spherical,
         )
         for (_, camera, *_), numbers in members.items()
     )
@@ -115,6 +140,15 @@ def group_by_given(photos: Photos, given: GivenIntrinsics) -> PhotoGroups:
 def start_model(exif: Exif) -> str:
     """Return the initial COLMAP camera model: one distortion term, or a fisheye if the lens suggests it."""
     return START_FISHEYE if "fisheye" in (exif.lens or "").lower() else START_MODEL
+
+
+def _panorama_notes(groups: Sequence[CameraGroup], *, chosen: bool) -> tuple[str, ...]:
+    """Return a note on photos taken for panoramas without the user's word."""
+    count = sum(len(group.photos) for group in groups if group.is_panorama)
+    if chosen or not count:
+        return ()
+    these = "this photo shows" if count == 1 else f"{count} photos show"
+    return (f"{these} the whole sphere (equirectangular); if not, give --camera-model SIMPLE_RADIAL",)
 
 
 def _doubts(doubted: Mapping[str, Sequence[str]]) -> tuple[str, ...]:

@@ -11,6 +11,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from nerfcli.poses.model.projection import offsets_px
+
 Array = NDArray[np.float64]
 
 _FRACTION = 0.1
@@ -156,8 +158,8 @@ def observation_errors_px(model: pycolmap.Reconstruction) -> Array:
         points = np.array([model.point3D(point.point3D_id).xyz for point in seen])
         pose = image.cam_from_world()
         local = points @ pose.rotation.matrix().T + pose.translation
-        projected = np.asarray(model.camera(image.camera_id).img_from_cam(local), dtype=np.float64).reshape(-1, 2)
-        errors.append(np.linalg.norm(projected - np.array([point.xy for point in seen]), axis=1))
+        pixels = np.array([point.xy for point in seen])
+        errors.append(np.linalg.norm(offsets_px(model.camera(image.camera_id), local, pixels), axis=1))
     joined = np.concatenate([np.zeros(0), *errors])
     return joined[np.isfinite(joined)]
 

@@ -29,6 +29,7 @@ from nerfcli.poses.model.point_descriptors import (
     resembling,
     votes,
 )
+from nerfcli.poses.model.projection import is_ahead, offsets_px, projected
 from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs
 
@@ -256,8 +257,8 @@ def _expected(
     """
     local = model_points.places @ pose.rotation.matrix().T + pose.translation
     pixels = np.full((len(local), 2), np.nan)
-    before = local[:, 2] > 0
-    pixels[before] = np.asarray(photo.camera.img_from_cam(local[before]), dtype=np.float64).reshape(-1, 2)
+    ahead = is_ahead(photo.camera, local)
+    pixels[ahead] = projected(photo.camera, local[ahead])
     pixels += photo.tolerance_px * beside
     with np.errstate(invalid="ignore"):
         seen = np.flatnonzero(np.all((pixels >= 0) & (pixels < (photo.camera.width, photo.camera.height)), axis=1))
@@ -314,8 +315,7 @@ def _deviations(photo: PhotoFeatures, model_points: KnownPoints, placed: _Placed
         return np.inf, np.inf
     pose = refined["cam_from_world"]
     local = model_points.places[placed.points] @ pose.rotation.matrix().T + pose.translation
-    pixels = np.asarray(photo.camera.img_from_cam(local), dtype=np.float64).reshape(-1, 2)
-    noise_px = np.sqrt(np.mean((pixels - photo.pixels[placed.features]) ** 2))
+    noise_px = np.sqrt(np.mean(offsets_px(photo.camera, local, photo.pixels[placed.features]) ** 2))
     spread = np.sqrt(np.maximum(np.diag(refined["covariance"]), 0)) * noise_px  # three of angles, three of translation
     distance = np.median(np.linalg.norm(local, axis=1))
     return float(np.degrees(spread[:3].max())), float(spread[3:].max() / distance)

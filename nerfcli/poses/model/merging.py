@@ -19,6 +19,7 @@ from nerfcli.cameras.alignment import align as similarity
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.poses.input.plan import duration
 from nerfcli.poses.model.intrinsics import settle
+from nerfcli.poses.model.projection import is_ahead, offsets_px
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs
 
 Array = NDArray[np.float64]
@@ -158,9 +159,9 @@ def _fits(first: pycolmap.Reconstruction, common: CommonPoints, first_from_secon
         image = first.image(int(photo))
         pose = image.cam_from_world()
         local = moved[rows] @ pose.rotation.matrix().T + pose.translation
-        pixels = np.asarray(first.camera(image.camera_id).img_from_cam(local), dtype=np.float64).reshape(-1, 2)
-        distances = np.linalg.norm(pixels - common.pixels[rows], axis=1)
-        fits[rows] = (local[:, 2] > 0) & (distances < _TOLERANCE_PX)  # NaN is not smaller
+        camera = first.camera(image.camera_id)
+        distances = np.linalg.norm(offsets_px(camera, local, common.pixels[rows]), axis=1)
+        fits[rows] = is_ahead(camera, local) & (distances < _TOLERANCE_PX)  # NaN is not smaller
     return fits
 
 

@@ -13,6 +13,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from nerfcli.poses.model.projection import panorama_camera, px_per_radian
+
 Array = NDArray[np.float64]
 
 # COLMAP verifies matches within 4 px of the epipolar line; a model that fits more than the pair may leave twice that.
@@ -98,7 +100,7 @@ def agreements(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) ->
         pose = second.cam_from_world() * first.cam_from_world().inverse()
         R, t = pose.rotation.matrix(), np.asarray(pose.translation)
         p, q = p[finite] @ R.T, q[finite]  # both in the second camera's axes
-        focal_px = 0.5 * (camera.mean_focal_length() + other_camera.mean_focal_length())
+        focal_px = 0.5 * (px_per_radian(camera) + px_per_radian(other_camera))
         angles = _angles(p, q)
         # Noise decides on which side of the cameras nearly parallel rays meet.
         far = angles * focal_px < TOLERANCE_PX
@@ -167,6 +169,20 @@ def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair
         degrees = float(np.degrees((own.rotation * pose.rotation.inverse()).angle()))
         errors.append(RotationError(pair.one, pair.other, degrees, int(inliers.sum())))
     return errors
+
+
+def panorama_inliers(
+    pixels_one: Array, pixels_other: Array, sizes: tuple[tuple[int, int], tuple[int, int]], *, within_px: float
+) -> NDArray[np.bool_]:
+    """Return which matches (n, 2) of two panoramas of these (width, height) agree on one motion of the camera."""
+    if not len(pixels_one):
+        return np.zeros(0, dtype=bool)
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed = within_px, 0
+    found = pycolmap.estimate_relative_pose(
+        panorama_camera(sizes[0]), pixels_one, panorama_camera(sizes[1]), pixels_other, options=options
+    )
+    return np.zeros(len(pixels_one), dtype=bool) if found is None else np.asarray(found["inlier_mask"], dtype=bool)
 
 
 def strongest(pairs: Sequence[VerifiedPair], *, per_photo: int) -> list[VerifiedPair]:

@@ -1,0 +1,240 @@
+"""Photos of 360-degree cameras: told from others, placed by structure from motion, trained on and rendered."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import error_of, nerfcli
+from in_this_process import poses_in_this_process
+from panorama_room import CENTRES, WIDTH, world_from_cam, write_panoramas
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from nerfcli import scene as scenes
+from nerfcli.cameras.alignment import align
+from nerfcli.cameras.camera import Camera
+from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.media.images import read_image
+from nerfcli.media.panoramas import PANORAMA, is_panorama
+from nerfcli.poses.input.photos import find_photos
+from nerfcli.poses.input.settings import PoseSettings, for_panoramas
+from nerfcli.poses.judge.acceptance import nothing_placed
+from nerfcli.poses.judge.parallax import panorama_rotation_fit
+from nerfcli.poses.model.cameras import group_photos
+from nerfcli.poses.model.projection import is_ahead, offsets_px, panorama_camera, projected, px_per_radian
+from nerfcli.poses.model.two_views import VerifiedPair, panorama_inliers, rays
+
+DESK = Path(__file__).parent.parent / "sample_scenes" / "desk" / "images"
+FEW = PoseSettings(max_features=400, threads=1)
+XMP = (
+    '<rdf:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
+    'GPano:ProjectionType="{projection}" GPano:FullPanoWidthPixels="{full}">'
+    "<GPano:CroppedAreaImageWidthPixels>{cropped}</GPano:CroppedAreaImageWidthPixels></rdf:Description>"
+)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture") / "my room"
+    write_panoramas(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("solved") / "scene"
+    report = poses_in_this_process(photos, folder, FEW)
+    assert (report.registered, report.total) == (6, 6)
+    return folder
+
+
+# Which photos are panoramas
+
+
+def test_panoramas_without_metadata_are_told_by_their_edges_and_poles(photos):
+    assert all(photo.is_panorama for photo in find_photos(photos).photos)
+
+
+def test_a_panorama_may_begin_at_any_longitude_but_not_be_cut(photos, tmp_path):
+    picture = read_image(photos / "0.png")
+    for turned in (1, 100, WIDTH // 2):
+        assert is_panorama(photos / "0.png", np.roll(picture, turned, axis=1))
+    for cut in (picture[: WIDTH // 4], picture[:, : WIDTH // 2], picture[10:-10, 20:-20], picture[:, ::-1][:, 100:]):
+        height = len(cut) - len(cut) % 2
+        assert not is_panorama(photos / "0.png", np.ascontiguousarray(cut[:height, : 2 * height]))
+
+
+def test_other_pictures_of_this_shape_are_no_panoramas():
+    rng = np.random.default_rng(0)
+    ramp = np.linspace(0, 255, 200)[:, None, None].repeat(400, axis=1).repeat(3, axis=2)
+    object_on_white = np.full((200, 400, 3), 255.0)
+    object_on_white[60:140, 150:250] = rng.uniform(0, 255, (80, 100, 3))
+    bars = rng.uniform(0, 255, (200, 400, 3))
+    bars[:30] = bars[-30:] = 0
+    for other in (ramp, object_on_white, bars, np.zeros((200, 400, 3))):
+        assert not is_panorama(DESK / "desk_000.jpg", other.astype(np.uint8))
+    for path in sorted(DESK.iterdir())[:12]:
+        picture = read_image(path)
+        top = (len(picture) - picture.shape[1] // 2) // 2
+        assert not is_panorama(path, picture[top : top + picture.shape[1] // 2])
+
+
+@pytest.mark.parametrize(
+    ("projection", "full", "cropped", "size", "expected"),
+    [
+        ("equirectangular", 64, 64, (64, 32), True),
+        ("cylindrical", 64, 64, (64, 32), False),
+        ("equirectangular", 128, 64, (64, 32), False),
+        ("equirectangular", 64, 64, (64, 40), False),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+def test_metadata_tells_panoramas_that_show_nothing(projection, full, cropped, size, expected, suffix, tmp_path):
+    path = tmp_path / f"grey{suffix}"
+    xmp = XMP.format(projection=projection, full=full, cropped=cropped).encode()
+    image = Image.new("RGB", size, (90, 90, 90))
+    if suffix == ".png":
+        from PIL.PngImagePlugin import PngInfo
+
+        info = PngInfo()
+        info.add_itxt("XML:com.adobe.xmp", xmp.decode())
+        image.save(path, pnginfo=info)
+    else:
+        image.save(path, xmp=xmp)
+    assert is_panorama(path, read_image(path)) == expected
+
+
+def test_most_photos_of_a_camera_decide(photos):
+    found = find_photos(photos)
+    few = replace(found, photos=tuple(replace(p, is_panorama=number > 3) for number, p in enumerate(found.photos)))
+    most = replace(found, photos=tuple(replace(p, is_panorama=number > 1) for number, p in enumerate(found.photos)))
+    assert [group.model for group in group_photos(few, model="auto").groups] == ["SIMPLE_RADIAL"]
+    grouped = group_photos(most, model="auto")
+    (group,) = grouped.groups
+    assert (group.model, group.params, group.fixed) == (PANORAMA, (768.0, 384.0), True)
+    assert grouped.notes == (
+        "6 photos show the whole sphere (equirectangular); if not, give --camera-model SIMPLE_RADIAL",
+    )
+
+
+def test_the_user_has_the_last_word(photos):
+    found = find_photos(photos)
+    assert group_photos(found, model="SIMPLE_RADIAL").groups[0].model == "SIMPLE_RADIAL"
+    chosen = group_photos(
+        replace(found, photos=tuple(replace(p, is_panorama=False) for p in found.photos)), model=PANORAMA
+    )
+    assert (chosen.groups[0].model, chosen.notes) == (PANORAMA, ())
+    with pytest.raises(UserError, match=r"0.png is no panorama of the whole sphere: 768x380 pixels") as caught:
+        group_photos(replace(found, photos=tuple(replace(p, height=380) for p in found.photos)), model=PANORAMA)
+    assert caught.value.exit_code == BAD_INPUT
+
+
+# Geometry
+
+
+def test_pixels_are_those_of_our_own_camera():
+    """The cameras of pycolmap and of `nerfcli.cameras` agree in every direction."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(500, 3))
+    ours, valid = Camera(PANORAMA, 800, 400, (800.0, 400.0)).project(points)
+    assert valid.all()
+    camera = panorama_camera((800, 400))
+    assert np.allclose(projected(camera, points), ours, atol=1e-9)
+    assert np.allclose(rays(camera, ours), points / np.linalg.norm(points, axis=1, keepdims=True), atol=1e-9)
+    assert is_ahead(camera, points).all()
+
+
+def test_offsets_cross_the_edge_of_a_panorama():
+    camera = panorama_camera((800, 400))
+    behind = np.array([[1e-3, 0.0, -1.0], [-1e-3, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    pixels = np.array([[0.5, 200.0], [799.5, 200.0], [600.5, 201.0]])
+    px = 1e-3 * px_per_radian(camera)
+    expected = [[-px - 0.5, 0.0], [px + 0.5, 0.0], [-0.5, -1.0]]
+    assert np.allclose(offsets_px(camera, behind, pixels), expected, atol=1e-6)
+
+
+def test_pixels_per_radian_are_those_of_a_small_turn():
+    camera = panorama_camera((800, 400))
+    turned = projected(camera, np.array([[np.sin(1e-6), 0.0, np.cos(1e-6)], [0.0, np.sin(1e-6), np.cos(1e-6)]]))
+    assert np.allclose((turned - [400.0, 200.0]).max(axis=1) / 1e-6, px_per_radian(camera), rtol=1e-6)
+
+
+def seen_twice(shift: float, *, wrong: int = 0) -> VerifiedPair:
+    """Return matches of two panoramas: turned by 100 degrees, moved by `shift` with points 2 to 5 away."""
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(120, 3))
+    points *= (rng.uniform(2, 5, 120) / np.linalg.norm(points, axis=1))[:, None]
+    camera = panorama_camera((800, 400))
+    turn = Rotation.from_euler("yx", [100.0, 5.0], degrees=True).as_matrix()
+    other = projected(camera, (points - [shift, 0.0, 0.0]) @ turn.T)
+    other[:wrong] = rng.uniform((0, 0), (800, 400), (wrong, 2))
+    return VerifiedPair(1, 2, projected(camera, points), other)
+
+
+@pytest.mark.parametrize(("shift", "turned"), [(0.0, True), (0.005, True), (0.3, False)])
+def test_turns_and_movements_of_panoramas_are_told_apart(shift, turned):
+    fit = panorama_rotation_fit([seen_twice(shift)], {1: (800, 400), 2: (800, 400)})
+    assert fit is not None
+    assert fit.explains_all == turned
+    assert fit.parallax_px < 1e-6 if shift == 0 else fit.parallax_px > 0
+    assert [failure.kind for failure in nothing_placed(fit).failures] == ["no baseline (pure rotation)"] * turned
+    assert panorama_rotation_fit([], {}) is None
+
+
+def test_matches_of_panoramas_that_agree_on_one_motion():
+    pair = seen_twice(0.5, wrong=40)
+    agree = panorama_inliers(pair.pixels_one, pair.pixels_other, ((800, 400), (800, 400)), within_px=2.0)
+    assert agree[40:].all()
+    assert agree[:40].mean() < 0.2  # wrong ones near their epipolar line
+    assert panorama_inliers(np.zeros((0, 2)), np.zeros((0, 2)), ((8, 4), (8, 4)), within_px=2.0).shape == (0,)
+
+
+# From photos to pictures
+
+
+def test_poses_of_panoramas_are_the_true_ones(scene):
+    found = scenes.load(scene)
+    numbers = [int(Path(frame.name).stem) for frame in found.frames]
+    assert {frame.camera for frame in found.frames} == {Camera(PANORAMA, 768, 384, (768.0, 384.0))}
+    poses = np.array([frame.world_from_cam for frame in found.frames])
+    truth_from_scene = align(poses[:, :3, 3], CENTRES[numbers])
+    assert np.abs(truth_from_scene.apply(poses[:, :3, 3]) - CENTRES[numbers]).max() < 2e-3  # metres
+    for number, pose in zip(numbers, poses, strict=True):
+        apart = world_from_cam(number).T @ truth_from_scene.rotation @ pose[:3, :3]
+        assert np.degrees(Rotation.from_matrix(apart).magnitude()) < 0.1
+    report = json.loads((scene / "poses_report.json").read_text())
+    assert report["verdict"]["accepted"]
+    assert report["verdict"]["measures"]["share_in_front"] == 1.0
+    assert report["verdict"]["measures"]["parallax_px"] > 10
+    assert report["verdict"]["measures"]["focal_over_longer_side"] == []
+    assert not report["not_computed"]
+
+
+def test_features_of_panoramas_are_more_and_of_larger_pictures():
+    assert for_panoramas(FEW) == replace(FEW, max_image_size=3200, max_features=800)
+
+
+def test_a_field_of_panoramas_renders_distances_along_rays(scene, tmp_path):
+    run = tmp_path / "run"
+    assert nerfcli("train", scene, "-o", run, "--steps", "2", "--downscale", "8", "--model", "default").exit_code == 0
+    assert nerfcli("render", run, "--outputs", "rgb,depth", "--depth-format", "npy").exit_code == 0
+    (picture,) = (run / "renders" / "test-conditional-ray" / "rgb").glob("*.png")
+    assert read_image(picture).shape == (48, 96, 3)
+    pinhole = nerfcli("render", run, "--cameras", "orbit", "--count", "2", "--lens", "pinhole", "--outputs", "depth")
+    assert pinhole.exit_code == 0, pinhole.stderr
+    assert (run / "renders" / "orbit-pinhole-conditional-z").is_dir()
+    error, hint = error_of(nerfcli("render", run, "--outputs", "depth", "--depth-axis", "z"))
+    assert "equirectangular" in error
+    assert "--depth-axis ray" in hint
+
+
+def test_doctor_knows_panoramas(photos, tmp_path):
+    done = nerfcli("doctor", photos, "-o", tmp_path / "page.html", "--json")
+    found = json.loads(done.stdout)
+    verdicts = {finding["check"]: finding for finding in found["findings"]}
+    assert verdicts["focal length"]["summary"] == "panoramas of the whole sphere need none"
+    assert verdicts["connectivity"]["verdict"] == "good"
+    assert not {"moving content", "movement", "depth relief"} & verdicts.keys()
+    assert any("whole sphere" in item["reason"] for item in found["not_checked"])
