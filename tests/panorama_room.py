@@ -25,8 +25,11 @@ def world_from_cam(number: int) -> np.ndarray:
     return turned.as_matrix() @ level
 
 
-def render(centre: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Return the panorama seen from `centre`: columns are longitudes, in the middle that of the camera's z axis."""
+def render(centre: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the panorama seen from `centre`, and the distances along its rays.
+
+    Columns are longitudes, in the middle that of the camera's z axis.
+    """
     width = WIDTH
     longitude, latitude = np.meshgrid(
         ((np.arange(width) + 0.5) / width - 0.5) * 2 * np.pi, ((np.arange(width // 2) + 0.5) / width - 0.25) * 2 * np.pi
@@ -45,14 +48,14 @@ def render(centre: np.ndarray, rotation: np.ndarray) -> np.ndarray:
                 places = centre + np.minimum(along, 1e3)[..., None] * directions
                 inside = np.all((places >= low) & (places <= high) | (np.arange(3) == axis), axis=-1)
                 hit = inside & (along > 0) & (along < nearest)
-                u, v = (np.float32(120 * places[..., other]) for other in others)
+                u, v = ((120 * places[..., other]).astype(np.float32) for other in others)
                 painted = cv2.remap(wall(2 * seed + axis), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
                 nearest, picture = np.where(hit, along, nearest), np.where(hit[..., None], painted, picture)
-    return picture
+    return picture, nearest
 
 
 def write_panoramas(folder: Path) -> None:
     """Write the panoramas, as a 360-degree camera without metadata stores them."""
     folder.mkdir(parents=True)
     for number, centre in enumerate(CENTRES):
-        Image.fromarray(render(centre, world_from_cam(number))).save(folder / f"{number}.png")
+        Image.fromarray(render(centre, world_from_cam(number))[0]).save(folder / f"{number}.png")

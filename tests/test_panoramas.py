@@ -8,16 +8,21 @@ import numpy as np
 import pytest
 from commands import error_of, nerfcli
 from in_this_process import poses_in_this_process
-from panorama_room import CENTRES, WIDTH, world_from_cam, write_panoramas
+from panorama_room import CENTRES, WIDTH, render, world_from_cam, write_panoramas
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from nerfcli import scene as scenes
 from nerfcli.cameras.alignment import align
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.media.images import read_image
 from nerfcli.media.panoramas import PANORAMA, is_panorama
+from nerfcli.multiview.panorama_faces import FACES, Faces
+from nerfcli.multiview.stereo import dense_depths
+from nerfcli.multiview.tracks import Tracks, tracks_of_model
+from nerfcli.photos.loading import LoadedPhoto, load_photos
 from nerfcli.poses.input.photos import find_photos
 from nerfcli.poses.input.settings import PoseSettings, for_panoramas
 from nerfcli.poses.judge.acceptance import nothing_placed
@@ -189,6 +194,83 @@ def test_matches_of_panoramas_that_agree_on_one_motion():
     assert agree[40:].all()
     assert agree[:40].mean() < 0.2  # wrong ones near their epipolar line
     assert panorama_inliers(np.zeros((0, 2)), np.zeros((0, 2)), ((8, 4), (8, 4)), within_px=2.0).shape == (0,)
+
+
+# Faces of a cube
+
+
+def by_direction(directions: np.ndarray) -> np.ndarray:
+    """Return a colour for each direction, levels (N, 3), that changes smoothly over the sphere."""
+    return 128 + 100 * directions
+
+
+def loaded(picture: np.ndarray, used: np.ndarray | None = None) -> LoadedPhoto:
+    height, width = picture.shape[:2]
+    camera = Camera(PANORAMA, width, height, (float(width), float(height)))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", [10, 50, -20], degrees=True).as_matrix(), (1, 2, 3)
+    return LoadedPhoto(Frame("a.png", camera, pose, image=None), picture.astype(np.uint8), used)
+
+
+def test_faces_show_what_the_panorama_shows_in_their_directions():
+    camera = Camera(PANORAMA, 400, 200, (400.0, 200.0))
+    photo = loaded(by_direction(camera.pixel_bearings()[0]).reshape(200, 400, 3))
+    faces = Faces.of([photo])
+    assert len(faces.photos) == FACES == 6
+    seen = np.zeros((200, 400), bool)
+    for number, face in enumerate(faces.photos):
+        frame = face.frame
+        in_panorama = (
+            frame.camera.pixel_bearings()[0] @ (photo.frame.world_from_cam[:3, :3].T @ frame.world_from_cam[:3, :3]).T
+        )
+        assert np.allclose(face.pixels.reshape(-1, 3), by_direction(in_panorama), atol=2.5), number
+        assert np.array_equal(frame.centre, photo.frame.centre)
+        assert np.isclose(np.linalg.det(frame.world_from_cam[:3, :3]), 1)
+        every = np.stack(np.meshgrid(np.arange(frame.camera.width), np.arange(frame.camera.height)), -1).reshape(-1, 2)
+        nothing = np.zeros((0, 2), np.int64)
+        pixels, index = faces.joined(0, [every if other == number else nothing for other in range(6)])
+        assert np.abs(by_direction(in_panorama)[index] - photo.pixels[pixels[:, 1], pixels[:, 0]]).max() < 4
+        seen[pixels[:, 1], pixels[:, 0]] = True
+    assert seen[50:150].mean() > 0.95  # around the poles a panorama has more pixels than the faces
+    assert seen[[2, -3]].any(axis=1).all()
+
+
+def test_other_photos_stay_as_they_are_among_faces():
+    panorama = loaded(np.zeros((20, 40, 3)), used=np.arange(800).reshape(20, 40) >= 400)  # the upper half is masked
+    pinhole = LoadedPhoto(
+        Frame("b.png", Camera.pinhole(8, 6, 5.0), np.eye(4), image=None), np.zeros((6, 8, 3), np.uint8), None
+    )
+    faces = Faces.of([pinhole, panorama, pinhole])
+    assert faces.photos[0] is faces.photos[7] is pinhole
+    assert [faces.own(number) for number in range(3)] == [slice(0, 1), slice(1, 7), slice(7, 8)]
+    *_, up, down = faces.photos[1:7]
+    assert up.used is not None
+    assert not up.used.any()
+    assert down.used is not None
+    assert down.used.all()
+    tracks = faces.tracks(Tracks(np.array([0, 1, 2]), np.array([0, 0, 1]), np.ones((3, 3))))
+    assert tracks.photos.tolist() == [0, 1, 7]
+    pixels, index = faces.joined(2, [np.array([[3, 4], [1, 2]])])
+    assert pixels.tolist() == [[3, 4], [1, 2]]
+    assert index.tolist() == [0, 1]
+
+
+def test_stereo_measures_distances_all_around(scene):
+    found = scenes.load(scene)
+    photos = load_photos(found.frames, factor=1, threads=2)
+    tracks = tracks_of_model(found, photos)
+    depths = dense_depths(photos, tracks, longer_side_px=300, threads=2)
+    numbers = [int(Path(frame.name).stem) for frame in found.frames]
+    scale = align(np.array([frame.centre for frame in found.frames]), CENTRES[numbers]).scale
+    for number, depth in zip(numbers, depths, strict=True):
+        _, truth = render(CENTRES[number], world_from_cam(number))
+        columns, rows = depth.pixels.T
+        errors = np.abs(scale * depth.distances / truth[rows, columns] - 1)
+        assert len(errors) > 0.1 * truth.size
+        assert np.median(errors) < 0.01
+        assert (errors < 0.05).mean() > 0.9
+        quarters = np.bincount(columns * 4 // WIDTH, minlength=4)
+        assert quarters.min() > 0.03 * quarters.sum()  # not only in front
 
 
 # From photos to pictures

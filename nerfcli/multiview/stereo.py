@@ -14,6 +14,7 @@ import numpy as np
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.rigid import apply, inverse
+from nerfcli.multiview.panorama_faces import FACES, Faces
 from nerfcli.multiview.tracks import Tracks
 from nerfcli.multiview.triangulation import LEAST_ANGLE_RAD, triangulate
 from nerfcli.photos.loading import LoadedPhoto
@@ -88,7 +89,10 @@ class _View:
 
 def affordable_side_px(photos: Sequence[LoadedPhoto], *, seconds: float, threads: int) -> int:
     """Return the longer side of the pictures that can be matched in a given time; 0 if it is too short."""
-    aspects = [min(photo.pixels.shape[:2]) / max(photo.pixels.shape[:2]) for photo in photos]
+    aspects = [
+        FACES if photo.frame.camera.is_spherical else min(photo.pixels.shape[:2]) / max(photo.pixels.shape[:2])
+        for photo in photos
+    ]
     side = min(LONGER_SIDE_PX, math.sqrt(seconds * threads / (SECONDS_PER_PIXEL * sum(aspects))))
     return int(side) if side >= LEAST_SIDE_PX else 0
 
@@ -100,7 +104,8 @@ def dense_depths(
 
     Each photo is rectified with up to `NEIGHBOURS` others and matched by semi-global matching. A depth is accepted if
     `LEAST_AGREEING` neighbours agree on it within the errors (one, where there is only one), and if the depth map of a
-    neighbour confirms it. It is the mean of the agreeing depths, weighted by inverse variance.
+    neighbour confirms it. It is the mean of the agreeing depths, weighted by inverse variance. Panoramas are matched by
+    the faces of a cube, each like a photo.
 
     Args:
         photos: the training photos.
@@ -113,6 +118,19 @@ def dense_depths(
 
     Source: Hirschmüller 2008, Stereo processing by semi-global matching, TPAMI 30(2); OpenCV's StereoSGBM.
     """
+    faces = Faces.of(photos)
+    found = _depths_of(faces.photos, faces.tracks(tracks), longer_side_px=longer_side_px, threads=threads)
+    depths = []
+    for number in range(len(photos)):
+        own = found[faces.own(number)]
+        pixels, index = faces.joined(number, [depth.pixels for depth in own])
+        distances, errors = (np.concatenate([getattr(d, name) for d in own])[index] for name in ("distances", "errors"))
+        depths.append(DenseDepth(pixels, distances, errors))
+    return depths
+
+
+def _depths_of(photos: Sequence[LoadedPhoto], tracks: Tracks, *, longer_side_px: int, threads: int) -> list[DenseDepth]:
+    """Return `dense_depths` of photos that are no panoramas."""
     points, shown = _points_shown(photos, tracks)
     centres = np.array([photo.frame.centre for photo in photos])
     near = _neighbours(points, shown, centres)
