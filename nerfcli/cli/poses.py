@@ -72,7 +72,7 @@ def poses(
         Path | None, typer.Option(help="File with the pairs of photos to match, two names per line.", dir_okay=False)
     ] = None,
     camera_model: Annotated[
-        str, typer.Option(help="auto, or a COLMAP camera model such as SIMPLE_RADIAL or OPENCV.")
+        str, typer.Option(help="auto, or a COLMAP camera model: SIMPLE_RADIAL, OPENCV, EQUIRECTANGULAR...")
     ] = "auto",
     intrinsics: Intrinsics = None,
     intrinsics_as: IntrinsicsAs = None,

@@ -92,7 +92,8 @@ def _describe_scene(folder: Path) -> dict[str, Any]:
         "held_out": len(scene.test_frames),
         "missing": len(scene.missing),
         "cameras": [
-            f"{lens.model} {lens.width}x{lens.height} focal {lens.focal_px:.1f} px"
+            f"{lens.model} {lens.width}x{lens.height} "
+            + ("all directions" if lens.is_spherical else f"focal {lens.focal_px:.1f} px")
             + (f", {len(cameras)} principal points" if len(cameras) > 1 else "")
             for lens, cameras in list(lenses.items())[:5]
         ],
