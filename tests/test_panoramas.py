@@ -75,10 +75,13 @@ def test_other_pictures_of_this_shape_are_no_panoramas():
     rng = np.random.default_rng(0)
     ramp = np.linspace(0, 255, 200)[:, None, None].repeat(400, axis=1).repeat(3, axis=2)
     object_on_white = np.full((200, 400, 3), 255.0)
-    object_on_white[60:140, 150:250] = rng.uniform(0, 255, (80, 100, 3))
+    object_on_white[20:180, 60:340] = rng.uniform(0, 255, (160, 280, 3))
+    # The edges differ less than distant columns, but more than neighbours.
+    waves = np.sin(np.linspace(0, 1.08 * 2 * np.pi, 400)) * np.sin(np.linspace(0, np.pi, 200))[:, None]
+    cut = (0.5 * ramp[..., 0] + 60 * (1 + waves))[..., None].repeat(3, axis=2)
     bars = rng.uniform(0, 255, (200, 400, 3))
     bars[:30] = bars[-30:] = 0
-    for other in (ramp, object_on_white, bars, np.zeros((200, 400, 3))):
+    for other in (ramp, object_on_white, cut, bars, np.zeros((200, 400, 3))):
         assert not is_panorama(DESK / "desk_000.jpg", other.astype(np.uint8))
     for path in sorted(DESK.iterdir())[:12]:
         picture = read_image(path)
@@ -213,26 +216,26 @@ def loaded(picture: np.ndarray, used: np.ndarray | None = None) -> LoadedPhoto:
 
 
 def test_faces_show_what_the_panorama_shows_in_their_directions():
-    camera = Camera(PANORAMA, 400, 200, (400.0, 200.0))
-    photo = loaded(by_direction(camera.pixel_bearings()[0]).reshape(200, 400, 3))
+    camera = Camera(PANORAMA, 100, 50, (100.0, 50.0))
+    photo = loaded(by_direction(camera.pixel_bearings()[0]).reshape(50, 100, 3))
     faces = Faces.of([photo])
     assert len(faces.photos) == FACES == 6
-    seen = np.zeros((200, 400), bool)
+    seen = np.zeros((50, 100), bool)
     for number, face in enumerate(faces.photos):
         frame = face.frame
         in_panorama = (
             frame.camera.pixel_bearings()[0] @ (photo.frame.world_from_cam[:3, :3].T @ frame.world_from_cam[:3, :3]).T
         )
-        assert np.allclose(face.pixels.reshape(-1, 3), by_direction(in_panorama), atol=2.5), number
+        assert np.allclose(face.pixels.reshape(-1, 3), by_direction(in_panorama), atol=1.8), number
         assert np.array_equal(frame.centre, photo.frame.centre)
         assert np.isclose(np.linalg.det(frame.world_from_cam[:3, :3]), 1)
         every = np.stack(np.meshgrid(np.arange(frame.camera.width), np.arange(frame.camera.height)), -1).reshape(-1, 2)
         nothing = np.zeros((0, 2), np.int64)
         pixels, index = faces.joined(0, [every if other == number else nothing for other in range(6)])
-        assert np.abs(by_direction(in_panorama)[index] - photo.pixels[pixels[:, 1], pixels[:, 0]]).max() < 4
+        assert np.abs(by_direction(in_panorama)[index] - photo.pixels[pixels[:, 1], pixels[:, 0]]).max() < 8
         seen[pixels[:, 1], pixels[:, 0]] = True
-    assert seen[50:150].mean() > 0.95  # around the poles a panorama has more pixels than the faces
-    assert seen[[2, -3]].any(axis=1).all()
+    assert seen[13:37].mean() > 0.95  # around the poles a panorama has more pixels than the faces
+    assert seen[[1, -2]].any(axis=1).all()
 
 
 def test_other_photos_stay_as_they_are_among_faces():
@@ -259,14 +262,14 @@ def test_stereo_measures_distances_all_around(scene):
     found = scenes.load(scene)
     photos = load_photos(found.frames, factor=1, threads=2)
     tracks = tracks_of_model(found, photos)
-    depths = dense_depths(photos, tracks, longer_side_px=300, threads=2)
+    depths = dense_depths(photos, tracks, longer_side_px=220, threads=2)
     numbers = [int(Path(frame.name).stem) for frame in found.frames]
     scale = align(np.array([frame.centre for frame in found.frames]), CENTRES[numbers]).scale
     for number, depth in zip(numbers, depths, strict=True):
         _, truth = render(CENTRES[number], world_from_cam(number))
         columns, rows = depth.pixels.T
         errors = np.abs(scale * depth.distances / truth[rows, columns] - 1)
-        assert len(errors) > 0.1 * truth.size
+        assert len(errors) > 0.08 * truth.size
         assert np.median(errors) < 0.01
         assert (errors < 0.05).mean() > 0.9
         quarters = np.bincount(columns * 4 // WIDTH, minlength=4)
