@@ -16,7 +16,7 @@ from nerfcli import scene as scenes
 from nerfcli.cameras.alignment import align
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
 from nerfcli.media.images import read_image
 from nerfcli.media.panoramas import PANORAMA, is_panorama
 from nerfcli.multiview.panorama_faces import FACES, Faces
@@ -260,12 +260,12 @@ def test_other_photos_stay_as_they_are_among_faces():
 
 def test_stereo_measures_distances_all_around(scene):
     found = scenes.load(scene)
-    photos = load_photos(found.frames, factor=1, threads=2)
+    photos = load_photos(found.frames[:4], factor=1, threads=2)
     tracks = tracks_of_model(found, photos)
     depths = dense_depths(photos, tracks, longer_side_px=220, threads=2)
     numbers = [int(Path(frame.name).stem) for frame in found.frames]
     scale = align(np.array([frame.centre for frame in found.frames]), CENTRES[numbers]).scale
-    for number, depth in zip(numbers, depths, strict=True):
+    for number, depth in zip(numbers[:4], depths, strict=True):
         _, truth = render(CENTRES[number], world_from_cam(number))
         columns, rows = depth.pixels.T
         errors = np.abs(scale * depth.distances / truth[rows, columns] - 1)
@@ -299,6 +299,39 @@ def test_poses_of_panoramas_are_the_true_ones(scene):
 
 def test_features_of_panoramas_are_more_and_of_larger_pictures():
     assert for_panoramas(FEW) == replace(FEW, max_image_size=3200, max_features=800)
+
+
+@pytest.mark.slow
+def test_a_panorama_camera_that_only_turns_is_refused(tmp_path):
+    folder = tmp_path / "turning"
+    folder.mkdir()
+    for number in range(5):
+        Image.fromarray(render(CENTRES[0], world_from_cam(number))[0]).save(folder / f"{number}.png")
+    with pytest.raises(UserError, match=r"no baseline \(pure rotation\)|explains all matches") as caught:
+        poses_in_this_process(folder, tmp_path / "scene", FEW)
+    assert caught.value.exit_code == TOO_FEW_PHOTOS
+
+
+@pytest.mark.slow
+def test_panoramas_and_other_photos_share_a_scene(photos, tmp_path):
+    """Each panorama has a photo beside it, whose focal length is found: that of a face, whose pixels are as large."""
+    folder = tmp_path / "mixed"
+    folder.mkdir()
+    beside = CENTRES + np.random.default_rng(1).uniform(-0.25, 0.25, CENTRES.shape)
+    for number, path in enumerate(sorted(photos.iterdir())):
+        (folder / path.name).write_bytes(path.read_bytes())
+        front = Faces.of([loaded(render(beside[number], world_from_cam(number))[0])]).photos[0].pixels
+        Image.fromarray(front[len(front) // 8 : -len(front) // 8]).save(folder / f"photo {number}.png")
+    report = poses_in_this_process(folder, tmp_path / "scene", FEW)
+    assert (report.registered, report.total) == (12, 12)
+    frames = scenes.load(tmp_path / "scene").frames
+    truth = np.array([beside[int(f.name[6])] if f.name[0] == "p" else CENTRES[int(f.name[0])] for f in frames])
+    centres = np.array([frame.centre for frame in frames])
+    errors = np.linalg.norm(align(centres, truth).apply(centres) - truth, axis=1)
+    assert errors.max() < 0.02  # metres; a pixel at the distance of the walls
+    assert np.median(errors) < 0.005
+    focals = {frame.camera.focal_px for frame in frames if not frame.camera.is_spherical}
+    assert np.allclose(list(focals), WIDTH / (2 * np.pi), rtol=0.01)
 
 
 def test_a_field_of_panoramas_renders_distances_along_rays(scene, tmp_path):
