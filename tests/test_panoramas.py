@@ -322,14 +322,13 @@ def test_panoramas_and_other_photos_share_a_scene(photos, tmp_path):
         (folder / path.name).write_bytes(path.read_bytes())
         front = Faces.of([loaded(render(beside[number], world_from_cam(number))[0])]).photos[0].pixels
         Image.fromarray(front[len(front) // 8 : -len(front) // 8]).save(folder / f"photo {number}.png")
-    report = poses_in_this_process(folder, tmp_path / "scene", FEW)
+    report = poses_in_this_process(folder, tmp_path / "scene", replace(FEW, max_features=2000))
     assert (report.registered, report.total) == (12, 12)
     frames = scenes.load(tmp_path / "scene").frames
     truth = np.array([beside[int(f.name[6])] if f.name[0] == "p" else CENTRES[int(f.name[0])] for f in frames])
     centres = np.array([frame.centre for frame in frames])
     errors = np.linalg.norm(align(centres, truth).apply(centres) - truth, axis=1)
-    assert errors.max() < 0.02  # metres; a pixel at the distance of the walls
-    assert np.median(errors) < 0.005
+    assert errors.max() < 0.01  # metres; a pixel at the distance of the walls is 0.016
     focals = {frame.camera.focal_px for frame in frames if not frame.camera.is_spherical}
     assert np.allclose(list(focals), WIDTH / (2 * np.pi), rtol=0.01)
 
