@@ -134,7 +134,7 @@ def test_the_user_has_the_last_word(photos):
         replace(found, photos=tuple(replace(p, is_panorama=False) for p in found.photos)), model=PANORAMA
     )
     assert (chosen.groups[0].model, chosen.notes) == (PANORAMA, ())
-    with pytest.raises(UserError, match=r"0.png is no panorama of the whole sphere: 768x380 pixels") as caught:
+    with pytest.raises(UserError, match=r"0.png is not a panorama of the whole sphere: 768x380 pixels") as caught:
         group_photos(replace(found, photos=tuple(replace(p, height=380) for p in found.photos)), model=PANORAMA)
     assert caught.value.exit_code == BAD_INPUT
 
@@ -351,7 +351,7 @@ def test_doctor_knows_panoramas(photos, tmp_path):
     done = nerfcli("doctor", photos, "-o", tmp_path / "page.html", "--json")
     found = json.loads(done.stdout)
     verdicts = {finding["check"]: finding for finding in found["findings"]}
-    assert verdicts["focal length"]["summary"] == "panoramas of the whole sphere need none"
+    assert verdicts["focal length"]["summary"] == "not needed for panoramas of the whole sphere"
     assert verdicts["connectivity"]["verdict"] == "good"
     assert not {"moving content", "movement", "depth relief"} & verdicts.keys()
-    assert any("whole sphere" in item["reason"] for item in found["not_checked"])
+    assert any("panoramas" in item["reason"] for item in found["not_checked"])

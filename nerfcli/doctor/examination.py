@@ -160,7 +160,7 @@ def judged(
         turning = checks.run("turning object", lambda: turntable.turning_object(pairs), otherwise=None)
         planned.append(("connectivity", lambda: connectivity.connectivity(photos, pairs)))
         if len(panoramas) == len(photos):
-            reason = "the photos show the whole sphere: nerfcli poses measures their movement"
+            reason = "not supported for panoramas; nerfcli poses checks that the camera moved"
             not_checked.append(("moving content, movement, depth relief", reason))
         elif turning is None:
             planned += [

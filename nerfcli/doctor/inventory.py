@@ -126,7 +126,7 @@ def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
     if doubtful:
         summary = f"EXIF does not match {several(len(doubtful), 'file')}: {doubtful[0][1]}"
     elif not found:
-        summary = "panoramas of the whole sphere need none"
+        summary = "not needed for panoramas of the whole sphere"
     elif fractions:
         summary = f"{np.median(fractions):.2f} times the longer side, from EXIF ({several(len(fractions), 'photo')})"
     else:

@@ -89,8 +89,8 @@ def _panoramas(photos: tuple[int, ...], first: Photo) -> CameraGroup:
     """Return the group of photos that show the whole sphere: their size determines the camera."""
     if first.width != 2 * first.height:
         raise UserError(
-            f"{first.name} is no panorama of the whole sphere: {first.width}x{first.height} pixels",
-            "equirectangular pictures are twice as wide as high; choose another --camera-model for other photos",
+            f"{first.name} is not a panorama of the whole sphere: {first.width}x{first.height} pixels",
+            "equirectangular pictures are twice as wide as high; choose another --camera-model for these photos",
         )
     size = (float(first.width), float(first.height))
     return CameraGroup(photos, PANORAMA, first.width, first.height, params=size, fixed=True)
