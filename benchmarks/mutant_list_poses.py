@@ -235,8 +235,25 @@ POSES: tuple[Group, ...] = (
         "renders",
         (),
         (
-            Mutant("(lens is None and spherical)", "spherical"),
-            Mutant('or (lens is None and spherical) else "z"', 'else "z"'),
+            Mutant("views.look.lens is not None or views.cameras not in", "views.cameras not in"),
+            Mutant(
+                ' or views.cameras not in ("test", "train", *PATHS):\n        return "ray"', ':\n        return "ray"'
+            ),
+            Mutant('"ray" if any(frame.camera.is_spherical', '"z" if any(frame.camera.is_spherical'),
         ),
+    ),
+    Group(
+        "poses/model/held_out.py",
+        ("tests/test_panoramas.py",),
+        "held_out",
+        (),
+        (Mutant("across_edge(model.camera(image.camera_id), (projected", "((projected"),),
+    ),
+    Group(
+        "doctor/compared_pairs.py",
+        ("tests/test_panoramas.py",),
+        "doctor",
+        (),
+        (Mutant("pinholes = not any(", "pinholes = not all("),),
     ),
 )

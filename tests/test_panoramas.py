@@ -1,10 +1,11 @@
-"""Photos of 360-degree cameras: told from others, placed by structure from motion, trained on and rendered."""
+"""Photos of 360-degree cameras: recognition, poses, stereo matching, training and rendering."""
 
 import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from commands import error_of, nerfcli
 from in_this_process import poses_in_this_process
@@ -16,6 +17,8 @@ from nerfcli import scene as scenes
 from nerfcli.cameras.alignment import align
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.doctor.compared_pairs import compare
+from nerfcli.doctor.photo_facts import Source, read_all
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
 from nerfcli.media.images import read_image
 from nerfcli.media.panoramas import PANORAMA, is_panorama
@@ -27,9 +30,15 @@ from nerfcli.poses.input.photos import find_photos
 from nerfcli.poses.input.settings import PoseSettings, for_panoramas
 from nerfcli.poses.judge.acceptance import nothing_placed
 from nerfcli.poses.judge.parallax import panorama_rotation_fit
-from nerfcli.poses.model.cameras import group_photos
+from nerfcli.poses.model import held_out
+from nerfcli.poses.model.cameras import group_by_given, group_photos
 from nerfcli.poses.model.projection import is_ahead, offsets_px, panorama_camera, projected, px_per_radian
 from nerfcli.poses.model.two_views import VerifiedPair, panorama_inliers, rays
+from nerfcli.runs.run import load_run
+from nerfcli.workflows.poses import given_intrinsics
+from nerfcli.workflows.render import render_run
+from nerfcli.workflows.report import report_runs
+from nerfcli.workflows.views import Views, usual_axis
 
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk" / "images"
 FEW = PoseSettings(max_features=400, threads=1)
@@ -58,7 +67,7 @@ def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 # Which photos are panoramas
 
 
-def test_panoramas_without_metadata_are_told_by_their_edges_and_poles(photos):
+def test_panoramas_without_metadata_are_recognized_by_their_edges_and_poles(photos):
     assert all(photo.is_panorama for photo in find_photos(photos).photos)
 
 
@@ -99,7 +108,7 @@ def test_other_pictures_of_this_shape_are_no_panoramas():
     ],
 )
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
-def test_metadata_tells_panoramas_that_show_nothing(projection, full, cropped, size, expected, suffix, tmp_path):
+def test_metadata_identifies_panoramas_without_content(projection, full, cropped, size, expected, suffix, tmp_path):
     path = tmp_path / f"grey{suffix}"
     xmp = XMP.format(projection=projection, full=full, cropped=cropped).encode()
     image = Image.new("RGB", size, (90, 90, 90))
@@ -123,7 +132,8 @@ def test_most_photos_of_a_camera_decide(photos):
     (group,) = grouped.groups
     assert (group.model, group.params, group.fixed) == (PANORAMA, (768.0, 384.0), True)
     assert grouped.notes == (
-        "6 photos show the whole sphere (equirectangular); if not, give --camera-model SIMPLE_RADIAL",
+        "6 photos recognized as 360-degree panoramas (equirectangular); if this is wrong, give "
+        "--camera-model SIMPLE_RADIAL",
     )
 
 
@@ -152,6 +162,9 @@ def test_pixels_are_those_of_our_own_camera():
     assert np.allclose(projected(camera, points), ours, atol=1e-9)
     assert np.allclose(rays(camera, ours), points / np.linalg.norm(points, axis=1, keepdims=True), atol=1e-9)
     assert is_ahead(camera, points).all()
+    pinhole = pycolmap.Camera(model="PINHOLE", width=800, height=400, params=[500.0, 500.0, 400.0, 200.0])
+    assert np.array_equal(is_ahead(pinhole, points), points[:, 2] > 0)
+    assert np.isnan(projected(pinhole, points[points[:, 2] < 0])).all()
 
 
 def test_offsets_cross_the_edge_of_a_panorama():
@@ -161,6 +174,28 @@ def test_offsets_cross_the_edge_of_a_panorama():
     px = 1e-3 * px_per_radian(camera)
     expected = [[-px - 0.5, 0.0], [px + 0.5, 0.0], [-0.5, -1.0]]
     assert np.allclose(offsets_px(camera, behind, pixels), expected, atol=1e-6)
+    pinhole = pycolmap.Camera(model="PINHOLE", width=800, height=400, params=[500.0, 500.0, 400.0, 200.0])
+    far = offsets_px(pinhole, np.array([[0.0, 0.0, 1.0]]), np.array([[-300.0, 200.0]]))
+    assert np.allclose(far, [[700.0, 0.0]])  # not shortened by 800
+    assert px_per_radian(pinhole) == 500.0
+
+
+def test_held_out_errors_cross_the_edge_of_a_panorama(scene):
+    """An observation moved to the other side of the edge, where it is the same place, has the same error."""
+    model = pycolmap.Reconstruction(str(scene / "sparse" / "0"))
+    _, held = held_out.split(model, seed=0)
+    moved = replace(held, pixels=held.pixels + np.array([WIDTH, 0.0]))
+    assert len(held.points) > 20
+    assert np.allclose(held_out.errors_px(model, moved), held_out.errors_px(model, held), atol=1e-6)
+
+
+@pytest.mark.parametrize("use", ["fixed", "prior"])
+def test_given_panorama_cameras_are_fixed(photos, tmp_path, use):
+    (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 768 384 768 384\n")
+    given = given_intrinsics(tmp_path / "cameras.txt", photos, use=use)
+    assert given is not None
+    (group,) = group_by_given(find_photos(photos), given).groups
+    assert (group.model, group.params, group.fixed, group.is_panorama) == (PANORAMA, (768.0, 384.0), True, True)
 
 
 def test_pixels_per_radian_are_those_of_a_small_turn():
@@ -182,7 +217,7 @@ def seen_twice(shift: float, *, wrong: int = 0) -> VerifiedPair:
 
 
 @pytest.mark.parametrize(("shift", "turned"), [(0.0, True), (0.005, True), (0.3, False)])
-def test_turns_and_movements_of_panoramas_are_told_apart(shift, turned):
+def test_rotation_alone_explains_panoramas_only_without_a_baseline(shift, turned):
     fit = panorama_rotation_fit([seen_twice(shift)], {1: (800, 400), 2: (800, 400)})
     assert fit is not None
     assert fit.explains_all == turned
@@ -342,6 +377,17 @@ def test_a_field_of_panoramas_renders_distances_along_rays(scene, tmp_path):
     pinhole = nerfcli("render", run, "--cameras", "orbit", "--count", "2", "--lens", "pinhole", "--outputs", "depth")
     assert pinhole.exit_code == 0, pinhole.stderr
     assert (run / "renders" / "orbit-pinhole-conditional-z").is_dir()
+    cameras = tmp_path / "pinholes"
+    assert nerfcli("render", run, "--cameras", "orbit", "--count", "2", "--lens", "pinhole", "--cameras-only",
+                   "-o", cameras).exit_code == 0  # fmt: skip
+    frames = load_run(run).cameras
+    assert usual_axis(load_run(run), Views("orbit")) == "ray"
+    assert usual_axis(load_run(run), Views(str(cameras))) == "z"
+    assert all(frame.camera.is_spherical for frame in frames.test)
+    written = render_run(run, tmp_path / "by-python")
+    assert {path.name for path in written} == {"rgb", "depth", "opacity"}
+    page = report_runs([run], tmp_path / "page.html").read_text()
+    assert "along the ray" in page
     error, hint = error_of(nerfcli("render", run, "--outputs", "depth", "--depth-axis", "z"))
     assert "equirectangular" in error
     assert "--depth-axis ray" in hint
@@ -355,3 +401,13 @@ def test_doctor_knows_panoramas(photos, tmp_path):
     assert verdicts["connectivity"]["verdict"] == "good"
     assert not {"moving content", "movement", "depth relief"} & verdicts.keys()
     assert any("panoramas" in item["reason"] for item in found["not_checked"])
+
+
+def test_doctor_measures_no_movement_between_a_panorama_and_another_photo(photos):
+    panorama, *_ = read_all([Source("0.png", photos / "0.png")], threads=1, progress=lambda done: None)[0]
+    other, *_ = read_all([Source("1.png", photos / "1.png")], threads=1, progress=lambda done: None)[0]
+    both = compare((panorama, replace(other, is_panorama=False)), (0, 1), (400.0, 400.0))
+    assert both.views is None
+    assert (both.patches, both.motions) == ((), None)
+    pinholes = [replace(photo, is_panorama=False) for photo in (panorama, other)]
+    assert compare((pinholes[0], pinholes[1]), (0, 1), (400.0, 400.0)).inliers > 0

@@ -312,7 +312,7 @@ def render(
                 raise UserError(f"{folder} is a reconstruction of a scan; --dry-run is for photos", "remove --dry-run")
             render_one_scan(folder, one_of_many)
             return
-        axis = depth_axis or usual_axis(load_run(folder), look)
+        axis = depth_axis or usual_axis(load_run(folder), views)
         settings = replace(usual, depth=replace(request, axis=axis))
         name = f"{views.name}-cameras" if cameras_only else folder_name(views, settings)
         target = folder / RENDERS / name

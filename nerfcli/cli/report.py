@@ -45,7 +45,7 @@ def report(
     from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
     from nerfcli.runs.run import load_run
     from nerfcli.workflows.report import report_runs
-    from nerfcli.workflows.views import usual_axis
+    from nerfcli.workflows.views import Views, usual_axis
 
     if not is_convention(depth) or depth == "background":
         choices = ", ".join(name for name in CONVENTIONS if name != "background")
@@ -60,7 +60,7 @@ def report(
             paths,
             output,
             views=views,
-            depth=DepthRequest(convention=depth, axis=depth_axis or usual_axis(load_run(paths[0]))),
+            depth=DepthRequest(convention=depth, axis=depth_axis or usual_axis(load_run(paths[0]), Views("test"))),
             device=device_name(device),
             threads=thread_count(threads),
             overwrite=overwrite,

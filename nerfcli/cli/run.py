@@ -82,7 +82,6 @@ def run(
     from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.memory import default_memory_limit
     from nerfcli.poses.input.settings import Limits, PoseSettings
-    from nerfcli.render.pictures import DepthRequest
     from nerfcli.runs.components import Components, choose
     from nerfcli.runs.run import load_run
     from nerfcli.runs.settings import TrainSettings, sizes_for
@@ -91,7 +90,7 @@ def run(
     from nerfcli.workflows.render import render_run
     from nerfcli.workflows.report import report_runs
     from nerfcli.workflows.train import train_scene, was_interrupted
-    from nerfcli.workflows.views import Views, usual_axis
+    from nerfcli.workflows.views import Views, usual_depth
 
     console = Console(quiet=quiet, json_lines=json)
     requirements, rule = requirements_of(require), holdout_rule(holdout)
@@ -159,7 +158,7 @@ def run(
         console.result(scene)
         console.result(field)
         console.result(evaluation.path, evaluation.metrics)
-        depth = DepthRequest(convention="conditional", axis=usual_axis(load_run(field)))
+        depth = usual_depth(load_run(field), Views("test"))
         for cameras, video in (("test", False), ("orbit", True)):
             settings = ExportSettings(
                 outputs=OUTPUTS[: 2 if video else 3], depth=depth, video=VideoSettings() if video else None
@@ -172,7 +171,7 @@ def run(
             for path in written:
                 console.result(path)
         with console.progress("report") as update:
-            page = report_runs([field], depth=depth, keep=True, **where, notify=console.note, progress=update)
+            page = report_runs([field], keep=True, **where, notify=console.note, progress=update)
         console.note(f"report with all results: {page}")
         console.result(page)
         check_requirements(trained, evaluation.metrics, requirements)

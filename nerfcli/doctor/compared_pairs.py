@@ -85,8 +85,9 @@ def compare(
     one, other = (photo.features for photo in photos)
     a, b = mutual_matches(one.descriptors[:most_features], other.descriptors[:most_features], ratio=LOOSE_RATIO)
     x, y = one.pixels[a], other.pixels[b]
-    panoramas = all(photo.is_panorama for photo in photos)
-    if panoramas:
+    # Movements are estimated for pinholes; two panoramas are compared by their rays, without a movement.
+    pinholes = not any(photo.is_panorama for photo in photos)
+    if all(photo.is_panorama for photo in photos):
         agree = panorama_inliers(x, y, (one.size, other.size), within_px=EPIPOLAR_PX)
     else:
         _, agree = fundamental_matrix(x, y, within_px=EPIPOLAR_PX)
@@ -99,9 +100,9 @@ def compare(
     lighter, redder = (other.light[b[agree]] - one.light[a[agree]]).T
     stops = _median(lighter)
     views, patches, still = None, (), None
-    if not panoramas and one.size == other.size and in_place(x, y, one.size)[0].any():
+    if pinholes and one.size == other.size and in_place(x, y, one.size)[0].any():
         still = motions(x, y, one.size)
-    if not panoramas and count >= _LEAST_FOR_GEOMETRY:
+    if pinholes and count >= _LEAST_FOR_GEOMETRY:
         centres = [np.array(features.size) / 2 for features in (one, other)]
         views = camera_motion.estimate(x[agree] - centres[0], y[agree] - centres[1], focals_px)
         patches = moving_patches(x, y, agree, within_px=EPIPOLAR_PX)

@@ -155,11 +155,10 @@ def judged(
     ]
     not_checked: list[tuple[str, str]] = []
     few = "too few pairs have enough matches"
-    panoramas = [photo for photo in photos if photo.is_panorama]
     if len(photos) > 1:
         turning = checks.run("turning object", lambda: turntable.turning_object(pairs), otherwise=None)
         planned.append(("connectivity", lambda: connectivity.connectivity(photos, pairs)))
-        if len(panoramas) == len(photos):
+        if all(photo.is_panorama for photo in photos):
             reason = "not supported for panoramas; nerfcli poses checks that the camera moved"
             not_checked.append(("moving content, movement, depth relief", reason))
         elif turning is None:

@@ -1,4 +1,4 @@
-"""Panoramas of the whole sphere, as 360-degree cameras take them, told from other photos.
+"""Recognize panoramas of the whole sphere, as 360-degree cameras take them.
 
 Their columns are equal steps of longitude and their rows equal steps of latitude: they are twice as wide as high, the
 left and the right edge are neighbours, and the first and the last row each show a single place.

@@ -1,4 +1,4 @@
-"""Panoramas as the six faces of a cube: pinhole pictures from one place, for what works with these only."""
+"""Six pinhole pictures of each panorama, the faces of a cube, for methods that need pinhole pictures."""
 
 import math
 from collections.abc import Sequence
@@ -87,7 +87,7 @@ def _places(camera: Camera, directions: np.ndarray, turn: np.ndarray) -> np.ndar
 
 
 def _face(photo: LoadedPhoto, turn: np.ndarray) -> LoadedPhoto:
-    """Return a face of a panorama, with as many pixels per radian in its middle."""
+    """Return a face of a panorama, at the panorama's resolution in the middle."""
     camera = photo.frame.camera
     focal_px = camera.width / (2 * math.pi)
     side = max(1, round(2 * focal_px * math.tan(math.radians(FACE_DEG / 2))))

@@ -10,19 +10,16 @@ from nerfcli.errors import UserError
 from nerfcli.export.frames import Workers, automatic_workers, export_frames, export_part
 from nerfcli.export.order import Order, refuse_foreign
 from nerfcli.export.settings import OUTPUTS, ExportSettings
-from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.runs.members import members_of
-from nerfcli.runs.run import Run
+from nerfcli.runs.run import Run, load_run
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 from nerfcli.workflows.photo_depths import depth_errors, photo_depths
-from nerfcli.workflows.views import Views, chosen_frames, refuse_z_depth_for_equirectangular
+from nerfcli.workflows.views import Views, chosen_frames, refuse_z_depth_for_equirectangular, usual_depth
 
 RENDERS = "renders"
 HELD_OUT = Views("test")
-# Colours, depths and opacities, as `nerfcli render` writes them by default.
-USUAL = ExportSettings(outputs=OUTPUTS[:3], depth=DepthRequest(convention="conditional", axis="z"))
 
 
 def folder_name(views: Views, settings: ExportSettings) -> str:
@@ -32,12 +29,17 @@ def folder_name(views: Views, settings: ExportSettings) -> str:
     return f"{views.name}-{settings.depth.convention.replace(':', '-')}-{settings.depth.axis}"
 
 
+def usual_settings(run: Run, views: Views) -> ExportSettings:
+    """Return the settings of colours, depths and opacities, as `nerfcli render` writes them by default."""
+    return ExportSettings(outputs=OUTPUTS[:3], depth=usual_depth(run, views))
+
+
 def render_run(
     run: str | Path,
     target: str | Path | None = None,
     *,
     views: Views = HELD_OUT,
-    settings: ExportSettings = USUAL,
+    settings: ExportSettings | None = None,
     device: str = "auto",
     threads: int = 0,
     step: float = 1.0,
@@ -58,7 +60,7 @@ def render_run(
         run: the folder that `train_scene` wrote.
         target: the folder to write; in RUN/renders by default, named after views and depth.
         views: which cameras; the held-out ones by default.
-        settings: outputs, depth, file formats, videos, and quality of the pictures.
+        settings: outputs, depth, file formats, videos, and quality of the pictures; `usual_settings` by default.
         device: "auto", "cpu", "cuda" or "cuda:1".
         threads: number of CPU threads; 0 for all.
         step: length of the steps along rays, relative to training.
@@ -75,6 +77,7 @@ def render_run(
         UserError: the run or the cameras do not exist, or `target` holds other files.
     """
     trained, cores, torch_device = Run(Path(run)), thread_count(threads), device_name(device)
+    settings = usual_settings(load_run(run), views) if settings is None else settings
     folder = trained.path / RENDERS / folder_name(views, settings) if target is None else Path(target)
     torch.set_num_threads(cores)
     model = trained.model(torch_device)

@@ -18,11 +18,11 @@ from nerfcli.export.frames import MOST_AT_A_TIME, Workers, export_frames
 from nerfcli.export.order import Order
 from nerfcli.export.settings import ExportSettings
 from nerfcli.photos.loading import load_photos
-from nerfcli.runs.run import Run
+from nerfcli.runs.run import Run, load_run
 from nerfcli.train.loop import peak_memory_bytes
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import silent
-from nerfcli.workflows.render import USUAL
+from nerfcli.workflows.render import usual_settings
 from nerfcli.workflows.views import Views, chosen_frames
 
 # Number of measured pictures, and their longer side: large enough to need the memory of a full tile of rays.
@@ -68,7 +68,7 @@ def plan_rendering(
     run: str | Path,
     *,
     views: Views,
-    settings: ExportSettings = USUAL,
+    settings: ExportSettings | None = None,
     device: str = "auto",
     threads: int = 0,
     step: float = 1.0,
@@ -82,6 +82,7 @@ def plan_rendering(
     Raises:
         UserError: see `render_run`; or an output needs the depths of training photos, or members.
     """
+    settings = usual_settings(load_run(run), views) if settings is None else settings
     if settings.needs_visibility or settings.needs_members:
         raise UserError(
             "--dry-run does not cover coverage, parallax, intervals and deviations",

@@ -19,10 +19,10 @@ from nerfcli.runs.run import load_run
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 from nerfcli.workflows.photo_depths import photo_depths
+from nerfcli.workflows.views import Views, usual_depth
 
 # Default of the maximum number of held-out photos on a page.
 VIEWS = 8
-DEPTH = DepthRequest(convention="conditional", axis="z")
 
 
 def report_runs(
@@ -30,7 +30,7 @@ def report_runs(
     page: Path | None = None,
     *,
     views: int = VIEWS,
-    depth: DepthRequest = DEPTH,
+    depth: DepthRequest | None = None,
     device: str = "auto",
     threads: int = 0,
     overwrite: bool = False,
@@ -44,7 +44,7 @@ def report_runs(
         runs: folders that training wrote, at least one.
         page: the file to write; by default RUN/report.html, or report.html beside the first of several runs.
         views: maximum number of held-out photos to show per capture, from the worst to the best.
-        depth: the depth to show.
+        depth: the depth to show; `usual_depth` of the first run by default.
         device, threads: to render with; 0 threads for all.
         overwrite: replace any existing file, even if it is not a report on these runs.
         keep: keep a page that was made from the same files with the same options.
@@ -67,6 +67,7 @@ def report_runs(
         opened.append(run)
         hashes.append(run.checkpoint_sha256())
         facts.append(read_facts(run, label, checkpoint_sha256=hashes[-1]))
+    depth = usual_depth(opened[0], Views("test")) if depth is None else depth
     origin = origin_of(facts, hashes, views=views, depth=depth)
     if keep and not overwrite and is_made_from(target, origin):
         notify(f"{target} is kept: it is up to date; add --overwrite to write it again")

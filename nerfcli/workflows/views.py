@@ -20,6 +20,7 @@ from nerfcli.convert.finding import find_camera_path
 from nerfcli.convert.formats import UserInputs, recognise
 from nerfcli.errors import UserError
 from nerfcli.photos.loading import downscaled_camera
+from nerfcli.render.depth import DepthRequest
 from nerfcli.runs.run import Run
 from nerfcli.workflows.notices import Notify, warn_python
 
@@ -146,11 +147,19 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
     return [replace(frame, camera=look(frame.camera)) for frame in chosen]
 
 
-def usual_axis(run: Run, look: PictureOptions = PictureOptions()) -> str:
-    """Return the usual axis of depth: "z", but "ray" for pictures of all directions, half of which have no z."""
-    lens, cameras = look.lens, run.cameras
-    spherical = any(frame.camera.is_spherical for frame in (*cameras.train, *cameras.test))
-    return "ray" if lens == "equirectangular" or (lens is None and spherical) else "z"
+def usual_axis(run: Run, views: Views) -> str:
+    """Return the usual axis of depth: "z", but "ray" for pictures of all directions, half of which have no z.
+
+    The cameras of a file are not looked at: their axis is "z".
+    """
+    if views.look.lens is not None or views.cameras not in ("test", "train", *PATHS):
+        return "ray" if views.look.lens == "equirectangular" else "z"
+    return "ray" if any(frame.camera.is_spherical for frame in (*run.cameras.train, *run.cameras.test)) else "z"
+
+
+def usual_depth(run: Run, views: Views) -> DepthRequest:
+    """Return the depth that is rendered unless another one is wanted: conditional, along `usual_axis`."""
+    return DepthRequest(convention="conditional", axis=usual_axis(run, views))
 
 
 def refuse_z_depth_for_equirectangular(frames: Sequence[Frame], *, notify: Notify) -> None:

@@ -90,8 +90,8 @@ def result_key(job: Job) -> str:
 def _looked_at(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> tuple[Job, dict[str, Any] | None]:
     """Return the job with masks of an object that turns in front of a static background, and facts to report, if any.
 
-    Held-out photos get masks too, but only features of the training photos are compared. Panoramas are not looked at:
-    what they show without motion is the tripod, or the person who holds the camera.
+    Held-out photos get masks too, but only features of the training photos are compared. Panoramas are not
+    checked: what stands still in them is the tripod, or the person holding the camera.
     """
     if any(group.is_panorama for group in job.groups):
         return job, None

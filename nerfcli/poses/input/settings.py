@@ -59,7 +59,7 @@ class PoseSettings:
 
 
 def for_panoramas(settings: PoseSettings) -> PoseSettings:
-    """Return the settings with features of panoramas: they show six times as much as photos, each thing smaller."""
+    """Return the settings for panoramas, which show about six times as much as a photo, at a smaller scale."""
     return replace(settings, max_image_size=2 * settings.max_image_size, max_features=2 * settings.max_features)
 
 

@@ -81,7 +81,7 @@ def group_photos(photos: Photos, *, model: str) -> PhotoGroups:
 
 
 def _are_panoramas(photos: Sequence[Photo]) -> bool:
-    """Return whether photos of one camera are panoramas; a single one may show what looks otherwise."""
+    """Return whether photos of one camera are panoramas: most of them have to look like one."""
     return sum(photo.is_panorama for photo in photos) > MOST_OF_A_CAMERA * len(photos)
 
 
@@ -143,12 +143,14 @@ def start_model(exif: Exif) -> str:
 
 
 def _panorama_notes(groups: Sequence[CameraGroup], *, chosen: bool) -> tuple[str, ...]:
-    """Return a note on photos taken for panoramas without the user's word."""
+    """Return a note on photos that were recognized as panoramas, unless the user chose the camera model."""
     count = sum(len(group.photos) for group in groups if group.is_panorama)
     if chosen or not count:
         return ()
-    these = "this photo shows" if count == 1 else f"{count} photos show"
-    return (f"{these} the whole sphere (equirectangular); if not, give --camera-model SIMPLE_RADIAL",)
+    return (
+        f"{_photos(count)} recognized as 360-degree panoramas (equirectangular); if this is wrong, give "
+        "--camera-model SIMPLE_RADIAL",
+    )
 
 
 def _doubts(doubted: Mapping[str, Sequence[str]]) -> tuple[str, ...]:

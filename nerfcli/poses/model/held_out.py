@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from nerfcli.poses.model.projection import offsets_px
+from nerfcli.poses.model.projection import across_edge, offsets_px
 
 Array = NDArray[np.float64]
 
@@ -70,9 +70,11 @@ def errors_px(model: pycolmap.Reconstruction, held: HeldOutObservations) -> Arra
     """Return the reprojection error of each held-out observation, (n,); inf if its point does not project."""
     errors = np.full(len(held.points), np.inf)
     for index, (image_id, point_id) in enumerate(zip(held.images, held.points, strict=True)):
-        projected = model.image(int(image_id)).project_point(model.point3D(int(point_id)).xyz)
+        image = model.image(int(image_id))
+        projected = image.project_point(model.point3D(int(point_id)).xyz)
         if projected is not None:
-            errors[index] = np.linalg.norm(projected - held.pixels[index])
+            offset = across_edge(model.camera(image.camera_id), (projected - held.pixels[index])[None])
+            errors[index] = np.linalg.norm(offset)
     return errors
 
 

@@ -130,7 +130,7 @@ def camera_of_lens(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pyc
     """Return the camera of a lens by the ids of images taken with it, at least one: their median principal point."""
     cameras = [model.camera(model.image(photo).camera_id) for photo in photos]
     middle = pycolmap.Camera(cameras[0].todict())
-    if not middle.principal_point_idxs():  # of a panorama
+    if not middle.principal_point_idxs():  # panoramas have none
         return middle
     middle.principal_point_x = float(np.median([camera.principal_point_x for camera in cameras]))
     middle.principal_point_y = float(np.median([camera.principal_point_y for camera in cameras]))

@@ -1,4 +1,4 @@
-"""Where points appear in photos: of perspective and fisheye cameras, and of panorama cameras, which see all around."""
+"""Projection of points into photos of perspective, fisheye and panorama cameras."""
 
 import numpy as np
 import pycolmap
@@ -15,26 +15,32 @@ def panorama_camera(size: tuple[int, int]) -> pycolmap.Camera:
 
 
 def projected(camera: pycolmap.Camera, local: Array) -> Array:
-    """Return the pixels (n, 2) of points (n, 3) in the camera's axes; NaN for those that it cannot see."""
+    """Return the pixels (n, 2) of points (n, 3) in the camera's axes; NaN where pycolmap cannot project them."""
     return np.asarray(camera.img_from_cam(local), dtype=np.float64).reshape(-1, 2)
 
 
 def is_ahead(camera: pycolmap.Camera, local: Array) -> NDArray[np.bool_]:
-    """Return which points (n, 3) in the camera's axes lie before it; before a panorama camera lies everything."""
+    """Return which points (n, 3) in the camera's axes lie in front of it; all of them for panoramas."""
     return np.full(len(local), True) if camera.is_spherical() else local[:, 2] > 0
 
 
 def offsets_px(camera: pycolmap.Camera, local: Array, pixels: Array) -> Array:
-    """Return how far points (n, 3) in the camera's axes appear from observations (n, 2), in pixels, (n, 2).
+    """Return the projections of points (n, 3) in the camera's axes minus the observations (n, 2), in pixels."""
+    return across_edge(camera, projected(camera, local) - pixels)
 
-    The left and the right edge of a panorama are the same place.
+
+def across_edge(camera: pycolmap.Camera, offsets: Array) -> Array:
+    """Return the shorter of two ways between pixels: across the left and right edge of a panorama, or as it is.
+
+    Args:
+        camera: of the photo.
+        offsets: (n, 2) differences of pixels; they are changed.
     """
-    offsets = projected(camera, local) - pixels
     if camera.is_spherical():
         offsets[:, 0] -= camera.width * np.round(offsets[:, 0] / camera.width)
     return offsets
 
 
 def px_per_radian(camera: pycolmap.Camera) -> float:
-    """Return the pixels per radian in the middle of a picture: its focal length, if it is no panorama."""
+    """Return the pixels per radian in the middle of a picture: the focal length, except for panoramas."""
     return camera.width / (2 * np.pi) if camera.is_spherical() else camera.mean_focal_length()
