@@ -235,10 +235,11 @@ POSES: tuple[Group, ...] = (
         "renders",
         (),
         (
-            Mutant("views.look.lens is not None or views.cameras not in", "views.cameras not in"),
             Mutant(
-                ' or views.cameras not in ("test", "train", *PATHS):\n        return "ray"', ':\n        return "ray"'
+                "    if views.look.lens is not None:\n        return",
+                "    if views.look.lens:\n        pass\n    if False:\n        return",
             ),
+            Mutant(".get(views.cameras, [])", ".get(views.cameras, run.cameras.test)"),
             Mutant('"ray" if any(frame.camera.is_spherical', '"z" if any(frame.camera.is_spherical'),
         ),
     ),

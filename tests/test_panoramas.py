@@ -38,7 +38,7 @@ from nerfcli.runs.run import load_run
 from nerfcli.workflows.poses import given_intrinsics
 from nerfcli.workflows.render import render_run
 from nerfcli.workflows.report import report_runs
-from nerfcli.workflows.views import Views, usual_axis
+from nerfcli.workflows.views import PictureOptions, Views, usual_axis
 
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk" / "images"
 FEW = PoseSettings(max_features=400, threads=1)
@@ -381,8 +381,10 @@ def test_a_field_of_panoramas_renders_distances_along_rays(scene, tmp_path):
     assert nerfcli("render", run, "--cameras", "orbit", "--count", "2", "--lens", "pinhole", "--cameras-only",
                    "-o", cameras).exit_code == 0  # fmt: skip
     frames = load_run(run).cameras
-    assert usual_axis(load_run(run), Views("orbit")) == "ray"
-    assert usual_axis(load_run(run), Views(str(cameras))) == "z"
+    axes = {views: usual_axis(load_run(run), Views(views)) for views in ("test", "train", "orbit", str(cameras))}
+    assert axes == {"test": "ray", "train": "ray", "orbit": "z", str(cameras): "z"}
+    assert usual_axis(load_run(run), Views("test", look=PictureOptions(lens="pinhole"))) == "z"
+    assert usual_axis(load_run(run), Views("orbit", look=PictureOptions(lens="equirectangular"))) == "ray"
     assert all(frame.camera.is_spherical for frame in frames.test)
     written = render_run(run, tmp_path / "by-python")
     assert {path.name for path in written} == {"rgb", "depth", "opacity"}

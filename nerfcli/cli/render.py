@@ -75,7 +75,7 @@ def render(
     ] = "conditional",
     depth_axis: Annotated[
         str | None,
-        typer.Option(help="ray: along the ray; z: along the optical axis.  [default: z, ray if equirectangular]"),
+        typer.Option(help="ray: along the ray; z: along the optical axis.  [default: z, ray for panoramas]"),
     ] = None,
     min_opacity: Annotated[
         float, typer.Option(help="Pixels with less opacity have no depth (NaN).", min=0, max=1)

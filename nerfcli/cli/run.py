@@ -158,12 +158,13 @@ def run(
         console.result(scene)
         console.result(field)
         console.result(evaluation.path, evaluation.metrics)
-        depth = usual_depth(load_run(field), Views("test"))
         for cameras, video in (("test", False), ("orbit", True)):
-            settings = ExportSettings(
-                outputs=OUTPUTS[: 2 if video else 3], depth=depth, video=VideoSettings() if video else None
-            )
             views = Views(cameras, count, max_size=max_size if video else None)
+            settings = ExportSettings(
+                outputs=OUTPUTS[: 2 if video else 3],
+                depth=usual_depth(load_run(field), views),
+                video=VideoSettings() if video else None,
+            )
             with console.progress(f"render {views.name}") as update:
                 written = render_run(
                     field, views=views, settings=settings, **where, notify=console.note, progress=update

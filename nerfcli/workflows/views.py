@@ -150,11 +150,13 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
 def usual_axis(run: Run, views: Views) -> str:
     """Return the usual axis of depth: "z", but "ray" for pictures of all directions, half of which have no z.
 
-    The cameras of a file are not looked at: their axis is "z".
+    These are the views of photos that are panoramas; pictures along a path are not, unless their lens is chosen so. The
+    cameras of a file are not looked at.
     """
-    if views.look.lens is not None or views.cameras not in ("test", "train", *PATHS):
+    if views.look.lens is not None:
         return "ray" if views.look.lens == "equirectangular" else "z"
-    return "ray" if any(frame.camera.is_spherical for frame in (*run.cameras.train, *run.cameras.test)) else "z"
+    photos = {"test": run.cameras.test, "train": run.cameras.train}.get(views.cameras, [])
+    return "ray" if any(frame.camera.is_spherical for frame in photos) else "z"
 
 
 def usual_depth(run: Run, views: Views) -> DepthRequest:
