@@ -280,13 +280,15 @@ def ball_mesh() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 def test_a_ply_comes_back_and_says_what_it_is(tmp_path):
     vertices, faces, _, _ = ball_mesh()
-    described = {"format": "nerfcli geometry 1", "unit": "metre", "unit_source": "gps", "frame": "of the scene"}
+    source = "6 control points (Hügel.txt), ± 0.3 %"
+    described = {"format": "nerfcli geometry 1", "unit": "metre", "unit_source": source, "frame": "of the scene"}
     write_ply(tmp_path / "a.ply", dict(zip("xyz", vertices.T, strict=True)), faces=faces, description=described)
     again, triangles = read_ply_mesh(tmp_path / "a.ply")
     np.testing.assert_array_equal(again, vertices)
     np.testing.assert_array_equal(triangles, faces)
     _, _, comments, _ = read_ply_header(tmp_path / "a.ply")
-    assert "unit metre (gps)" in comments
+    assert r"unit metre (6 control points (H\xfcgel.txt), +- 0.3 %)" in comments
+    assert json.loads(comments[-1].partition(" ")[2])["unit_source"] == source
     assert "frame of the scene" in comments
     facts = describe(tmp_path / "a.ply")
     assert (facts["kind"], facts["vertices"], facts["faces"], facts["unit"]) == ("mesh", 4, 4, "metre")

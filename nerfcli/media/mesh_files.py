@@ -40,15 +40,16 @@ _FAR = 1000.0
 
 
 def comments_of(description: Mapping[str, Any]) -> list[str]:
-    """Return the comment lines that describe a file, first for people, then for programs."""
+    """Return the comment lines that describe a file, first for people, then for programs; in ASCII, as PLY wants it."""
     unit, source = description.get("unit"), description.get("unit_source")
     stated = {"metre": "metre", "arbitrary": "arbitrary, the scale of the scene is not known"}.get(str(unit), str(unit))
-    return [
+    lines = [
         "written by nerfcli",
         f"unit {stated}{f' ({source})' if source else ''}",
         f"frame {description.get('frame')}",
         f"{KEY} {json.dumps(dict(description), ensure_ascii=True, allow_nan=False)}",
     ]
+    return [line.replace("±", "+-").encode("ascii", "backslashreplace").decode() for line in lines]
 
 
 def write_ply(
