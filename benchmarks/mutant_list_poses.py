@@ -257,4 +257,58 @@ POSES: tuple[Group, ...] = (
         (),
         (Mutant("pinholes = not any(", "pinholes = not all("),),
     ),
+    Group(
+        "scale/control_points.py",
+        ("tests/test_georeference.py",),
+        "",
+        (),
+        (
+            Mutant("np.floor(given.mean(axis=0))", "given.mean(axis=0)"),
+            Mutant("[(y, x, height) for", "[(x, y, height) for"),
+            Mutant("metres = given - reference", "metres = given + reference"),
+            Mutant("index.get(photo.lower(), [])", "index.get(photo, [])"),
+            Mutant("if len(found) > 1:", "if False:"),
+            Mutant("_NOT_LEVEL or re.search", "set() or re.search"),
+            Mutant('r"\\+UNITS=(?!M(\\+|$))|\\+TO', 'r"\\+TO'),
+            Mutant("places.setdefault(name, place) != place", "places.setdefault(name, place) is None"),
+            Mutant("_DEGREES | {", "{"),
+        ),
+    ),
+    Group(
+        "scale/georeference.py",
+        ("tests/test_georeference.py",),
+        "",
+        (),
+        (
+            Mutant(
+                "    fit = align_robustly(x, y)", "    fit = Alignment(align(x, y), np.ones(len(x), dtype=bool), 0.0)"
+            ),
+            Mutant("others = used[used != i]", "others = used"),
+            Mutant("if len(seen) < 3:", "if len(seen) < 2:"),
+            Mutant("min(_thinness(x), _thinness(y)) < _THINNEST", "False"),
+            Mutant("if spread < SPREAD_PER_NOISE * np.sqrt(3) * noise or", "if False and"),
+            Mutant("jackknife(x[keep], y[keep]) if checked else None", "jackknife(x[keep], y[keep])"),
+            Mutant("if not kept\n    ]", "if kept\n    ]"),
+            Mutant("if fit.enu_from_world is None:", "if False:"),
+            Mutant("_ENOUGH_TO_CHECK = 4", "_ENOUGH_TO_CHECK = 5"),
+        ),
+    ),
+    Group(
+        "convert/world_frame.py",
+        ("tests/test_georeference.py",),
+        "",
+        (),
+        (
+            Mutant("if _has_photo(f) else f", "if True else f"),
+            Mutant('given |= {"--world-up"', 'given |= {"--worlds-up"'),
+            Mutant("; {found.origin}", ""),
+        ),
+    ),
+    Group(
+        "media/mesh_files.py",
+        ("tests/test_surface.py",),
+        "ply",
+        (),
+        (Mutant('.encode("ascii", "backslashreplace").decode()', ""), Mutant('line.replace("±", "+-")', "line")),
+    ),
 )

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -11,8 +12,10 @@ from nerfcli.cameras.world import moved_to_origin, transformed, up_aligned
 from nerfcli.convert.stored_pixels import measure_of, upright
 from nerfcli.errors import UserError
 from nerfcli.scale.boards import CharucoBoard, scale_from_charuco, scale_from_markers
+from nerfcli.scale.control_points import Origin, read_control_points
 from nerfcli.scale.distances import known_distance, scale_from_distances
 from nerfcli.scale.estimate import ScaleEstimate
+from nerfcli.scale.georeference import Georeference, georeference_by_gps, georeference_by_points
 from nerfcli.scale.gps import gps_positions, scale_from_gps
 
 GPS = "gps"
@@ -30,6 +33,8 @@ class WorldFrame:
             "DICTIONARY:COLUMNSxROWS:SQUARE:MARKER", with sides in metres: lengths become metres. Append ":legacy" for
             boards with an even number of rows that were made with OpenCV before 4.6.
         distances: known distances, "A B METRES", between images by name or points x,y,z: lengths become metres.
+        georeference: "gps" for metres east, north and up by the positions in the photos' EXIF, or a file of control
+            points (see `read_control_points`). It determines origin, directions and unit.
     """
 
     up: str | None = None
@@ -37,17 +42,38 @@ class WorldFrame:
     scale: str | None = None
     markers: str | None = None
     distances: Sequence[str] = ()
+    georeference: str | None = None
 
 
-def in_world_frame(capture: Capture, wanted: WorldFrame) -> tuple[Capture, Similarity, ScaleEstimate | None]:
+@dataclass(frozen=True)
+class Moved:
+    """A capture in another world frame.
+
+    Args:
+        capture: in the new frame.
+        new_from_old: the change.
+        scale: the estimate of the scale if lengths became metres.
+        origin: where the origin is on Earth, if the capture was georeferenced.
+    """
+
+    capture: Capture
+    new_from_old: Similarity
+    scale: ScaleEstimate | None = None
+    origin: Origin | None = None
+
+
+def in_world_frame(capture: Capture, wanted: WorldFrame) -> Moved:
     """Move a capture to another world frame: first the origin, then the up axis, then the scale about the new origin.
-
-    Returns:
-        The capture, the similarity new_from_old, and the estimate of the scale if lengths became metres.
 
     Raises:
         UserError: a value is invalid, or the photos do not determine the scale.
     """
+    _check_combination(wanted)
+    if wanted.georeference is not None:
+        found = _georeference(capture, wanted.georeference)
+        moved = transformed(capture, found.metres_from_world)
+        moved = replace(moved, unit="metre", unit_source=f"{_source(found.estimate)}; {found.origin}")
+        return Moved(moved, found.metres_from_world, found.estimate, found.origin)
     estimate = _estimate(capture, wanted)
     change = Similarity.identity()
     if wanted.origin is not None:
@@ -60,7 +86,26 @@ def in_world_frame(capture: Capture, wanted: WorldFrame) -> tuple[Capture, Simil
     moved = transformed(capture, change)
     if estimate is not None:
         moved = replace(moved, unit="metre", unit_source=_source(estimate))
-    return moved, change, estimate
+    return Moved(moved, change, estimate)
+
+
+def _check_combination(wanted: WorldFrame) -> None:
+    scales = {"--scale": wanted.scale, "--markers": wanted.markers, "--distance": wanted.distances or None}
+    given = {"--georeference": wanted.georeference, **scales}
+    if wanted.georeference is not None:
+        given |= {"--world-up": wanted.up, "--origin": wanted.origin}
+    if len(named := [name for name, value in given.items() if value is not None]) > 1:
+        raise UserError(f"{' and '.join(named)} cannot be combined", "give only one of them", exit_code=2)
+
+
+def _georeference(capture: Capture, text: str) -> Georeference:
+    if text == GPS:
+        frames = _with_photos(capture)
+        return georeference_by_gps(frames, gps_positions(frames))
+    path = Path(text)
+    control = read_control_points(path)
+    frames = [upright(f, measure_of(capture)) if _has_photo(f) else f for f in capture.frames]
+    return georeference_by_points(frames, control, path.name)
 
 
 def _source(estimate: ScaleEstimate) -> str:
@@ -70,17 +115,22 @@ def _source(estimate: ScaleEstimate) -> str:
 
 
 def _estimate(capture: Capture, wanted: WorldFrame) -> ScaleEstimate | None:
-    given = {"--scale": wanted.scale, "--markers": wanted.markers, "--distance": wanted.distances or None}
-    if len(named := [name for name, value in given.items() if value is not None]) > 1:
-        raise UserError(f"{' and '.join(named)} cannot be combined", "give only one of them", exit_code=2)
     if wanted.distances:
         return scale_from_distances([known_distance(text, capture.frames) for text in wanted.distances])
-    frames = [frame for frame in capture.frames if frame.image is not None and frame.image.is_file()]
+    frames = _with_photos(capture)
     if wanted.markers is not None:
         return _scale_from_markers([upright(frame, measure_of(capture)) for frame in frames], wanted.markers)
     if wanted.scale == GPS:
         return scale_from_gps(frames, gps_positions(frames)).estimate
     return None
+
+
+def _with_photos(capture: Capture) -> list[Frame]:
+    return [frame for frame in capture.frames if _has_photo(frame)]
+
+
+def _has_photo(frame: Frame) -> bool:
+    return frame.image is not None and frame.image.is_file()
 
 
 def _scale_from_markers(frames: Sequence[Frame], text: str) -> ScaleEstimate:

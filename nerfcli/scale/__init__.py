@@ -1,1 +1,1 @@
-"""Metric scale: metres per scene unit from known distances, GPS, or printed markers, with its uncertainty."""
+"""Metric scale from known distances, GPS, markers or control points, with its uncertainty; georeferencing."""

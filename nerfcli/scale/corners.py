@@ -58,17 +58,11 @@ def scale_from_corners(
     Raises:
         UserError: no side has two corners seen in two photos, in directions that differ enough, whose rays meet.
     """
-    points, reasons = {}, []
-    for corner, rays in _rays(frames, sightings).items():
-        point = _triangulated(rays)
-        if isinstance(point, str):
-            reasons.append(point)
-        else:
-            points[corner] = point
+    points, reasons = triangulate(frames, sightings)
     measured_sides = [side for side in sides if side.first in points and side.second in points]
     lengths = np.array([np.linalg.norm(points[side.first] - points[side.second]) for side in measured_sides])
     if not len(lengths) or not lengths.min() > 0:
-        raise _no_scale(pattern, sightings, reasons)
+        raise _no_scale(pattern, sightings, list(reasons.values()))
     metres = np.array([side.metres for side in measured_sides])
     scale = float(np.median(metres / lengths))
     deviation = _SIGMA_PER_MAD * float(np.median(np.abs(metres / lengths - scale)))
@@ -82,6 +76,19 @@ def scale_from_corners(
         residual_unit="percent",
         source=f"{pattern}, {len(measured_sides)} sides",
     )
+
+
+def triangulate(frames: Sequence[Frame], sightings: Sightings) -> tuple[dict[Any, np.ndarray], dict[Any, str]]:
+    """Return the points (3,) that photos show in several places, and why the others cannot be triangulated."""
+    points: dict[Any, np.ndarray] = {}
+    reasons: dict[Any, str] = {}
+    for corner, rays in _rays(frames, sightings).items():
+        point = _triangulated(rays)
+        if isinstance(point, str):
+            reasons[corner] = point
+        else:
+            points[corner] = point
+    return points, reasons
 
 
 def _rays(frames: Sequence[Frame], sightings: Sightings) -> dict[Any, list[tuple[Frame, np.ndarray]]]:

@@ -10,26 +10,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerfcli.cameras.alignment import align, align_robustly
+from nerfcli.cameras.alignment import align_robustly
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.media.exif import read_exif
 from nerfcli.media.geodesy import Position, east_north_up
-from nerfcli.scale.estimate import ScaleEstimate
-
-# Least ratio of the photos' spread to the GPS noise; pure noise, part of which a similarity fits, reaches 1.7 with 6
-# photos and 1.1 with 20.
-_SPREAD_PER_NOISE = 3.0
+from nerfcli.scale.estimate import SPREAD_PER_NOISE, ScaleEstimate, jackknife, spans_a_plane
 
 # GPS noise per coordinate in metres, assumed if there are too few photos to estimate it. Smartphones under open sky
 # are within 4.9 m. Source: gps.gov, "GPS accuracy", after van Diggelen & Enge 2015.
 _TYPICAL_NOISE = 3.0
 _ENOUGH_TO_TELL = 6
-
-# Most groups of neighbouring photos, whose errors are correlated, that the jackknife leaves out in turn.
-_JACKKNIFE_GROUPS = 20
 
 
 @dataclass(frozen=True)
@@ -100,12 +93,12 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
     sigma = fit.sigma if enough else float(np.fmax(fit.sigma, _TYPICAL_NOISE))
     spread = float(np.sqrt(np.mean(np.sum((y[keep] - y[keep].mean(axis=0)) ** 2, axis=1))))
     noise = float(np.sqrt(3)) * sigma
-    if not spread >= _SPREAD_PER_NOISE * noise:
+    if not spread >= SPREAD_PER_NOISE * noise:
         how = "estimated from the fit to the poses" if enough else f"as assumed for {int(keep.sum())} photos"
         raise UserError(
             f"GPS is too inaccurate for a scale: the photos are spread over {spread:.2g} m, and the GPS error is "
             f"{noise:.2g} m ({how})",
-            f"a spread of at least {_SPREAD_PER_NOISE * noise:.2g} m is needed; give a known distance instead",
+            f"a spread of at least {SPREAD_PER_NOISE * noise:.2g} m is needed; give a known distance instead",
         )
     scale = fit.b_from_a.scale
     residuals = np.linalg.norm(fit.b_from_a.apply(x) - y, axis=1)
@@ -113,33 +106,11 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
     off = f"; outliers ignored: {', '.join(left_out)}" if left_out else ""
     estimate = ScaleEstimate(
         metres_per_unit=scale,
-        standard_error=max(_jackknife(x[keep], y[keep]), scale * sigma / (np.sqrt(keep.sum()) * spread)),
+        standard_error=max(jackknife(x[keep], y[keep]), scale * sigma / (np.sqrt(keep.sum()) * spread)),
         residuals=tuple((frame.name, float(r)) for frame, r in zip(used, residuals, strict=True)),
         residual_unit="metre",
         source=f"GPS of {int(keep.sum())} photos (EXIF)",
         details=f"the photos are spread over {spread:.3g} m, and the GPS error is {noise:.2g} m{off}",
     )
-    directions = fit.b_from_a if _spans_a_plane(scale * x[keep], sigma) else None
+    directions = fit.b_from_a if spans_a_plane(scale * x[keep], sigma) else None
     return GpsFit(estimate, directions, reference, left_out, spread, noise)
-
-
-def _spans_a_plane(metres: np.ndarray, sigma: float) -> bool:
-    """Return whether points (N, 3) deviate from their best line by clearly more than the noise."""
-    off = np.linalg.svd(metres - metres.mean(axis=0), compute_uv=False)[1] if len(metres) >= 3 else 0.0
-    return bool(off > _SPREAD_PER_NOISE * sigma)
-
-
-def _jackknife(x: np.ndarray, y: np.ndarray) -> float:
-    """Return the standard error of the scale: sqrt((g - 1) / g sum (s_i - mean)^2), s_i without the i-th of g groups.
-
-    Groups are neighbouring photos, whose errors are correlated. The result is 0 for fewer than 4 points, which are too
-    few to leave one out.
-
-    Source: Kuensch 1989, The jackknife and the bootstrap for general stationary observations, for the groups.
-    """
-    if len(x) < 4:
-        return 0.0
-    groups = np.array_split(np.arange(len(x)), min(len(x), _JACKKNIFE_GROUPS))
-    left = [(np.delete(x, group, axis=0), np.delete(y, group, axis=0)) for group in groups]
-    scales = np.array([align(*pair).scale for pair in left if np.ptp(pair[0], axis=0).max() > 0])
-    return float(np.sqrt((len(groups) - 1) / len(groups) * np.sum((scales - scales.mean()) ** 2)))

@@ -1,6 +1,6 @@
 """Convert a capture and verify it, or detect its convention."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,8 @@ def convert_capture(
     notify(f"{found}: {form.name}, {contents(capture)}")
     for text in describe_rescaling(other_sizes(capture)):
         notify(f"{text.removesuffix(': rescaled')}; written to {to} unchanged")
-    capture, new_from_old, scale = in_world_frame(capture, world)
+    moved = in_world_frame(capture, world)
+    scale = moved.scale
     if scale is not None:
         error = "" if scale.standard_error is None else f" ± {scale.standard_error:.2g}"
         unit = "%" if scale.residual_unit == "percent" else "m"
@@ -61,12 +62,17 @@ def convert_capture(
             f"one scene unit is {scale.metres_per_unit:.6g}{error} metres, from {scale.source}; residual "
             f"{scale.rms_residual:.2g} {unit}" + (f"; {scale.details}" if scale.details else "")
         )
-    frame = {"new_from_old": new_from_old.to_json()} | ({} if scale is None else {"scale": scale.to_json()})
+    frame = {"new_from_old": moved.new_from_old.to_json()} | ({} if scale is None else {"scale": scale.to_json()})
+    if moved.origin is not None:
+        notify(f"world: x east, y north, z up; {moved.origin}")
+        frame |= {"origin": asdict(moved.origin)}
     wanted = replace(wanted, form=recording(wanted.form, {"source": str(found), **frame}))
-    done = convert(capture, target, source_format=form.name, wanted=wanted)
+    done = convert(moved.capture, target, source_format=form.name, wanted=wanted)
     for text in done.notes:
         notify(text)
-    if to != "nerfcli" and any(f.image is not None and f.image.suffix.lower() in HEIC_SUFFIXES for f in capture.frames):
+    if to != "nerfcli" and any(
+        f.image is not None and f.image.suffix.lower() in HEIC_SUFFIXES for f in done.capture.frames
+    ):
         notify("the photos are HEIC, which many other programs cannot read")
     for loss in done.losses:
         warn(f"{to} cannot hold {loss}")
