@@ -1,4 +1,4 @@
-"""nerfcli export: export a run as a page, a mesh, points, a volume, or COLMAP's dense folder."""
+"""nerfcli export: export a run as a page, a mesh, points, a volume, a map, or COLMAP's dense folder."""
 
 import math
 from pathlib import Path
@@ -15,7 +15,9 @@ from nerfcli.cli.render_options import finite
 @command
 def export(
     run: Annotated[str, typer.Argument(help="Run folder written by train, or - to read paths from standard input.")],
-    to: Annotated[str, typer.Option("--to", help="What to export: page, mesh, points, volume, tsdf or colmap-dense.")],
+    to: Annotated[
+        str, typer.Option("--to", help="What to export: page, mesh, points, volume, tsdf, ortho or colmap-dense.")
+    ],
     output: Output = None,
     form: Annotated[
         str | None,
@@ -28,7 +30,10 @@ def export(
         typer.Option(help="Exported region X0,Y0,Z0,X1,Y1,Z1, in scene units.  [default: the subject of the photos]"),
     ] = None,
     voxel_size: Annotated[
-        float | None, typer.Option(help="Voxel size in scene units.  [default: the resolution of the photos]")
+        float | None,
+        typer.Option(
+            help="Size of a voxel, or of a pixel of ortho, in scene units.  [default: the resolution of the photos]"
+        ),
     ] = None,
     faces: Annotated[
         int | None,
@@ -46,7 +51,7 @@ def export(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Export a run as a page, a mesh, points, a volume, or for COLMAP.
+    """Export a run: page, mesh, points, volume, map, or for COLMAP.
 
     All results are in the frame and unit of the scene and state both; nerfcli info shows them.
 
@@ -57,6 +62,7 @@ def export(
                   photos, parallax and spread
     volume        .npz (density, colour) or .nrrd (density, 1 / unit)
     tsdf          .npz (signed distance, weight) or .nrrd (signed distance): the input of the mesh
+    ortho         folder with orthophoto.tif and heights.tif, GeoTIFF as seen from straight above (+z of the scene)
     colmap-dense  folder with undistorted photos, depth and normal maps for COLMAP's stereo fusion
 
     Writes RUN.html, RUN-mesh.ply, ... next to the run. Regions that no photo sees stay open. In a .glb, the rotation to
@@ -72,6 +78,7 @@ def export(
       nerfcli export photos-scene-run --to mesh --box=-1,-1,0,1,1,2
       nerfcli export photos-scene-run --to points -o kitchen.ply
       nerfcli export photos-scene-run --to volume --format nrrd
+      nerfcli export survey-run --to ortho --voxel-size 0.02
       nerfcli export photos-scene-run --to colmap-dense -o kitchen-dense
       nerfcli export tooth-scene-run --to volume -o tooth.nrrd
     """

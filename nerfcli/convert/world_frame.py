@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.origin import Origin
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.cameras.world import moved_to_origin, transformed, up_aligned
 from nerfcli.convert.stored_pixels import measure_of, upright
 from nerfcli.errors import UserError
 from nerfcli.scale.boards import CharucoBoard, scale_from_charuco, scale_from_markers
-from nerfcli.scale.control_points import Origin, read_control_points
+from nerfcli.scale.control_points import read_control_points
 from nerfcli.scale.distances import known_distance, scale_from_distances
 from nerfcli.scale.estimate import ScaleEstimate
 from nerfcli.scale.georeference import Georeference, georeference_by_gps, georeference_by_points

@@ -21,7 +21,7 @@ from nerfcli.media.ffmpeg import ffmpeg_program
 VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".mov", ".gif")
 
 # Exceptions of the readers for damaged files; no common base class is documented.
-_DAMAGED = (
+DAMAGED = (
     *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError, NotImplementedError),
     *(struct.error, zlib.error, zipfile.BadZipFile, tifffile.TiffFileError, Image.DecompressionBombError),
 )
@@ -49,7 +49,7 @@ def description_of(path: Path) -> dict[str, Any] | None:
         raise UserError(f"{path} does not exist", "check the path") from error
     except UserError:
         raise
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise damaged(path, error) from error
     return entries_of_text(text)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.origin import Origin
 from nerfcli.errors import UserError
 from nerfcli.media.geodesy import east_north_up
 from nerfcli.scale.corners import Sightings
@@ -22,27 +23,6 @@ HEADER = "a first line with the coordinate system, such as EPSG:32611, then x y 
 _DEGREES = {"EPSG:4326", "EPSG:4979", "EPSG:4258", "EPSG:4937", "EPSG:4269", "EPSG:6318"}
 # Systems whose metres are not those of the ground: web Mercator, and coordinates from the centre of the earth.
 _NOT_LEVEL = {"EPSG:3857", "EPSG:900913", "EPSG:4978"}
-
-
-@dataclass(frozen=True)
-class Origin:
-    """Where the origin of a georeferenced world is.
-
-    Args:
-        system: the coordinate system, such as EPSG:32611.
-        coordinates: of the origin in it: x, y, height in metres, or latitude, longitude in degrees, height in metres.
-        in_degrees: which of the two. If False, adding `coordinates` to the world's gives coordinates in the system.
-    """
-
-    system: str
-    coordinates: tuple[float, float, float]
-    in_degrees: bool
-
-    def __str__(self) -> str:
-        a, b, height = self.coordinates
-        if self.in_degrees:
-            return f"origin at latitude {a:.8f}, longitude {b:.8f}, height {height:.3f} m"
-        return f"origin at {a:.0f}, {b:.0f}, {height:.0f} in {self.system}"
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,11 @@ import numpy as np
 
 from nerfcli.cameras.alignment import Alignment, align, align_robustly
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.origin import Origin
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.media.geodesy import Position
-from nerfcli.scale.control_points import ControlPoints, Origin
+from nerfcli.scale.control_points import ControlPoints
 from nerfcli.scale.corners import triangulate
 from nerfcli.scale.estimate import SPREAD_PER_NOISE, ScaleEstimate, jackknife, spans_a_plane
 from nerfcli.scale.gps import scale_from_gps

@@ -8,6 +8,7 @@ from typing import Any
 
 from nerfcli.errors import UserError
 from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
+from nerfcli.media.geotiff import map_facts
 from nerfcli.media.model_facts import SUFFIXES as MODEL_SUFFIXES
 from nerfcli.media.model_facts import model_facts, volume_facts
 from nerfcli.tomography.result import is_reconstruction, load_reconstruction
@@ -41,6 +42,8 @@ def describe(path: str | Path) -> dict[str, Any]:
             return facts
     if folder.is_file() and is_volume_file(folder):
         return volume_facts(map_of(read_volume(folder)), folder.suffix[1:].upper())
+    if folder.is_file() and folder.suffix.lower() in (".tif", ".tiff") and (facts := map_facts(folder)) is not None:
+        return facts
     if folder.is_file() and folder.suffix.lower() != ".json":
         return file_facts(folder)
     if (folder / RENDERS).exists():

@@ -1,4 +1,4 @@
-"""Export a run to files that other programs open: a page, a mesh, points, a volume, COLMAP's dense folder."""
+"""Export a run to files that other programs open: a page, a mesh, points, a volume, a map, COLMAP's dense folder."""
 
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from nerfcli.viewer.proof import make_proof
 from nerfcli.workflows.export_geometry import (
     export_colmap_dense,
     export_mesh,
+    export_ortho,
     export_points,
     export_tsdf,
     export_volume,
@@ -38,6 +39,7 @@ TARGETS = {
     "points": (".ply", ".las", ".laz"),
     "volume": (".npz", ".nrrd"),
     "tsdf": (".npz", ".nrrd"),
+    "ortho": ("",),
     "colmap-dense": ("",),
 }
 SURFACE = SurfaceSettings()
@@ -175,5 +177,6 @@ _EXPORTS = {
     "points": export_points,
     "volume": export_volume,
     "tsdf": export_tsdf,
+    "ortho": export_ortho,
     "colmap-dense": export_colmap_dense,
 }

@@ -11,8 +11,11 @@ from nerfcli import __version__
 from nerfcli.atomic import atomic_folder
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction
+from nerfcli.cameras.origin import Origin
 from nerfcli.cameras.rigid import look_at
 from nerfcli.errors import UserError
+from nerfcli.media.geodesy import degrees_per_metre
+from nerfcli.media.geotiff import MapPlace, write_geotiff
 from nerfcli.media.las_files import SUFFIXES as LAS_SUFFIXES
 from nerfcli.media.las_files import las_module, write_las
 from nerfcli.media.mesh_files import write_glb, write_obj, write_ply
@@ -28,6 +31,8 @@ from nerfcli.surface.extent import automatic_voxel, scene_box
 from nerfcli.surface.fusion import fuse
 from nerfcli.surface.grid import Grid
 from nerfcli.surface.marching import SEEN, Mesh, surface_of, without_small_pieces
+from nerfcli.surface.ortho import SEEN as SEEN_FROM_ABOVE
+from nerfcli.surface.ortho import automatic_pixel, check_upright, ortho_of, typical_depth
 from nerfcli.surface.points import agreed_points
 from nerfcli.surface.settings import MOST_VIEWS, SurfaceSettings
 from nerfcli.surface.simplify import simplified
@@ -39,7 +44,7 @@ FORMAT = "nerfcli geometry 1"
 FRAME = "of the scene, as its cameras have it"
 PARALLAX = "largest angle between the rays of two photos that see the point"
 # Fraction of the work that is spent on rendering depths.
-_DEPTHS = 0.7
+_DEPTHS, _ORTHO_DEPTHS = 0.7, 0.6
 
 
 def export_mesh(
@@ -126,6 +131,75 @@ def export_tsdf(
     notify(_grid_in_words(grid, model))
 
 
+def export_ortho(
+    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
+) -> None:
+    """Write a folder with an orthophoto and a map of heights, as GeoTIFF."""
+    frames = run.cameras.train
+    check_upright(frames)
+    box = settings.box or scene_box(model, frames)
+    views = depth_views(
+        model,
+        spread_frames(frames, MOST_VIEWS),
+        max_size=settings.max_size,
+        on_progress=_part(progress, 0.02, _ORTHO_DEPTHS, "renders depths"),
+    )
+    depth = typical_depth(views)
+    pixel = settings.voxel_size or automatic_pixel(frames, run.config.downscale, depth, box)
+    seen = [view.distances() for view in views]
+    made = ortho_of(
+        model,
+        seen,
+        box,
+        pixel,
+        height_above=depth,
+        on_progress=_part(progress, _ORTHO_DEPTHS, 1.0, "renders from above"),
+    )
+    shown = np.isfinite(made.heights)
+    if not shown.any():
+        raise UserError("no surface seen from above is in three photos", "use another --box, or train longer")
+    origin = _origin(run)
+    place = _place_on_map(made.corner, pixel, origin)
+    described = {
+        **_provenance(run, model),
+        "box": list(box),
+        "seen": f"by {SEEN_FROM_ABOVE} photos or more; transparent or NaN elsewhere",
+    }
+    height = np.float32(origin.coordinates[2] if origin else 0.0)
+    with atomic_folder(path) as partial:
+        write_geotiff(partial / "orthophoto.tif", made.rgba, place, description={**described, "holds": "orthophoto"})
+        write_geotiff(
+            partial / "heights.tif", made.heights + height, place, description={**described, "holds": "heights"}
+        )
+    unit = {"metre": "m"}.get(model.unit, "units of the scene")
+    where = f"coordinates in {place.words}" if origin else "coordinates of the scene, which is not georeferenced"
+    notify(
+        f"{shown.shape[1]}x{shown.shape[0]} pixels of {pixel:.3g} {unit}, three photos see {100 * shown.mean():.0f} %; "
+        f"{where}"
+    )
+
+
+def _origin(run: Run) -> Origin | None:
+    """Return the origin of the scene on Earth, if the scene was georeferenced."""
+    try:
+        return Origin.from_json((run.config.history or {})["origin"])
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _place_on_map(corner: tuple[float, float], pixel: float, origin: Origin | None) -> MapPlace:
+    """Return where a map lies, with its upper left corner given in the scene's frame."""
+    if origin is None:
+        return MapPlace(corner, (pixel, pixel), None, False, "frame of the scene")
+    a, b, height = origin.coordinates
+    if not origin.in_degrees:
+        return MapPlace((a + corner[0], b + corner[1]), (pixel, pixel), origin.epsg, False, origin.system)
+    north, east = degrees_per_metre(a, height)
+    return MapPlace(
+        (b + east * corner[0], a + north * corner[1]), (east * pixel, north * pixel), origin.epsg, True, "WGS 84"
+    )
+
+
 def export_colmap_dense(
     run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
 ) -> None:
@@ -174,11 +248,17 @@ def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any
     return {
         "format": FORMAT,
         "holds": kind,
-        "unit": model.unit,
-        "unit_source": model.unit_source,
         "frame": FRAME,
         "box": [*grid.low.tolist(), *grid.high.tolist()],
         "voxel_size": grid.voxel_size,
+        **_provenance(run, model),
+    }
+
+
+def _provenance(run: Run, model: Model) -> dict[str, Any]:
+    return {
+        "unit": model.unit,
+        "unit_source": model.unit_source,
         "nerfcli": __version__,
         "run": run.path.resolve().name,
         "field_sha256": model.sha256,

@@ -1,0 +1,52 @@
+"""Where on Earth the origin of a scene is."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Origin of a georeferenced world: metres, x east, y north and z up.
+
+    Args:
+        system: the coordinate system, such as EPSG:32611.
+        coordinates: of the origin in it: x, y, height in metres, or latitude, longitude in degrees, height in metres.
+        in_degrees: which of the two. If False, adding `coordinates` to the world's gives coordinates in the system.
+    """
+
+    system: str
+    coordinates: tuple[float, float, float]
+    in_degrees: bool
+
+    @staticmethod
+    def from_json(content: Mapping[str, Any]) -> "Origin":
+        """Read what `dataclasses.asdict` gave.
+
+        Raises:
+            KeyError, TypeError, ValueError: the content is invalid.
+        """
+        a, b, height = (float(value) for value in content["coordinates"])
+        return Origin(str(content["system"]), (a, b, height), bool(content["in_degrees"]))
+
+    @property
+    def epsg(self) -> int | None:
+        """EPSG code of the system, also of UTM zones given in words; None if it has another name."""
+        if self.in_degrees:
+            return 4326
+        compact = re.sub(r"\s", "", self.system).upper()
+        if code := re.fullmatch(r"EPSG:(\d{4,5})", compact):
+            return int(code[1])
+        if zone := re.fullmatch(r"WGS84UTM(\d{1,2})([NS])", compact):
+            return (32700 if zone[2] == "S" else 32600) + int(zone[1])
+        zone = re.search(r"\+PROJ=UTM.*\+ZONE=(\d{1,2})(?!\d)", compact)
+        if zone and ("DATUM=WGS84" in compact or "ELLPS=WGS84" in compact):
+            return (32700 if "+SOUTH" in compact else 32600) + int(zone[1])
+        return None
+
+    def __str__(self) -> str:
+        a, b, height = self.coordinates
+        if self.in_degrees:
+            return f"origin at latitude {a:.8f}, longitude {b:.8f}, height {height:.3f} m"
+        return f"origin at {a:.0f}, {b:.0f}, {height:.0f} in {self.system}"
