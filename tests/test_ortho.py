@@ -217,7 +217,9 @@ def test_the_command_maps_balls_where_they_are(run, tmp_path):
     assert np.nanmedian(np.abs(errors)) < 0.06  # 250 steps; pixels of the photos are 0.04 wide
     colours = tifffile.imread(out / "orthophoto.tif")
     np.testing.assert_array_equal(colours[..., 3] > 0, np.isfinite(heights))
-    assert "holds: heights" in nerfcli("info", out / "heights.tif").stdout
+    words = nerfcli("info", out / "heights.tif").stdout
+    assert "holds: heights" in words
+    assert f"corner: {left:.10g} {top:.10g}" in words
     again = nerfcli("export", run, "-o", out, *options)
     assert "exists" in error_of(again)[0]
 

@@ -57,7 +57,9 @@ def lines_of(facts: dict[str, Any]) -> list[str]:
         if value is None or value in ([], {}):
             continue
         name = _name(key)
-        if isinstance(value, list):
+        if key == "corner":  # of a map: northings have seven digits before the point
+            lines.append(f"{name}: {' '.join(f'{number:.10g}' for number in value)}")
+        elif isinstance(value, list):
             lines += [
                 f"{name}:",
                 *(f"  {_listed(entry) if isinstance(entry, dict) else _plain(entry)}" for entry in value),
