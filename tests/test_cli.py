@@ -176,6 +176,8 @@ def test_all_threads_are_the_processors_of_this_process():
         ("train x --budget 2", "'2' has no unit; write 2s or 2m"),
         ("view x --port 80000", "'80000' is too large; give at most 65535"),
         ("ablate x --seeds 0", "'0' is too small; give at least 1"),
+        ("train x --seed 4294967296", "'4294967296' is too large; give at most 4294967295"),
+        ("render x --cameras-only --dry-run", "it renders nothing; remove --dry-run"),
         ("report x --depth expected", "'expected'; choose conditional, moment, max-weight, median or quantile:Q"),
         ("export x --to page --faces 100", "--faces: it is for meshes"),
         ("export x --to volume --water 0.2", "--water: it is for X-ray scans"),

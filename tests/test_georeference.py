@@ -115,7 +115,7 @@ def test_degrees_become_metres_east_north_and_up(tmp_path):
     found = solved(frames, path)
     assert found.origin.in_degrees
     np.testing.assert_allclose(found.origin.coordinates, degrees[0][[1, 0, 2]], rtol=0, atol=1e-12)
-    assert str(found.origin).startswith("origin at latitude 34.4080")
+    assert str(found.origin).startswith("at latitude 34.4080")
     moved = found.metres_from_world.apply(PLACES)
     np.testing.assert_allclose(moved, PLACES - PLACES[0], rtol=0, atol=5e-4)  # the Earth's curve over 30 m
 
@@ -271,6 +271,12 @@ def test_the_command_writes_a_world_of_metres_and_says_where_it_is(tmp_path):
     assert written.unit == "metre"
     assert (written.unit_source or "").endswith("; origin at 235280, 3811220, 12 in EPSG:32611")
     np.testing.assert_allclose(written.points + record["origin"]["coordinates"], PLACES + CORNER, rtol=0, atol=1e-7)
+    for options, kept in (((), True), (("--origin", "1,0,0"), False), (("--world-up", "-y"), False)):
+        done = nerfcli("convert", out, tmp_path / f"{kept}.npz", "--to", "npz", "--overwrite", *options)
+        assert done.exit_code == 0, done.stderr
+        source_of_unit = parse_npz(tmp_path / f"{kept}.npz").unit_source or ""
+        assert source_of_unit.startswith("6 control points")
+        assert ("origin" in source_of_unit) == kept
     refused = nerfcli("convert", source, tmp_path / "x.npz", "--to", "npz", "--georeference", path, "--world-up", "z")
     assert refused.exit_code == 2
     assert "--georeference and --world-up cannot be combined" in error_of(refused)[0]

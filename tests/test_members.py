@@ -286,6 +286,7 @@ def test_deviations_of_fog_are_those_of_its_closed_form(ensemble, tmp_path):
     np.testing.assert_allclose(read_tiff(of_colour)[0], expected, atol=1.5 / 255)
     # Outside of all cubes only the three backgrounds are visible: 3/4, 1/2, 1/4.
     assert read_tiff(of_colour)[0].max() == pytest.approx(0.25, abs=0.05)
+    assert "metric scale" not in nerfcli("info", of_colour).stdout  # it is no length
     channels = read_exr(next((tmp_path / "all" / "exr").rglob("*.exr")))
     np.testing.assert_array_equal(channels["depth_deviation.V"], read_tiff(of_depth)[0])
     np.testing.assert_array_equal(channels["colour_deviation.V"], read_tiff(of_colour)[0])

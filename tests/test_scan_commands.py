@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -266,6 +267,53 @@ def test_hounsfield_units_of_water_and_air(tmp_path: Path, bean_run: Path) -> No
     volume = np.asarray(load_reconstruction(bean_run).volume)
     seen = np.isfinite(back.values)
     np.testing.assert_allclose(back.values[seen], 1000 * (volume[seen] / 0.12 - 1), rtol=1e-4, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (("train", "SCAN", "--holdout", "every:4"), "--holdout"),
+        (("train", "SCAN", "--blocks", "2"), "--blocks"),
+        (("render", "RUN", "--dry-run"), "--dry-run"),
+        (("render", "RUN", "--video"), "--video"),
+        (("render", "RUN", "--lens", "fisheye"), "--lens"),
+        (("evaluate", "RUN", "--align", "pose"), "--align"),
+        (("export", "RUN", "--to", "volume", "--box", "0,0,0,1,1,1"), "--box"),
+        (("export", "RUN", "--to", "volume", "--faces", "5"), "--faces"),
+    ],
+)
+def test_options_for_photos_are_refused_and_nothing_is_written(
+    arguments: tuple[str, ...], option: str, bean_run: Path, tmp_path: Path
+) -> None:
+    named = {"SCAN": bean_run.with_name("bean"), "RUN": bean_run}
+    place = () if arguments[0] == "evaluate" else ("-o", tmp_path / "out")
+    code, _, err = call(*(named.get(word, word) for word in arguments), *place)
+    assert code == 2
+    assert f"of an X-ray scan; {option} is for photos" in err
+    assert f"remove {option}" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_outputs_of_scans_are_refused_for_runs_of_photos(finished: Path) -> None:
+    for options in (("--slices", "z=0"), ("--outputs", "projection")):
+        code, _, err = call("render", finished, *options)
+        assert code == 2
+        assert f"{finished} is not a reconstruction of a scan; {options[0]}" in err
+
+
+def test_the_format_and_the_attenuation_of_water_are_used_and_checked(bean_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "bean-run"
+    shutil.copytree(bean_run, run)
+    code, out, err = call("export", run, "--to", "volume", "--format", "mha")
+    assert code == 0, err
+    assert Path(out.split()[0]) == tmp_path / "bean-run-volume.mha"
+    for options in (
+        ("--format", "obj"),
+        ("--format", "mha", "-o", tmp_path / "a.nii"),
+        ("--water", "0"),
+        ("--water", "nan"),
+    ):
+        assert call("export", run, "--to", "volume", "--overwrite", *options)[0] == 2
 
 
 def test_other_suffixes_and_types_are_refused(tmp_path: Path) -> None:

@@ -5,6 +5,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+_SEPARATOR = "; origin "
+
+
+def without_origin(unit_source: str | None) -> str | None:
+    """Return the source of a unit without the origin that `Origin.in_source` added."""
+    return None if unit_source is None else unit_source.partition(_SEPARATOR)[0]
+
 
 @dataclass(frozen=True)
 class Origin:
@@ -45,8 +52,12 @@ class Origin:
             return (32700 if "+SOUTH" in compact else 32600) + int(zone[1])
         return None
 
+    def in_source(self, unit_source: str) -> str:
+        """Return the source of a unit, followed by this origin."""
+        return f"{unit_source}{_SEPARATOR}{self}"
+
     def __str__(self) -> str:
         a, b, height = self.coordinates
         if self.in_degrees:
-            return f"origin at latitude {a:.8f}, longitude {b:.8f}, height {height:.3f} m"
-        return f"origin at {a:.0f}, {b:.0f}, {height:.0f} in {self.system}"
+            return f"at latitude {a:.8f}, longitude {b:.8f}, height {height:.3f} m"
+        return f"at {a:.0f}, {b:.0f}, {height:.0f} in {self.system}"

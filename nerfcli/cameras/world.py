@@ -10,6 +10,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_direction
+from nerfcli.cameras.origin import without_origin
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 
@@ -21,10 +22,13 @@ def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
     """Return the same capture in another world frame.
 
     Poses and points are mapped, and depths along the cameras' axes are scaled. Pictures, observations and cameras do
-    not change, since a similarity preserves angles. The unit is kept if the scale is 1, else it becomes "arbitrary".
+    not change, since a similarity preserves angles. The unit is kept if the scale is 1, else it becomes "arbitrary"; if
+    anything moves, the origin on Earth is no longer stated with it.
     """
     poses = new_from_world.apply_pose(np.stack([frame.world_from_cam for frame in capture.frames] or [np.eye(4)]))
     bounds = capture.depth_bounds
+    moves = not np.array_equal(new_from_world.matrix(), np.eye(4))
+    source = without_origin(capture.unit_source) if moves else capture.unit_source
     return replace(
         capture,
         # Not strict: for a capture without frames there is one pose too many.
@@ -32,7 +36,7 @@ def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
         points=new_from_world.apply(capture.points),
         depth_bounds=None if bounds is None else new_from_world.scale * bounds,
         unit=capture.unit if new_from_world.scale == 1 else "arbitrary",
-        unit_source=capture.unit_source if new_from_world.scale == 1 else None,
+        unit_source=source if new_from_world.scale == 1 else None,
     )
 
 

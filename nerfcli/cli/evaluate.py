@@ -26,6 +26,9 @@ _COLUMNS = {
 }
 _MEASURES = (("psnr", 2), ("ssim", 4), ("lpips", 4))
 
+# Parameters for reconstructions of X-ray scans.
+_OF_SCANS = "runs reference device threads overwrite json quiet"
+
 
 @command
 def evaluate(
@@ -85,6 +88,7 @@ def evaluate(
       nerfcli evaluate first-run second-run third-run
       nerfcli evaluate tooth-15-views-run --reference tooth-run
     """
+    values = dict(locals())
     from nerfcli.evaluate.predictions import KINDS
     from nerfcli.runs.run import Run
     from nerfcli.tomography.result import is_reconstruction
@@ -109,9 +113,10 @@ def evaluate(
     cores, torch_device = thread_count(threads), device_name(device)
 
     def measure_scan(folder: Path) -> None:
-        from nerfcli.cli.scans import print_scan_numbers
+        from nerfcli.cli.scans import print_scan_numbers, refuse_photo_options
         from nerfcli.workflows.tomography_scores import evaluate_scan
 
+        refuse_photo_options(folder, evaluate, values, of_scans=_OF_SCANS)
         with console.progress("evaluate") as update:
             scan = evaluate_scan(
                 folder,

@@ -11,6 +11,9 @@ from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, one_of, thread_count
 from nerfcli.cli.render_options import finite
 
+# Parameters for reconstructions of X-ray scans.
+_OF_SCANS = "run to output form water device threads overwrite json quiet"
+
 
 @command
 def export(
@@ -53,7 +56,7 @@ def export(
 ) -> None:
     """Export a run: page, mesh, points, volume, map, or for COLMAP.
 
-    All results are in the frame and unit of the scene and state both; nerfcli info shows them.
+    All results are in the frame and unit of the scene. Files state both, but for COLMAP's; nerfcli info shows them.
 
     \b
     page          one .html that renders the field in a browser (WebGL2), from the disk, without a server
@@ -82,17 +85,28 @@ def export(
       nerfcli export photos-scene-run --to colmap-dense -o kitchen-dense
       nerfcli export tooth-scene-run --to volume -o tooth.nrrd
     """
+    values = dict(locals())
     from nerfcli.surface.settings import FACES, SurfaceSettings
     from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.export import TARGETS, default_target, export_run
 
     console = Console(quiet=quiet, json_lines=json)
+    finite(water, "--water")
+    if water is not None and water <= 0:
+        raise typer.BadParameter(f"{water:g} is not a positive attenuation", param_hint="--water")
 
     def export_one_scan(folder: Path, one_of_many: bool) -> None:
+        from nerfcli.cli.scans import refuse_photo_options
+        from nerfcli.tomography.volume_files import SUFFIXES
         from nerfcli.workflows.tomography_files import export_scan
 
+        refuse_photo_options(folder, export, values, of_scans=_OF_SCANS)
         one_of(to, ("volume",), "--to")
-        usual = folder.with_name(f"{folder.name}-volume.nrrd")
+        suffix = "nrrd" if form is None else form.lstrip(".").lower()
+        one_of(suffix, [known[1:] for known in SUFFIXES], "--format")
+        if form is not None and output is not None and not one_of_many and output.suffix.lower() != f".{suffix}":
+            raise typer.BadParameter(f"{form!r} contradicts -o {output}; remove one of them", param_hint="--format")
+        usual = folder.with_name(f"{folder.name}-volume.{suffix}")
         target = usual if output is None else output / usual.name if one_of_many else output
         for path in export_scan(folder, target, water=water, overwrite=overwrite, notify=console.note):
             console.result(path)

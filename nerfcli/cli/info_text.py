@@ -9,7 +9,7 @@ from typing import Any
 HEADINGS = ("field", "weights", "optimiser", "step keeps", "ops/sample", "B/sample", "ops/picture", "B/picture")
 _UNITS = ("", "k", "M", "G", "T", "P")
 # Units of maps that are not lengths.
-_UNITS_OF_MAPS = {"coverage": " photos", "parallax": " degrees", "confidence": ""}
+_UNITS_OF_MAPS = {"coverage": " photos", "parallax": " degrees", "confidence": "", "colour_deviation": ""}
 _LENGTHS = ("depth", "spread", "disagreement", "lower", "upper", "depth_deviation")
 # Labels of facts whose names in JSON are not plain English.
 _LABELS = {

@@ -22,7 +22,7 @@ Output = Annotated[
     ),
 ]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:1.")]
-Seed = Annotated[int, typer.Option(help="Seed of all random numbers.", min=0)]
+Seed = Annotated[int, typer.Option(help="Seed of all random numbers.", min=0, max=2**32 - 1)]
 Threads = Annotated[int, typer.Option(help="Number of CPU threads; 0 uses all.", min=0)]
 Downscale = Annotated[str, typer.Option(help="Reduce photos by this factor: auto, 1, 2, 4 or 8.")]
 Include = Annotated[

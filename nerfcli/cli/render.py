@@ -37,10 +37,14 @@ from nerfcli.cli.render_options import (
     tolerance_of,
     video_settings,
 )
-from nerfcli.cli.scans import is_of_scan, scan_pictures
+from nerfcli.cli.scans import is_of_scan, refuse_photo_options, scan_pictures
 from nerfcli.errors import UserError
 
 DEFAULT_FPS = 24.0
+
+
+# Parameters for reconstructions of X-ray scans.
+_OF_SCANS = "run output outputs slices cameras device threads overwrite json quiet"
 
 
 @command
@@ -224,6 +228,7 @@ def render(
       nerfcli render tooth-scene-run --outputs projection,residual
       nerfcli render tooth-scene-run --slices z=0 --slices x=12.5
     """
+    values = dict(locals())
     from nerfcli.export.settings import OUTPUTS, ExportSettings
     from nerfcli.media.colour_maps import COLOUR_MAPS
     from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
@@ -236,6 +241,10 @@ def render(
     console = Console(quiet=quiet, json_lines=json)
 
     def render_one_scan(folder: Path, one_of_many: bool) -> None:
+        if not is_reconstruction(folder):
+            option = "--slices" if slices else f"--outputs {outputs}"
+            raise UserError(f"{folder} is not a reconstruction of a scan; {option} is for those", f"remove {option}", 2)
+        refuse_photo_options(folder, render, values, of_scans=_OF_SCANS)
         pictures = scan_pictures(outputs, slices, views=cameras)
         target = folder / RENDERS if output is None else output / folder.name if one_of_many else output
         with console.progress("render") as update:
@@ -279,6 +288,8 @@ def render(
         depth_tolerance=depth_tolerance,
     )
     one_of(colour_map, COLOUR_MAPS, "--colour-map")
+    if cameras_only and dry_run:
+        raise typer.BadParameter("it renders nothing; remove --dry-run", param_hint="--cameras-only")
     if max_size is not None and (width is not None or height is not None):
         raise typer.BadParameter("cannot be combined with --width or --height", param_hint="--max-size")
     look = look_of(width, height, lens=lens, fov_deg=fov, crop=crop)
@@ -308,8 +319,6 @@ def render(
 
     def work(folder: Path, one_of_many: bool) -> None:
         if is_reconstruction(folder):
-            if dry_run:
-                raise UserError(f"{folder} is a reconstruction of a scan; --dry-run is for photos", "remove --dry-run")
             render_one_scan(folder, one_of_many)
             return
         axis = depth_axis or usual_axis(load_run(folder), views)

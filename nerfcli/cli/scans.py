@@ -1,10 +1,11 @@
 """Options and printed results of commands for X-ray scans."""
 
 import functools
+import inspect
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from nerfcli.tomography.result import ReconstructionSettings
     from nerfcli.workflows.tomography_scores import ScanEvaluation
 
+# Options whose parameters have other names.
+_OPTIONS = {"include": "with", "exclude": "without", "form": "format"}
 _COMPONENTS = "tv=WEIGHT, centre=COLUMNS, tilt=DEGREES, air=measured"
 
 
@@ -79,6 +82,25 @@ def slices_of(texts: list[str]) -> tuple[tuple[str, float], ...]:
             raise typer.BadParameter(f"{text!r}; write x=, y= or z= and a position, as in z=0.3", param_hint="--slices")
         found.append((axis, position))
     return tuple(found)
+
+
+def refuse_photo_options(path: Path, command: Callable[..., None], values: dict[str, Any], *, of_scans: str) -> None:
+    """Refuse options that are for photos where a scan, or its run, is given.
+
+    Args:
+        path: the scan or its run.
+        command: the function of the command, whose parameters have the defaults.
+        values: of its parameters, by name.
+        of_scans: the parameters that scans have, separated by spaces.
+
+    Raises:
+        UserError: another one has a value other than its default.
+    """
+    defaults = {name: parameter.default for name, parameter in inspect.signature(command).parameters.items()}
+    for name, default in defaults.items():
+        if name not in of_scans.split() and values[name] != default:
+            option = "--" + _OPTIONS.get(name, name.replace("_", "-"))
+            raise UserError(f"{path} is of an X-ray scan; {option} is for photos", f"remove {option}", exit_code=2)
 
 
 def refuse_scan(path: Path, command: str) -> None:

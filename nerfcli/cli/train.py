@@ -42,6 +42,8 @@ from nerfcli.cli.options import (
 )
 
 DEFAULT_BUDGET = "2m"
+# Parameters for X-ray scans.
+_OF_SCANS = "scene output budget steps include exclude field voxel_size seed threads device resume overwrite json quiet"
 
 
 @command
@@ -182,6 +184,7 @@ def train(
       nerfcli train photos-scene --field voxels --field-memory 16MB
       nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
     """
+    values = dict(locals())
     from nerfcli.errors import UserError
     from nerfcli.memory import default_memory_limit
     from nerfcli.runs.components import Components, choose
@@ -216,9 +219,10 @@ def train(
     limit = None if memory is None else bytes_from_text(memory)
 
     def train_one_scan(folder: Path, run: Path) -> None:
-        from nerfcli.cli.scans import reconstruction_settings
+        from nerfcli.cli.scans import reconstruction_settings, refuse_photo_options
         from nerfcli.workflows.tomography import train_scan
 
+        refuse_photo_options(folder, train, values, of_scans=_OF_SCANS)
         settings = reconstruction_settings(
             budget_seconds=budget_seconds,
             passes=steps,
@@ -340,9 +344,6 @@ def train(
     def work(folder: Path, one_of_many: bool) -> None:
         run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
         if is_scan(folder):
-            if dry_run or members or count:
-                option = "--dry-run" if dry_run else "--members" if members else "--blocks"
-                raise UserError(f"{folder} is a scan; {option} is for photos", f"remove {option}")
             train_one_scan(folder, run)
         elif recognise(folder):
             raise UserError(

@@ -16,8 +16,8 @@ _WRONG_VALUES = {
     "int_parsing": "is not a whole number",
     "int_parsing_size": "is too long for a whole number",
     "float_parsing": "is not a number",
-    "greater_than_equal": "is too small; give at least {ge:g}",
-    "less_than_equal": "is too large; give at most {le:g}",
+    "greater_than_equal": "is too small; give at least {ge:.10g}",
+    "less_than_equal": "is too large; give at most {le:.10g}",
 }
 
 

@@ -73,7 +73,7 @@ def in_world_frame(capture: Capture, wanted: WorldFrame) -> Moved:
     if wanted.georeference is not None:
         found = _georeference(capture, wanted.georeference)
         moved = transformed(capture, found.metres_from_world)
-        moved = replace(moved, unit="metre", unit_source=f"{_source(found.estimate)}; {found.origin}")
+        moved = replace(moved, unit="metre", unit_source=found.origin.in_source(_source(found.estimate)))
         return Moved(moved, found.metres_from_world, found.estimate, found.origin)
     estimate = _estimate(capture, wanted)
     change = Similarity.identity()

@@ -223,4 +223,6 @@ def _failure(target: Path, log: IO[bytes]) -> UserError:
     log.seek(0)
     lines = log.read().decode("utf-8", errors="replace").strip().splitlines()
     reason = lines[-1] if lines else "the encoder stopped"
-    return UserError(f"cannot write {target}: {reason}", "free some disk space, or write elsewhere")
+    full = not lines or any("No space left" in line for line in lines)
+    hint = "free some disk space, or write elsewhere" if full else "try another size, or another --video-format"
+    return UserError(f"cannot write {target}: {reason}", hint)

@@ -82,6 +82,10 @@ def read_volume(path: Path) -> VolumeFile:
         ) from error
 
 
+# Suffixes of volumes, the default first.
+SUFFIXES = (".nrrd", ".mha", ".nii", ".tif")
+
+
 def _writer(path: Path) -> Callable[[Path, VolumeFile], None]:
     writers = {
         ".nrrd": _write_nrrd,
@@ -91,7 +95,7 @@ def _writer(path: Path) -> Callable[[Path, VolumeFile], None]:
         ".tiff": _write_tiff,
     }
     if path.suffix.lower() not in writers:
-        raise UserError(f"{path.name}: unknown volume format", "choose .nrrd, .mha, .nii or .tif")
+        raise UserError(f"{path.name}: unknown volume format", f"choose one of {', '.join(SUFFIXES)}")
     return writers[path.suffix.lower()]
 
 

@@ -64,7 +64,7 @@ def convert_capture(
         )
     frame = {"new_from_old": moved.new_from_old.to_json()} | ({} if scale is None else {"scale": scale.to_json()})
     if moved.origin is not None:
-        notify(f"world: x east, y north, z up; {moved.origin}")
+        notify(f"world: x east, y north, z up; origin {moved.origin}")
         frame |= {"origin": asdict(moved.origin)}
     wanted = replace(wanted, form=recording(wanted.form, {"source": str(found), **frame}))
     done = convert(moved.capture, target, source_format=form.name, wanted=wanted)

@@ -225,6 +225,8 @@ def export_colmap_dense(
         write_sparse(partial, cameras, points)
         write_stereo(partial, views)
     notify(f"{len(frames)} photos share {len(points.places)} points: colmap stereo_fusion --workspace_path {path}")
+    if model.unit != "arbitrary":
+        notify(f"COLMAP's files hold no unit: their lengths are in {model.unit}s, as those of the scene")
 
 
 def _seen(
@@ -307,8 +309,8 @@ def _write_volume(path: Path, volume: Volume, name: str) -> None:
 
 
 def _y_up_from_scene(run: Run) -> np.ndarray:
-    """Return the rotation that turns the up direction of the cameras to +y."""
-    up = up_direction(run.cameras.train)
+    """Return the rotation that turns up to +y: z of a georeferenced scene, else the up direction of the cameras."""
+    up = up_direction(run.cameras.train) if _origin(run) is None else np.array([0.0, 0.0, 1.0])
     aside = np.eye(3)[np.argmin(np.abs(up))]
     # The axes (right, down, ahead) of a camera whose down direction is -up.
     right, down, ahead = look_at(np.zeros(3), np.cross(up, aside), up)[:3, :3].T
