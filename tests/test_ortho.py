@@ -15,17 +15,20 @@ from make_spheres import BALLS
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.run_cameras import write_cameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.origin import Origin
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.media.geodesy import degrees_per_metre, east_north_up
 from nerfcli.media.geotiff import MapPlace, write_geotiff
+from nerfcli.media.mesh_files import read_glb_json
 from nerfcli.render.visibility import DepthMap
 from nerfcli.runs.config import write_config
 from nerfcli.runs.run import Run
 from nerfcli.surface.ortho import Ortho, automatic_pixel, check_upright, ortho_of
 from nerfcli.workflows.describe import describe
+from nerfcli.workflows.views import Views, chosen_frames
 
 # The scene is twice as large as the training frame, turned about z and moved.
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -222,6 +225,24 @@ def test_the_command_maps_balls_where_they_are(run, tmp_path):
     assert f"corner: {left:.10g} {top:.10g}" in words
     again = nerfcli("export", run, "-o", out, *options)
     assert "exists" in error_of(again)[0]
+
+
+def test_georeferenced_scenes_stand_on_z(run, tmp_path):
+    """The cameras are turned on their sides: without an origin their own up is x, with one it is z."""
+    cameras = Run(run).cameras
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turned = [
+        replace(f, world_from_cam=rigid.from_parts(f.world_from_cam[:3, :3] @ quarter, f.centre)) for f in cameras.train
+    ]
+    write_cameras(run, turned, list(cameras.test))
+    for origin in (None, Origin("EPSG:32611", (0.0, 0.0, 0.0), in_degrees=False)):
+        put(run, origin)
+        centres = np.stack([f.centre for f in chosen_frames(Run(run), Views("ellipse", 8), depth_hint=1.0)])
+        assert (np.ptp(centres[:, 2]) < 1e-9) == (origin is not None)
+        done = nerfcli("export", run, "--to", "mesh", "-o", tmp_path / "a.glb", "--max-size", "48", "--overwrite")
+        assert done.exit_code == 0, done.stderr
+        matrix = np.array(read_glb_json(tmp_path / "a.glb")["nodes"][0]["matrix"]).reshape(4, 4).T
+        assert (abs(matrix[1, 2] - 1) < 1e-9) == (origin is not None)
 
 
 def test_degrees_and_scenes_without_a_place(run, tmp_path):

@@ -158,7 +158,7 @@ def export_ortho(
     shown = np.isfinite(made.heights)
     if not shown.any():
         raise UserError("no surface seen from above is in three photos", "use another --box, or train longer")
-    origin = _origin(run)
+    origin = run.config.origin
     place = _place_on_map(made.corner, pixel, origin)
     described = {
         **_provenance(run, model),
@@ -177,14 +177,6 @@ def export_ortho(
         f"{shown.shape[1]}x{shown.shape[0]} pixels of {pixel:.3g} {unit}, three photos see {100 * shown.mean():.0f} %; "
         f"{where}"
     )
-
-
-def _origin(run: Run) -> Origin | None:
-    """Return the origin of the scene on Earth, if the scene was georeferenced."""
-    try:
-        return Origin.from_json((run.config.history or {})["origin"])
-    except (KeyError, TypeError, ValueError):
-        return None
 
 
 def _place_on_map(corner: tuple[float, float], pixel: float, origin: Origin | None) -> MapPlace:
@@ -310,7 +302,7 @@ def _write_volume(path: Path, volume: Volume, name: str) -> None:
 
 def _y_up_from_scene(run: Run) -> np.ndarray:
     """Return the rotation that turns up to +y: z of a georeferenced scene, else the up direction of the cameras."""
-    up = up_direction(run.cameras.train) if _origin(run) is None else np.array([0.0, 0.0, 1.0])
+    up = up_direction(run.cameras.train) if run.config.origin is None else np.array([0.0, 0.0, 1.0])
     aside = np.eye(3)[np.argmin(np.abs(up))]
     # The axes (right, down, ahead) of a camera whose down direction is -up.
     right, down, ahead = look_at(np.zeros(3), np.cross(up, aside), up)[:3, :3].T

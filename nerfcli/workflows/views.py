@@ -133,8 +133,11 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
             raise UserError(f"{run.path} has no {cameras} cameras", f"use --cameras train, {', '.join(PATHS)}")
     elif cameras == "interpolate":
         chosen = paths.interpolate(keyframes, count=views.count)
+    elif cameras == "ellipse":
+        up = None if run.config.origin is None else np.array([0.0, 0.0, 1.0])
+        chosen = paths.ellipse(keyframes, count=views.count, depth_hint=depth_hint, up=up)
     elif cameras in PATHS:
-        path = {"orbit": paths.orbit, "ellipse": paths.ellipse, "spiral": paths.spiral}[cameras]
+        path = {"orbit": paths.orbit, "spiral": paths.spiral}[cameras]
         chosen = path(keyframes, count=views.count, depth_hint=depth_hint)
     else:
         chosen = _frames_of(Path(cameras), views.nerfstudio_frame)
