@@ -1,5 +1,8 @@
 """Errors that a user can fix: one exception, and the exit codes that scripts rely on."""
 
+import shlex
+from pathlib import Path
+
 BAD_INPUT = 3
 TOO_FEW_PHOTOS = 4
 NON_FINITE = 5
@@ -30,3 +33,9 @@ def reason_of(error: BaseException) -> str:
     """Describe an exception in one line: its type and the first line of its text."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def in_shell(path: Path) -> str:
+    """Return a path as it is typed in a shell: quoted if it has spaces, and with ./ if it begins with a dash."""
+    text = str(path)
+    return shlex.quote(f"./{text}" if text.startswith("-") else text)

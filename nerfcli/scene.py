@@ -23,7 +23,7 @@ from nerfcli.cameras.formats.run_cameras import CAMERAS
 from nerfcli.cameras.formats.scene_json import SCENE_FILE, SCENE_VERSION, UNITS, UNUSED, read_description
 from nerfcli.cameras.formats.transforms import read_transforms
 from nerfcli.cameras.frame import Capture, Frame, Size
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, in_shell
 from nerfcli.holdout import moments, names_held_out
 from nerfcli.media.exif import read_exif
 from nerfcli.media.images import image_size, list_images
@@ -352,7 +352,7 @@ def photo_folder(path: Path) -> Path | None:
 
 def _no_scene(path: Path) -> UserError:
     if (path / CAMERAS).is_file():
-        hint = f"give the scene it was trained on; to continue it: nerfcli train SCENE -o {path} --resume"
+        hint = f"give the scene it was trained on; to continue it: nerfcli train SCENE -o {in_shell(path)} --resume"
         return UserError(f"{path} is a run, not a scene", hint)
     looked_for = (
         f"{SCENE_FILE}, {', '.join(name for name in _MODEL_FOLDERS[:-1])} (COLMAP), "
@@ -361,7 +361,7 @@ def _no_scene(path: Path) -> UserError:
     if folder := photo_folder(path):
         return UserError(
             f"{folder} has {len(list_images(folder))} photos but no poses; looked for {looked_for}",
-            f"estimate them with: nerfcli poses {folder}",
+            f"estimate them with: nerfcli poses {in_shell(folder)}",
         )
     return UserError(
         f"{path} is not a scene; looked for {looked_for}",

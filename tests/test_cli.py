@@ -25,7 +25,7 @@ from typer.exceptions import TyperException
 from nerfcli import cli, scene
 from nerfcli.atomic import write_json
 from nerfcli.cli.options import seconds_from_text, thread_count
-from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TERMINATED, TOO_FEW_PHOTOS
+from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TERMINATED, TOO_FEW_PHOTOS, in_shell
 from nerfcli.interrupts import install_handlers
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
@@ -237,16 +237,26 @@ def test_a_scene_where_a_run_is_needed_is_told_with_what_to_do(command, capture,
 def test_a_run_where_a_scene_is_needed_is_told_with_what_to_do(command, finished, tmp_path):
     error, hint = error_of(nerfcli(command, finished, "-o", tmp_path / "out"))
     assert error == f"Error: {finished} is a run, not a scene"
-    assert hint.endswith(f"to continue it: nerfcli train SCENE -o {finished} --resume")
+    assert hint.endswith(f"to continue it: nerfcli train SCENE -o '{finished}' --resume")
 
 
 def test_photos_where_cameras_are_needed_are_told_with_what_to_do(tmp_path):
-    photos = write_photos(tmp_path / "photos", 1)
+    photos = write_photos(tmp_path / "my photos", 1)
     error = error_of(nerfcli("convert", photos, tmp_path / "out.json", "--to", "transforms"))
     assert error == (
         f"Error: {photos} contains photos but no cameras",
-        f"Hint:  estimate them with: nerfcli poses {photos}",
+        f"Hint:  estimate them with: nerfcli poses '{photos}'",
     )
+
+
+def test_paths_in_hints_can_be_typed():
+    assert [in_shell(Path(name)) for name in ("a/b", "-a", "-a b", "it's", "/a b")] == [
+        "a/b",
+        "./-a",
+        "'./-a b'",
+        """'it'"'"'s'""",
+        "'/a b'",
+    ]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -185,7 +185,7 @@ def train(
       nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
     """
     values = dict(locals())
-    from nerfcli.errors import UserError
+    from nerfcli.errors import UserError, in_shell
     from nerfcli.memory import default_memory_limit
     from nerfcli.runs.components import Components, choose
     from nerfcli.runs.run import Run
@@ -347,7 +347,8 @@ def train(
             train_one_scan(folder, run)
         elif recognise(folder):
             raise UserError(
-                f"{folder} is a scan in a scanner's format", f"convert it first: nerfcli convert {folder} SCAN"
+                f"{folder} is a scan in a scanner's format",
+                f"convert it first: nerfcli convert {in_shell(folder)} SCAN",
             )
         elif voxel_size is not None:
             raise UserError(f"--voxel-size is for X-ray scans, and {folder} is not one", "remove --voxel-size")

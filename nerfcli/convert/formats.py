@@ -52,7 +52,7 @@ from nerfcli.convert.finding import (
 )
 from nerfcli.convert.scene_folder import SCENE_FILES, losses_scene, write_scene
 from nerfcli.convert.stored_pixels import STORED, UPRIGHT, measure
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, in_shell
 from nerfcli.media.images import list_images
 from nerfcli.media.masks import find_mask
 
@@ -117,7 +117,7 @@ def recognise(path: Path) -> tuple[Format, Path]:
         if found is not None and form.parse is not None:
             return form, found
     if path.is_dir() and list_images(path):
-        raise UserError(f"{path} contains photos but no cameras", f"estimate them with: nerfcli poses {path}")
+        raise UserError(f"{path} contains photos but no cameras", f"estimate them with: nerfcli poses {in_shell(path)}")
     looked_for = ", ".join(dict.fromkeys(form.looked_for for form in FORMATS if form.parse is not None))
     raise UserError(f"{path} contains no capture in a supported format", f"looked for {looked_for}")
 

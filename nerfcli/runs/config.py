@@ -12,7 +12,7 @@ from nerfcli import __version__
 from nerfcli.cameras.formats.run_cameras import MEND
 from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.cameras.origin import Origin
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, in_shell
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
 from nerfcli.runs.files import BLOCKS, CONFIG, RECONSTRUCTION
@@ -184,7 +184,7 @@ def no_run(path: Path) -> UserError:
     if path.is_file():
         return UserError(f"{path} is a file, not a run folder", hint)
     if is_scene(path):
-        return UserError(f"{path} is a scene, not a run", f"train it first: nerfcli train {path}")
+        return UserError(f"{path} is a scene, not a run", f"train it first: nerfcli train {in_shell(path)}")
     if (path / RECONSTRUCTION).exists():
         return UserError(
             f"{path} is the reconstruction of an X-ray scan, not a run of photos",
@@ -193,10 +193,12 @@ def no_run(path: Path) -> UserError:
     if (path / BLOCKS).is_dir():
         return UserError(
             f"the blocks of {path} are not complete",
-            f"train them: nerfcli train SCENE --blocks N -o {path}, with the options that they were begun with",
+            f"train them: nerfcli train SCENE --blocks N -o {in_shell(path)}, with the options of the first ones",
         )
     if photos := photo_folder(path):
-        return UserError(f"{photos} is a folder of photos, not a run", f"make a run of it first: nerfcli run {photos}")
+        return UserError(
+            f"{photos} is a folder of photos, not a run", f"make a run of it first: nerfcli run {in_shell(photos)}"
+        )
     return UserError(f"{path} is not a run folder: it has no {CONFIG}", hint)
 
 

@@ -13,7 +13,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.origin import Origin
 from nerfcli.cameras.rigid import look_at
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, in_shell
 from nerfcli.media.geodesy import degrees_per_metre
 from nerfcli.media.geotiff import MapPlace, write_geotiff
 from nerfcli.media.las_files import SUFFIXES as LAS_SUFFIXES
@@ -216,7 +216,10 @@ def export_colmap_dense(
             progress(_DEPTHS + (1 - _DEPTHS) * (index + 1) / len(frames), "photos")
         write_sparse(partial, cameras, points)
         write_stereo(partial, views)
-    notify(f"{len(frames)} photos share {len(points.places)} points: colmap stereo_fusion --workspace_path {path}")
+    notify(
+        f"{len(frames)} photos share {len(points.places)} points; to fuse them: "
+        f"colmap stereo_fusion --workspace_path {in_shell(path)}"
+    )
     if model.unit != "arbitrary":
         notify(f"COLMAP's files hold no unit: their lengths are in {model.unit}s, as those of the scene")
 

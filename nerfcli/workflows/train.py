@@ -1,6 +1,5 @@
 """Train a scene, keep an existing run, resume one, or refuse to overwrite another one."""
 
-import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +7,7 @@ from pathlib import Path
 from nerfcli import scene as scenes
 from nerfcli.atomic import clear_leftovers
 from nerfcli.cameras.orientation import describe_rescaling
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, in_shell
 from nerfcli.exclusive import exclusive
 from nerfcli.runs.blocks import divide
 from nerfcli.runs.config import split_hash
@@ -85,7 +84,7 @@ def train_scene(
         )
     except KeyboardInterrupt:
         if (run / STATE).exists():
-            paths = f"{shlex.quote(str(folder))} -o {shlex.quote(str(run))}"
+            paths = f"{in_shell(folder)} -o {in_shell(run)}"
             notify(f"checkpoint saved; continue with: nerfcli train {paths} --resume")
         raise
 
