@@ -177,6 +177,10 @@ def test_all_threads_are_the_processors_of_this_process():
         ("view x --port 80000", "'80000' is too large; give at most 65535"),
         ("ablate x --seeds 0", "'0' is too small; give at least 1"),
         ("train x --seed 4294967296", "'4294967296' is too large; give at most 4294967295"),
+        ("render x --direction reverse", "--direction: it works with --video"),
+        ("render x --crf 5", "--crf: it works with --video"),
+        ("render x --background-distance 5", "it works with --depth background"),
+        ("train x --vary photos", "--vary: it works with --members"),
         ("render x --cameras-only --dry-run", "it renders nothing; remove --dry-run"),
         ("report x --depth expected", "'expected'; choose conditional, moment, max-weight, median or quantile:Q"),
         ("export x --to page --faces 100", "--faces: it is for meshes"),
@@ -226,7 +230,7 @@ def test_a_missing_path_is_told_in_two_lines(command, tmp_path):
 @pytest.mark.parametrize("command", ["evaluate", "render", "report"])
 def test_a_scene_where_a_run_is_needed_is_told_with_what_to_do(command, capture, tmp_path):
     error = error_of(nerfcli(command, capture))
-    assert error == (f"Error: {capture} is a scene, not a run", f"Hint:  train it first: nerfcli train {capture}")
+    assert error == (f"Error: {capture} is a scene, not a run", f"Hint:  train it first: nerfcli train '{capture}'")
     photos = write_photos(tmp_path / "photos", 1)
     hint = f"Hint:  make a run of it first: nerfcli run {photos}"
     assert error_of(nerfcli(command, photos)) == (f"Error: {photos} is a folder of photos, not a run", hint)

@@ -294,6 +294,12 @@ def test_options_for_photos_are_refused_and_nothing_is_written(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_reconstruction_is_not_taken_for_cameras(bean_run: Path, tmp_path: Path) -> None:
+    code, _, err = call("convert", bean_run, tmp_path / "out", "--to", "nerfcli")
+    assert code == 3
+    assert "is the reconstruction of an X-ray scan, which has no photos" in err
+
+
 def test_outputs_of_scans_are_refused_for_runs_of_photos(finished: Path) -> None:
     for options in (("--slices", "z=0"), ("--outputs", "projection")):
         code, _, err = call("render", finished, *options)

@@ -52,7 +52,9 @@ def up_aligned(frames: Sequence[Frame], axis: str, *, up: np.ndarray | None = No
         UserError: an unknown axis, an `up` of length 0, or neither frames nor `up`.
     """
     if axis not in WORLD_AXES:
-        raise UserError(f"unknown axis {axis!r} for the up direction", f"choose one of {', '.join(WORLD_AXES)}")
+        raise UserError(
+            f"unknown axis {axis!r} for the up direction", f"choose one of {', '.join(WORLD_AXES)}", exit_code=2
+        )
     if up is None:
         if not frames:
             raise UserError("the capture has no cameras to estimate the up direction from", "give the up direction")
@@ -92,9 +94,9 @@ def point_of(text: str, hint: str) -> np.ndarray:
     try:
         point = np.array([float(part) for part in text.split(",")])
     except ValueError as error:
-        raise UserError(f"{text!r} is not a point", hint) from error
+        raise UserError(f"{text!r} is not a point", hint, exit_code=2) from error
     if point.shape != (3,) or not np.isfinite(point).all():
-        raise UserError(f"{text!r} is not a point of three finite numbers", hint)
+        raise UserError(f"{text!r} is not a point of three finite numbers", hint, exit_code=2)
     return point
 
 

@@ -10,6 +10,7 @@ from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.convert_scan import CentreOfRotation, Mirrored, Photons, Unit, scan_work
 from nerfcli.cli.options import Holdout, Json, Overwrite, Quiet, one_of
+from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
     from nerfcli.convert.conversion import Conversion
@@ -182,6 +183,7 @@ def convert(
     from nerfcli.convert.conversion import ConventionOverrides, TargetOptions
     from nerfcli.convert.formats import UserInputs, format_named
     from nerfcli.convert.world_frame import WorldFrame
+    from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.convert import convert_capture, detect_convention, detection_record
 
     console = Console(quiet=quiet, json_lines=json)
@@ -246,6 +248,10 @@ def convert(
             console.result(done.conversion.path, done.record)
 
     def either(path: Path, one_of_many: bool) -> None:
+        if is_reconstruction(path):
+            raise UserError(
+                f"{path} is the reconstruction of an X-ray scan, which has no photos", "use nerfcli export --to volume"
+            )
         if not convert_scan(path, one_of_many):
             work(path, one_of_many)
 

@@ -293,10 +293,22 @@ def render(
     if max_size is not None and (width is not None or height is not None):
         raise typer.BadParameter("cannot be combined with --width or --height", param_hint="--max-size")
     look = look_of(width, height, lens=lens, fov_deg=fov, crop=crop)
+    writes_video = video or video_format is not None
+    unused = {
+        "--fps": (fps is not None and not (writes_video or cameras_only), "--video"),
+        "--crf": (crf is not None and not writes_video, "--video"),
+        "--loop": (loop is not None and not writes_video, "--video"),
+        "--video-layout": (video_layout != "separate" and not writes_video, "--video"),
+        "--direction": (direction != "forward" and not writes_video, "--video"),
+        "--background-distance": (background_distance is not None and depth != "background", "--depth background"),
+    }
+    for option, (is_unused, needed) in unused.items():
+        if is_unused:
+            raise typer.BadParameter(f"it works with {needed}; add that, or remove it", param_hint=option)
     fps = fps or file_fps(cameras) or DEFAULT_FPS
     part = None if frames is None else frame_range(frames)
     videos = None
-    if video or video_format is not None:
+    if writes_video:
         videos = video_settings(
             video_format or "mp4", layout=video_layout, direction=direction, fps=fps, crf=crf, loop=loop
         )

@@ -201,6 +201,8 @@ def train(
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
     one_of(vary, VARIED, "--vary")
+    if vary != "seeds" and members is None:
+        raise typer.BadParameter("it works with --members; add that, or remove it", param_hint="--vary")
     if members is not None and (dry_run or view):
         option = "--dry-run" if dry_run else "--view"
         raise typer.BadParameter(

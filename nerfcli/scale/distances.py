@@ -63,9 +63,9 @@ def known_distance(text: str, frames: Sequence[Frame]) -> KnownDistance:
         first, second, length = shlex.split(text)
         metres, *tolerance = (float(part) for part in length.replace("±", "+-").split("+-"))
     except ValueError as error:
-        raise UserError(f"{text!r} is not a valid distance", EXPECTED) from error
+        raise UserError(f"{text!r} is not a valid distance", EXPECTED, exit_code=2) from error
     if len(tolerance) > 1:
-        raise UserError(f"{text!r} is not a valid distance", EXPECTED)
+        raise UserError(f"{text!r} is not a valid distance", EXPECTED, exit_code=2)
     a, b = (_place(place, frames) for place in (first, second))
     units = float(np.linalg.norm(a - b))
     return KnownDistance(f"{first} to {second}", units, metres, tolerance[0] if tolerance else None)
