@@ -288,7 +288,7 @@ POSES: tuple[Group, ...] = (
             Mutant("min(_thinness(x), _thinness(y)) < _THINNEST", "False"),
             Mutant("if spread < SPREAD_PER_NOISE * np.sqrt(3) * noise or", "if False and"),
             Mutant("jackknife(x[keep], y[keep]) if checked else None", "jackknife(x[keep], y[keep])"),
-            Mutant("if not kept\n    ]", "if kept\n    ]"),
+            Mutant("if name not in used}", "if name in used}"),
             Mutant("if fit.enu_from_world is None:", "if False:"),
             Mutant("_ENOUGH_TO_CHECK = 4", "_ENOUGH_TO_CHECK = 5"),
         ),

@@ -1,6 +1,7 @@
 """Georeferenced worlds: control points and GPS, on scenes whose place on Earth is known."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from commands import error_of, nerfcli
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from test_scale import photographed, random_similarity, with_gps
 
@@ -22,6 +24,7 @@ from nerfcli.errors import UserError
 from nerfcli.media.geodesy import ecef
 from nerfcli.scale.control_points import read_control_points
 from nerfcli.scale.georeference import Georeference, georeference_by_gps, georeference_by_points
+from nerfcli.scene import load
 
 few = examples(10)
 seeds = st.integers(0, 2**32 - 1)
@@ -282,3 +285,19 @@ def test_the_command_writes_a_world_of_metres_and_says_where_it_is(tmp_path):
     assert "--georeference and --world-up cannot be combined" in error_of(refused)[0]
     missing = nerfcli("convert", source, tmp_path / "x.npz", "--to", "npz", "--georeference", tmp_path / "no.txt")
     assert "no.txt does not exist" in error_of(missing)[0]
+
+
+def test_a_scene_keeps_its_place_until_it_is_moved(tmp_path):
+    frames = survey()
+    path = control_file(tmp_path / "gcp_list.txt", frames)
+    for frame in frames:
+        Image.new("L", (800, 600)).save(tmp_path / frame.name)
+    photos = tuple(replace(frame, image=tmp_path / frame.name) for frame in frames)
+    write_npz(Capture(photos, PLACES, (), None, "npz"), tmp_path / "in.npz")
+    place = ("--georeference", path)
+    for source, target, options in (("in.npz", "a", place), ("a", "b", ()), ("b", "c", ("--world-up", "y"))):
+        done = nerfcli("convert", tmp_path / source, tmp_path / target, "--to", "nerfcli", *options)
+        assert done.exit_code == 0, done.stderr
+    a, b, c = (load(tmp_path / name).history.get("origin") for name in "abc")
+    assert a == b == {"system": UTM, "coordinates": [235280.0, 3811220.0, 12.0], "in_degrees": False}
+    assert c is None

@@ -85,39 +85,55 @@ def georeference_by_points(frames: Sequence[Frame], control: ControlPoints, sour
             "they must span an area, or nothing says which way is up",
         )
     fit = align_robustly(x, y)
-    keep = fit.follows
+    keep, offsets = fit.follows, _offsets(x, y, fit)
+    misses = dict(zip(names, np.linalg.norm(offsets, axis=1).tolist(), strict=True))
+    spread = _rms(y[keep] - y[keep].mean(axis=0))
     noise = _noise(x[keep], y[keep], fit)
-    offsets = _offsets(x, y, fit)
-    spread = float(np.sqrt(np.mean(np.sum((y[keep] - y[keep].mean(axis=0)) ** 2, axis=1))))
-    level, height = (float(np.sqrt(np.mean(np.sum(offsets[keep][:, part] ** 2, axis=1)))) for part in ([0, 1], [2]))
-    distances = np.linalg.norm(offsets, axis=1)
-    worst = int(np.argmax(np.where(keep, distances, -1.0)))
     if spread < SPREAD_PER_NOISE * np.sqrt(3) * noise or not spans_a_plane(y[keep], noise):
+        worst = max(misses, key=lambda name: misses[name])
         raise UserError(
             f"the control points contradict each other: they are spread over {spread:.2g} m, and the noise is "
-            f"{np.sqrt(3) * noise:.2g} m; {names[worst]} misses by {distances[worst]:.2g} m",
+            f"{np.sqrt(3) * noise:.2g} m; {worst} misses by {misses[worst]:.2g} m",
             "check their names, the order of coordinates, and that pixels refer to the photos at full size",
         )
     checked = int(keep.sum()) >= _ENOUGH_TO_CHECK
-    how = "each predicted from the others, they miss by" if checked else "the fit, which nothing checks, misses by"
-    details = [
-        f"spread over {spread:.3g} m; {how} {level:.2g} m horizontally and {height:.2g} m vertically (RMS), at most "
-        f"{distances[worst]:.2g} m ({names[worst]})"
-    ]
-    outliers = [
-        f"{name} (by {distance:.2g} m)" for name, distance, kept in zip(names, distances, keep, strict=True) if not kept
-    ]
-    details += [f"outliers ignored: {', '.join(outliers)}"] if outliers else []
-    details += [f"not used: {', '.join(f'{name} ({reason})' for name, reason in unused.items())}"] if unused else []
+    used = {name: misses[name] for name, kept in zip(names, keep, strict=True) if kept}
+    outliers = {name: miss for name, miss in misses.items() if name not in used}
+    details = f"spread over {spread:.3g} m; {_errors_in_words(offsets[keep], used)}"
     estimate = ScaleEstimate(
         metres_per_unit=fit.b_from_a.scale,
         standard_error=jackknife(x[keep], y[keep]) if checked else None,
-        residuals=tuple((name, float(distance)) for name, distance in zip(names, distances, strict=True)),
+        residuals=tuple(misses.items()),
         residual_unit="metre",
-        source=f"{int(keep.sum())} control points ({source})",
-        details="; ".join(details),
+        source=f"{len(used)} control points ({source})",
+        details=details + _left_out_in_words(outliers, unused),
     )
     return Georeference(estimate, fit.b_from_a, control.origin)
+
+
+def _errors_in_words(offsets: np.ndarray, misses: Mapping[str, float]) -> str:
+    """Describe the offsets (N, 3) of the used points, which miss by `misses`."""
+    checked = len(misses) >= _ENOUGH_TO_CHECK
+    how = "each predicted from the others, they miss by" if checked else "the fit, which nothing checks, misses by"
+    worst = max(misses, key=lambda name: misses[name])
+    return (
+        f"{how} {_rms(offsets[:, :2]):.2g} m horizontally and {_rms(offsets[:, 2:]):.2g} m vertically (RMS), at most "
+        f"{misses[worst]:.2g} m ({worst})"
+    )
+
+
+def _left_out_in_words(outliers: Mapping[str, float], unused: Mapping[str, str]) -> str:
+    words = ""
+    if outliers:
+        words += f"; outliers ignored: {', '.join(f'{name} (by {miss:.2g} m)' for name, miss in outliers.items())}"
+    if unused:
+        words += f"; not used: {', '.join(f'{name} ({reason})' for name, reason in unused.items())}"
+    return words
+
+
+def _rms(offsets: np.ndarray) -> float:
+    """Return the root mean square length of offsets (N, D)."""
+    return float(np.sqrt(np.mean(np.sum(offsets**2, axis=1))))
 
 
 def _offsets(x: np.ndarray, y: np.ndarray, fit: Alignment) -> np.ndarray:

@@ -4,14 +4,18 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from nerfcli.cameras.formats.scene_json import read_description
 from nerfcli.cameras.frame import Capture
 from nerfcli.cameras.orientation import describe_rescaling
+from nerfcli.cameras.origin import Origin
 from nerfcli.convert import detect
 from nerfcli.convert.conversion import ConventionOverrides, Conversion, TargetOptions, convert, load
 from nerfcli.convert.formats import Format, UserInputs, recording
 from nerfcli.convert.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.convert.world_frame import WorldFrame, in_world_frame
+from nerfcli.errors import UserError
 from nerfcli.media.images import HEIC_SUFFIXES
+from nerfcli.runs.run import Run
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
 
@@ -65,7 +69,8 @@ def convert_capture(
     frame = {"new_from_old": moved.new_from_old.to_json()} | ({} if scale is None else {"scale": scale.to_json()})
     if moved.origin is not None:
         notify(f"world: x east, y north, z up; origin {moved.origin}")
-        frame |= {"origin": asdict(moved.origin)}
+    if origin := moved.origin or (_origin_of(found, form.name) if world == WorldFrame() else None):
+        frame |= {"origin": asdict(origin)}
     wanted = replace(wanted, form=recording(wanted.form, {"source": str(found), **frame}))
     done = convert(moved.capture, target, source_format=form.name, wanted=wanted)
     for text in done.notes:
@@ -79,6 +84,16 @@ def convert_capture(
     if done.loss_px > wanted.tolerance_px:
         warn(f"dropping lens parameters shifts pixels by up to {done.loss_px:.3g} px")
     return Converted(done, _record(done, to) | frame)
+
+
+def _origin_of(path: Path, form: str) -> Origin | None:
+    """Return where the origin of a scene, or of a run's scene, is on Earth; None if it is unknown."""
+    try:
+        if form == "run":
+            return Run(path.parent).config.origin
+        return Origin.from_json(read_description(path).provenance["origin"]) if form == "nerfcli" else None
+    except (UserError, KeyError, TypeError, ValueError):  # cameras.json may be alone, and a scene may have no origin
+        return None
 
 
 def detect_convention(

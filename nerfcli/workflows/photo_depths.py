@@ -8,6 +8,7 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.depth_errors import measure_depth_errors
+from nerfcli.findings import several
 from nerfcli.media.masks import read_mask
 from nerfcli.render.depth_errors import STRATA, DepthErrors
 from nerfcli.render.model import Model
@@ -75,9 +76,8 @@ def depth_errors(
             notify(f"the errors of depth are not kept: {error.message}")
     for least, pixels, quantiles in zip(STRATA, errors.pixels, errors.quantiles, strict=True):
         if np.isnan(quantiles).any():
-            notify(
-                f"no intervals or confidence where {least} photos see the surface: only {pixels} pixels were measured"
-            )
+            seen = several(least, "photo sees", "photos see")
+            notify(f"no intervals or confidence where {seen} the surface: only {pixels} pixels were measured")
     notify(
         f"errors of depth measured at {100.0 * errors.matched:.1f} % of the pixels of {errors.photos} held-out photos"
     )
