@@ -269,7 +269,7 @@ POSES: tuple[Group, ...] = (
             Mutant("index.get(photo.lower(), [])", "index.get(photo, [])"),
             Mutant("if len(found) > 1:", "if False:"),
             Mutant("_NOT_LEVEL or re.search", "set() or re.search"),
-            Mutant('r"\\+UNITS=(?!M(\\+|$))|\\+TO', 'r"\\+TO'),
+            Mutant('r"\\+V?UNITS=(?!M(\\+|$))|\\+V?TO', 'r"\\+V?TO'),
             Mutant("places.setdefault(name, place) != place", "places.setdefault(name, place) is None"),
             Mutant("_DEGREES | {", "{"),
         ),

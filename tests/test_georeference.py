@@ -184,6 +184,7 @@ def test_the_stated_errors_are_those_of_other_places(tmp_path):
         (lambda text: text.replace(UTM, "EPSG:3857"), "metres of EPSG:3857 are not those of the ground", "UTM"),
         (lambda text: text.replace(UTM, "+proj=utm +zone=11 +units=us-ft"), "is not in metres", "to metres"),
         (lambda text: text.replace(UTM, "+proj=tmerc +to_meter=0.3048"), "is not in metres", "to metres"),
+        (lambda text: text.replace(UTM, "+proj=utm +zone=11 +vunits=us-ft"), "is not in metres", "heights too"),
         (lambda text: text.replace(UTM, "EPSG:4326"), "not all coordinates are degrees", "longitude comes before"),
         (lambda text: UTM, "has no control points", "a first line with the coordinate system"),
         (lambda text: "\n# nothing\n", "is empty", "a first line with the coordinate system"),

@@ -129,7 +129,8 @@ def test_scenes_that_do_not_stand_upright_are_refused():
 )
 def test_codes_of_coordinate_systems(system, code):
     assert Origin(system, (0.0, 0.0, 0.0), in_degrees=False).epsg == code
-    assert Origin("WGS 84", (1.0, 2.0, 3.0), in_degrees=True).epsg == 4326
+    for name, degrees in (("WGS 84", 4326), ("EPSG:4979", 4326), ("EPSG:4269", 4269), ("+proj=longlat", 4326)):
+        assert Origin(name, (1.0, 2.0, 3.0), in_degrees=True).epsg == degrees
 
 
 @pytest.mark.parametrize("latitude", [0.0, 34.4, -61.0])

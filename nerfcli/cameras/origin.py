@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 _SEPARATOR = "; origin "
+# Systems of longitude, latitude and height, and the same without heights: WGS 84, ETRS89.
+_WITHOUT_HEIGHT = {4979: 4326, 4937: 4258}
 
 
 def without_origin(unit_source: str | None) -> str | None:
@@ -39,12 +41,12 @@ class Origin:
 
     @property
     def epsg(self) -> int | None:
-        """EPSG code of the system, also of UTM zones given in words; None if it has another name."""
-        if self.in_degrees:
-            return 4326
+        """EPSG code of the system without heights, also of UTM zones given in words; None if it has another name."""
         compact = re.sub(r"\s", "", self.system).upper()
         if code := re.fullmatch(r"EPSG:(\d{4,5})", compact):
-            return int(code[1])
+            return _WITHOUT_HEIGHT.get(int(code[1]), int(code[1]))
+        if self.in_degrees:
+            return 4326
         if zone := re.fullmatch(r"WGS84UTM(\d{1,2})([NS])", compact):
             return (32700 if zone[2] == "S" else 32600) + int(zone[1])
         zone = re.search(r"\+PROJ=UTM.*\+ZONE=(\d{1,2})(?!\d)", compact)

@@ -125,7 +125,7 @@ def _in_degrees(system: str, path: Path) -> bool:
             f"{path}: the metres of {system} are not those of the ground",
             "convert the coordinates to UTM, another national grid, or longitude and latitude (EPSG:4326)",
         )
-    if re.search(r"\+UNITS=(?!M(\+|$))|\+TO_METER=(?!1(\.0*)?(\+|$))", compact):
+    if re.search(r"\+V?UNITS=(?!M(\+|$))|\+V?TO_METER=(?!1(\.0*)?(\+|$))", compact):
         raise UserError(f"{path}: {system} is not in metres", "convert the coordinates, heights too, to metres")
     return compact in _DEGREES | {"WGS84"} or bool(re.search(r"\+PROJ=(LONGLAT|LATLONG|LONLAT|LATLON)", compact))
 

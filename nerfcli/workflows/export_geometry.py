@@ -188,7 +188,7 @@ def _place_on_map(corner: tuple[float, float], pixel: float, origin: Origin | No
         return MapPlace((a + corner[0], b + corner[1]), (pixel, pixel), origin.epsg, False, origin.system)
     north, east = degrees_per_metre(a, height)
     return MapPlace(
-        (b + east * corner[0], a + north * corner[1]), (east * pixel, north * pixel), origin.epsg, True, "WGS 84"
+        (b + east * corner[0], a + north * corner[1]), (east * pixel, north * pixel), origin.epsg, True, origin.system
     )
 
 
