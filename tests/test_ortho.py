@@ -246,6 +246,27 @@ def test_georeferenced_scenes_stand_on_z(run, tmp_path):
         assert (abs(matrix[1, 2] - 1) < 1e-9) == (origin is not None)
 
 
+def test_las_files_of_surveys_are_in_their_system(run, tmp_path):
+    laspy = pytest.importorskip("laspy", reason="an extra")
+    options = ("--to", "points", "--max-size", "48", "--threads", "2")
+    put(run, None)
+    assert nerfcli("export", run, "-o", tmp_path / "a.las", *options).exit_code == 0
+    put(run, Origin("EPSG:32611", (235000.0, 3811000.0, 100.0), in_degrees=False))
+    assert nerfcli("export", run, "-o", tmp_path / "b.las", *options).exit_code == 0
+    plain, surveyed = (laspy.read(tmp_path / name) for name in ("a.las", "b.las"))
+    np.testing.assert_allclose(
+        surveyed.xyz - plain.xyz, np.tile([235000.0, 3811000.0, 100.0], (len(plain), 1)), atol=1e-5
+    )
+    records = {vlr.record_id: vlr for vlr in surveyed.header.vlrs if vlr.user_id == "LASF_Projection"}
+    keys = {key.id: key.value_offset for key in records[34735].geo_keys}
+    assert (keys[1024], keys[3072]) == (1, 32611)
+    assert "frame: EPSG:32611" in nerfcli("info", tmp_path / "b.las").stdout
+    low, high = describe(tmp_path / "b.las")["box"][:3], describe(tmp_path / "b.las")["box"][3:]
+    assert (surveyed.xyz >= low).all()
+    assert (surveyed.xyz <= high).all()
+    assert not [vlr for vlr in plain.header.vlrs if vlr.user_id == "LASF_Projection"]
+
+
 def test_degrees_and_scenes_without_a_place(run, tmp_path):
     options = ("--to", "ortho", "--voxel-size", "0.2", "--max-size", "32", "--threads", "2")
     origins = (Origin("WGS 84", (48.0, 11.0, 500.0), in_degrees=True), None)

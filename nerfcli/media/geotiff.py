@@ -17,7 +17,7 @@ from nerfcli.media.descriptions import DAMAGED, damaged
 
 _TILE_PX = 256
 # Tags: ModelPixelScale, ModelTiepoint, GeoKeyDirectory, GeoAsciiParams, and GDAL's value of undefined pixels.
-_SCALE, _TIEPOINT, _KEYS, _TEXT, _NO_DATA = 33550, 33922, 34735, 34737, 42113
+_SCALE, _TIEPOINT, KEYS, TEXT, _NO_DATA = 33550, 33922, 34735, 34737, 42113
 _DOUBLE, _SHORT, _ASCII = 12, 3, 2
 # Keys and values: the model is projected, geographic (degrees) or defined by the user; pixels are areas.
 _MODEL, _RASTER, _CITATION, _GEOGRAPHIC, _PROJECTED = 1024, 1025, 1026, 2048, 3072
@@ -43,6 +43,22 @@ class MapPlace:
     words: str
 
 
+def geo_keys(epsg: int | None, words: str, *, in_degrees: bool) -> tuple[list[int], str]:
+    """Return the values of the tags `KEYS` and `TEXT`, which LAS files have too, for a coordinate system.
+
+    Args:
+        epsg: its code; None if it has none.
+        words: the system as text.
+        in_degrees: whether it has longitude and latitude.
+    """
+    text = words.encode("ascii", "replace").decode() + "|"
+    model = _IS_OWN if epsg is None else _IS_GEOGRAPHIC if in_degrees else _IS_PROJECTED
+    keys = [(_MODEL, 0, 1, model), (_RASTER, 0, 1, _IS_AREA), (_CITATION, TEXT, len(text), 0)]
+    if epsg is not None:
+        keys.append((_GEOGRAPHIC if in_degrees else _PROJECTED, 0, 1, epsg))
+    return [1, 1, 1, len(keys), *(value for key in keys for value in key)], text
+
+
 def write_geotiff(path: Path, values: np.ndarray, place: MapPlace, *, description: Mapping[str, Any]) -> None:
     """Write a picture on a map, atomically.
 
@@ -55,17 +71,12 @@ def write_geotiff(path: Path, values: np.ndarray, place: MapPlace, *, descriptio
     Raises:
         UserError: the file cannot be written.
     """
-    words = place.words.encode("ascii", "replace").decode() + "|"
-    model = _IS_OWN if place.epsg is None else _IS_GEOGRAPHIC if place.in_degrees else _IS_PROJECTED
-    keys = [(_MODEL, 0, 1, model), (_RASTER, 0, 1, _IS_AREA), (_CITATION, _TEXT, len(words), 0)]
-    if place.epsg is not None:
-        keys.append((_GEOGRAPHIC if place.in_degrees else _PROJECTED, 0, 1, place.epsg))
-    directory = [1, 1, 1, len(keys), *(value for key in keys for value in key)]
+    directory, words = geo_keys(place.epsg, place.words, in_degrees=place.in_degrees)
     tags = [
         (_SCALE, _DOUBLE, 3, (*place.pixel, 0.0), True),
         (_TIEPOINT, _DOUBLE, 6, (0.0, 0.0, 0.0, *place.corner, 0.0), True),
-        (_KEYS, _SHORT, len(directory), directory, True),
-        (_TEXT, _ASCII, len(words) + 1, words, True),
+        (KEYS, _SHORT, len(directory), directory, True),
+        (TEXT, _ASCII, len(words) + 1, words, True),
     ]
     colours = values.ndim == 3
     if not colours:

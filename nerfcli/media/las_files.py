@@ -14,6 +14,7 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
+from nerfcli.media.geotiff import KEYS, TEXT, geo_keys
 from nerfcli.media.mesh_files import KEY
 
 SUFFIXES = (".las", ".laz")
@@ -38,7 +39,13 @@ def las_module() -> ModuleType:
         raise UserError(".las and .laz files need laspy and lazrs", "pip install 'nerfcli[las]'") from error
 
 
-def write_las(path: Path, columns: Mapping[str, np.ndarray], *, description: Mapping[str, Any]) -> None:
+def write_las(
+    path: Path,
+    columns: Mapping[str, np.ndarray],
+    *,
+    description: Mapping[str, Any],
+    system: tuple[str, int | None] | None = None,
+) -> None:
     """Write points, compressed if the suffix is .laz; atomic.
 
     Args:
@@ -46,6 +53,7 @@ def write_las(path: Path, columns: Mapping[str, np.ndarray], *, description: Map
         columns: arrays (N,) by name: x, y, z, rounded to between 1e-8 and 1e-7 of the largest extent; red, green, blue,
             uint8; all others become extra dimensions with their own dtype.
         description: plain values, stored as JSON in a variable-length record of the user "nerfcli".
+        system: name and EPSG code of the projected coordinate system that x, y and z are in; None for none.
 
     Raises:
         UserError: the file cannot be written, or laspy is not installed.
@@ -61,6 +69,10 @@ def write_las(path: Path, columns: Mapping[str, np.ndarray], *, description: Map
     header.add_extra_dims([laspy.ExtraBytesParams(name, columns[name].dtype) for name in extras])
     text = json.dumps(dict(description), allow_nan=False).encode()
     header.vlrs.append(laspy.VLR(user_id=KEY, record_id=1, description="what the points are", record_data=text))
+    if system is not None:
+        directory, words = geo_keys(system[1], system[0], in_degrees=False)
+        for record, data in ((KEYS, np.array(directory, "<u2").tobytes()), (TEXT, words.encode() + b"\0")):
+            header.vlrs.append(laspy.VLR(user_id="LASF_Projection", record_id=record, record_data=data))
     points = laspy.LasData(header)
     points.x, points.y, points.z = places.T
     for name in _COLOURS:

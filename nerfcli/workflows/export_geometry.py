@@ -93,8 +93,16 @@ def export_points(
         "parallax_deg": PARALLAX,
         "spread": "standard deviation of where the light of the pixel ends, in the unit",
     }
-    write = write_las if las else write_ply
-    write(path, columns, description=described)
+    origin = run.config.origin
+    if las and origin is not None and not origin.in_degrees:
+        columns |= {axis: columns[axis] + shift for axis, shift in zip("xyz", origin.coordinates, strict=True)}
+        box = np.add(described["box"], 2 * origin.coordinates).tolist()
+        described |= {"frame": origin.system, "box": box}
+        write_las(path, columns, description=described, system=(origin.system, origin.epsg))
+    elif las:
+        write_las(path, columns, description=described)
+    else:
+        write_ply(path, columns, description=described)
     notify(f"{len(points.places)} points that two photos or more see, {_grid_in_words(grid, model)}")
 
 
