@@ -260,7 +260,9 @@ def test_las_files_of_surveys_are_in_their_system(run, tmp_path):
     records = {vlr.record_id: vlr for vlr in surveyed.header.vlrs if vlr.user_id == "LASF_Projection"}
     keys = {key.id: key.value_offset for key in records[34735].geo_keys}
     assert (keys[1024], keys[3072]) == (1, 32611)
-    assert "frame: EPSG:32611" in nerfcli("info", tmp_path / "b.las").stdout
+    words = nerfcli("info", tmp_path / "b.las").stdout
+    assert "frame: EPSG:32611" in words
+    assert f"{surveyed.header.mins[1]:.2f}" in words
     low, high = describe(tmp_path / "b.las")["box"][:3], describe(tmp_path / "b.las")["box"][3:]
     assert (surveyed.xyz >= low).all()
     assert (surveyed.xyz <= high).all()

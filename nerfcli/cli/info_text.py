@@ -200,7 +200,7 @@ def _with_unit(key: str, value: Any) -> str:
 
 def _plain(value: Any) -> str:
     if isinstance(value, float):
-        return f"{value:.6g}"
+        return f"{value:.2f}" if 1e5 <= abs(value) < 1e9 else f"{value:.6g}"  # northings to a centimetre
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
