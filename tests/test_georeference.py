@@ -10,7 +10,7 @@ from commands import error_of, nerfcli
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 from test_scale import photographed, random_similarity, with_gps
 
@@ -180,7 +180,7 @@ def test_the_stated_errors_are_those_of_other_places(tmp_path):
 @pytest.mark.parametrize(
     ("change", "error", "hint"),
     [
-        (lambda text: text.replace(UTM, "x y z"), "the first line is no coordinate system: 'x y z'", "EPSG:32611"),
+        (lambda text: text.replace(UTM, "x y z"), "the first line is not a coordinate system: 'x y z'", "EPSG:32611"),
         (lambda text: text.replace(UTM, "EPSG:3857"), "metres of EPSG:3857 are not those of the ground", "UTM"),
         (lambda text: text.replace(UTM, "+proj=utm +zone=11 +units=us-ft"), "is not in metres", "to metres"),
         (lambda text: text.replace(UTM, "+proj=tmerc +to_meter=0.3048"), "is not in metres", "to metres"),
@@ -235,7 +235,7 @@ def test_photos_are_found_by_the_end_of_their_name_in_any_case(tmp_path):
         solved(twice, path)
 
 
-def test_places_without_a_name_are_told_apart_by_their_coordinates(tmp_path):
+def test_points_without_a_name_are_identified_by_their_coordinates(tmp_path):
     frames = survey()
     path = control_file(tmp_path / "gcp.txt", frames, header="WGS84 UTM 11N")
     path.write_text("\n".join("\t".join(line.split("\t")[:6]) for line in path.read_text().splitlines()))
@@ -302,3 +302,32 @@ def test_a_scene_keeps_its_place_until_it_is_moved(tmp_path):
     a, b, c = (load(tmp_path / name).history.get("origin") for name in "abc")
     assert a == b == {"system": UTM, "coordinates": [235280.0, 3811220.0, 12.0], "in_degrees": False}
     assert c is None
+
+
+def test_positions_in_exif_give_the_place(tmp_path):
+    """Photos 11 m apart in a square at 48 degrees north, with positions to a hundredth of a second of arc."""
+    frames = []
+    for i, (east, north) in enumerate([(0, 0), (11, 0), (22, 0), (0, 11), (11, 11), (22, 11), (0, 22), (22, 22)]):
+        exif = Image.Exif()
+        seconds = (3600 * north / 111194.0, 3600 * east / 74629.0)  # metres per degree there
+        exif[ExifTags.IFD.GPSInfo] = {
+            1: "N",
+            2: (48, 0, seconds[0]),
+            3: "E",
+            4: (11, 0, seconds[1]),
+            5: b"\0",
+            6: 500.0,
+        }
+        path = tmp_path / f"{i}.jpg"
+        Image.new("RGB", (800, 600)).save(path, exif=exif)
+        pose = rigid.from_parts(np.diag([1.0, -1, -1]), np.array([north, -east, 3.0]) / 10)
+        frames.append(Frame(path.name, CAMERA, pose, image=path))
+    write_npz(Capture(tuple(frames), PLACES, (), None, "npz"), tmp_path / "in.npz")
+    done = nerfcli(
+        "convert", tmp_path / "in.npz", tmp_path / "out.npz", "--to", "npz", "--georeference", "gps", "--json"
+    )
+    assert done.exit_code == 0, done.stderr
+    record = json.loads(done.stdout)
+    assert record["origin"] == {"system": "WGS 84", "coordinates": [48.0, 11.0, 500.0], "in_degrees": True}
+    centres = np.array([frame.centre for frame in parse_npz(tmp_path / "out.npz").frames])
+    np.testing.assert_allclose(centres[7], [22, 22, 0], rtol=0, atol=0.2)

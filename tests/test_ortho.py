@@ -221,9 +221,9 @@ def test_the_command_maps_balls_where_they_are(run, tmp_path):
     assert np.nanmedian(np.abs(errors)) < 0.06  # 250 steps; pixels of the photos are 0.04 wide
     colours = tifffile.imread(out / "orthophoto.tif")
     np.testing.assert_array_equal(colours[..., 3] > 0, np.isfinite(heights))
-    words = nerfcli("info", out / "heights.tif").stdout
-    assert "holds: heights" in words
-    assert f"corner: {left:.10g} {top:.10g}" in words
+    printed = nerfcli("info", out / "heights.tif").stdout
+    assert "holds: heights" in printed
+    assert f"corner: {left:.10g} {top:.10g}" in printed
     again = nerfcli("export", run, "-o", out, *options)
     assert "exists" in error_of(again)[0]
 
@@ -260,9 +260,9 @@ def test_las_files_of_surveys_are_in_their_system(run, tmp_path):
     records = {vlr.record_id: vlr for vlr in surveyed.header.vlrs if vlr.user_id == "LASF_Projection"}
     keys = {key.id: key.value_offset for key in records[34735].geo_keys}
     assert (keys[1024], keys[3072]) == (1, 32611)
-    words = nerfcli("info", tmp_path / "b.las").stdout
-    assert "frame: EPSG:32611" in words
-    assert f"{surveyed.header.mins[1]:.2f}" in words
+    printed = nerfcli("info", tmp_path / "b.las").stdout
+    assert "frame: EPSG:32611" in printed
+    assert f"{surveyed.header.mins[1]:.2f}" in printed
     low, high = describe(tmp_path / "b.las")["box"][:3], describe(tmp_path / "b.las")["box"][3:]
     assert (surveyed.xyz >= low).all()
     assert (surveyed.xyz <= high).all()

@@ -113,6 +113,13 @@ def test_what_comes_after_training_loads_no_trainer():
     assert not [name for name in loaded if name.startswith("nerfcli.train")]
 
 
+def test_a_conversion_imports_no_torch():
+    """It would take twice as long to start."""
+    loaded = in_python("import sys; from nerfcli.workflows import convert; print(*sys.modules)").stdout.split()
+    assert "nerfcli.workflows.convert" in loaded
+    assert "torch" not in loaded
+
+
 @pytest.mark.parametrize("name", nerfcli.__all__)
 def test_a_public_function_says_how_it_is_called(name):
     function = getattr(nerfcli, name)

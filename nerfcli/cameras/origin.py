@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 _SEPARATOR = "; origin "
-# Systems of longitude, latitude and height, and the same without heights: WGS 84, ETRS89.
+# Three-dimensional geographic systems and their two-dimensional counterparts: WGS 84, ETRS89.
 _WITHOUT_HEIGHT = {4979: 4326, 4937: 4258}
 
 
 def without_origin(unit_source: str | None) -> str | None:
-    """Return the source of a unit without the origin that `Origin.in_source` added."""
+    """Remove the origin that `Origin.in_source` appended."""
     return None if unit_source is None else unit_source.partition(_SEPARATOR)[0]
 
 
@@ -22,7 +22,8 @@ class Origin:
     Args:
         system: the coordinate system, such as EPSG:32611.
         coordinates: of the origin in it: x, y, height in metres, or latitude, longitude in degrees, height in metres.
-        in_degrees: which of the two. If False, adding `coordinates` to the world's gives coordinates in the system.
+        in_degrees: True for latitude and longitude. Otherwise, world coordinates + `coordinates` are coordinates in the
+            system.
     """
 
     system: str
@@ -41,7 +42,7 @@ class Origin:
 
     @property
     def epsg(self) -> int | None:
-        """EPSG code of the system without heights, also of UTM zones given in words; None if it has another name."""
+        """EPSG code of the horizontal coordinate system; None if `system` neither contains nor implies one."""
         compact = re.sub(r"\s", "", self.system).upper()
         if code := re.fullmatch(r"EPSG:(\d{4,5})", compact):
             return _WITHOUT_HEIGHT.get(int(code[1]), int(code[1]))
@@ -55,7 +56,7 @@ class Origin:
         return None
 
     def in_source(self, unit_source: str) -> str:
-        """Return the source of a unit, followed by this origin."""
+        """Append this origin to the source of a unit, see `Scene.unit_source`."""
         return f"{unit_source}{_SEPARATOR}{self}"
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""Pictures on maps as GeoTIFF: north up, with their place and coordinate system in tags that GIS programs read.
+"""GeoTIFF: pictures with north up, whose position and coordinate system are in tags that GIS programs read.
 
 Source: OGC 19-008r4, OGC GeoTIFF Standard 1.1.
 """
@@ -26,32 +26,32 @@ _IS_PROJECTED, _IS_GEOGRAPHIC, _IS_OWN, _IS_AREA = 1, 2, 32767, 1
 
 @dataclass(frozen=True)
 class MapPlace:
-    """Where a picture lies.
+    """Position of a picture in a coordinate system.
 
     Args:
         corner: x and y, or longitude and latitude, of the outer corner of the top left pixel.
         pixel: width and height of a pixel, > 0, in the same unit.
         epsg: code of the coordinate system; None if it has none.
-        in_degrees: whether that system has longitude and latitude.
-        words: the coordinate system as text.
+        in_degrees: whether that system is geographic, in degrees.
+        system: its name, for people.
     """
 
     corner: tuple[float, float]
     pixel: tuple[float, float]
     epsg: int | None
     in_degrees: bool
-    words: str
+    system: str
 
 
-def geo_keys(epsg: int | None, words: str, *, in_degrees: bool) -> tuple[list[int], str]:
+def geo_keys(epsg: int | None, system: str, *, in_degrees: bool) -> tuple[list[int], str]:
     """Return the values of the tags `KEYS` and `TEXT`, which LAS files have too, for a coordinate system.
 
     Args:
         epsg: its code; None if it has none.
-        words: the system as text.
-        in_degrees: whether it has longitude and latitude.
+        system: its name.
+        in_degrees: whether it is geographic, in degrees.
     """
-    text = words.encode("ascii", "replace").decode() + "|"
+    text = system.encode("ascii", "replace").decode() + "|"
     model = _IS_OWN if epsg is None else _IS_GEOGRAPHIC if in_degrees else _IS_PROJECTED
     keys = [(_MODEL, 0, 1, model), (_RASTER, 0, 1, _IS_AREA), (_CITATION, TEXT, len(text), 0)]
     if epsg is not None:
@@ -60,23 +60,23 @@ def geo_keys(epsg: int | None, words: str, *, in_degrees: bool) -> tuple[list[in
 
 
 def write_geotiff(path: Path, values: np.ndarray, place: MapPlace, *, description: Mapping[str, Any]) -> None:
-    """Write a picture on a map, atomically.
+    """Write a picture, atomically.
 
     Args:
         path: the file.
         values: (H, W, 4) uint8 sRGB with straight alpha, or (H, W) float32, NaN where undefined.
-        place: where it lies; row 0 is in the north.
+        place: its position; row 0 is in the north.
         description: plain values, for the ImageDescription as JSON.
 
     Raises:
         UserError: the file cannot be written.
     """
-    directory, words = geo_keys(place.epsg, place.words, in_degrees=place.in_degrees)
+    directory, text = geo_keys(place.epsg, place.system, in_degrees=place.in_degrees)
     tags = [
         (_SCALE, _DOUBLE, 3, (*place.pixel, 0.0), True),
         (_TIEPOINT, _DOUBLE, 6, (0.0, 0.0, 0.0, *place.corner, 0.0), True),
         (KEYS, _SHORT, len(directory), directory, True),
-        (TEXT, _ASCII, len(words) + 1, words, True),
+        (TEXT, _ASCII, len(text) + 1, text, True),
     ]
     colours = values.ndim == 3
     if not colours:
@@ -96,7 +96,7 @@ def write_geotiff(path: Path, values: np.ndarray, place: MapPlace, *, descriptio
 
 
 def map_facts(path: Path) -> dict[str, Any] | None:
-    """Return the facts about a GeoTIFF by name; None for a TIFF without a place.
+    """Return the facts about a GeoTIFF by name; None for a TIFF without a position.
 
     Keys: kind ("map"), format, width, height, system, epsg, corner (x, y of the upper left one), pixel (width, height),
     and its description.

@@ -1,7 +1,7 @@
-"""Control points: surveyed places, and where photos show them, from OpenDroneMap's gcp_list.txt.
+"""Ground control points and their observations in photos, as in OpenDroneMap's gcp_list.txt.
 
-The first line names the coordinate system: EPSG:32611, WGS84 UTM 11N, or +proj=utm +zone=11. Each further line is one
-sighting: x, y and height of the place, x and y of the pixel, the photo, and the name of the place, which is optional.
+The first line is the coordinate system: EPSG:32611, WGS84 UTM 11N, or +proj=utm +zone=11. Each other line is one
+observation: x, y and height of the point, x and y of the pixel, the photo, and the name of the point (optional).
 """
 
 import re
@@ -19,7 +19,7 @@ from nerfcli.scale.corners import Sightings
 
 HEADER = "a first line with the coordinate system, such as EPSG:32611, then x y height pixel-x pixel-y photo [name]"
 
-# Systems of longitude and latitude in degrees: WGS 84 with and without height, ETRS89, NAD83, NAD83(2011).
+# Geographic systems, in degrees: WGS 84 with and without height, ETRS89, NAD83, NAD83(2011).
 _DEGREES = {"EPSG:4326", "EPSG:4979", "EPSG:4258", "EPSG:4937", "EPSG:4269", "EPSG:6318"}
 # Systems whose metres are not those of the ground: web Mercator, and coordinates from the centre of the earth.
 _NOT_LEVEL = {"EPSG:3857", "EPSG:900913", "EPSG:4978"}
@@ -27,11 +27,11 @@ _NOT_LEVEL = {"EPSG:3857", "EPSG:900913", "EPSG:4978"}
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """Surveyed places.
+    """Ground control points.
 
     Args:
-        places: metres east, north and up of `origin`, (3,), by name.
-        pixels: the photos that show each place, by name, and the pixels (x, y) where they do.
+        places: their positions in metres east, north and up of `origin`, (3,), by name.
+        pixels: their observations by name: the photo and the pixel (x, y).
         origin: in the coordinate system of the file.
     """
 
@@ -40,10 +40,10 @@ class ControlPoints:
     origin: Origin
 
     def sightings(self, frames: Sequence[Frame]) -> Sightings:
-        """Return the sightings of each place in those photos that have a pose. Letters' case in names does not matter.
+        """Return the observations in photos that have a pose. Upper and lower case in the names of photos are the same.
 
         Raises:
-            UserError: a name fits several photos, or no photo is among the frames.
+            UserError: a name matches several photos, or none of the photos is among the frames.
         """
         index: dict[str, list[int]] = {}
         for i, frame in enumerate(frames):
@@ -72,8 +72,9 @@ class ControlPoints:
 def read_control_points(path: Path) -> ControlPoints:
     """Read control points from a file in the format of OpenDroneMap's gcp_list.txt.
 
-    Projected coordinates are metres; the origin is their mean, rounded down to metres. Degrees, longitude first, become
-    metres east, north and up of the first place. Places without a name are told apart by their coordinates.
+    Projected coordinates are in metres; the origin is their mean, rounded down to metres. Degrees, longitude first, are
+    converted to metres east, north and up of the first point. Points without a name are identified by their
+    coordinates.
 
     Raises:
         UserError: the file cannot be read, has another format, or has a system in other units than metres or degrees.
@@ -96,7 +97,7 @@ def read_control_points(path: Path) -> ControlPoints:
         if places.setdefault(name, place) != place:
             raise UserError(
                 f"{path}, line {number}: {name} has other coordinates than before",
-                "give each place its own name, and the same coordinates on all of its lines",
+                "give each point its own name, and the same coordinates on all of its lines",
             )
         pixels.setdefault(name, []).append((photo, pixel))
     if not places:
@@ -119,7 +120,7 @@ def _in_degrees(system: str, path: Path) -> bool:
     """Return whether coordinates are degrees; otherwise they are metres."""
     compact = re.sub(r"\s", "", system).upper()
     if not re.match(r"EPSG:\d+$|\+PROJ=|WGS84(UTM\d+[NS])?$", compact):
-        raise UserError(f"{path}: the first line is no coordinate system: {system[:60]!r}", f"expected {HEADER}")
+        raise UserError(f"{path}: the first line is not a coordinate system: {system[:60]!r}", f"expected {HEADER}")
     if compact in _NOT_LEVEL or re.search(r"\+PROJ=(WEBMERC|GEOCENT)", compact):
         raise UserError(
             f"{path}: the metres of {system} are not those of the ground",
@@ -131,16 +132,16 @@ def _in_degrees(system: str, path: Path) -> bool:
 
 
 def _sighting(line: str, where: str) -> tuple[str, tuple[float, float, float], np.ndarray, str]:
-    """Parse a line into the place's name and coordinates, the pixel and the photo."""
+    """Parse a line into the name and the coordinates of the point, the pixel and the photo."""
     words = line.split()
     try:
-        x, y, height, across, down = (float(word) for word in words[:5])
+        x, y, height, pixel_x, pixel_y = (float(word) for word in words[:5])
         photo = words[5]
     except (ValueError, IndexError) as error:
         raise UserError(f"{where} is not a control point: {line[:60]!r}", f"expected {HEADER}") from error
-    if not np.isfinite([x, y, height, across, down]).all():
+    if not np.isfinite([x, y, height, pixel_x, pixel_y]).all():
         raise UserError(
             f"{where}: not all numbers are finite", "control points need a height; remove those whose height is unknown"
         )
     name = words[6] if len(words) > 6 else f"{words[0]},{words[1]}"
-    return name, (x, y, height), np.array([across, down]), photo
+    return name, (x, y, height), np.array([pixel_x, pixel_y]), photo

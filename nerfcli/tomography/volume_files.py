@@ -23,6 +23,9 @@ _NIFTI_UNITS = {"m": 1, "mm": 2, "um": 3}
 _NIFTI_TYPES = {np.dtype(np.uint8): (2, 8), np.dtype(np.float32): (16, 32)}
 _WORDS = {np.dtype(np.uint8): "MET_UCHAR", np.dtype(np.float32): "MET_FLOAT"}
 
+# Suffixes of volumes, the default first.
+SUFFIXES = (".nrrd", ".mha", ".nii", ".tif")
+
 
 @dataclass(frozen=True)
 class VolumeFile:
@@ -80,10 +83,6 @@ def read_volume(path: Path) -> VolumeFile:
         raise UserError(
             f"{path} is damaged or not a volume written by nerfcli: {error}", "export the volume again"
         ) from error
-
-
-# Suffixes of volumes, the default first.
-SUFFIXES = (".nrrd", ".mha", ".nii", ".tif")
 
 
 def _writer(path: Path) -> Callable[[Path, VolumeFile], None]:

@@ -15,7 +15,6 @@ from nerfcli.convert.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.convert.world_frame import WorldFrame, in_world_frame
 from nerfcli.errors import UserError
 from nerfcli.media.images import HEIC_SUFFIXES
-from nerfcli.runs.run import Run
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
 
@@ -90,6 +89,8 @@ def _origin_of(path: Path, form: str) -> Origin | None:
     """Return where the origin of a scene, or of a run's scene, is on Earth; None if it is unknown."""
     try:
         if form == "run":
+            from nerfcli.runs.run import Run  # imports torch, which no other conversion needs
+
             return Run(path.parent).config.origin
         return Origin.from_json(read_description(path).provenance["origin"]) if form == "nerfcli" else None
     except (UserError, KeyError, TypeError, ValueError):  # cameras.json may be alone, and a scene may have no origin

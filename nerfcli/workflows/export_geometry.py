@@ -180,7 +180,7 @@ def export_ortho(
             partial / "heights.tif", made.heights + height, place, description={**described, "holds": "heights"}
         )
     unit = {"metre": "m"}.get(model.unit, "units of the scene")
-    where = f"coordinates in {place.words}" if origin else "coordinates of the scene, which is not georeferenced"
+    where = f"coordinates in {place.system}" if origin else "coordinates of the scene, which is not georeferenced"
     notify(
         f"{shown.shape[1]}x{shown.shape[0]} pixels of {pixel:.3g} {unit}, three photos see {100 * shown.mean():.0f} %; "
         f"{where}"
