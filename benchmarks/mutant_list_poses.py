@@ -330,7 +330,7 @@ POSES: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "workflows/export_geometry.py",
+        "workflows/export_map.py",
         ("tests/test_ortho.py",),
         "command or degrees",
         (),

@@ -21,11 +21,11 @@ from nerfcli.viewer.proof import make_proof
 from nerfcli.workflows.export_geometry import (
     export_colmap_dense,
     export_mesh,
-    export_ortho,
     export_points,
     export_tsdf,
     export_volume,
 )
+from nerfcli.workflows.export_map import export_ortho
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 from nerfcli.workflows.photo_depths import photo_depths

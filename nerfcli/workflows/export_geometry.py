@@ -11,11 +11,8 @@ from nerfcli import __version__
 from nerfcli.atomic import atomic_folder
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction
-from nerfcli.cameras.origin import Origin
 from nerfcli.cameras.rigid import look_at
 from nerfcli.errors import UserError, in_shell
-from nerfcli.media.geodesy import degrees_per_metre
-from nerfcli.media.geotiff import MapPlace, write_geotiff
 from nerfcli.media.las_files import SUFFIXES as LAS_SUFFIXES
 from nerfcli.media.las_files import las_module, write_las
 from nerfcli.media.mesh_files import write_glb, write_obj, write_ply
@@ -31,8 +28,6 @@ from nerfcli.surface.extent import automatic_voxel, scene_box
 from nerfcli.surface.fusion import fuse
 from nerfcli.surface.grid import Grid
 from nerfcli.surface.marching import SEEN, Mesh, surface_of, without_small_pieces
-from nerfcli.surface.ortho import SEEN as SEEN_FROM_ABOVE
-from nerfcli.surface.ortho import automatic_pixel, check_upright, ortho_of, typical_depth
 from nerfcli.surface.points import agreed_points
 from nerfcli.surface.settings import MOST_VIEWS, SurfaceSettings
 from nerfcli.surface.simplify import simplified
@@ -44,7 +39,7 @@ FORMAT = "nerfcli geometry 1"
 FRAME = "of the scene, as its cameras have it"
 PARALLAX = "largest angle between the rays of two photos that see the point"
 # Fraction of the work that is spent on rendering depths.
-_DEPTHS, _ORTHO_DEPTHS = 0.7, 0.6
+_DEPTHS = 0.7
 
 
 def export_mesh(
@@ -52,8 +47,8 @@ def export_mesh(
 ) -> None:
     """Write the surface as .ply, .glb or .obj."""
     views, grid = _seen(run, model, settings, progress)
-    fused = fuse(views, grid, on_progress=_part(progress, _DEPTHS, 0.9, "fuses"))
-    mesh = without_small_pieces(surface_of(fused, on_progress=_part(progress, 0.9, 0.95, "marches")))
+    fused = fuse(views, grid, on_progress=part_of(progress, _DEPTHS, 0.9, "fuses"))
+    mesh = without_small_pieces(surface_of(fused, on_progress=part_of(progress, 0.9, 0.95, "marches")))
     if not len(mesh.faces):
         raise UserError("no surface found in the box", "use another --box, a larger --voxel-size, or train longer")
     found = len(mesh.faces)
@@ -82,7 +77,7 @@ def export_points(
     if las:
         las_module()  # fails before the work if laspy is missing, not after it
     views, grid = _seen(run, model, settings, progress)
-    points = agreed_points(views, grid, on_progress=_part(progress, _DEPTHS, 1.0, "compares"))
+    points = agreed_points(views, grid, on_progress=part_of(progress, _DEPTHS, 1.0, "compares"))
     if not len(points.places):
         raise UserError("no two photos see the same point in the box", "use another --box, or train longer")
     columns = dict(zip("xyz", points.places.T, strict=True))
@@ -112,7 +107,7 @@ def export_volume(
     """Write density and colour on a grid as .npz, or only the density as .nrrd."""
     box = settings.box or scene_box(model, run.cameras.train)
     grid = Grid.over(box, settings.voxel_size or automatic_volume_voxel(box))
-    maps = sample_volume(model, grid, on_progress=_part(progress, 0.05, 1.0, "evaluating the field"))
+    maps = sample_volume(model, grid, on_progress=part_of(progress, 0.05, 1.0, "evaluating the field"))
     per_unit = {"metre": "1/m"}.get(model.unit, "1 / unit")
     described = _description(run, model, "volume", grid) | {
         "density": f"fraction of light that ends per length, {per_unit}; 0 where rays pass over cells",
@@ -127,7 +122,7 @@ def export_tsdf(
 ) -> None:
     """Write the signed distances that the mesh is made from, with their weights as .npz or without them as .nrrd."""
     views, grid = _seen(run, model, settings, progress)
-    fused = fuse(views, grid, on_progress=_part(progress, _DEPTHS, 1.0, "fuses"))
+    fused = fuse(views, grid, on_progress=part_of(progress, _DEPTHS, 1.0, "fuses"))
     distance, weight = fused.dense((0, 0, 0), grid.shape)
     described = _description(run, model, "tsdf", grid) | {
         "distance": "to the surface, positive outside, in the unit; NaN where too few photos see",
@@ -137,67 +132,6 @@ def export_tsdf(
     maps = {"distance": np.where(weight >= SEEN, distance, np.float32(np.nan)), "weight": weight}
     _write_volume(path, Volume(maps, grid.centres(np.zeros(3)), grid.voxel_size, described), "distance")
     notify(_grid_in_words(grid, model))
-
-
-def export_ortho(
-    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
-) -> None:
-    """Write a folder with an orthophoto and a map of heights, as GeoTIFF."""
-    frames = run.cameras.train
-    check_upright(frames)
-    box = settings.box or scene_box(model, frames)
-    views = depth_views(
-        model,
-        spread_frames(frames, MOST_VIEWS),
-        max_size=settings.max_size,
-        on_progress=_part(progress, 0.02, _ORTHO_DEPTHS, "renders depths"),
-    )
-    depth = typical_depth(views)
-    pixel = settings.voxel_size or automatic_pixel(frames, run.config.downscale, depth, box)
-    seen = [view.distances() for view in views]
-    made = ortho_of(
-        model,
-        seen,
-        box,
-        pixel,
-        height_above=depth,
-        on_progress=_part(progress, _ORTHO_DEPTHS, 1.0, "renders from above"),
-    )
-    shown = np.isfinite(made.heights)
-    if not shown.any():
-        raise UserError("no surface seen from above is in three photos", "use another --box, or train longer")
-    origin = run.config.origin
-    place = _place_on_map(made.corner, pixel, origin)
-    described = {
-        **_provenance(run, model),
-        "box": list(box),
-        "seen": f"by {SEEN_FROM_ABOVE} photos or more; transparent or NaN elsewhere",
-    }
-    height = np.float32(origin.coordinates[2] if origin else 0.0)
-    with atomic_folder(path) as partial:
-        write_geotiff(partial / "orthophoto.tif", made.rgba, place, description={**described, "holds": "orthophoto"})
-        write_geotiff(
-            partial / "heights.tif", made.heights + height, place, description={**described, "holds": "heights"}
-        )
-    unit = {"metre": "m"}.get(model.unit, "units of the scene")
-    where = f"coordinates in {place.system}" if origin else "coordinates of the scene, which is not georeferenced"
-    notify(
-        f"{shown.shape[1]}x{shown.shape[0]} pixels of {pixel:.3g} {unit}, three photos see {100 * shown.mean():.0f} %; "
-        f"{where}"
-    )
-
-
-def _place_on_map(corner: tuple[float, float], pixel: float, origin: Origin | None) -> MapPlace:
-    """Return where a map lies, with its upper left corner given in the scene's frame."""
-    if origin is None:
-        return MapPlace(corner, (pixel, pixel), None, False, "frame of the scene")
-    a, b, height = origin.coordinates
-    if not origin.in_degrees:
-        return MapPlace((a + corner[0], b + corner[1]), (pixel, pixel), origin.epsg, False, origin.system)
-    north, east = degrees_per_metre(a, height)
-    return MapPlace(
-        (b + east * corner[0], a + north * corner[1]), (east * pixel, north * pixel), origin.epsg, True, origin.system
-    )
 
 
 def export_colmap_dense(
@@ -239,12 +173,13 @@ def _seen(
     chosen = spread_frames(run.cameras.train, MOST_VIEWS) if frames is None else frames
     box = settings.box or scene_box(model, run.cameras.train)
     views = depth_views(
-        model, chosen, max_size=settings.max_size, on_progress=_part(progress, 0.02, _DEPTHS, "renders depths")
+        model, chosen, max_size=settings.max_size, on_progress=part_of(progress, 0.02, _DEPTHS, "renders depths")
     )
     return views, Grid.over(box, settings.voxel_size or automatic_voxel(views, box))
 
 
-def _part(progress: Progress, start: float, end: float, words: str) -> Callable[[float], None]:
+def part_of(progress: Progress, start: float, end: float, words: str) -> Callable[[float], None]:
+    """Return a function that reports the progress of a part of the work, from `start` to `end` of the whole."""
     return lambda fraction: progress(start + (end - start) * fraction, words)
 
 
@@ -256,11 +191,12 @@ def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any
         "frame": FRAME,
         "box": [*grid.low.tolist(), *grid.high.tolist()],
         "voxel_size": grid.voxel_size,
-        **_provenance(run, model),
+        **provenance_of(run, model),
     }
 
 
-def _provenance(run: Run, model: Model) -> dict[str, Any]:
+def provenance_of(run: Run, model: Model) -> dict[str, Any]:
+    """Return the unit of lengths and the origin of an exported file."""
     return {
         "unit": model.unit,
         "unit_source": model.unit_source,
