@@ -544,7 +544,7 @@ def test_many_captures_each_under_its_name(tmp_path):
         (("--to", "colmap"), "OUT"),
         (("out", "--detect"), "--detect"),
         (("out", "--to", "colmap", "--pixel-center", "1"), "--pixel-center"),
-        (("out", "--to", "npz", "--scale", "0"), "--scale"),
+        *((("out", "--to", "npz", "--scale", factor), "--scale") for factor in ("0", "-1", "nan", "1e-300", "1e300")),
     ],
 )
 def test_wrong_usage(options, named, tmp_path):

@@ -223,3 +223,13 @@ def test_renders_whose_depth_files_differ_are_refused(tmp_path):
     assert result.exit_code == 3
     assert "b.tiff" in result.stderr
     assert "have different definitions: axis ray and z" in result.stderr
+
+
+def test_a_text_file_of_a_run_shows_the_run(finished, capture):
+    whole = json.loads(info(finished, "--json").stdout)
+    assert whole["kind"] == "run"
+    for name in ("config.json", "cameras.json"):
+        of_file = json.loads(info(finished / name, "--json").stdout)
+        assert {**of_file, "path": whole["path"]} == whole
+    (capture / "metrics.json").write_text("{}")  # not of a run
+    assert "has no list of frames" in info(capture / "metrics.json").stderr

@@ -144,7 +144,7 @@ def test_commands_for_runs_of_photos_name_what_works(bean_run: Path) -> None:
     from nerfcli.tomography.result import DESCRIPTION
 
     assert RECONSTRUCTION == DESCRIPTION
-    for command in (("report",), ("bench",), ("export", "--to", "mesh")):
+    for command in (("report",), ("bench",), ("doctor",), ("export", "--to", "mesh")):
         code, _, err = call(*command, bean_run)
         assert code in (2, 3)
         assert "is the reconstruction of an X-ray scan" in err or "choose volume" in err, err

@@ -349,7 +349,7 @@ def test_volumes_come_back(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.glb", "a.nrrd", "a.npz"])
-def test_damaged_files_are_told(name, tmp_path):
+def test_damaged_files_are_refused(name, tmp_path):
     (tmp_path / name).write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\n")
     with pytest.raises(UserError, match=r"a\."):
         describe(tmp_path / name)
@@ -378,11 +378,27 @@ def test_points_come_back_from_las_files(suffix, far, tmp_path):
     np.testing.assert_allclose(facts["low"], places.min(0), rtol=0, atol=1e-6)
 
 
-def test_damaged_las_files_are_told(tmp_path):
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_damaged_las_files_are_refused(suffix, tmp_path):
+    """Without points, or cut short anywhere: in the last point, in the middle, and in the header."""
     pytest.importorskip("laspy", reason="an extra")
-    (tmp_path / "a.las").write_bytes(b"LASF" + bytes(400))
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"LASF" + bytes(400))
     with pytest.raises(UserError, match="damaged or not a LAS file"):
-        describe(tmp_path / "a.las")
+        describe(path)
+    columns: dict[str, np.ndarray] = dict(zip("xyz", np.random.default_rng(0).random((3, 500)), strict=True))
+    write_las(path, columns | dict.fromkeys(("red", "green", "blue"), np.zeros(500, np.uint8)), description={})
+    whole = path.read_bytes()
+    for length in (len(whole) - 1, len(whole) // 2, 400, 100):
+        path.write_bytes(whole[:length])
+        with pytest.raises(UserError, match="damaged or not a LAS file"):
+            describe(path)
+
+
+def test_a_mesh_without_vertices_is_refused(tmp_path):
+    (tmp_path / "a.obj").write_text("# nothing\n")
+    with pytest.raises(UserError, match="has no vertices"):
+        describe(tmp_path / "a.obj")
 
 
 def test_las_files_say_what_they_need(monkeypatch, blocked, tmp_path):

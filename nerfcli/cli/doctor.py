@@ -64,6 +64,7 @@ def doctor(
     from nerfcli.cameras.formats.run_cameras import find_run
     from nerfcli.doctor.examination import content
     from nerfcli.tomography.formats.read import recognise
+    from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.doctor import examine_capture
 
     console = Console(quiet=quiet, json_lines=json)
@@ -78,6 +79,10 @@ def doctor(
             folder = result_path(path, suffix="-next-views", output=output, one_of_many=one_of_many)
             _examine_run(path, folder, console, count=views, threads=threads, overwrite=overwrite)
             return
+        if is_reconstruction(path):
+            raise UserError(
+                f"{path} is the reconstruction of an X-ray scan", "doctor examines the scan itself: give its folder"
+            )
         page = result_path(path, suffix="-doctor.html", output=output, one_of_many=one_of_many)
         if recognise(path) is not None:
             if intrinsics is not None or subfolders:

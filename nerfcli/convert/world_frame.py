@@ -20,6 +20,8 @@ from nerfcli.scale.georeference import Georeference, georeference_by_gps, georef
 from nerfcli.scale.gps import gps_positions, scale_from_gps
 
 GPS = "gps"
+# Beyond this factor or its inverse, squares of lengths of ordinary scenes come near the ends of float32.
+SMALLEST_SCALE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,7 @@ def _factor(text: str | None) -> float:
         factor = float(text)
     except ValueError:
         factor = 0.0
-    if not 0 < factor < np.inf:
-        raise UserError(f"invalid --scale {text!r}", "expected a positive number, or gps", exit_code=2)
+    if not SMALLEST_SCALE <= factor <= 1 / SMALLEST_SCALE:
+        hint = f"expected a number from {SMALLEST_SCALE:g} to {1 / SMALLEST_SCALE:g}, or gps"
+        raise UserError(f"invalid --scale {text!r}", hint, exit_code=2)
     return factor

@@ -84,7 +84,7 @@ def write_las(
 
 
 def las_facts(path: Path) -> dict[str, Any]:
-    """Return the facts in the header of a .las or .laz file, with its description.
+    """Return the facts in the header of a .las or .laz file, with its description, if its last point can be read.
 
     Raises:
         UserError: the file is damaged, or laspy is not installed.
@@ -93,6 +93,10 @@ def las_facts(path: Path) -> dict[str, Any]:
     try:
         with laspy.open(path) as file:
             header = file.header
+            if header.point_count:  # the last point is there only if the file is whole
+                file.seek(header.point_count - 1)
+                if len(file.read_points(1)) != 1:
+                    raise ValueError(f"its header says {header.point_count} points")
     except (laspy.LaspyException, OSError, ValueError, RuntimeError) as error:
         raise UserError(f"{path} is damaged or not a LAS file: {error}", "copy or export it once more") from error
     described = next((vlr.record_data for vlr in header.vlrs if vlr.user_id == KEY), b"{}")

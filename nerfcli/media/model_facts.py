@@ -94,6 +94,8 @@ def _obj_facts(path: Path) -> dict[str, Any]:
                 counts[word] += 1
             elif word == "#":
                 comments.append(line[1:].strip())
+    if not counts["v"]:
+        raise UserError(f"{path} has no vertices", "copy or export it once more")
     facts = {"kind": "mesh", "format": "OBJ", "vertices": counts["v"], "faces": counts["f"]}
     return _described(comments) | facts
 

@@ -26,6 +26,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         raise UserError(f"{folder} does not exist", "give a scene, a run, renders, or one of their files")
     if folder.name == RENDERS:
         folder = folder.parent
+    folder = _whole(folder)
     if _is_scan_to_describe(folder):
         from nerfcli.workflows.scans import describe_scan
 
@@ -56,6 +57,18 @@ def describe(path: str | Path) -> dict[str, Any]:
     from nerfcli.workflows.describe_run import describe_run
 
     return describe_run(Run(folder))
+
+
+def _whole(path: Path) -> Path:
+    """Return the run or scene that a file such as metrics.json or poses_report.json is part of; else the path."""
+    from nerfcli.runs import files
+
+    parts_of_runs = (files.CONFIG, files.CAMERAS, files.LOG, files.METRICS, files.DEPTH_ERRORS, files.REPORT)
+    if path.name in parts_of_runs and (path.parent / files.CONFIG).is_file():
+        return path.parent
+    if path.name == "poses_report.json" and (path.parent / "scene.json").is_file():
+        return path.parent
+    return path
 
 
 def _is_scan_to_describe(path: Path) -> bool:
