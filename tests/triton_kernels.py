@@ -20,6 +20,8 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from triton.language import core
+from triton.language.semantic import TritonSemantic
 from triton.runtime import interpreter
 
 from nerfcli import kernels
@@ -58,12 +60,18 @@ def first_builtin(language: Any) -> str | None:
 def _interpreted_fast() -> Iterator[None]:
     """Spare Triton's interpreter what it does again at each call or operation, and what it computes and then drops.
 
-    It patches Triton's language at each call of a function, builds a table of all types at each operation, and finds
-    out whether integers overflow, but would tell only if it debugged.
+    It patches Triton's language at each call of a function, builds a table of all types at each operation, describes
+    the shape of each result anew, and finds out whether integers overflow, but would tell only if it debugged.
     """
     with pytest.MonkeyPatch.context() as patch:
         replace_all, dtype_of = interpreter._patch_builtin, interpreter._get_np_dtype
+        broadcast, new_tensor, new_type = (
+            TritonSemantic.broadcast_impl_value,
+            core.tensor.__init__,
+            core.block_type.__init__,
+        )
         builder, dtypes = interpreter.interpreter_builder, dict[str, Any]()
+        types, shapes = dict[Any, dict[str, Any]](), dict[str, tuple[Any, Any]]()
 
         def replace_once(language: Any, *others: Any) -> None:
             name = first_builtin(language)
@@ -76,9 +84,31 @@ def _interpreted_fast() -> Iterator[None]:
                 dtypes[name] = dtype_of(of)
             return dtypes[name]
 
+        def known_type(self: Any, element_ty: Any, shape: Any) -> None:
+            key = (element_ty.name, *(getattr(size, "value", size) for size in shape))
+            if key not in types:
+                new_type(self, element_ty, shape)
+                types[key] = vars(self).copy()
+            vars(self).update(types[key])
+
+        def known_shape(self: Any, handle: Any, of: Any) -> None:
+            key = of.name
+            if key not in shapes:
+                new_tensor(self, handle, of)
+                shapes[key] = self.shape, self.numel
+            self.handle, self.type, self.dtype = handle, of, of.scalar
+            self.shape, self.numel = shapes[key]
+
+        def broadcast_if_different(self: Any, left: Any, right: Any) -> tuple[Any, Any]:
+            same = left.handle.data.shape == right.handle.data.shape and left.type.is_block() == right.type.is_block()
+            return (left, right) if same else broadcast(self, left, right)
+
         assert not builder.options.debug
         patch.setattr(interpreter, "_patch_builtin", replace_once)
         patch.setattr(interpreter, "_get_np_dtype", known_dtype)
+        patch.setattr(core.block_type, "__init__", known_type)
+        patch.setattr(core.tensor, "__init__", known_shape)
+        patch.setattr(TritonSemantic, "broadcast_impl_value", broadcast_if_different)
         patch.setattr(builder, "options", replace(builder.options, sanitize_overflow=False))
         yield
 
