@@ -13,10 +13,10 @@ from nerfcli.tomography.scan import Scan, held_out_views
 def phantom_circle(
     *,
     beam: Beam = "cone",
-    views: int = 36,
+    views: int = 24,
     first_deg: float = 0.0,
     span_deg: float = 360.0,
-    columns: int = 48,
+    columns: int = 40,
     rows: int = 1,
     column_shift: float = 0.0,
 ) -> Circle:

@@ -31,11 +31,11 @@ from nerfcli.workflows.tomography import Limit
 PHOTONS = 2e4
 
 
-def cone(views: int = 30, *, rows: int = 24, columns: int = 40, turn: float = 2 * np.pi) -> ScanGeometry:
-    angles = np.arange(views) * turn / views
-    return circular_cone(
-        angles, source_origin=60, source_detector=90, pixel_width=0.9, pixel_height=0.9, rows=rows, columns=columns
-    )
+def cone(
+    views: int = 30, *, rows: int = 24, columns: int = 40, pixel: float = 0.9, turn: float = 2 * np.pi
+) -> ScanGeometry:
+    sizes = {"pixel_width": pixel, "pixel_height": pixel, "rows": rows, "columns": columns}
+    return circular_cone(np.arange(views) * turn / views, source_origin=60, source_detector=90, **sizes)
 
 
 def scan_of(geometry: ScanGeometry, *, photons: float = PHOTONS, seed: int = 0, held_out: tuple[int, ...] = ()) -> Scan:
@@ -96,9 +96,9 @@ def test_fit_beats_the_baselines_with_the_same_views(scan: Scan, grid: VoxelGrid
 
 def test_many_views_over_a_limited_angle_do_not_diverge(monkeypatch: pytest.MonkeyPatch) -> None:
     """60 subsets with momentum diverge on 300 views over 90 degrees, as 30 did on a measured disc (chi-square 1,700):
-    fewer subsets, and halving them when the objective rises, each prevent it.
+    fewer subsets, and halving them when the objective rises, each prevent it. The detector is a little too small.
     """
-    angles, sizes = np.arange(300) * np.pi / 600, {"pixel_width": 0.8, "pixel_height": 0.8, "rows": 1, "columns": 140}
+    angles, sizes = np.arange(300) * np.pi / 600, {"pixel_width": 0.8, "pixel_height": 0.8, "rows": 1, "columns": 100}
     geometry = circular_cone(angles, source_origin=410, source_detector=553, **sizes)
     integrals = line_integrals(bean(4.0), *geometry.rays())
     noisy = integrals + 0.01 * np.random.default_rng(0).normal(size=integrals.shape)
@@ -107,7 +107,7 @@ def test_many_views_over_a_limited_angle_do_not_diverge(monkeypatch: pytest.Monk
     every = np.arange(300)
 
     def chi_square() -> float:
-        fit = reconstruct(problem, start(problem), strength=0.1, passes=8)
+        fit = reconstruct(problem, start(problem), strength=0.1, passes=5)
         predicted = Projector(geometry, grid).forward(fit.volume, every)
         return float(problem.likelihood.deviance(predicted, torch.from_numpy(every)).nanmean())
 
@@ -281,7 +281,7 @@ def test_few_photons_are_not_biased(grid: VoxelGrid) -> None:
     """20 photons of open beam, 2 behind the middle: the mean is right, unlike with a fit to logarithms."""
     scan = scan_of(cone(60), photons=20.0)
     problem = problem_of(scan, grid)
-    volume = reconstruct(problem, start(problem), strength=0.3, passes=12).volume.numpy()
+    volume = reconstruct(problem, start(problem), strength=0.3, passes=6).volume.numpy()
     true = truth(grid)
     body = np.asarray(binary_erosion(np.abs(true - 0.12) < 1e-3, iterations=2), dtype=bool)
     assert body.sum() > 200
@@ -338,7 +338,7 @@ def test_centre_of_a_parallel_half_turn_is_found() -> None:
 
 
 def test_tilt_of_the_detector_is_found() -> None:
-    geometry = cone(20)
+    geometry = cone(12, rows=20, columns=32, pixel=1.1)
     scan = scan_of(geometry, photons=2e5)
     misaligned = Scan(geometry.tilted(np.deg2rad(-1.0)), "counts", scan.values, scan.open_beam, photons_per_value=200.0)
     found = detector_tilt(misaligned)

@@ -32,10 +32,10 @@ def call(*arguments: str | Path) -> tuple[int, str, str]:
 def bean_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scan of the bean with its truth beside it, and the run that `train` made of it."""
     folder = tmp_path_factory.mktemp("bean")
-    grid = centred_grid((18.0, 18.0, 15.0), 0.6)
+    grid = centred_grid((18.0, 18.0, 15.0), 0.8)
     true = attenuation_of_voxels(bean(), x=grid.axis("x"), y=grid.axis("y"), z=grid.axis("z")).astype(np.float32)
     np.save(folder / "truth.npy", true)
-    scan = scan_of(cone(), held_out=(0, 6, 12, 18, 24))
+    scan = scan_of(cone(rows=18, columns=30, pixel=1.2), held_out=(0, 6, 12, 18, 24))
     described = {
         "path": str(folder / "truth.npy"),
         "shape": list(true.shape),
@@ -57,7 +57,7 @@ def test_train_says_what_it_decided_and_keeps_a_run(bean_run: Path) -> None:
     result = load_reconstruction(bean_run)
     assert result.passes >= 8
     assert any("total variation" in sentence for sentence in result.decisions)
-    assert result.grid.size == pytest.approx(0.6)
+    assert result.grid.size == pytest.approx(0.8)
     scan = bean_run.with_name("bean")
     again = ("train", scan, "--steps", "8", "--with", "centre=0", "--with", "tilt=0")
     code, _, err = call(*again)
@@ -106,9 +106,9 @@ def test_render_writes_projections_residuals_and_slices(bean_run: Path, tmp_path
     assert code == 0, err
     assert len(out.splitlines()) == 10
     residual = tifffile.imread(tmp_path / "pictures" / "residual" / "0006.tif")
-    assert residual.shape == (24, 40)
+    assert residual.shape == (18, 30)
     assert 0.8 < float(np.sqrt(np.mean(residual**2))) < 2.5
-    assert read_image(tmp_path / "pictures" / "projection" / "0000.png").shape == (24, 40, 3)
+    assert read_image(tmp_path / "pictures" / "projection" / "0000.png").shape == (18, 30, 3)
     code, out, err = call("render", bean_run, "--slices", "z=0.3", "-o", tmp_path / "slices")
     assert code == 0, err
     picture = tifffile.imread(tmp_path / "slices" / "z=0.3.tif")

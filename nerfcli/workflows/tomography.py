@@ -1,6 +1,5 @@
 """Reconstruct a scan: correct its geometry, choose weights, fit a volume."""
 
-import math
 import platform
 import time
 from collections import deque
@@ -277,7 +276,9 @@ def _fit_hash(
         )
     except KeyboardInterrupt:
         interrupted = True
-    return Fit(volume.on_grid(problem.grid), torch.zeros(0), math.ceil(volume.passes)), volume.arrays, interrupted
+    # The last step ends a little beyond a pass.
+    passes = max(1, round(volume.passes))
+    return Fit(volume.on_grid(problem.grid), torch.zeros(0), passes), volume.arrays, interrupted
 
 
 def _geometry(
