@@ -5,6 +5,7 @@ the noise's standard deviation per coordinate.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 from math import comb
 
@@ -14,6 +15,8 @@ from nerfcli.cameras.rigid import Similarity
 
 # Number of hypotheses, from three points each; even with half of the points outliers, one in eight has none.
 _TRIPLES = 200
+# Residuals of so many points are computed at once.
+_POINTS_AT_ONCE = 100_000
 
 # Squared length of noise in three dimensions, in sigma^2 (chi^2 with 3 degrees of freedom): median, 99.9 % quantile.
 _MEDIAN, _QUANTILE_999 = 2.366, 16.266
@@ -46,11 +49,12 @@ def align(x: np.ndarray, y: np.ndarray) -> Similarity:
     variance = np.sum((x - x.mean(axis=0)) ** 2)
     if len(x) < 2 or not variance > 0:
         raise ValueError(f"align needs two points apart, got {len(x)} with a variance of {variance}")
-    return _aligned(x[None], y[None])[0]
+    (scale,), (rotation,), (translation,) = _aligned(x[None], y[None])
+    return Similarity(float(scale), rotation, translation)
 
 
-def _aligned(x: np.ndarray, y: np.ndarray) -> list[Similarity]:
-    """Return `align` of each of many sets of points, (sets, N, 3), all of them with points apart."""
+def _aligned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return scales, rotations and translations as `align` of many sets of points, (sets, N, 3), none in one place."""
     mx, my = x.mean(axis=1), y.mean(axis=1)
     from_mx, from_my = x - mx[:, None], y - my[:, None]
     u, d, vt = np.linalg.svd(np.swapaxes(from_my, 1, 2) @ from_mx)
@@ -59,7 +63,7 @@ def _aligned(x: np.ndarray, y: np.ndarray) -> list[Similarity]:
     rotations = (u * sign[:, None]) @ vt
     scales = np.sum(d * sign, axis=1) / np.sum(from_mx**2, axis=(1, 2))
     translations = my - scales[:, None] * (rotations @ mx[..., None])[..., 0]
-    return [Similarity(float(s), r, t) for s, r, t in zip(scales, rotations, translations, strict=True)]
+    return scales, rotations, translations
 
 
 def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
@@ -83,10 +87,16 @@ def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
     least = np.partition(_squared(best, x, y), half)[half]
     triples = _triples(count)
     apart = np.ptp(x[triples], axis=1).max(axis=1) > 0
-    for candidate in _aligned(x[triples[apart]], y[triples[apart]]):
-        median = np.partition(_squared(candidate, x, y), half)[half]
-        if median < least:
-            best, least = candidate, median
+    scales, rotations, translations = _aligned(x[triples[apart]], y[triples[apart]])
+    medians = [np.array([least])]
+    at_once = max(1, _POINTS_AT_ONCE // count)
+    for some in (slice(first, first + at_once) for first in range(0, len(scales), at_once)):
+        off = scales[some, None, None] * (rotations[some] @ x.T) + translations[some, :, None] - y.T  # (some, 3, N)
+        medians.append(np.partition(np.sum(off**2, axis=1), half, axis=1)[:, half])
+    joined = np.concatenate(medians)
+    chosen = int(np.nanargmin(joined)) - 1
+    if chosen >= 0:
+        best, least = Similarity(float(scales[chosen]), rotations[chosen], translations[chosen]), joined[chosen + 1]
     # Rousseeuw's correction for few points.
     sigma = np.sqrt(least / _MEDIAN) * (1 + 5 / (count - _PARAMETERS / 3))
     follows = everywhere
@@ -111,6 +121,7 @@ def _sigma(b_from_a: Similarity, x: np.ndarray, y: np.ndarray) -> float:
     return float(np.sqrt(_squared(b_from_a, x, y).sum() / free)) if len(x) >= 4 else float("nan")
 
 
+@cache
 def _triples(count: int) -> np.ndarray:
     """Return the indices (triples, 3) of the points that define the hypotheses."""
     if comb(count, 3) <= _TRIPLES:

@@ -6,6 +6,7 @@ d(own) or u(p), f(orward) or b(ackward). OpenCV's are rdf. Some have names.
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import permutations, product
 
 import numpy as np
@@ -22,8 +23,9 @@ NAMED_AXES = {"opencv": "rdf", "opengl": "rub", "llff": "drb", "pytorch3d": "luf
 _DIRECTIONS = {"r": (1, 0, 0), "l": (-1, 0, 0), "d": (0, 1, 0), "u": (0, -1, 0), "f": (0, 0, 1), "b": (0, 0, -1)}
 
 
+@cache
 def opencv_from_axes(axes: str) -> np.ndarray:
-    """Return the rotation (4, 4) whose columns are the axes of a camera, expressed in OpenCV's axes.
+    """Return the rotation (4, 4) whose columns are the axes of a camera, expressed in OpenCV's axes; read-only.
 
     Args:
         axes: a name ("opencv", "opengl", "llff", "pytorch3d", "ros") or three letters such as "rub".
@@ -40,7 +42,9 @@ def opencv_from_axes(axes: str) -> np.ndarray:
         )
     if np.linalg.det(columns) < 0:
         raise UserError(f"camera axes {axes!r} are left-handed", "reverse one of the axes")
-    return rigid.from_parts(columns, np.zeros(3))
+    turn = rigid.from_parts(columns, np.zeros(3))
+    turn.flags.writeable = False
+    return turn
 
 
 def all_axes() -> Iterator[str]:

@@ -7,6 +7,7 @@ the best answers to the others.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -206,13 +207,11 @@ def _question(
     by_fraction = not 0 < answers[0].median_px < np.inf and not answers[0].median_px < answers[1].median_px
     if by_fraction:
         ratio = answers[0].inlier_fraction / max(answers[1].inlier_fraction, 1e-9)
-        low, high = _interval(
-            best, second, evidence.groups, lambda errors: -float(np.mean(errors <= evidence.threshold_px))
-        )
+        low, high = _interval(best, second, evidence.groups, partial(_minus_inliers, evidence.threshold_px))
         what = f"the inlier ratios differ by {100 * (answers[0].inlier_fraction - answers[1].inlier_fraction):.1f} %"
     else:
         ratio = answers[1].median_px / max(answers[0].median_px, 1e-9)
-        low, high = _interval(best, second, evidence.groups, lambda errors: float(np.median(errors)))
+        low, high = _interval(best, second, evidence.groups, _median)
         what = f"the medians differ by {answers[1].median_px - answers[0].median_px:.2g} px"
     if answers[0].inlier_fraction < LEAST_FRACTION and not isinstance(evidence, FrustumEvidence):
         return Question(name, answers, "none holds", ratio, "most of the evidence contradicts each of them")
@@ -230,21 +229,40 @@ def _same(name: str, convention: Convention, declared: Convention) -> bool:
 
 
 def _interval(
-    best: np.ndarray, second: np.ndarray, groups: np.ndarray, statistic: Callable[[np.ndarray], float]
+    best: np.ndarray, second: np.ndarray, groups: np.ndarray, statistic: Callable[[np.ndarray, np.ndarray], float]
 ) -> tuple[float, float]:
     """Return the 99 % interval of the statistic of `second` minus that of `best`, under resampling of photos.
 
     With few photos, the items themselves are resampled.
+
+    Args:
+        statistic: of errors in ascending order, given how often each was drawn.
     """
     rng = np.random.default_rng(0)
-    members = [np.flatnonzero(groups == group) for group in np.unique(groups)]
-    if len(members) < _LEAST_GROUPS:
-        members = [np.array([index]) for index in range(len(groups))]
+    names, members = np.unique(groups, return_inverse=True)
+    if len(names) < _LEAST_GROUPS:
+        members = np.arange(len(groups))
+    count = int(members.max()) + 1
     # Infinite errors are limited, because differences of infinities are undefined.
     best, second = np.minimum(best, 1e6), np.minimum(second, 1e6)
+    # Sorted once: the median of a sample is then found by counting, in a fifth of the time.
+    ascending = [(errors[order], members[order]) for errors in (second, best) for order in [np.argsort(errors)]]
     differences = []
     for _ in range(_RESAMPLES):
-        drawn = np.concatenate([members[k] for k in rng.integers(0, len(members), len(members))])
-        differences.append(statistic(second[drawn]) - statistic(best[drawn]))
+        times = np.bincount(rng.integers(0, count, count), minlength=count)
+        of_second, of_best = (statistic(errors, times[owners]) for errors, owners in ascending)
+        differences.append(of_second - of_best)
     low, high = np.quantile(differences, (0.005, 0.995))
     return float(low), float(high)
+
+
+def _median(ascending: np.ndarray, times: np.ndarray) -> float:
+    """Return the median of errors in ascending order, each of which was drawn so many times."""
+    until = np.cumsum(times)
+    lower, upper = until.searchsorted(((until[-1] - 1) // 2, until[-1] // 2), side="right")
+    return float((ascending[lower] + ascending[upper]) / 2)
+
+
+def _minus_inliers(threshold_px: float, ascending: np.ndarray, times: np.ndarray) -> float:
+    """Return the negative fraction of the drawn errors within the threshold."""
+    return -float(times[ascending <= threshold_px].sum() / times.sum())

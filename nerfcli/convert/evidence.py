@@ -79,8 +79,8 @@ class MatchEvidence:
 
     def __init__(self, pairs: Sequence[Matches], cameras: dict[int, Camera], num_frames: int):
         self.groups = np.repeat(np.arange(len(pairs)), [len(pair.pixels[0]) for pair in pairs])
-        self._first = np.array([pair.photos[0] for pair in pairs])[self.groups]
-        self._second = np.array([pair.photos[1] for pair in pairs])[self.groups]
+        self._pairs = np.array([pair.photos for pair in pairs]).T
+        self._first, self._second = self._pairs[:, self.groups]
         self._first_pixels = np.concatenate([pair.pixels[0] for pair in pairs])
         self._second_pixels = np.concatenate([pair.pixels[1] for pair in pairs])
         stand_in = next(iter(cameras.values()))
@@ -96,7 +96,8 @@ class MatchEvidence:
     def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
         """Return the error of each match, (M,)."""
         first, second, valid, focal_px = directions
-        second_from_first = rigid.inverse(world_from_cam[self._second]) @ world_from_cam[self._first]
+        firsts, seconds = self._pairs
+        second_from_first = (rigid.inverse(world_from_cam[seconds]) @ world_from_cam[firsts])[self.groups]
         rotation, t = second_from_first[:, :3, :3], second_from_first[:, :3, 3]
         turned = np.einsum("mij,mj->mi", rotation, first)  # the first direction in the second camera's axes
         normal1 = np.cross(t, turned)  # E b1

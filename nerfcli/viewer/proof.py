@@ -67,11 +67,11 @@ def _maps(model: Model, frame: Frame) -> list[np.ndarray]:
     """Render the colour and `MAPS` of one camera as `nerfcli render` does, each flattened."""
     farthest = model.marching.far / model.training_from_scene.scale
     pictures = {}
-    for name in MAPS[1:-2]:
+    for name in ("conditional", "max-weight", "moment", "background", "quantile"):
         convention = f"quantile:{FRACTION}" if name == "quantile" else name
         request = DepthRequest(convention, "z", background_distance=farthest)
         pictures[name] = render_picture(model, frame, background=model.background, depth=request)
     first = pictures["conditional"]
-    maps = {"opacity": first.opacity, "spread": first.spread, "disagreement": first.disagreement}
+    maps = {name: getattr(first, name) for name in ("opacity", "median", "spread", "disagreement")}
     maps |= {name: picture.depth for name, picture in pictures.items()}
     return [first.rgb.reshape(-1), *(np.asarray(maps[name]).reshape(-1) for name in MAPS)]

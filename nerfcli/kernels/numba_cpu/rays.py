@@ -55,7 +55,8 @@ def look_ahead(
 
 def padded(edges: Tensor) -> np.ndarray:
     """Return edges followed by the CHUNK copies of the last one that `look_ahead` may read."""
-    return torch.nn.functional.pad(edges[None], (0, CHUNK), mode="replicate")[0].numpy()
+    values = edges.numpy()
+    return np.concatenate([values, np.repeat(values[-1:], CHUNK)])  # torch pads this in 0.3 ms, not 0.01
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")

@@ -249,9 +249,9 @@ def _masks(
     masks: list[np.ndarray | None] = []
     for picture in pictures:
         fitting = [behind for behind in behinds if behind.colours.shape == picture.shape]
-        best = max(fitting, key=lambda behind: still.agreement(picture, behind), default=None)
-        believed = best is not None and still.agreement(picture, best) >= _SAME_PLACE
-        masks.append(still.differs(picture, best) if best is not None and believed else None)
+        agreements = [still.agreement(picture, behind) for behind in fitting]
+        best = max(agreements, default=0.0)
+        masks.append(still.differs(picture, fitting[agreements.index(best)]) if best >= _SAME_PLACE else None)
     return masks
 
 
