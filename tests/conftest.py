@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 # Threads of two test processes on two cores must not spin while they wait. Must be set before torch is imported.
@@ -22,13 +23,14 @@ from hypothesis import settings
 from nerfcli import scene
 from nerfcli.atomic import write_json
 from nerfcli.cameras.formats.run_cameras import write_cameras
+from nerfcli.fit.extent import Extent, choose_extent
 from nerfcli.fit.normalisation import object_frame
 from nerfcli.render.model import Model, save_model
 from nerfcli.runs.config import RunConfig
 from nerfcli.runs.files import CONFIG, FIELD
 from nerfcli.runs.log import LogEntry, append_log
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.train import held_out_pixels
+from nerfcli.train import held_out_pixels, preparation
 from nerfcli.train.loop import train
 
 # Relative tolerance of a chain of about a dozen operations, per dtype. A test with a looser one states its reason.
@@ -91,6 +93,17 @@ def spheres_run(spheres: scene.Scene, tmp_path_factory: pytest.TempPathFactory) 
                 patched.setattr(held_out_pixels, "PIXELS", 4096)
                 train(spheres, run, training, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
     return run
+
+
+@pytest.fixture
+def coarse_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cut rays into an eighth of the steps: after a step of training all space is fog, and pictures take seconds."""
+
+    def choose(captured: scene.Scene, settings: TrainSettings, *, fills_frame: bool) -> Extent:
+        extent = choose_extent(captured, settings, fills_frame=fills_frame)
+        return replace(extent, marching=extent.marching.stretched(8.0))
+
+    monkeypatch.setattr(preparation, "choose_extent", choose)
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """Panoramas of a room with textured walls and a box, with known poses: a small capture of a 360-degree camera."""
 
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -45,17 +46,26 @@ def render(centre: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.nda
             for side in (low[axis], high[axis]):
                 with np.errstate(divide="ignore"):
                     along = (side - centre[axis]) / directions[..., axis]
-                places = centre + np.minimum(along, 1e3)[..., None] * directions
-                inside = np.all((places >= low) & (places <= high) | (np.arange(3) == axis), axis=-1)
-                hit = inside & (along > 0) & (along < nearest)
-                u, v = ((120 * places[..., other]).astype(np.float32) for other in others)
+                hit = (along > 0) & (along < nearest)
+                places = [centre[other] + np.minimum(along, 1e3) * directions[..., other] for other in others]
+                for place, other in zip(places, others, strict=True):
+                    hit &= (place >= low[other]) & (place <= high[other])
+                if not hit.any():
+                    continue
+                u, v = ((120 * place).astype(np.float32) for place in places)
                 painted = cv2.remap(wall(2 * seed + axis), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
                 nearest, picture = np.where(hit, along, nearest), np.where(hit[..., None], painted, picture)
     return picture, nearest
 
 
+@cache
+def panorama(number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the panorama of a camera, and the distances along its rays. Do not write into them."""
+    return render(CENTRES[number], world_from_cam(number))
+
+
 def write_panoramas(folder: Path) -> None:
     """Write the panoramas, as a 360-degree camera without metadata stores them."""
     folder.mkdir(parents=True)
-    for number, centre in enumerate(CENTRES):
-        Image.fromarray(render(centre, world_from_cam(number))[0]).save(folder / f"{number}.png")
+    for number in range(len(CENTRES)):
+        Image.fromarray(panorama(number)[0]).save(folder / f"{number}.png")

@@ -53,7 +53,7 @@ def cloudy(similarity: Similarity, *, kind: str = "hash", seed: int = 0) -> Mode
     return Model(
         field=field,
         occupied=torch.rand(16, 16, 16) < 0.67,
-        marching=Marching(near=0.03, far=2.5, shortest_step=1 / 100, growth=1 / 100),
+        marching=Marching(near=0.03, far=2.5, shortest_step=1 / 50, growth=1 / 50),
         background=(0.1, 0.2, 0.3),
         training_from_scene=similarity,
         unit="arbitrary",
@@ -95,7 +95,7 @@ def test_blocks_of_one_field_render_what_it_renders_in_float64(kind):
 def test_pictures_of_blocks_of_one_field_are_those_of_the_field(spheres, convention, axis):
     """To float32 rounding, with hardly anything left out: the spans of compiled marching join into the whole ray."""
     frame = spheres.test_frames[0]
-    frame = replace(frame, camera=frame.camera.resized(12, 9))
+    frame = replace(frame, camera=frame.camera.resized(8, 6))
     alone = cloudy(Similarity(0.4, np.eye(3), np.zeros(3)))
     depth = DepthRequest(convention, axis, background_distance=9.0)
     expected, seen = (
@@ -125,12 +125,12 @@ def test_blocks_of_other_fields_render_what_the_joined_field_gives_sample_by_sam
 @pytest.mark.parametrize("contrast", [1.0, 4.0])
 def test_what_spans_leave_out_of_a_colour_is_within_its_bound(contrast):
     """With more contrast there are more negligible samples, and more rays stop, some of them inside a span."""
-    models = [cloudy(Similarity(1.0 + n / 4, np.eye(3), np.full(3, n / 9)), seed=n) for n in range(4)]
+    models = [cloudy(Similarity(1.0 + n / 4, np.eye(3), np.full(3, n / 9)), seed=n).stretched(0.5) for n in range(4)]
     for model in models:
         assert isinstance(model.field, HashField)
         with torch.no_grad():
             model.field.weights[1][0] *= contrast
-    together, rays, tolerance = joined(models, division()), random_rays(150, torch.float32), 0.05
+    together, rays, tolerance = joined(models, division()), random_rays(60, torch.float32), 0.05
     exact, seen = (render_rays(together, *rays, background=torch.zeros(3), tolerance=t) for t in (1e-12, tolerance))
     apart = (seen.rgb - exact.rgb).abs().amax(1)
     assert (apart <= seen.truncation_error + 2e-6).all()
@@ -142,12 +142,12 @@ def test_every_bit_of_a_picture_of_blocks_is_the_same_in_tiles_of_any_size(spher
     models = [cloudy(Similarity(0.4 + n / 4, np.eye(3), np.full(3, n / 9)), seed=n) for n in range(4)]
     together = joined(models, division())
     frame = spheres.test_frames[0]
-    frame = replace(frame, camera=frame.camera.resized(12, 9))
+    frame = replace(frame, camera=frame.camera.resized(8, 6))
     large, small = (
         render_picture(
             together, frame, background=together.background, depth=DepthRequest("median", "z"), rays_per_tile=rays
         )
-        for rays in (2**14, 25)
+        for rays in (2**14, 11)
     )
     for name in ("rgb", "opacity", "depth", "spread", "truncation_error"):
         np.testing.assert_array_equal(getattr(large, name), getattr(small, name), err_msg=name)
@@ -287,6 +287,7 @@ def test_photos_belong_to_the_blocks_whose_points_they_see(captured):
     assert parts.scenes[1].test_names == {"08.png"}
 
 
+@pytest.mark.usefixtures("coarse_steps")
 def test_blocks_are_trained_into_the_run_and_joined(captured):
     run = captured.with_name("r")
     command = ("train", captured, *QUICK, "-o", run)
@@ -322,13 +323,14 @@ def test_blocks_are_trained_into_the_run_and_joined(captured):
     assert Run(run).log[-1]["step"] == 6
 
 
+@pytest.mark.usefixtures("coarse_steps")
 def test_an_interrupted_block_is_resumed_by_the_same_command(captured, monkeypatch):
     run = captured.with_name("r")
-    command = ("train", captured, *QUICK, "--steps", "40", "-o", run, "--blocks", "2")
+    command = ("train", captured, *QUICK, "--steps", "8", "-o", run, "--blocks", "2")
     advance = Fitting.advance
 
     def interrupted(fitting, *arguments, **options):
-        if fitting.settings.block == 2 and fitting.step == 20:
+        if fitting.settings.block == 2 and fitting.step == 4:
             raise KeyboardInterrupt
         return advance(fitting, *arguments, **options)
 
@@ -340,9 +342,9 @@ def test_an_interrupted_block_is_resumed_by_the_same_command(captured, monkeypat
     first = (run / "blocks" / "1" / "field.safetensors").read_bytes()
     again = nerfcli(*command)
     assert again.exit_code == 0
-    assert "resumed at step 20" in again.stderr
+    assert "resumed at step 4" in again.stderr
     assert (run / "blocks" / "1" / "field.safetensors").read_bytes() == first
-    assert Run(run).log[-1]["step"] == 80
+    assert Run(run).log[-1]["step"] == 16
 
 
 def test_what_cannot_be_divided_is_refused_in_two_lines(captured, capture, finished):
@@ -383,6 +385,7 @@ def test_too_few_points_or_photos_of_a_block_are_refused_in_two_lines(captured):
     assert "has no points with the photos that see them" in refused(seen.point_index < 0)
 
 
+@pytest.mark.usefixtures("coarse_steps")
 def test_a_run_of_one_field_is_not_replaced_by_blocks(captured):
     run = captured.with_name("r")
     assert nerfcli("train", captured, *QUICK, "-o", run).exit_code == 0
@@ -403,6 +406,7 @@ def test_a_dry_run_names_the_photos_and_memory_of_each_block(captured):
     assert not captured.with_name("town-run").exists()
 
 
+@pytest.mark.usefixtures("coarse_steps")
 def test_the_array_job_of_the_examples_trains_and_joins_all_blocks(captured):
     """Run the command line of the example with the variables that Slurm sets, for two tasks and one step."""
     (line,) = re.findall(r"^nerfcli (.+)$", (EXAMPLES / "blocks.sbatch").read_text(encoding="utf-8"), re.MULTILINE)

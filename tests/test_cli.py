@@ -29,6 +29,7 @@ from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, 
 from nerfcli.interrupts import install_handlers
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
+from nerfcli.runs import settings
 from nerfcli.runs.log import append_log, read_log
 from nerfcli.train import loop
 from nerfcli.train.loop import Progress
@@ -374,6 +375,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch, finished):
 # Results, batches, what is kept
 
 
+@pytest.mark.usefixtures("coarse_steps")
 def test_train_evaluate_render_info_in_a_row(capture):
     run = capture.with_name("spheres-run")
     trained = nerfcli("train", capture, *QUICK)
@@ -760,6 +762,7 @@ def test_options_of_views_that_do_not_fit_are_wrong_usage(options, finished):
     assert nerfcli("render", finished, *options).exit_code == 2
 
 
+@pytest.mark.usefixtures("coarse_steps")
 def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch, capture, tmp_path):
     # Structure from motion has its own tests; here it finds the poses that the capture has.
     def known_poses(folder: Path, target: Path, settings: object, **more: object) -> None:
@@ -767,14 +770,15 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
             shutil.copytree(folder, target)
 
     monkeypatch.setattr(poses_workflow, "estimate_poses", known_poses)
+    monkeypatch.setattr(settings, "FEWEST_LOG2_ROWS", 10)
     arguments = ["run", capture, "-o", tmp_path / "all", "--budget", "0.2s", "--count", "2", "--max-size", "16"]
     arguments += ["--downscale", "4"]
 
-    def interrupted(*args: Any, on_progress: Callable[[Progress], None], **settings: Any) -> None:
+    def interrupted(*args: Any, on_progress: Callable[[Progress], None], **more: Any) -> None:
         def stop_at_the_first_step(progress: Progress) -> None:
             raise KeyboardInterrupt
 
-        loop_train(*args, on_progress=stop_at_the_first_step, **settings)
+        loop_train(*args, on_progress=stop_at_the_first_step, **more)
 
     loop_train = loop.train
     monkeypatch.setattr(loop, "train", interrupted)

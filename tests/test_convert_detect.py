@@ -1,6 +1,7 @@
 """Which convention a capture follows, found out from captures whose convention was broken on purpose."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,12 +17,13 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.archive import write_npz
 from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.convert import matches
 from nerfcli.convert.axes import Convention, expressed, for_picture, opencv_from_axes, poses_of, reinterpreted
 from nerfcli.convert.detect import Detection, detect
 from nerfcli.convert.evidence import Intrinsics, MatchEvidence
 from nerfcli.convert.matches import match_neighbours
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.multiview.features import Matches
+from nerfcli.multiview.features import Features, Matches, find_features
 
 
 def silent(fraction: float, detail: str) -> None:
@@ -207,6 +209,22 @@ def photograph(folder: Path, *, count: int, camera: Camera) -> Capture:
         Image.fromarray(np.clip(picture, 0, 255).astype(np.uint8)).save(folder / name)
         frames.append(Frame(name, camera, pose, image=folder / name))
     return Capture(tuple(frames), np.zeros((0, 3)), (), None, "transforms")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _features_found_once() -> Iterator[None]:
+    """Keep the features of each photo, which take most of the time: the tests look at the same photos again."""
+    kept: dict[bytes, Features] = {}
+
+    def found(grey: np.ndarray, *, longer_side_px: int, most: int) -> Features:
+        key = grey.tobytes()
+        if key not in kept:
+            kept[key] = find_features(grey, longer_side_px=longer_side_px, most=most)
+        return kept[key]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(matches, "find_features", found)
+        yield
 
 
 @pytest.fixture(scope="module")

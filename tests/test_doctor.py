@@ -223,8 +223,8 @@ def test_something_that_moves_by_itself_is_found_where_it_is(tmp_path):
     found = finding(diagnosis, "moving content")
     middle = dict(found.photos)["02.jpg"]  # there the mover is at x 0.2, y 0.75, distance 2.5
     across, down = (int(word) for word in middle.replace(",", "").split() if word.isdigit())
-    assert abs(across - 100 * (0.5 + 0.2 / 2.5 * FOCAL_PX / 560)) < 6
-    assert abs(down - 100 * (0.5 + 0.75 / 2.5 * FOCAL_PX / 420)) < 8
+    assert abs(across - 100 * (0.5 + 0.2 / 2.5 * FOCAL_PX / WIDTH)) < 6
+    assert abs(down - 100 * (0.5 + 0.75 / 2.5 * FOCAL_PX / HEIGHT)) < 8
 
 
 def test_a_flat_world_is_told_from_a_camera_that_only_turns(tmp_path):

@@ -168,11 +168,11 @@ def test_tasks_of_an_array_job_train_one_member_each(capture):
 
 def test_an_interrupted_member_is_resumed_by_the_same_command(capture, monkeypatch):
     run = capture.with_name("r")
-    command = ("train", capture, *QUICK, "--steps", "40", "-o", run, "--members", "2")
+    command = ("train", capture, *QUICK, "--steps", "8", "-o", run, "--members", "2")
     advance = Fitting.advance
 
     def interrupted(fitting, *arguments, **options):
-        if fitting.settings.seed == 2 and fitting.step == 20:
+        if fitting.settings.seed == 2 and fitting.step == 4:
             raise KeyboardInterrupt
         return advance(fitting, *arguments, **options)
 
@@ -186,10 +186,10 @@ def test_an_interrupted_member_is_resumed_by_the_same_command(capture, monkeypat
     first = (run / "members" / "1" / "field.safetensors").read_bytes()
     again = nerfcli(*command)
     assert again.exit_code == 0
-    assert "resumed at step 20" in again.stderr
+    assert "resumed at step 4" in again.stderr
     assert (run / "members" / "1" / "field.safetensors").read_bytes() == first
     members = members_of(Run(run))
-    assert [member.log[-1]["step"] for member in members] == [40, 40]
+    assert [member.log[-1]["step"] for member in members] == [8, 8]
 
 
 def test_members_keep_to_the_memory_of_the_run(capture):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerfcli import kernels
 from nerfcli.field.hash_field import HashField, HashFieldSettings
-from nerfcli.fit.open_cells import FINE_SIDE, LOOK_AROUND_EVERY, OCCUPANCY_SIDE, REFRESH_EVERY, OpenCells
+from nerfcli.fit.open_cells import FINE_SIDE, LOOK_AROUND_EVERY, OCCUPANCY_SIDE, REFRESH_EVERY, REFRESH_TURNS, OpenCells
 from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.kernels import March, Rays, numba_cpu, reference
 from nerfcli.render.model import Marching
@@ -165,13 +165,13 @@ def test_a_coarse_cell_stays_open_while_samples_hit_what_random_points_miss():
     """Here these never hit it: the field is empty wherever it is evaluated at random."""
     cells, needle = cells_of(Slab()), (10, 12, FINE_SIDE - 7)
     coarse = (5, 6, OCCUPANCY_SIDE - 4)
-    for turn in range(1, 100):
+    for turn in range(1, 4 * REFRESH_TURNS):
         visit(cells, needle, 0.02)
         refresh(cells, turn * REFRESH_EVERY)
         assert cells.coarse[coarse]
         assert cells.at(1)[needle]
     assert int(cells.coarse[:, :, OCCUPANCY_SIDE // 2 :].sum()) == 1
-    for turn in range(100, 105):  # 0.02 * 0.8^4 is below the threshold
+    for turn in range(4 * REFRESH_TURNS, 4 * REFRESH_TURNS + 5):  # 0.02 * 0.8^4 is below the threshold
         visit(cells, needle, 1e-4)
         refresh(cells, turn * REFRESH_EVERY)
     assert not cells.coarse[coarse]

@@ -39,7 +39,7 @@ from nerfcli.viewer.coverage import seen_cells
 from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_rows
 from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import PagePhotos
-from nerfcli.viewer.proof import HEIGHT, WIDTH, make_proof
+from nerfcli.viewer.proof import HEIGHT, WIDTH, Proof, make_proof
 from nerfcli.workflows.export import export_run
 
 # The change of a colour in [0, 1] by 16-bit rows, single precision and the colours that neither side evaluates.
@@ -48,6 +48,7 @@ COMPRESSED_NOTHING = base64.b64encode(zlib.compress(b"")).decode()
 # The fraction of pixels within the bound of depths: at edges a median jumps from one surface to another.
 AGREEING = 0.98
 UNSEEN = np.zeros((2, 2, 2), "<u2")
+NO_PROOF = Proof({}, np.zeros(0, "<f4"))
 SIMILARITY = Similarity(0.7, rotation_from_vector(np.array([0.2, -0.4, 0.9])), np.array([0.1, -0.2, 0.3]))
 
 
@@ -72,9 +73,9 @@ def rough(field: Field, *, sky: bool = False) -> Model:
     return Model(field, occupied, Marching(0.05, 40.0, 0.05, 0.05), background, SIMILARITY, "metre")
 
 
-def page_of(model: Model, frames: list[Frame]) -> str:
+def page_of(model: Model, frames: list[Frame], proof: Proof) -> str:
     photos = PagePhotos([], 0, 0)
-    numbers = PageNumbers.of(pack_model(model), make_proof(model, frames), UNSEEN)
+    numbers = PageNumbers.of(pack_model(model), proof, UNSEEN)
     box = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
     return page_html(model, numbers, run=Path("a-run"), frames=frames, photos=photos, box=box)
 
@@ -105,7 +106,7 @@ def hash_settings(contraction: str, *, antialias: bool = False, view_degree: int
 def test_the_numbers_in_the_page_render_what_the_kernels_render(field, sky):
     """Against an independent implementation of the shader, applied to the page's own text."""
     model, frame = rough(field, sky=sky), at((1.6, -0.4, 0.8))
-    page = page_of(model, [frame])
+    page = page_of(model, [frame], NO_PROOF)
     pages_view = json.loads(element(page, "scene"))["home"]
     traced = PageField(page).trace(pages_view)
     request = DepthRequest("median", "ray", min_opacity=0.0)
@@ -158,7 +159,8 @@ def test_rows_that_no_vertex_has_are_left_out():
 
 def test_the_proof_holds_the_pictures_of_nerfcli_render():
     model, frame = rough(HashField(hash_settings("l2"))), at((1.6, -0.4, 0.8))
-    page = page_of(model, [frame, at((0.2, 1.5, 0.1))])
+    frames = [frame, at((0.2, 1.5, 0.1))]
+    page = page_of(model, frames, make_proof(model, frames))
     described = json.loads(element(page, "scene"))["proof"]
     expected = array(page, "expected", "<f4")
     count = WIDTH * HEIGHT
@@ -224,7 +226,7 @@ def test_names_of_a_capture_stay_text():
     evil = "</script><script>alert(1)</script>"
     page = page_html(
         model,
-        PageNumbers.of(pack_model(model), make_proof(model, [at((1, 1, 1))]), UNSEEN),
+        PageNumbers.of(pack_model(model), NO_PROOF, UNSEEN),
         run=Path("a-run"),
         frames=[at((1, 1, 1))],
         photos=PagePhotos([{"name": evil, "split": "train"}], 0, 0),
@@ -346,7 +348,8 @@ def test_the_browser_shows_how_many_photos_see_the_surface(opened, spheres_run):
 )
 def test_the_browser_draws_other_fields(field, sky, browser, tmp_path):
     page = tmp_path / "other.html"
-    page.write_text(page_of(rough(field, sky=sky), [at((1.6, -0.4, 0.8)), at((0.2, 1.5, 0.1))]), encoding="utf-8")
+    model, frames = rough(field, sky=sky), [at((1.6, -0.4, 0.8)), at((0.2, 1.5, 0.1))]
+    page.write_text(page_of(model, frames, make_proof(model, frames)), encoding="utf-8")
     browser.open(page, "#check")
     assert browser.run("document.getElementById('trouble').textContent") == ""
     found = json.loads(browser.wait("document.getElementById('checked').dataset.found"))

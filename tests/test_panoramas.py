@@ -1,6 +1,7 @@
 """Photos of 360-degree cameras: recognition, poses, stereo matching, training and rendering."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pycolmap
 import pytest
 from commands import error_of, nerfcli
 from in_this_process import poses_in_this_process
-from panorama_room import CENTRES, WIDTH, render, world_from_cam, write_panoramas
+from panorama_room import CENTRES, WIDTH, panorama, render, world_from_cam, write_panoramas
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -301,7 +302,7 @@ def test_stereo_measures_distances_all_around(scene):
     numbers = [int(Path(frame.name).stem) for frame in found.frames]
     scale = align(np.array([frame.centre for frame in found.frames]), CENTRES[numbers]).scale
     for number, depth in zip(numbers[:4], depths, strict=True):
-        _, truth = render(CENTRES[number], world_from_cam(number))
+        _, truth = panorama(number)
         columns, rows = depth.pixels.T
         errors = np.abs(scale * depth.distances / truth[rows, columns] - 1)
         assert len(errors) > 0.08 * truth.size
@@ -368,6 +369,7 @@ def test_panoramas_and_other_photos_share_a_scene(photos, tmp_path):
     assert np.allclose(list(focals), WIDTH / (2 * np.pi), rtol=0.01)
 
 
+@pytest.mark.usefixtures("coarse_steps")
 def test_a_field_of_panoramas_renders_distances_along_rays(scene, tmp_path):
     run = tmp_path / "run"
     assert nerfcli("train", scene, "-o", run, "--steps", "2", "--downscale", "8", "--model", "default").exit_code == 0
@@ -396,7 +398,9 @@ def test_a_field_of_panoramas_renders_distances_along_rays(scene, tmp_path):
 
 
 def test_doctor_knows_panoramas(photos, tmp_path):
-    done = nerfcli("doctor", photos, "-o", tmp_path / "page.html", "--json")
+    few = tmp_path / "four of them"
+    shutil.copytree(photos, few, ignore=shutil.ignore_patterns("4.png", "5.png"))
+    done = nerfcli("doctor", few, "-o", tmp_path / "page.html", "--json")
     found = json.loads(done.stdout)
     verdicts = {finding["check"]: finding for finding in found["findings"]}
     assert verdicts["focal length"]["summary"] == "not needed for panoramas of the whole sphere"

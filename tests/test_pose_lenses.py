@@ -14,7 +14,7 @@ from nerfcli.poses.model.intrinsics import choose_lenses, converted
 def ring_model(name: str, params: tuple[float, ...], *, seed: int = 0) -> pycolmap.Reconstruction:
     """Twelve photos around a boulder in a room, so that pictures are full to the corners; half a pixel of noise."""
     views = synthetic.ring(12, [Lens(name, 1024, 768, params)], seed=1, radius=2.5)
-    scene = synthetic.together(synthetic.boulder(150, seed=2), synthetic.room(350, seed=3))
+    scene = synthetic.together(synthetic.boulder(100, seed=2), synthetic.room(240, seed=3))
     return synthetic.observed_model(views, scene, noise_px=0.5, seed=seed)
 
 

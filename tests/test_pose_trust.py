@@ -82,7 +82,7 @@ def solve(folder: Path, views: Sequence[View], scene: Scene, noise: Noise = Nois
 def solved(tmp_path_factory: pytest.TempPathFactory) -> Solved:
     """Two cameras, a fifth of the matches wrong, three photos in ten unmatched."""
     views = synthetic.ring(10, [WIDE, LONG], seed=0, turn_deg=200)
-    return solve(tmp_path_factory.mktemp("right"), views, synthetic.boulder(900, seed=0), Noise(outliers=0.2))
+    return solve(tmp_path_factory.mktemp("right"), views, synthetic.boulder(650, seed=0), Noise(outliers=0.2))
 
 
 def test_a_right_result_is_accepted_and_right(solved: Solved):

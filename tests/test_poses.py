@@ -21,7 +21,7 @@ from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses
 
-FAST = PoseSettings(max_features=1000, threads=2)
+FAST = PoseSettings(max_features=500, threads=2)
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndar
 
 
 def test_poses_agree_with_the_truth(solved: Solved):
-    """Synthetic truth. The cameras are 4 units from the corner; the observed errors are 0.003 and 0.09 degrees."""
+    """Synthetic truth. The cameras are 4 units from the corner; the observed errors are 0.002 and 0.09 degrees."""
     model = solved.model
     estimated = [model.find_image_with_name(name) for name in NAMES]
     centres = np.array([image.projection_center() for image in estimated])
@@ -136,7 +136,7 @@ def test_the_report_file_has_the_promised_keys(solved: Solved):
     assert report["verdict"]["accepted"]
     assert report["parts"] == [7]
     assert report["models"][0] == report["registered"] == 7
-    assert report["settings"]["max_features"] == 1000
+    assert report["settings"]["max_features"] == 500
     assert report["versions"]["pycolmap"] == pycolmap.__version__
     assert report["matching"] == {"rule": "exhaustive", "pairs": 28}
 
@@ -167,7 +167,7 @@ def write_noise(folder: Path) -> None:
     """Five photos that have nothing in common."""
     folder.mkdir()
     for seed in range(5):
-        Image.fromarray(wall(100 + seed)[:200, :200]).save(folder / f"{seed}.png")
+        Image.fromarray(wall(100 + seed)[:160, :160]).save(folder / f"{seed}.png")
 
 
 def estimate(photos: Path, scene_dir: Path, progress: Callable[[str, int, int], None] | None = None) -> PosesReport:
@@ -184,7 +184,7 @@ def test_photos_without_overlap_are_too_few_and_leave_no_scene(tmp_path: Path):
         estimate_poses(
             tmp_path / "photos",
             tmp_path / "scene",
-            settings=FAST,
+            settings=replace(FAST, max_features=130),
             notify=reported.append,
             progress=lambda stage, done, total: reported.append(stage),
         )

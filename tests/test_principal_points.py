@@ -247,7 +247,7 @@ def stabilised(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarr
     shifts = np.random.default_rng(7).normal(scale=6, size=(len(NAMES), 2))
     write_capture(folder / "photos", shifts)
     (folder / "test.txt").write_text(f"{NAMES[2]}\n")
-    settings = replace(FAST, threads=1, strict=True, holdout=str(folder / "test.txt"))
+    settings = replace(FAST, max_features=1000, threads=1, strict=True, holdout=str(folder / "test.txt"))
     report = poses_in_this_process(folder / "photos", folder / "scene", settings)
     return folder / "scene", shifts, report
 

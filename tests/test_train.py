@@ -27,6 +27,7 @@ from nerfcli.cameras.rigid import Similarity, apply, rotation_from_quaternion
 from nerfcli.convert.formats import UserInputs, recognise
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model, over_white
+from nerfcli.field import hash_field
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image, write_png
@@ -73,6 +74,13 @@ def fit(
 
     train(scene, run, settings, resume=resume, notify=lambda text: None, on_progress=record)
     return steps
+
+
+@pytest.fixture(scope="module")
+def straight(views: Scene, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Progress]]:
+    """A training with `ADAPTIVE` that nothing interrupts, and the progress of its steps. Do not write into its run."""
+    run = tmp_path_factory.mktemp("straight") / "run"
+    return run, fit(views, run, ADAPTIVE)
 
 
 def weights(run: Path) -> dict[str, bytes]:
@@ -187,13 +195,13 @@ def test_the_reference_trains_as_the_compiled_kernels_do(views, tmp_path, monkey
     assert [step.loss for step in reference] == pytest.approx([step.loss for step in compiled], rel=1e-3)
 
 
-def test_interrupted_and_resumed_equals_straight_bit_for_bit(views, tmp_path):
+def test_interrupted_and_resumed_equals_straight_bit_for_bit(views, straight, tmp_path):
     def stop(progress: Progress) -> None:
         if progress.step == 11:
             raise KeyboardInterrupt
 
     assert kernels.backend_for(torch.device("cpu"), torch.float32).deterministic
-    straight = fit(views, tmp_path / "straight", ADAPTIVE)
+    whole, steps = straight
     with pytest.raises(KeyboardInterrupt):
         fit(views, tmp_path / "parts", ADAPTIVE, on_progress=stop)
     halfway = load_model(tmp_path / "parts" / "field.safetensors", "cpu")  # the run left by Ctrl-C can be loaded
@@ -201,12 +209,12 @@ def test_interrupted_and_resumed_equals_straight_bit_for_bit(views, tmp_path):
     assert not Run(tmp_path / "parts").is_complete(ADAPTIVE)
     second = fit(views, tmp_path / "parts", ADAPTIVE, resume=True)
     assert [progress.step for progress in second] == list(range(12, 25))
-    assert [progress.loss for progress in second] == [progress.loss for progress in straight[11:]]
-    assert weights(tmp_path / "parts") == weights(tmp_path / "straight")
+    assert [progress.loss for progress in second] == [progress.loss for progress in steps[11:]]
+    assert weights(tmp_path / "parts") == weights(whole)
     assert Run(tmp_path / "parts").is_complete(ADAPTIVE)
     log = read_log(tmp_path / "parts")
     assert [entry["step"] for entry in log] == sorted(entry["step"] for entry in log)
-    assert log[-1]["samples"] == read_log(tmp_path / "straight")[-1]["samples"]
+    assert log[-1]["samples"] == read_log(whole)[-1]["samples"]
 
 
 @pytest.mark.parametrize("kind", ["voxels", "mlp"])
@@ -284,11 +292,11 @@ def test_detailed_fields_train_and_resume_bit_for_bit_with_their_fine_cells(view
             raise KeyboardInterrupt
 
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)  # also while the sentinel takes snapshots
-    settings = replace(FEW, log2_rows=17)
-    straight = fit(views, tmp_path / "straight", settings)
+    monkeypatch.setattr(hash_field, "DETAILED_LOG2_ROWS", FEW.log2_rows)
+    straight = fit(views, tmp_path / "straight", FEW)
     with pytest.raises(KeyboardInterrupt):
-        fit(views, tmp_path / "parts", settings, on_progress=stop)
-    second = fit(views, tmp_path / "parts", settings, resume=True)
+        fit(views, tmp_path / "parts", FEW, on_progress=stop)
+    second = fit(views, tmp_path / "parts", FEW, resume=True)
     assert [progress.loss for progress in second] == [progress.loss for progress in straight[11:]]
     states = [load_tensors(tmp_path / name / "state.safetensors", "cpu")[0] for name in ("straight", "parts")]
     for name in ("fine_depth", "fine_occupied", "fine_visits", "occupied"):
@@ -337,31 +345,30 @@ def test_what_has_learned_goes_on_learning_in_a_larger_budget(views, tmp_path):
 
 
 @pytest.mark.parametrize("last", ["field.safetensors", "state.safetensors"])
-def test_a_kill_between_field_and_state_is_no_harm(last, views, tmp_path):
+def test_a_kill_between_field_and_state_is_no_harm(last, views, straight, tmp_path):
     # The process dies between the two files of the second checkpoint, or of the first.
     def stop(progress: Progress) -> None:
         if progress.step == 9:
             raise KeyboardInterrupt
 
-    straight = tmp_path / "straight"
-    fit(views, straight, ADAPTIVE)
+    whole, _ = straight
     with pytest.raises(KeyboardInterrupt):
         fit(views, tmp_path / "run", ADAPTIVE, on_progress=stop)
     if last == "state.safetensors":
         (tmp_path / "run" / "field.safetensors").unlink()  # the first time, the state is written first
     else:
-        shutil.copy(straight / "field.safetensors", tmp_path / "run")  # a field that is ahead of the state
+        shutil.copy(whole / "field.safetensors", tmp_path / "run")  # a field that is ahead of the state
     with (tmp_path / "run" / "log.jsonl").open("a") as log:
         log.write('{"step": 24, "seconds": 1e3, "loss": 1}\n{"step": 25, "seco')
     assert not Run(tmp_path / "run").is_complete(ADAPTIVE)
     fit(views, tmp_path / "run", ADAPTIVE, resume=True)
-    assert weights(tmp_path / "run") == weights(straight)
+    assert weights(tmp_path / "run") == weights(whole)
     steps = [entry["step"] for entry in read_log(tmp_path / "run")]
     assert steps == sorted(set(steps))
     assert (steps[-1], 9 in steps) == (24, True)
 
 
-def test_ctrl_c_waits_for_the_end_of_the_step(views, tmp_path, monkeypatch):
+def test_ctrl_c_waits_for_the_end_of_the_step(views, straight, tmp_path, monkeypatch):
     draw = PixelPool.draw
     calls = 0
 
@@ -379,8 +386,7 @@ def test_ctrl_c_waits_for_the_end_of_the_step(views, tmp_path, monkeypatch):
     assert signal.getsignal(signal.SIGINT) is before
     assert Run(tmp_path / "run").saved_progress()[0] == 5
     fit(views, tmp_path / "run", ADAPTIVE, resume=True)
-    fit(views, tmp_path / "straight", ADAPTIVE)
-    assert weights(tmp_path / "run") == weights(tmp_path / "straight")
+    assert weights(tmp_path / "run") == weights(straight[0])
 
 
 def test_resume_without_a_checkpoint_is_told(views, tmp_path):

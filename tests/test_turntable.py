@@ -168,7 +168,7 @@ class TestTogether:
 
 @pytest.fixture(scope="module")
 def capture() -> Turntable:
-    return turntable(9, size=(480, 360), turn_deg=90, supersampled=1, seed=1)
+    return turntable(8, size=(480, 360), turn_deg=90, supersampled=1, seed=1)
 
 
 class TestMasks:
@@ -279,7 +279,8 @@ class TestPoses:
         """Like a camera that moves around the object: the background outside the true masks is made grey."""
         photos = np.where(capture.masks[..., None], capture.photos, np.uint8(128))
         write(replace(capture, photos=photos), tmp_path)
-        report, notes = solved(tmp_path / "images", tmp_path / "scene")
+        # Half of 400 features are found without a search of enlarged pictures.
+        report, notes = solved(tmp_path / "images", tmp_path / "scene", max_features=400)
         assert report["moving_foreground"] is None
         assert not (tmp_path / "scene" / "masks").exists()
         assert not any("turns" in note for note in notes)

@@ -304,8 +304,9 @@ def write_replicate(folder: Path, *, seed: int, bias: float) -> None:
 
 
 @pytest.mark.parametrize(("bias", "verdict"), [(0.0, "YES"), (1.0, "LABEL ONLY")])
-def test_ensembles_of_known_quality_get_their_verdicts(tmp_path, bias, verdict):
+def test_ensembles_of_known_quality_get_their_verdicts(tmp_path, monkeypatch, bias, verdict):
     """The positive control through all files: YES for draws of the truth's Gaussian, but not if they share an error."""
+    monkeypatch.setattr(uncertainty, "PIXELS_PER_VIEW", 1024)
     for seed, one in enumerate(uncertainty.replicates()):
         write_replicate(tmp_path / one.name, seed=seed, bias=bias)
     uncertainty.judge(tmp_path)

@@ -322,7 +322,8 @@ def network_without_a_table(model: Model) -> Model:
 
 def two_blocks(model: Model) -> Model:
     cells = (Cell(high=(0.1, np.inf)), Cell(low=(0.1, -np.inf)))
-    return joined([model, deepcopy(model)], BlockDivision(np.eye(3)[:2], cells, ()))
+    coarse = model.stretched(4.0)
+    return joined([coarse, deepcopy(coarse)], BlockDivision(np.eye(3)[:2], cells, ()))
 
 
 @pytest.mark.parametrize(
@@ -334,7 +335,7 @@ def test_what_the_page_cannot_render_is_drawn_by_the_server(finished, made, refu
     with closing(Served(finished)) as served:
         assert f'"refusal":"the page cannot render {refusal}' in served.get().decode()
         assert served.refusal("field")[0] == 503
-        frame = frame_of(finished, width=30, height=20)
+        frame = frame_of(finished, width=12, height=8)
         picture = assembled(served.get("picture", view_request(frame)), frame)
     np.testing.assert_array_equal(picture[..., :3], rendered(model, frame, "conditional").rgb)
 
@@ -534,9 +535,8 @@ def test_a_disk_that_is_full_ends_the_view_and_not_the_training(capture, at_once
 
 
 def test_train_serves_its_run_with_view(capture):
-    process = started(
-        "train", capture, "--steps", "100000", "--downscale", "8", "--threads", "1", "--model", "default", "--view"
-    )
+    small = ("--downscale", "8", "--log2-rows", "10", "--threads", "1", "--model", "default")
+    process = started("train", capture, "--steps", "100000", *small, "--view")
     assert process.stderr is not None
     lines = iter(process.stderr.readline, "")
     url = next(found[0] for line in lines if (found := re.findall(r"http://\S+", line)))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-WIDTH, HEIGHT, FOCAL_PX = 560, 420, 500.0
+WIDTH, HEIGHT, FOCAL_PX = 448, 336, 400.0
 # Boards: centre x, y and distance in front of the first camera, and width; the first fills the background.
 BOARDS = (
     (0.0, 0.0, 6.0, 16.0),
@@ -56,8 +56,10 @@ def view(
         layer = cv2.warpPerspective(picture, large, size, flags=cv2.INTER_AREA)
         cover = cv2.warpPerspective(np.full(picture.shape[:2], 255, np.uint8), large, size)
         layer, cover = (cv2.resize(part, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for part in (layer, cover))
-        fraction = cover[..., None] / 255
-        photo = np.rint(layer * fraction + photo * (1 - fraction)).astype(np.uint8)
+        left, top, across, down = cv2.boundingRect(cover)
+        there = slice(top, top + down), slice(left, left + across)
+        fraction = cover[there][..., None] / 255
+        photo[there] = np.rint(layer[there] * fraction + photo[there] * (1 - fraction)).astype(np.uint8)
     return photo
 
 
