@@ -32,9 +32,8 @@ SPHERES = Path(__file__).parents[1] / "sample_scenes" / "spheres"
 # Each variant with its budget of steps and the step at which it is stopped. Once cameras move (after a tenth of the
 # budget) or rays end by opacity, a last bit decides about whole samples, even between one thread and two: stop soon.
 VARIANTS = {
-    "": (200, 50),
-    "exposure": (200, 50),
-    "background=black": (200, 50),
+    "": (200, 34),
+    "exposure,background=black": (200, 34),
     "pixels=error,points,entropy,movers": (100, 24),
     "cameras=all": (100, 14),
 }

@@ -2,7 +2,8 @@
 
 Same operations as `reference.project` and `reference.back_project`. Forwards, lines are processed in parallel.
 Backwards, each thread owns some planes across the axis that lines are most aligned with, and a line touches only four
-voxels of a plane: no two threads write to the same voxel, and the order of sums does not depend on the threads.
+voxels of a plane: no two threads write to the same voxel, and the order of sums does not depend on the threads. Which
+planes a line crosses is computed once, since most lines cross few of the planes that a thread owns.
 """
 
 from typing import Any
@@ -39,7 +40,7 @@ def _enter(start: Any, slope: Any, count: Any, low: Any, high: Any) -> tuple[Any
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _line(origin: Any, direction: Any, first: Any, size: Any, counts: Any, low: Any, high: Any) -> tuple:
+def _line(origin: Any, direction: Any, first: Any, size: Any, counts: Any) -> tuple:
     """Return a line's main and other axes, its planes, start and slope of its other coordinates, length per plane."""
     axis = 0
     for j in range(1, 3):
@@ -51,9 +52,7 @@ def _line(origin: Any, direction: Any, first: Any, size: Any, counts: Any, low: 
     slope_b, slope_c = direction[b] / direction[axis], direction[c] / direction[axis]
     start_b = (origin[b] - first[b]) / size - at * slope_b
     start_c = (origin[c] - first[c]) / size - at * slope_c
-    if high > counts[axis]:
-        high = counts[axis]
-    low, high = _enter(start_b, slope_b, counts[b], low, high)
+    low, high = _enter(start_b, slope_b, counts[b], 0, counts[axis])
     low, high = _enter(start_c, slope_c, counts[c], low, high)
     length = size * np.sqrt(1.0 + slope_b * slope_b + slope_c * slope_c)
     return axis, b, c, low, high, start_b, slope_b, start_c, slope_c, length
@@ -64,7 +63,7 @@ def _project(volume: Any, origins: Any, directions: Any, first: Any, size: Any, 
     strides = np.array([1, counts[0], counts[0] * counts[1]])
     for r in numba.prange(len(origins)):
         axis, b, c, low, high, start_b, slope_b, start_c, slope_c, length = _line(
-            origins[r], directions[r], first, size, counts, 0, np.int64(1) << 40
+            origins[r], directions[r], first, size, counts
         )
         step_a, step_b, step_c = strides[axis], strides[b], strides[c]
         total = 0.0
@@ -90,17 +89,23 @@ def _project(volume: Any, origins: Any, directions: Any, first: Any, size: Any, 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _back_project(values: Any, origins: Any, directions: Any, first: Any, size: Any, counts: Any, out: Any) -> None:
     strides = np.array([1, counts[0], counts[0] * counts[1]])
+    lines = len(origins)
+    axes, lows, highs = np.empty(lines, np.int8), np.empty(lines, np.int64), np.empty(lines, np.int64)
+    for r in numba.prange(lines):
+        axis, _, _, low, high, _, _, _, _, _ = _line(origins[r], directions[r], first, size, counts)
+        axes[r], lows[r], highs[r] = axis, low, high
     for wanted in range(3):
         for slab in numba.prange((counts[wanted] + SLAB - 1) // SLAB):
-            for r in range(len(origins)):
-                axis, b, c, low, high, start_b, slope_b, start_c, slope_c, length = _line(
-                    origins[r], directions[r], first, size, counts, slab * SLAB, (slab + 1) * SLAB
-                )
-                if axis != wanted:
+            begin, end = slab * SLAB, (slab + 1) * SLAB
+            for r in range(lines):
+                if axes[r] != wanted or highs[r] <= begin or lows[r] >= end:
                     continue
+                axis, b, c, low, high, start_b, slope_b, start_c, slope_c, length = _line(
+                    origins[r], directions[r], first, size, counts
+                )
                 step_a, step_b, step_c = strides[axis], strides[b], strides[c]
                 value = values[r] * length
-                for k in range(low, high):
+                for k in range(max(low, begin), min(high, end)):
                     place_b, place_c = start_b + k * slope_b, start_c + k * slope_c
                     floor_b, floor_c = np.floor(place_b), np.floor(place_c)
                     i, j = int(floor_b), int(floor_c)
