@@ -21,13 +21,14 @@ from nerfcli.poses.input.photos import Photo, Photos
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import estimate_poses
 
-SETTINGS = PoseSettings(max_features=300, threads=1)
+SETTINGS = PoseSettings(max_features=200, threads=1, camera_model="SIMPLE_RADIAL")
+SCALE = 0.6
 # A tenth of a picture's contrast leaves 8 to 12 features in it that SIFT's usual threshold accepts, this none.
 CONTRAST = 0.06
 
 
 def dark(centre: np.ndarray) -> Image.Image:
-    picture = render(centre, 1.0, np.zeros(2)).astype(float)
+    picture = render(centre, SCALE, np.zeros(2)).astype(float)
     return Image.fromarray(np.round(40 + CONTRAST * (picture - 128)).astype(np.uint8))
 
 
@@ -45,7 +46,7 @@ def photos(tmp_path: Path) -> Path:
 
 def test_poses_of_dark_photos_agree_with_the_truth(tmp_path: Path):
     """Without the third search, none of the photos has a feature."""
-    photos = write_photos(tmp_path / "photos", len(CENTRES))
+    photos = write_photos(tmp_path / "photos", 5)
     reported: dict[str, tuple[int, int]] = {}
     with worker_in_this_process():
         report = estimate_poses(
@@ -55,17 +56,17 @@ def test_poses_of_dark_photos_agree_with_the_truth(tmp_path: Path):
             notify=lambda note: None,
             progress=lambda stage, done, total: reported.update({stage: (done, total)}),
         )
-    assert report.registered == 7
-    assert reported["faint"] == (7, 7)
+    assert report.registered == 5
+    assert reported["faint"] == (5, 5)
     model = pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse/0"))
-    centres = np.array([model.find_image_with_name(f"{i}.png").projection_center() for i in range(7)])
-    scale, rotation, translation = similarity(centres, CENTRES)
-    assert np.linalg.norm(scale * centres @ rotation.T + translation - CENTRES, axis=1).max() < 0.03
+    centres = np.array([model.find_image_with_name(f"{i}.png").projection_center() for i in range(5)])
+    scale, rotation, translation = similarity(centres, CENTRES[:5])
+    assert np.linalg.norm(scale * centres @ rotation.T + translation - CENTRES[:5], axis=1).max() < 0.03
 
 
 def job_of(folder: Path, work: Path) -> Job:
     pictures = sorted(folder.iterdir())
-    photos = tuple(Photo(path.name, WIDTH, HEIGHT, read_exif(path)) for path in pictures)
+    photos = tuple(Photo(path.name, round(SCALE * WIDTH), round(SCALE * HEIGHT), read_exif(path)) for path in pictures)
     return replace(job_for(Photos(folder, photos, {}), (), work), max_features=600)
 
 
@@ -81,14 +82,14 @@ def test_only_photos_with_very_few_features_are_searched_for_faint_ones(
     """A photo with contrast keeps its features whatever the others need; a second call searches nothing again, though
     some photos still have few features.
     """
-    Image.fromarray(render(CENTRES[0], 1.0, np.zeros(2))).save(photos / "0.png")
-    job = replace(job_of(photos, tmp_path / "work" / "inner"), max_features=2400)
+    Image.fromarray(render(CENTRES[0], SCALE, np.zeros(2))).save(photos / "0.png")
+    job = replace(job_of(photos, tmp_path / "work" / "inner"), max_features=1200)
     stages: dict[str, int] = {}
     extract(job, lambda stage, done, total: stages.update({stage: total}))
     assert stages == {"extract": 3, "enlarge": 3, "faint": 2}
     counts = feature_counts(job)
-    assert counts[0] > 1200 > max(counts[1:])
-    assert min(counts) > 300
+    assert counts[0] > 600 > max(counts[1:])
+    assert min(counts) > 150
     before, forgotten = features(job), []
     monkeypatch.setattr(searching, "forget_features", lambda job, image_ids: forgotten.extend(image_ids))
     extract(job, lambda stage, done, total: None)

@@ -1,5 +1,6 @@
 """Focal lengths from pairs of photos, before any is placed, against synthetic truth."""
 
+import shutil
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import pycolmap
 import pytest
 import synthetic_captures as synthetic
 from numpy.typing import NDArray
-from synthetic_captures import FISHEYE, WIDE, Noise
+from synthetic_captures import FISHEYE, WIDE, Noise, View
 
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.engine.initial_focal import with_focal_lengths
@@ -104,13 +105,20 @@ def test_few_pairs_give_no_estimate():
     assert focal_length(weak, SIZE, seed=0) is None
 
 
-@pytest.fixture
-def job(tmp_path: Path) -> Job:
-    """Fourteen photos around an object, from uneven distances; the lens has a distortion of -0.05."""
+@pytest.fixture(scope="module")
+def matched(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], Path]:
+    """Fourteen photos around an object, from uneven distances, and their database; the distortion is -0.05."""
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    path = tmp_path_factory.mktemp("matched") / "database.db"
     views = synthetic.ring(14, [WIDE], seed=0)
-    boulder = synthetic.boulder(1500, seed=0)
-    synthetic.write_database(tmp_path / "database.db", views, boulder, noise=Noise(), seed=0)
+    synthetic.write_database(path, views, synthetic.boulder(1000, seed=0), noise=Noise(), seed=0)
+    return views, path
+
+
+@pytest.fixture
+def job(matched: tuple[list[View], Path], tmp_path: Path) -> Job:
+    views, database = matched
+    shutil.copy(database, tmp_path)
     return synthetic.synthetic_job(tmp_path, views, seed=0)
 
 

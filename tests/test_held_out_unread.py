@@ -5,6 +5,7 @@ held-out photos, which also covers what a library opens by itself. (Reading the 
 sizes of pictures, they are in the pictures' headers.)
 """
 
+import json
 import shutil
 import sys
 from collections.abc import Iterator
@@ -53,7 +54,12 @@ def opened() -> Iterator[list[str]]:
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
-    return Path(shutil.copytree(SPHERES, tmp_path / "capture"))
+    """The spheres with every other photo to train on."""
+    folder = Path(shutil.copytree(SPHERES, tmp_path / "capture"))
+    listed = json.loads((folder / "transforms_train.json").read_text())
+    listed["frames"] = listed["frames"][::2]
+    (folder / "transforms_train.json").write_text(json.dumps(listed))
+    return folder
 
 
 def settings(model: str, components: Components) -> TrainSettings:

@@ -32,7 +32,7 @@ from nerfcli.poses.model.cameras import GivenIntrinsics
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
 
-ONE_THREAD = PoseSettings(max_features=300, threads=1)
+ONE_THREAD = PoseSettings(max_features=200, max_image_size=256, threads=1)
 # The true camera at twice the size of the larger photos, in a model whose distortion terms are zero.
 TRUE = Camera("OPENCV", 960, 720, (2 * FOCAL_PX, 2 * FOCAL_PX, 480, 360, 0, 0, 0, 0))
 

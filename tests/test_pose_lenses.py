@@ -11,10 +11,15 @@ from nerfcli.poses.model import held_out
 from nerfcli.poses.model.intrinsics import choose_lenses, converted
 
 
-def ring_model(name: str, params: tuple[float, ...], *, seed: int = 0) -> pycolmap.Reconstruction:
-    """Twelve photos around a boulder in a room, so that pictures are full to the corners; half a pixel of noise."""
+def ring_model(
+    name: str, params: tuple[float, ...], *, points: tuple[int, int] = (100, 240), seed: int = 0
+) -> pycolmap.Reconstruction:
+    """Twelve photos around a boulder in a room, so that pictures are full to the corners; half a pixel of noise.
+
+    `points` are those of the boulder and of the room.
+    """
     views = synthetic.ring(12, [Lens(name, 1024, 768, params)], seed=1, radius=2.5)
-    scene = synthetic.together(synthetic.boulder(100, seed=2), synthetic.room(240, seed=3))
+    scene = synthetic.together(synthetic.boulder(points[0], seed=2), synthetic.room(points[1], seed=3))
     return synthetic.observed_model(views, scene, noise_px=0.5, seed=seed)
 
 

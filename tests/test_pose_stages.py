@@ -33,7 +33,7 @@ from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene, p
 from nerfcli.poses.workspace import database_bytes, drop_database, workspace
 
 # A fixed lens model: choosing one would only add adjustments.
-ONE_THREAD = PoseSettings(max_features=200, max_image_size=256, threads=1, camera_model="SIMPLE_RADIAL")
+ONE_THREAD = PoseSettings(max_features=200, max_image_size=192, threads=1, camera_model="SIMPLE_RADIAL")
 Progress = Callable[[str, int, int], None]
 
 
@@ -342,7 +342,7 @@ def test_ten_kills_at_random_moments_change_nothing(photos: Path, whole: Path, t
     rng = random.Random(0)
     scene = tmp_path / "scene"
     command = [sys.executable, "-m", "nerfcli", "poses", str(photos), "-o", str(scene), "--max-features", "200"]
-    command += ["--max-size", "256", "--camera-model", "SIMPLE_RADIAL"]
+    command += ["--max-size", "192", "--camera-model", "SIMPLE_RADIAL"]
     environment = {**os.environ, "PYTHONPATH": str(Path(nerfcli.__file__).parent.parent)}
     for _ in range(10):
         process = subprocess.Popen([*command, "--threads", "1", "--quiet"], env=environment, stderr=subprocess.PIPE)

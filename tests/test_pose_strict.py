@@ -27,7 +27,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, PoseSe
     folder = tmp_path_factory.mktemp("strict")
     write_capture(folder / "photos")
     (folder / "test.txt").write_text(f"{NAMES[HELD_OUT]}\nwall.png\n")
-    settings = replace(FAST, max_features=400, strict=True, holdout=str(folder / "test.txt"))
+    settings = replace(FAST, max_features=300, max_image_size=320, strict=True, holdout=str(folder / "test.txt"))
     report = poses_in_this_process(folder / "photos", folder / "scene", settings)
     return folder / "photos", folder / "scene", settings, report
 

@@ -23,7 +23,8 @@ from nerfcli.poses.input.photos import camera_groups, find_photos
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import is_same_scene
 
-RIG = PoseSettings(max_features=300, threads=1, subfolders=True)
+RIG = PoseSettings(max_features=200, threads=1, subfolders=True)
+PHOTOS, SCALE = 5, 2 / 3  # photos of each camera, and their size relative to those of `corner`
 # The camera on the right sees a quarter less of the scene than the one on the left, in pictures of the same size.
 ZOOM = 1.25
 BASELINE = np.array([0.15, -0.15, 0.1])
@@ -37,18 +38,19 @@ def write_photos(folder: Path, count: int) -> None:
 
 def zoomed(centre: np.ndarray) -> np.ndarray:
     """Return the middle of a larger picture, whose focal length in pixels is `ZOOM` times as long."""
-    larger = render(centre, ZOOM, np.zeros(2))
-    top, left = (larger.shape[0] - HEIGHT) // 2, (larger.shape[1] - WIDTH) // 2
-    return larger[top : top + HEIGHT, left : left + WIDTH]
+    larger = render(centre, SCALE * ZOOM, np.zeros(2))
+    height, width = round(SCALE * HEIGHT), round(SCALE * WIDTH)
+    top, left = (larger.shape[0] - height) // 2, (larger.shape[1] - width) // 2
+    return larger[top : top + height, left : left + width]
 
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Both cameras give their photos the same names."""
     folder = tmp_path_factory.mktemp("capture") / "my rig"
-    for camera, shift, draw in (("left", 0.0, lambda c: render(c, 1.0, np.zeros(2))), ("right", 1.0, zoomed)):
+    for camera, shift, draw in (("left", 0.0, lambda c: render(c, SCALE, np.zeros(2))), ("right", 1.0, zoomed)):
         (folder / camera).mkdir(parents=True)
-        for index, centre in enumerate(CENTRES):
+        for index, centre in enumerate(CENTRES[:PHOTOS]):
             Image.fromarray(draw(centre + shift * BASELINE)).save(folder / camera / f"{index}.png")
     return folder
 
@@ -57,7 +59,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scene(rig: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("solved") / "scene"
     report = poses_in_this_process(rig, folder, RIG)
-    assert (report.registered, report.total) == (14, 14)
+    assert (report.registered, report.total) == (2 * PHOTOS, 2 * PHOTOS)
     return folder
 
 
@@ -70,22 +72,22 @@ def test_each_subfolder_has_the_camera_that_took_its_photos(scene: Path):
     }
     assert [len(lengths) for lengths in focal.values()] == [1, 1]
     (left,), (right,) = focal.values()
-    assert left == pytest.approx(FOCAL_PX, rel=0.02)
+    assert left == pytest.approx(SCALE * FOCAL_PX, rel=0.02)
     assert right / left == pytest.approx(ZOOM, rel=0.01)
 
 
 def test_the_scene_has_the_photos_of_both_and_is_kept_the_second_time(rig: Path, scene: Path):
     loaded = scenes.load(scene)
-    names = [f"{folder}/{index}.png" for folder in ("left", "right") for index in range(7)]
+    names = [f"{folder}/{index}.png" for folder in ("left", "right") for index in range(PHOTOS)]
     assert sorted(frame.name for frame in loaded.frames) == names
     for frame in loaded.frames:
         assert frame.image is not None
         assert frame.image.samefile(rig / frame.name)
     assert is_same_scene(scene, rig, RIG)
-    result = nerfcli("poses", rig, "-o", scene, "--subfolders", "--max-features", "300", "--threads", "1", "--json")
+    result = nerfcli("poses", rig, "-o", scene, "--subfolders", "--max-features", "200", "--threads", "1", "--json")
     assert result.exit_code == 0, result.stderr
     assert "is kept" in result.stderr
-    assert not is_same_scene(scene, rig / "left", PoseSettings(max_features=300, threads=1))
+    assert not is_same_scene(scene, rig / "left", PoseSettings(max_features=200, threads=1))
 
 
 def test_pictures_of_such_photos_go_to_subfolders(scene: Path, tmp_path: Path):
@@ -177,7 +179,7 @@ def test_doctor_examines_the_photos_of_all_subfolders(rig: Path, scene: Path, tm
     done = nerfcli("doctor", rig, "--subfolders", "--json", "-o", tmp_path / "page.html")
     assert done.exit_code == 0, done.stderr
     content = json.loads(done.stdout)
-    assert [photo["name"] for photo in content["photos"][::7]] == ["left/0.png", "right/0.png"]
+    assert [photo["name"] for photo in content["photos"][::PHOTOS]] == ["left/0.png", "right/0.png"]
     (cameras,) = (finding for finding in content["findings"] if finding["check"] == "cameras")
     assert cameras["summary"].startswith("one camera in each of 2 folders")
     assert nerfcli("doctor", scene, "--subfolders").exit_code == BAD_INPUT

@@ -7,6 +7,7 @@ everything is real.
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,18 @@ def test_what_was_measured_on_a_right_result_is_as_it_must_be(solved: Solved):
     assert measures["parallax_px"] > 10
     # A ring of radius 3.5 around a ball of radius 1, seen from 2.5 at the nearest.
     assert 0.7 < measures["camera_spread_over_distance"] < 1.5
+
+
+def test_the_triangulation_angle_is_the_median_of_the_widest_angles_at_points(solved: Solved):
+    """Independent: a loop over points and pairs of the photos that see them."""
+    model, widest = solved.model, []
+    for point in model.points3D.values():
+        photos = {element.image_id for element in point.track.elements}
+        rays = [model.image(photo).projection_center() - point.xyz for photo in photos]
+        cosines = [one @ other / np.linalg.norm(one) / np.linalg.norm(other) for one, other in combinations(rays, 2)]
+        widest.append(np.degrees(np.arccos(min(cosines))))
+    measures = solved.examined.verdict.measures
+    assert measures["triangulation_angle_deg"] == pytest.approx(np.median(widest), rel=1e-9)
 
 
 def test_every_rotation_of_a_pair_agrees_with_a_right_result(solved: Solved):

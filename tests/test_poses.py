@@ -21,7 +21,7 @@ from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses
 
-FAST = PoseSettings(max_features=500, threads=2)
+FAST = PoseSettings(max_features=500, max_image_size=384, threads=2)
 
 
 @dataclass(frozen=True)

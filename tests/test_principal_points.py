@@ -1,6 +1,5 @@
 """Principal points of single photos, against models and pictures whose true ones are known."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,9 @@ import synthetic_captures as synthetic
 from corner import NAMES, write_capture
 from in_this_process import poses_in_this_process
 from synthetic_captures import Lens
-from test_poses import FAST
 
 from nerfcli import scene
+from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.lens_observability import uncertainty
 from nerfcli.poses.model.principal_points import (
@@ -247,7 +246,7 @@ def stabilised(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarr
     shifts = np.random.default_rng(7).normal(scale=6, size=(len(NAMES), 2))
     write_capture(folder / "photos", shifts)
     (folder / "test.txt").write_text(f"{NAMES[2]}\n")
-    settings = replace(FAST, max_features=1000, threads=1, strict=True, holdout=str(folder / "test.txt"))
+    settings = PoseSettings(max_features=600, threads=1, strict=True, holdout=str(folder / "test.txt"))
     report = poses_in_this_process(folder / "photos", folder / "scene", settings)
     return folder / "scene", shifts, report
 

@@ -533,7 +533,7 @@ def test_corners_through_distorted_lenses_and_how_well_their_error_is_told():
         )
         for i, a in enumerate(angles)
     ]
-    offsets = 1.2 * np.array([[0.0, 0, 0], [1, 0, 0.2], [0, 1, -0.2], [-1, 0, 0.1], [0, -1, 0]])
+    offsets = 1.2 * np.array([[0.0, 0, 0], [1, 0, 0.2], [-1, 0, 0.1]])
     sides = [Side(f"marker {m}", (m, k), (m, (k + 1) % 4), 0.1) for m in range(len(offsets)) for k in range(4)]
 
     corners = {(m, k): square[k] + offset for m, offset in enumerate(offsets) for k in range(4)}

@@ -36,6 +36,8 @@ _LEAST_SPREAD = 0.003
 _FOCAL_RANGE, _FOCAL_RANGE_OF_FEW, _FEW = (0.3, 3.0), (0.2, 10.0), 0.1
 _MOST_HELD_OUT_PX = 4.0
 _LEAST_OBSERVATIONS = 15
+# Cosines between directions to points that are in memory at a time.
+_COSINES = 2**20
 # Contradictions listed in the report; the fraction counts all.
 _MOST_LISTED = 20
 # Reported if the measurement failed.
@@ -154,29 +156,38 @@ def nothing_placed(turn: RotationFit | None) -> Verdict:
 def _geometry(model: pycolmap.Reconstruction) -> dict[str, Any]:
     """Measure the triangulation angles, the fraction of observations in front, and the spread of the cameras."""
     photos = sorted(model.reg_image_ids())
-    centres = {photo: np.asarray(model.image(photo).projection_center()) for photo in photos}
-    angles, distances, in_front, observations = [], [], 0, 0
-    forward = {photo: np.asarray(model.image(photo).viewing_direction()) for photo in photos}
-    wide = {photo: _sees_behind(model.camera(model.image(photo).camera_id)) for photo in photos}
+    centres = np.array([model.image(photo).projection_center() for photo in photos]).reshape(-1, 3)
+    forward = np.array([model.image(photo).viewing_direction() for photo in photos]).reshape(-1, 3)
+    wide = np.array([_sees_behind(model.camera(model.image(photo).camera_id)) for photo in photos])
+    places = {photo: place for place, photo in enumerate(photos)}
+    # Points that the same number of photos see are measured together.
+    by_count: dict[int, list[tuple[Any, list[int]]]] = {}
     for point in model.points3D.values():
-        seen = list({element.image_id for element in point.track.elements})
-        to = np.array([point.xyz - centres[photo] for photo in seen])
-        lengths = np.linalg.norm(to, axis=1)
-        directions = to / np.maximum(lengths, 1e-300)[:, None]
-        angles.append(np.arccos(np.clip((directions @ directions.T).min(), -1, 1)))
-        distances.append(np.median(lengths))
-        in_front += sum(
-            bool(wide[photo] or direction @ forward[photo] > 0)
-            for photo, direction in zip(seen, directions, strict=True)
-        )
-        observations += len(seen)
-    middle = np.mean(list(centres.values()), axis=0)
-    spread = np.sqrt(np.mean([np.sum((centre - middle) ** 2) for centre in centres.values()]))
+        seen = [places[photo] for photo in {element.image_id for element in point.track.elements}]
+        by_count.setdefault(len(seen), []).append((point.xyz, seen))
+    angles, distances, in_front, observations = [], [], 0, 0
+    for part in (part for count, alike in by_count.items() for part in _parts(alike, _COSINES // count**2)):
+        positions, seen_by = (np.array(each) for each in zip(*part, strict=True))  # (n, 3) and (n, photos)
+        to = positions[:, None] - centres[seen_by]
+        lengths = np.linalg.norm(to, axis=2)
+        directions = to / np.maximum(lengths, 1e-300)[..., None]
+        angles.append(np.arccos(np.clip((directions @ directions.swapaxes(1, 2)).min(axis=(1, 2)), -1, 1)))
+        distances.append(np.median(lengths, axis=1))
+        in_front += int((wide[seen_by] | ((directions * forward[seen_by]).sum(axis=2) > 0)).sum())
+        observations += seen_by.size
+    middle = np.mean(centres, axis=0)
+    spread = np.sqrt(np.mean(np.sum((centres - middle) ** 2, axis=1)))
     return {
-        "triangulation_angle_deg": float(np.degrees(np.median(angles))) if angles else None,
+        "triangulation_angle_deg": float(np.degrees(np.median(np.concatenate(angles)))) if angles else None,
         "share_in_front": in_front / observations if observations else None,
-        "camera_spread_over_distance": float(spread / np.median(distances)) if distances else None,
+        "camera_spread_over_distance": float(spread / np.median(np.concatenate(distances))) if distances else None,
     }
+
+
+def _parts(items: list[Any], length: int) -> list[list[Any]]:
+    """Cut a list into parts of a length, of one item at least."""
+    step = max(1, length)
+    return [items[first : first + step] for first in range(0, len(items), step)]
 
 
 def _cameras_in_use(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:

@@ -29,11 +29,7 @@ _MOST_PER_PAIR = 3.0
 _FITTING_STEPS = 6
 _RESAMPLED = 100
 _AWAY = 1.2
-# Generators of rotations.
-_TURNS = np.array(
-    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
-)
-_TWO = np.diag([1.0, 1.0, 0.0])
+_TWO = np.array([1.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -104,23 +100,24 @@ def _two_views(
 def _fitted_cost(F: Array, p: Array, q: Array, focal_px: float) -> Array:
     """Return per pair the robust sum of squared Sampson distances, px^2, of the essential matrix that fits best.
 
-    Gauss-Newton with weights from the essential matrix nearest to F, by the rotations U and V.
+    Gauss-Newton with weights from the essential matrix nearest to F, by the rotations U and V. With a = U^T q and
+    b = V p, the residual q^T E p is a1 b1 + a2 b2; a rotation U exp([w]x) changes it by w . (diag(1, 1, 0) b x a), a
+    rotation exp([w]x) V by w . (b x diag(1, 1, 0) a).
     """
     scale = np.diag([focal_px, focal_px, 1.0])
     U, _, V = np.linalg.svd(scale @ F @ scale)
     p, q = (np.insert(pixels / focal_px, 2, 1.0, axis=-1) for pixels in (p, q))
     best = np.full(len(F), np.inf)
     for _ in range(_FITTING_STEPS):
-        E = U @ _TWO @ V
-        there, back = p @ np.swapaxes(E, 1, 2), q @ E
-        slope = np.linalg.norm(np.concatenate([there[..., :2], back[..., :2]], axis=-1), axis=-1)
+        a, b = q @ U, p @ np.swapaxes(V, 1, 2)  # (pairs, matches, 3)
+        there, back = (b * _TWO) @ np.swapaxes(U, 1, 2), (a * _TWO) @ V  # E p and E^T q
+        slope = np.sqrt(there[..., 0] ** 2 + there[..., 1] ** 2 + back[..., 0] ** 2 + back[..., 1] ** 2)
         factor = focal_px / np.maximum(slope, 1e-12)
-        px = factor * (q * there).sum(axis=-1)  # (pairs, matches)
+        (a1, a2, a3), (b1, b2, b3) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+        px = factor * (a1 * b1 + a2 * b2)  # (pairs, matches)
         best = np.minimum(best, (_NOISE_PX**2 * np.log1p((px / _NOISE_PX) ** 2)).sum(axis=-1))
-        turned = np.concatenate(
-            [U[:, None] @ _TURNS @ (_TWO @ V)[:, None], (U @ _TWO)[:, None] @ _TURNS @ V[:, None]], axis=1
-        )
-        J = factor[..., None] * np.einsum("nmi,nkij,nmj->nmk", q, turned, p, optimize=True)
+        both = b1 * a2 - b2 * a1
+        J = factor[..., None] * np.stack([b2 * a3, -b1 * a3, both, -b3 * a2, b3 * a1, both], axis=-1)
         weighted = J / (1 + (px / _NOISE_PX) ** 2)[..., None]
         normal = np.swapaxes(J, 1, 2) @ weighted
         # One of six rotations changes nothing.
