@@ -3,7 +3,6 @@
 import csv
 import json
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -274,25 +273,6 @@ def test_a_model_measures_as_it_evaluates(spheres: Scene, foggy: Path, tmp_path:
     assert found["psnr"] == pytest.approx(evaluated["mean"]["psnr"], abs=1e-9)
     assert found["shown_psnr"] == pytest.approx(evaluated["images"][1]["psnr"], abs=1e-9)
     assert {path.name for path in tmp_path.iterdir()} == {"a-render.jpg", "a-error.jpg", "a-truth.jpg"}
-
-
-def test_peak_memory_is_that_of_the_work_since_it_began():
-    # In a process of its own, as in bench: after much other work, the system may not reset the peak.
-    program = """
-import numpy as np
-from nerfcli.bench.machine import PeakMemory
-memory = PeakMemory("cpu")
-memory.begin()
-before = memory.read()
-data = np.ones(60_000_000, np.uint8)
-during = memory.read()
-del data
-memory.begin()
-after = memory.read()
-assert before is None or (during - before > 50e6 and during - after > 50e6), (before, during, after)
-"""
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert ended.returncode == 0, ended.stderr
 
 
 def test_the_machine_is_named_and_a_busy_one_is_noticed():

@@ -21,6 +21,7 @@ from nerfcli.field.blocks_field import BlocksField
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.kinds import settings_from_json
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
+from nerfcli.fit import open_cells
 from nerfcli.fit.fitting import Fitting
 from nerfcli.kernels import March, Rays
 from nerfcli.render.depth import CONVENTIONS, DepthRequest
@@ -29,6 +30,7 @@ from nerfcli.render.pictures import Quality, render_picture
 from nerfcli.render.tracing import deepest, render_rays, uniform_cuts
 from nerfcli.runs.blocks import LEAST_FRACTION, MARGIN, PERCENTILES, BlockDivision, Cell, divide, joined
 from nerfcli.runs.run import Run
+from nerfcli.train import preparation
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 QUICK = ("--steps", "1", "--log2-rows", "8", "--threads", "1", "--model", "default")
@@ -229,6 +231,13 @@ def captured(tmp_path):
     return tmp_path / "town"
 
 
+@pytest.fixture
+def few_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Train with cells four times as long: joining blocks asks for every vertex of them."""
+    for module in (open_cells, preparation):
+        monkeypatch.setattr(module, "OCCUPANCY_SIDE", 16)
+
+
 @pytest.mark.parametrize("count", [2, 3, 4, 7])
 def test_every_place_is_in_one_cell_and_cells_have_equally_many_points(captured, count):
     scene = scenes.load(captured)
@@ -287,7 +296,7 @@ def test_photos_belong_to_the_blocks_whose_points_they_see(captured):
     assert parts.scenes[1].test_names == {"08.png"}
 
 
-@pytest.mark.usefixtures("coarse_steps")
+@pytest.mark.usefixtures("coarse_steps", "few_cells")
 def test_blocks_are_trained_into_the_run_and_joined(captured):
     run = captured.with_name("r")
     command = ("train", captured, *QUICK, "-o", run)
@@ -323,7 +332,7 @@ def test_blocks_are_trained_into_the_run_and_joined(captured):
     assert Run(run).log[-1]["step"] == 6
 
 
-@pytest.mark.usefixtures("coarse_steps")
+@pytest.mark.usefixtures("coarse_steps", "few_cells")
 def test_an_interrupted_block_is_resumed_by_the_same_command(captured, monkeypatch):
     run = captured.with_name("r")
     command = ("train", captured, *QUICK, "--steps", "8", "-o", run, "--blocks", "2")
@@ -385,7 +394,7 @@ def test_too_few_points_or_photos_of_a_block_are_refused_in_two_lines(captured):
     assert "has no points with the photos that see them" in refused(seen.point_index < 0)
 
 
-@pytest.mark.usefixtures("coarse_steps")
+@pytest.mark.usefixtures("coarse_steps", "few_cells")
 def test_a_run_of_one_field_is_not_replaced_by_blocks(captured):
     run = captured.with_name("r")
     assert nerfcli("train", captured, *QUICK, "-o", run).exit_code == 0
@@ -406,7 +415,7 @@ def test_a_dry_run_names_the_photos_and_memory_of_each_block(captured):
     assert not captured.with_name("town-run").exists()
 
 
-@pytest.mark.usefixtures("coarse_steps")
+@pytest.mark.usefixtures("coarse_steps", "few_cells")
 def test_the_array_job_of_the_examples_trains_and_joins_all_blocks(captured):
     """Run the command line of the example with the variables that Slurm sets, for two tasks and one step."""
     (line,) = re.findall(r"^nerfcli (.+)$", (EXAMPLES / "blocks.sbatch").read_text(encoding="utf-8"), re.MULTILINE)

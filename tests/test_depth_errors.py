@@ -98,9 +98,10 @@ def matched_by_truth(fraction: float = 1.0) -> Callable[..., list[DenseDepth]]:
     return dense_depths
 
 
-def copied(run: Path, tmp_path: Path) -> Path:
-    """Copy a run to a folder beside it, where the relative paths of its photos stay valid."""
-    return Path(shutil.copytree(run, run.with_name(f"{tmp_path.name}-run")))
+@pytest.fixture
+def copied(spheres_run, tmp_path, small_photo_depths) -> Path:
+    """A copy of the run, to write into, beside it, where the relative paths of its photos stay valid."""
+    return Path(shutil.copytree(spheres_run, spheres_run.with_name(f"{tmp_path.name}-run")))
 
 
 def test_errors_are_those_between_matched_and_median_distances(spheres_run, monkeypatch):
@@ -143,10 +144,9 @@ def test_a_run_without_held_out_photos_has_no_intervals(spheres_run):
         measure_depth_errors(run, run.model(), [], threads=1)
 
 
-def test_render_writes_the_interval_and_keeps_the_errors(spheres_run, tmp_path, monkeypatch):
-    run = copied(spheres_run, tmp_path)
+def test_render_writes_the_interval_and_keeps_the_errors(copied, tmp_path, monkeypatch):
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth())
-    common = ("render", run, "--depth", "median", "--depth-axis", "ray", "--threads", "2", "--level", "0.8")
+    common = ("render", copied, "--depth", "median", "--depth-axis", "ray", "--threads", "2", "--level", "0.8")
     result = nerfcli(*common, "--outputs", "depth,coverage,lower,upper", "-o", tmp_path / "views")
     assert result.exit_code == 0, result.stderr
     depth, coverage, lower, upper, truth = (
@@ -171,14 +171,14 @@ def test_render_writes_the_interval_and_keeps_the_errors(spheres_run, tmp_path, 
     monkeypatch.setattr(depth_errors, "dense_depths", pytest.fail)
     exr = nerfcli(*common, "--outputs", "lower,upper", "--depth-format", "exr", "-o", tmp_path / "other")
     assert exr.exit_code == 0, exr.stderr
-    assert json.loads((run / DEPTH_ERRORS).read_text())["photos"] == 3
+    assert json.loads((copied / DEPTH_ERRORS).read_text())["photos"] == 3
 
 
-def test_render_writes_the_proportion_of_depths_within_the_tolerance(spheres_run, tmp_path, monkeypatch):
+def test_render_writes_the_proportion_of_depths_within_the_tolerance(copied, tmp_path, monkeypatch):
     """With errors measured from the true distances of the same pictures, confidence equals this proportion."""
-    run = copied(spheres_run, tmp_path)
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth())
-    common = ("render", run, "--depth", "median", "--depth-axis", "ray", "--depth-format", "tiff,exr", "--threads", "2")
+    common = ("render", copied, "--depth", "median", "--depth-axis", "ray", "--threads", "2")
+    common += ("--depth-format", "tiff,exr")
     outputs = ("--outputs", "depth,coverage,confidence", "--depth-tolerance", "0.01", "-o", tmp_path / "views")
     result = nerfcli(*common, *outputs)
     assert result.exit_code == 0, result.stderr
@@ -209,10 +209,9 @@ def test_render_writes_the_proportion_of_depths_within_the_tolerance(spheres_run
     assert "is kept: it is complete" in kept.stderr
 
 
-def test_render_says_where_there_is_no_interval(spheres_run, tmp_path, monkeypatch):
-    run = copied(spheres_run, tmp_path)
+def test_render_says_where_there_is_no_interval(copied, tmp_path, monkeypatch):
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth(0.01))
-    result = nerfcli("render", run, "--outputs", "lower", "--threads", "2", "-o", tmp_path / "views")
+    result = nerfcli("render", copied, "--outputs", "lower", "--threads", "2", "-o", tmp_path / "views")
     assert result.exit_code == 0, result.stderr
     assert "no intervals or confidence where 4 photos see the surface: only" in result.stderr
     assert "what cannot be matched is usually worse" in result.stderr

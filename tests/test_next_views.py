@@ -17,6 +17,7 @@ from nerfcli.render.visibility import DepthMap, coverage_and_parallax, sees, wit
 from nerfcli.surface import next_views as candidates
 from nerfcli.surface.grid import Grid
 from nerfcli.surface.next_views import ENOUGH, candidate_frames, in_free_space, next_views, surface_points
+from nerfcli.workflows import next_views as workflow
 
 CAMERA = Camera.pinhole(120, 120, 130.0)
 UP = np.array([0.0, 0.0, 1.0])
@@ -98,8 +99,11 @@ def test_photos_from_one_place_have_only_their_flight_as_candidates():
     assert {frame.name.split("_")[0] for frame in found} == {"flight"}
 
 
+@pytest.mark.usefixtures("small_photo_depths")
 def test_doctor_tells_what_photos_of_a_run_have_seen(spheres_run, tmp_path, monkeypatch):
-    monkeypatch.setattr(candidates, "PER_PATH", 10)  # 60 on each path take 18 CPU seconds
+    monkeypatch.setattr(candidates, "PER_PATH", 6)  # 60 on each path take 18 CPU seconds
+    monkeypatch.setattr(workflow, "CANDIDATE_PX", 48)
+    monkeypatch.setattr(workflow, "PICTURE_PX", 96)
     run = shutil.copytree(spheres_run, tmp_path / "spheres-run")
     result = nerfcli("doctor", run, "--views", "2", "--threads", "2", "--json")
     assert result.exit_code == 0, result.stderr

@@ -100,26 +100,6 @@ def test_completion_is_shown_and_installed_for_the_shell_that_asks(option, tmp_p
 # The front door
 
 
-def test_the_package_is_imported_without_its_parts():
-    result = in_python("import sys; before = set(sys.modules); import nerfcli; print(*(set(sys.modules) - before))")
-    assert set(result.stdout.split()) <= {"nerfcli", "zlib"}
-
-
-def test_what_comes_after_training_loads_no_trainer():
-    parts = "evaluate, render, report"
-    code = f"import sys; from nerfcli.workflows import {parts}; print(*(m for m in sys.modules if 'nerfcli' in m))"
-    loaded = in_python(code).stdout.split()
-    assert "nerfcli.runs.run" in loaded
-    assert not [name for name in loaded if name.startswith("nerfcli.train")]
-
-
-def test_a_conversion_imports_no_torch():
-    """It would take twice as long to start."""
-    loaded = in_python("import sys; from nerfcli.workflows import convert; print(*sys.modules)").stdout.split()
-    assert "nerfcli.workflows.convert" in loaded
-    assert "torch" not in loaded
-
-
 @pytest.mark.parametrize("name", nerfcli.__all__)
 def test_a_public_function_says_how_it_is_called(name):
     function = getattr(nerfcli, name)

@@ -40,6 +40,7 @@ from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_
 from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import PagePhotos
 from nerfcli.viewer.proof import HEIGHT, WIDTH, Proof, make_proof
+from nerfcli.workflows import photo_depths
 from nerfcli.workflows.export import export_run
 
 # The change of a colour in [0, 1] by 16-bit rows, single precision and the colours that neither side evaluates.
@@ -260,7 +261,9 @@ def test_what_stands_there_is_not_replaced_unasked(spheres_run, tmp_path):
 @pytest.fixture(scope="module")
 def spheres_page(spheres_run, tmp_path_factory) -> Path:
     run = shutil.copytree(spheres_run, spheres_run.with_name(f"page-run-{os.getpid()}"))  # it keeps depths of photos
-    return export_run(run, tmp_path_factory.mktemp("page") / "spheres.html", to="page", threads=2)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(photo_depths, "MAX_SIZE", 48)  # a quarter of the rays
+        return export_run(run, tmp_path_factory.mktemp("page") / "spheres.html", to="page", threads=2)
 
 
 @pytest.fixture(scope="module")

@@ -369,10 +369,11 @@ def test_panoramas_and_other_photos_share_a_scene(photos, tmp_path):
     assert np.allclose(list(focals), WIDTH / (2 * np.pi), rtol=0.01)
 
 
-@pytest.mark.usefixtures("coarse_steps")
+@pytest.mark.usefixtures("coarse_steps", "small_photo_depths")
 def test_a_field_of_panoramas_renders_distances_along_rays(scene, tmp_path):
     run = tmp_path / "run"
-    assert nerfcli("train", scene, "-o", run, "--steps", "2", "--downscale", "8", "--model", "default").exit_code == 0
+    small = ("--steps", "2", "--downscale", "8", "--log2-rows", "10", "--model", "default")
+    assert nerfcli("train", scene, "-o", run, *small).exit_code == 0
     assert nerfcli("render", run, "--outputs", "rgb,depth", "--depth-format", "npy").exit_code == 0
     (picture,) = (run / "renders" / "test-conditional-ray" / "rgb").glob("*.png")
     assert read_image(picture).shape == (48, 96, 3)

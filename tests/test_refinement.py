@@ -516,8 +516,8 @@ def test_photos_find_back_into_a_field_that_knows_better(spheres, spheres_run):
     photos = load_photos(noisy.train_frames, factor=1, threads=1)
     pool = PixelPool(photos, extent.training_from_scene, torch.device("cpu"))
     settings = TrainSettings(
-        budget_seconds=None, steps=20, samples_per_step=2**13, threads=2, components=Components(cameras="poses"),
-        learning_rate=1e-30, final_learning_rate=1e-30,
+        budget_seconds=None, steps=20, samples_per_step=2**13, threads=2, log2_rows=14,
+        components=Components(cameras="poses"), learning_rate=1e-30, final_learning_rate=1e-30,
     )  # fmt: skip
     fitting = Fitting(pool, extent.marching, contraction=extent.contraction, settings=settings)
     cameras = fitting.parts.cameras

@@ -8,9 +8,16 @@ from commands import error_of, listing, nerfcli
 
 from nerfcli.errors import BAD_INPUT
 from nerfcli.runs.run import Run
+from nerfcli.workflows import render_plan
 from nerfcli.workflows.render import render_run
 from nerfcli.workflows.render_plan import plan_evaluation, plan_rendering
 from nerfcli.workflows.views import Views
+
+
+@pytest.fixture
+def measured_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure pictures of 32 x 24 pixels: their number and proportions do not depend on it."""
+    monkeypatch.setattr(render_plan, "_LONGER_SIDE", 32)
 
 
 def test_pictures_and_disk_space_are_those_of_the_rendering(spheres_run: Path, tmp_path: Path) -> None:
@@ -24,6 +31,7 @@ def test_pictures_and_disk_space_are_those_of_the_rendering(spheres_run: Path, t
     assert planned.seconds > 0
 
 
+@pytest.mark.usefixtures("measured_small")
 def test_a_plan_of_some_views_is_in_proportion_to_all(spheres_run: Path) -> None:
     orbit = Views("orbit", count=12)
     some, everything = (plan_rendering(spheres_run, views=orbit, threads=1, part=p) for p in (slice(0, 12, 4), None))
@@ -31,6 +39,7 @@ def test_a_plan_of_some_views_is_in_proportion_to_all(spheres_run: Path) -> None
     assert everything.disk_bytes == pytest.approx(4 * some.disk_bytes, rel=0.2)
 
 
+@pytest.mark.usefixtures("measured_small")
 def test_a_plan_of_an_evaluation_counts_held_out_pixels_and_saved_pictures(spheres_run: Path) -> None:
     plain, saving, unrounded = (
         plan_evaluation(spheres_run, threads=1, predictions=kind) for kind in (None, "png", "float")
@@ -40,6 +49,7 @@ def test_a_plan_of_an_evaluation_counts_held_out_pixels_and_saved_pictures(spher
     assert unrounded.disk_bytes - saving.disk_bytes == 3 * 4 * plain.pixels  # one float32 picture
 
 
+@pytest.mark.usefixtures("measured_small")
 def test_dry_runs_print_the_plan_and_write_nothing(spheres_run: Path) -> None:
     before = listing(spheres_run)
     for command in ("render", "evaluate"):

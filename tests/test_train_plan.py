@@ -11,15 +11,20 @@ from typer.testing import CliRunner
 from nerfcli.cli import app
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.runs.settings import TrainSettings
+from nerfcli.scene import Scene
+from nerfcli.train.loop import train
 from nerfcli.workflows.train_plan import plan_training
 
 STEPS = TrainSettings(budget_seconds=None, steps=250)
 
 
-def test_disk_space_covers_a_run_and_the_state_that_is_replaced(spheres_run: Path) -> None:
-    files = {file.name: file.stat().st_size for file in spheres_run.iterdir()}
+def test_disk_space_covers_a_run_and_the_state_that_is_replaced(spheres: Scene, tmp_path: Path) -> None:
+    settings = replace(STEPS, steps=1, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
+    run = tmp_path / "run"
+    train(spheres, run, settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
+    files = {file.name: file.stat().st_size for file in run.iterdir()}
     largest = sum(files.values()) + files["state.safetensors"]
-    planned = plan_training(SPHERES, STEPS).disk_bytes
+    planned = plan_training(SPHERES, settings).disk_bytes
     assert planned == pytest.approx(largest, rel=0.1)
 
 

@@ -17,6 +17,7 @@ from copy import deepcopy
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from queue import Queue
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,6 +31,7 @@ from fog import foggy_cells
 from nerfcli import scene
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.child import messages as child_messages
 from nerfcli.errors import INTERRUPTED, UserError
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.render.depth import DepthRequest
@@ -47,6 +49,7 @@ from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.painter import Painter, Tile, View, render_tile, strides_of, tiles_of, view_from_json
 from nerfcli.viewer.pictures import view_of
 from nerfcli.viewer.server import PageServer
+from nerfcli.workflows import view_worker
 from nerfcli.workflows.view import RunData
 
 FEW = TrainSettings(
@@ -534,21 +537,35 @@ def test_a_disk_that_is_full_ends_the_view_and_not_the_training(capture, at_once
     assert sum("can no longer be viewed" in note for note in notes) == 1
 
 
-def test_train_serves_its_run_with_view(capture):
+def test_train_serves_its_run_with_view(capture, monkeypatch):
+    """The server is a process of its own; what it announces is read here, and in what the command prints."""
+    announced: Queue[str] = Queue()
+    seen: list[int] = []
+
+    def overheard(child: Any) -> Iterator[dict[str, Any]]:
+        for message in child_messages(child):
+            announced.put(" ".join(message["lines"]))
+            yield message
+
+    def look_and_stop() -> None:
+        found = re.search(r"http://\S+", announced.get(timeout=60))
+        assert found is not None
+        with closing(events(found[0])) as stream:
+            seen.append(next(s["step"] for s in stream if s["state"] == "training" and s["version"] > 0))
+            request = urllib.request.Request(found[0] + "control", json.dumps({"action": "stop"}).encode())
+            urllib.request.urlopen(request, timeout=60).close()
+
+    monkeypatch.setattr(view_worker, "messages", overheard)
+    client = threading.Thread(target=look_and_stop)
+    client.start()
     small = ("--downscale", "8", "--log2-rows", "10", "--threads", "1", "--model", "default")
-    process = started("train", capture, "--steps", "100000", *small, "--view")
-    assert process.stderr is not None
-    lines = iter(process.stderr.readline, "")
-    url = next(found[0] for line in lines if (found := re.findall(r"http://\S+", line)))
-    with closing(events(url)) as stream:
-        step = next(s["step"] for s in stream if s["state"] == "training" and s["version"] > 0)
-        request = urllib.request.Request(url + "control", json.dumps({"action": "stop"}).encode())
-        urllib.request.urlopen(request, timeout=60).close()
-        _, stderr = process.communicate(timeout=60)
-    assert process.returncode == INTERRUPTED
-    assert "--resume" in stderr
+    result = nerfcli("train", capture, "--steps", "20000", *small, "--view")
+    client.join()
+    assert result.exit_code == INTERRUPTED
+    assert "view the training at http://" in result.stderr
+    assert "--resume" in result.stderr
     run = capture.with_name(f"{capture.name}-run")
-    assert Run(run).saved_progress()[0] >= step
+    assert Run(run).saved_progress()[0] >= seen[0]
     assert not (run / LIVE).exists()
 
 

@@ -194,7 +194,7 @@ def test_depths_of_a_field_are_those_of_its_surface():
 
 
 @pytest.fixture
-def run(spheres_run, tmp_path) -> Path:
+def run(spheres_run, tmp_path, small_photo_depths) -> Path:
     """A copy of the run, to write into."""
     return shutil.copytree(spheres_run, tmp_path / "spheres-run")
 

@@ -197,5 +197,7 @@ def _occupied(field: BlocksField, *, cells: int) -> Tensor:
         for z in along.tolist()
     ]
     # A cell has `merged` + 1 vertices along each axis; one more on either side belongs to its neighbours.
-    near = torch.nn.functional.max_pool3d(torch.stack(layers)[None].float(), merged + 3, stride=merged, padding=1)
-    return near[0] > 0
+    near = torch.stack(layers).float()
+    for _ in range(3):  # one axis after the other
+        near = torch.nn.functional.max_pool1d(near, merged + 3, stride=merged, padding=1).permute(2, 0, 1)
+    return near > 0
