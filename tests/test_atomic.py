@@ -51,7 +51,7 @@ def test_an_exception_before_anything_is_written(tmp_path):
     assert names(tmp_path) == []
 
 
-def test_a_folder_in_the_place_of_the_file_is_told(tmp_path):
+def test_a_folder_in_the_place_of_the_file_is_reported(tmp_path):
     path = tmp_path / "folder"
     path.mkdir()
     with pytest.raises(UserError, match=r"folder: Is a directory") as caught, atomic_path(path) as partial:
@@ -61,7 +61,7 @@ def test_a_folder_in_the_place_of_the_file_is_told(tmp_path):
 
 
 @pytest.mark.parametrize("context", [atomic_path, atomic_folder])
-def test_a_file_in_the_place_of_the_parent_folder_is_told(tmp_path, context):
+def test_a_file_in_the_place_of_the_parent_folder_is_reported(tmp_path, context):
     (tmp_path / "file").write_text("I am no folder")
     with pytest.raises(UserError, match=r"cannot write .*result: "), context(tmp_path / "file" / "result"):
         pass
@@ -118,7 +118,7 @@ def test_json_is_written_whole_and_without_nan(tmp_path):
 @pytest.mark.parametrize(
     "content", [b"", b"[]", b"{}", b'{"mean": 1', b"\xff\xfe", b'{"mean": "a\x00"}', b'{"nean": 1}']
 )
-def test_json_of_ours_that_is_damaged_is_told(content, tmp_path):
+def test_json_of_ours_that_is_damaged_is_reported(content, tmp_path):
     path = tmp_path / "metrics.json"
     path.write_bytes(content)
     with pytest.raises(UserError, match=r"cannot read .*metrics\.json"):

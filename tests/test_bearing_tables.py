@@ -84,7 +84,7 @@ def test_pixels_beyond_the_lens_are_left_out():
         assert seen.sum() > 100
 
 
-def test_lenses_are_told_apart_by_everything_but_the_principal_point():
+def test_lenses_are_distinguished_by_everything_but_the_principal_point():
     longer = replace(LENS, params=(141.0, 80.0, 60.0, 0.05))
     lenses = by_lens([LENS, longer, LENS.with_principal_point(70.0, 61.0), FISHEYE, LENS])
     assert sorted(len(cameras) for cameras in lenses.values()) == [1, 1, 2]

@@ -405,7 +405,7 @@ def check_points(content: dict, folder: Path) -> None:
     }
 
 
-def test_what_cannot_be_measured_is_said(tmp_path, foggy):
+def test_what_cannot_be_measured_is_reported(tmp_path, foggy):
     result = CliRunner().invoke(cli.app, ["bench", str(foggy), "--sweep", "all"])
     assert result.exit_code == 2
     result = CliRunner().invoke(cli.app, ["bench", str(foggy), "--budget", "3s"])

@@ -186,7 +186,7 @@ def test_an_outer_root_is_not_taken_for_the_direction():
 
 
 @pytest.mark.parametrize("model", PARAMS)
-def test_answers_are_finite_whatever_is_asked(model):
+def test_results_are_finite_for_any_input(model):
     camera = camera_of(model)
     pixels = np.array([[np.nan, 1], [np.inf, 1], [1e12, -1e12], [0, 0], [WIDTH, HEIGHT]])
     directions, valid = camera.bearings(pixels)

@@ -83,7 +83,7 @@ def test_the_focal_length_is_found_among_noise_and_wrong_matches(lens, factor):
         assert check.misses_px[0] > 1.3 * check.misses_px[1]
 
 
-def test_exact_matches_tell_it_to_a_hundredth_of_a_per_cent():
+def test_exact_matches_determine_it_to_a_hundredth_of_a_per_cent():
     photos = ring(PINHOLE)
     check = checked(with_lens(photos, 0.013), matched(photos, noise_px=0.0, wrong=0.0))
     assert check.log_focal == pytest.approx(-0.013, abs=1e-4)
@@ -123,7 +123,7 @@ def test_wrong_poses_are_not_taken_for_a_wrong_lens():
     assert min(check.misses_px) > 1.5
 
 
-def test_where_no_length_fits_the_misses_are_told():
+def test_where_no_length_fits_the_misses_are_reported():
     """Focal lengths that are 35 % too long, far outside of the range that is searched."""
     photos = ring(PINHOLE)
     check = checked(with_lens(photos, 3 * FARTHEST), matched(photos, noise_px=0.2, wrong=0.0))
@@ -131,7 +131,7 @@ def test_where_no_length_fits_the_misses_are_told():
     assert check.misses_px[0] == check.misses_px[1] > 3.0
 
 
-def test_nothing_is_said_where_there_is_too_little():
+def test_nothing_is_reported_without_enough_evidence():
     photos = ring(PINHOLE)
     matches = matched(photos, noise_px=0.2, wrong=0.0)
     few = [replace(m, pixels=(m.pixels[0][:2], m.pixels[1][:2])) for m in matches]

@@ -89,7 +89,7 @@ def test_frames_per_second(tmp_path, more, fps):
     assert read_path(written(tmp_path, content(**more))).fps == fps
 
 
-def test_a_path_is_told_from_other_files_and_parsed_as_a_capture(tmp_path):
+def test_a_camera_path_is_distinguished_from_other_files_and_parsed_as_a_capture(tmp_path):
     assert is_camera_path(content())
     assert not is_camera_path({"frames": [], "fl_x": 1.0})
     nested = content(camera_type="Perspective", keyframes=[{"matrix": "[1, 2]"}])
@@ -132,7 +132,7 @@ def test_round_trip(tmp_path_factory, seed, kind):
     assert [k["matrix"] for k in content["keyframes"]] == [v["camera_to_world"] for v in content["camera_path"]]
 
 
-def test_what_the_format_cannot_hold_is_told(tmp_path):
+def test_what_the_format_cannot_hold_is_reported(tmp_path):
     opencv = Camera("OPENCV", 64, 48, (50, 52, 33, 24, 0.1, 0, 0, 0))
     frames = (
         Frame("a.jpg", opencv, np.eye(4), image=Path("a.jpg"), mask=Path("m.png"), split="test"),
@@ -207,7 +207,7 @@ def test_nerfstudios_normalisation_is_a_similarity(tmp_path):
         ({"camera_path": [3]}, r"camera_path\[0\] is 3"),
     ],
 )
-def test_damaged_files_are_told_with_file_and_field(tmp_path, more, what):
+def test_damaged_files_are_reported_with_file_and_field(tmp_path, more, what):
     with pytest.raises(UserError, match=what) as caught:
         read_path(written(tmp_path, content(**more)))
     assert "path.json" in caught.value.message
@@ -235,7 +235,7 @@ TRANSPOSED = np.array(OPENGL_POSE).reshape(4, 4).T.ravel().tolist()
         ({"camera_to_world": [0.0, 0, -1, *OPENGL_POSE[3:]]}, "mirrors the scene"),
     ],
 )
-def test_damaged_views_are_told_with_their_number(tmp_path, more, what):
+def test_damaged_views_are_reported_with_their_number(tmp_path, more, what):
     good = {"camera_to_world": OPENGL_POSE, "fov": 60.0}
     with pytest.raises(UserError, match=what) as caught:
         read_path(written(tmp_path, content(camera_path=[good, {**good, **more}])))

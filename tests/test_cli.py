@@ -199,6 +199,7 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --depth expected", "'expected'; choose conditional, moment"),
         ("render x --depth-axis y", "'y'; choose ray or z"),
         ("render x --outputs rgb,normals", "'normals'; choose from rgb, depth, opacity"),
+        ("render x --outputs=", "''; choose from rgb"),
         ("render x --min-opacity 1.5", "--min-opacity"),
         ("render x --colour-map jet", "'jet'; choose turbo, viridis or grey"),
         ("render x --video-format avi", "'avi'; choose mp4, h265, webm or gif"),
@@ -221,7 +222,7 @@ def test_wrong_usage_is_exit_code_2_and_names_the_value(line, named):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_missing_path_is_told_in_two_lines(command, tmp_path):
+def test_a_missing_path_is_reported_in_two_lines(command, tmp_path):
     result = nerfcli(command, tmp_path / "nö such", *needed(command, tmp_path))
     assert result.exit_code == BAD_INPUT
     assert "nö such" in error_of(result)[0]
@@ -229,7 +230,7 @@ def test_a_missing_path_is_told_in_two_lines(command, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["evaluate", "render", "report"])
-def test_a_scene_where_a_run_is_needed_is_told_with_what_to_do(command, capture, tmp_path):
+def test_a_scene_where_a_run_is_needed_is_reported_with_what_to_do(command, capture, tmp_path):
     error = error_of(nerfcli(command, capture))
     assert error == (f"Error: {capture} is a scene, not a run", f"Hint:  train it first: nerfcli train '{capture}'")
     photos = write_photos(tmp_path / "photos", 1)
@@ -239,13 +240,13 @@ def test_a_scene_where_a_run_is_needed_is_told_with_what_to_do(command, capture,
 
 
 @pytest.mark.parametrize("command", ["train", "ablate"])
-def test_a_run_where_a_scene_is_needed_is_told_with_what_to_do(command, finished, tmp_path):
+def test_a_run_where_a_scene_is_needed_is_reported_with_what_to_do(command, finished, tmp_path):
     error, hint = error_of(nerfcli(command, finished, "-o", tmp_path / "out"))
     assert error == f"Error: {finished} is a run, not a scene"
     assert hint.endswith(f"to continue it: nerfcli train SCENE -o '{finished}' --resume")
 
 
-def test_photos_where_cameras_are_needed_are_told_with_what_to_do(tmp_path):
+def test_photos_where_cameras_are_needed_are_reported_with_what_to_do(tmp_path):
     photos = write_photos(tmp_path / "my photos", 1)
     error = error_of(nerfcli("convert", photos, tmp_path / "out.json", "--to", "transforms"))
     assert error == (
@@ -265,7 +266,7 @@ def test_paths_in_hints_can_be_typed():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_an_empty_folder_is_told_in_two_lines(command, tmp_path):
+def test_an_empty_folder_is_reported_in_two_lines(command, tmp_path):
     (tmp_path / "empty").mkdir()
     result = nerfcli(command, tmp_path / "empty", *needed(command, tmp_path))
     assert result.exit_code == BAD_INPUT
@@ -274,7 +275,7 @@ def test_an_empty_folder_is_told_in_two_lines(command, tmp_path):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_file_instead_of_a_folder_is_told_in_two_lines(command, tmp_path):
+def test_a_file_instead_of_a_folder_is_reported_in_two_lines(command, tmp_path):
     (tmp_path / "file.txt").write_text("hello")
     result = nerfcli(command, tmp_path / "file.txt", *needed(command, tmp_path))
     assert result.exit_code == BAD_INPUT
@@ -321,7 +322,7 @@ def test_photos_without_poses_are_sent_to_poses(tmp_path):
 
 
 @pytest.mark.parametrize("command", ["evaluate", "render"])
-def test_a_folder_that_is_no_run_is_told(command, capture):
+def test_a_folder_that_is_no_run_is_reported(command, capture):
     before = listing(capture.parent)
     result = nerfcli(command, capture)
     assert result.exit_code == BAD_INPUT
@@ -505,7 +506,7 @@ def test_many_inputs_share_one_output_folder(capture, tmp_path):
 
 @pytest.mark.parametrize("command", BATCH_COMMANDS)
 @pytest.mark.parametrize("stdin", ["", "\n\n"])
-def test_an_empty_batch_is_told(command, stdin, tmp_path):
+def test_an_empty_batch_is_reported(command, stdin, tmp_path):
     result = nerfcli(command, "-", *needed(command, tmp_path), stdin=stdin)
     assert result.exit_code == BAD_INPUT
     error, hint = error_of(result)
@@ -628,7 +629,7 @@ def test_poses_and_colours_can_be_aligned_in_one_call(finished):
     assert nerfcli("evaluate", finished, "--align", "light").exit_code == 2
 
 
-def test_other_seeds_are_trained_and_their_spread_is_told(finished):
+def test_other_seeds_are_trained_and_their_spread_is_reported(finished):
     result = nerfcli("evaluate", finished, "--seeds", "2", "--json")
     assert result.exit_code == 0, result.stderr
     first, second, last = map(json.loads, result.stdout.splitlines())

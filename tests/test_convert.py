@@ -314,7 +314,7 @@ def test_features_are_left_out_with_a_warning(tmp_path):
     assert "Warning: transforms cannot hold 3 observations" in result.stderr
 
 
-def test_what_a_lost_term_does_is_told_in_pixels(tmp_path):
+def test_the_effect_of_a_lost_term_is_reported_in_pixels(tmp_path):
     """The loss of the distortion moves pixels by at most f k r^3 at the corner of the picture."""
     source = npz_of(tmp_path, capture_of([RADIAL]))
     result = nerfcli("convert", source, tmp_path / "out", "--to", "llff", "--allow-loss", "--json")
@@ -506,7 +506,7 @@ def test_an_existing_result_is_kept(tmp_path):
     assert (tmp_path / "out.json").read_text() == "mine"
 
 
-def test_a_place_where_nothing_can_be_is_told_in_two_lines(tmp_path):
+def test_an_output_that_cannot_exist_is_an_error_of_two_lines(tmp_path):
     (tmp_path / "file").write_text("hello")
     source = npz_of(tmp_path, capture_of([PINHOLE]))
     result = nerfcli("convert", source, tmp_path / "file" / "x.npz", "--to", "npz")
@@ -565,7 +565,7 @@ def test_photos_of_a_model_are_found_whatever_its_names_are_relative_to(prefix, 
     assert content["frames"][0]["file_path"] == "../images/photo 00.png"
 
 
-def test_what_was_looked_for_is_told(tmp_path):
+def test_the_message_lists_what_was_looked_for(tmp_path):
     (tmp_path / "notes.md").write_text("hello")
     with pytest.raises(UserError, match="contains no capture in a supported format") as caught:
         recognise(tmp_path)

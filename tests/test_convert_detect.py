@@ -73,7 +73,7 @@ CONVENTIONS = [
 
 @pytest.mark.parametrize("meant", CONVENTIONS, ids=str)
 @pytest.mark.parametrize("parsed_axes", ["opengl", "opencv"])
-def test_exact_observations_tell_every_convention(meant, parsed_axes):
+def test_exact_observations_identify_every_convention(meant, parsed_axes):
     if meant.axes == "drb":
         meant = replace(meant, axes="llff")
     capture = misread(capture_of([PINHOLE, BROWN]), meant, parsed_axes)
@@ -104,7 +104,7 @@ def test_a_half_pixel_below_the_noise_is_not_decided():
     assert found.convention.pixel_centre == 0.5
 
 
-def test_poses_that_fit_in_no_convention_are_told():
+def test_poses_that_fit_in_no_convention_are_reported():
     capture = capture_of([PINHOLE], count=8)
     rng = np.random.default_rng(2)
     shuffled = poses_of(capture)[rng.permutation(8)]
@@ -163,7 +163,7 @@ def test_the_epipolar_error_is_the_distance_in_pixels():
     np.testing.assert_allclose(errors, 3 / np.sqrt(2), rtol=2e-3)
 
 
-def test_points_alone_tell_axes(tmp_path):
+def test_points_alone_identify_axes(tmp_path):
     capture = replace(misread(capture_of([PINHOLE]), Convention("opencv"), "opengl"), observations=None)
     found = detect(capture, axes="opengl", progress=silent)
     assert "the visibility of" in found.evidence
@@ -257,7 +257,7 @@ def test_matches_are_found_where_opencvs_best_estimator_gives_up(photographed, m
 
 
 @pytest.mark.parametrize("meant", [Convention("opengl"), Convention("opencv", inverted=True)], ids=str)
-def test_photos_tell_the_convention_and_how_to_read_it(meant, photographed, tmp_path):
+def test_photos_identify_the_convention_and_how_to_read_it(meant, photographed, tmp_path):
     spoiled = misread(photographed, meant, "opengl")
     write_transforms(spoiled, tmp_path / "transforms.json")
     report = json.loads(nerfcli("convert", tmp_path, "--detect", "--json").stdout)
@@ -279,7 +279,7 @@ def test_photos_tell_the_convention_and_how_to_read_it(meant, photographed, tmp_
     assert not (tmp_path / "cache").exists()
 
 
-def test_sharp_photos_tell_a_half_pixel(photographed):
+def test_sharp_photos_reveal_a_half_pixel(photographed):
     spoiled = misread(photographed, Convention("opencv", pixel_centre=0.0), "opencv")
     found = detect(spoiled, axes="opencv", progress=silent)
     assert found.convention == Convention("opencv", pixel_centre=0.0)
@@ -294,7 +294,7 @@ def test_nothing_to_judge_by(tmp_path):
     assert "--images" in error_of(result)[1]
 
 
-def test_a_photo_of_another_shape_is_told(photographed):
+def test_a_photo_of_another_shape_is_reported(photographed):
     other = replace(photographed.frames[0], camera=Camera.pinhole(500, 300, 420.0))
     with pytest.raises(UserError, match="480x360 pixels does not match a camera of 500x300"):
         match_neighbours((other, *photographed.frames[1:]), progress=silent)

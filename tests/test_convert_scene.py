@@ -268,7 +268,7 @@ def test_views_without_photos_make_no_scene(tmp_path):
     assert not (tmp_path / "scene").exists()
 
 
-def test_a_scene_is_replaced_only_when_asked_and_after_a_fault_stands_again(tmp_path, monkeypatch):
+def test_a_scene_is_replaced_only_with_overwrite_and_restored_after_a_fault(tmp_path, monkeypatch):
     capture = photographed(capture_of([PINHOLE]), tmp_path / "images")
     source = npz_of(tmp_path, capture)
     assert nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli").exit_code == 0
@@ -356,7 +356,7 @@ def test_what_stands_beside_the_cameras_is_compared(form, fault, message, tmp_pa
 
 
 @pytest.mark.parametrize("command", ["info", "convert", "train"])
-def test_intrinsics_for_another_size_are_told_once(command, tmp_path):
+def test_intrinsics_for_another_size_are_reported_once(command, tmp_path):
     capture = photographed(capture_of([PINHOLE]), tmp_path / "images", {0: 6})
     double = Camera("PINHOLE", 1280, 960, tuple(2 * value for value in PINHOLE.params))
     frames = tuple(replace(frame, camera=double) for frame in capture.frames)

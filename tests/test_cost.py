@@ -143,7 +143,7 @@ def test_nothing_is_finer_than_a_pixel(contraction):
     assert cells / 2 < 2 ** sizes["mlp"].octaves <= cells
 
 
-def test_memory_that_holds_no_field_is_told():
+def test_memory_that_holds_no_field_is_reported():
     with pytest.raises(UserError, match="no field fits into 100 bytes: the smallest needs"):
         chosen_size("voxels", hash_grid=HASH, footprint=0.01, memory_bytes=100)
 

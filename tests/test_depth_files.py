@@ -261,7 +261,7 @@ def test_maps_that_differ_in_view_and_bounds_belong_together():
     refuse_mixing([(Path("a.tiff"), META), (Path("b.tiff"), other)])
 
 
-def test_reading_what_is_no_depth_map_tells_why(tmp_path):
+def test_reading_what_is_no_depth_map_gives_the_reason(tmp_path):
     path = tmp_path / "a.tif"
     with pytest.raises(UserError, match=r"cannot read .*a\.tif: No such file"):
         read_tiff(path)

@@ -104,7 +104,7 @@ def test_a_photo_out_of_focus_is_named(clean, tmp_path):
     assert "smeared" not in finding(diagnosis, "sharpness").photos[0][1]
 
 
-def test_a_smeared_photo_is_named_and_told_from_one_out_of_focus(clean, tmp_path):
+def test_a_motion_blurred_photo_is_named_and_distinguished_from_one_out_of_focus(clean, tmp_path):
     smear = np.zeros((9, 9), np.float32)
     smear[4] = 1 / 9
     found = finding(clean.spoilt(cv2.filter2D(clean.photos[ONE], -1, smear), tmp_path), "sharpness")
@@ -147,7 +147,7 @@ def test_doubles_are_named_whether_the_file_is_the_same_or_not(clean, tmp_path):
     assert finding(lighter, "duplicates").photos == (("04.jpg", "same picture as 03.jpg"),)
 
 
-def test_mixed_lenses_and_zooms_are_told_but_not_a_phone_on_its_side(clean):
+def test_mixed_lenses_and_zooms_are_reported_but_not_a_phone_on_its_side(clean):
     exif = replace(clean.facts[0].exif, make="Maker", model="One", focal_mm=4.0, focal_35mm=28.0)
 
     def cameras(*odd: Exif) -> Finding:
@@ -198,7 +198,7 @@ def test_exif_of_another_picture_is_named(clean):
 # Whole captures
 
 
-def test_a_camera_that_only_turns_is_told_from_one_that_moves(tmp_path):
+def test_a_camera_that_only_turns_is_distinguished_from_one_that_moves(tmp_path):
     turning = examined(tmp_path / "turning", [view(pan_deg=angle) for angle in np.linspace(-15, 15, 5)]).diagnosis()
     assert list(alarms(turning)) == ["movement"]
     found = finding(turning, "movement")
@@ -206,7 +206,7 @@ def test_a_camera_that_only_turns_is_told_from_one_that_moves(tmp_path):
     assert (found.number or 0) < 0.03
 
 
-def test_two_halves_without_common_places_are_told_apart(clean, tmp_path):
+def test_two_halves_without_common_places_are_reported_separately(clean, tmp_path):
     halves = examined(tmp_path / "halves", [*clean.photos[:3], *walk(3, seed=50)]).diagnosis()
     assert list(alarms(halves)) == ["connectivity"]
     found = finding(halves, "connectivity")
@@ -227,13 +227,13 @@ def test_something_that_moves_by_itself_is_found_where_it_is(tmp_path):
     assert abs(down - 100 * (0.5 + 0.75 / 2.5 * FOCAL_PX / HEIGHT)) < 8
 
 
-def test_a_flat_world_is_told_from_a_camera_that_only_turns(tmp_path):
+def test_a_flat_world_is_distinguished_from_a_camera_that_only_turns(tmp_path):
     places = [((0.9 * s, 0.4 * s * s, 0.5 * s), -14 * s) for s in np.linspace(-1.5, 1.5, 4)]
     flat = examined(tmp_path / "flat", [view(c, pan_deg=a, boards=BOARDS[:1]) for c, a in places]).diagnosis()
     assert list(alarms(flat)) == ["depth relief"]
 
 
-def test_intrinsics_that_are_known_tell_how_far_things_are(tmp_path):
+def test_given_intrinsics_determine_how_far_things_are(tmp_path):
     """The camera moves by 0.5 in front of boards at 2.6 to 6; twice the stated focal length doubles all distances."""
     folder = write(tmp_path / "photos", [view((step, 0, 0)) for step in (0.0, 0.5)])
 
@@ -277,7 +277,7 @@ def seen(points: np.ndarray, turn_deg: float, centre: tuple[float, float, float]
 
 
 @pytest.mark.parametrize("focal_px", [700.0, 500.0])
-def test_turning_is_known_whatever_the_focal_length(focal_px):
+def test_a_pure_rotation_is_recognized_at_any_focal_length(focal_px):
     points, noise = two_view_points()
     x, y = seen(points, 0, (0, 0, 0)) + noise[0], seen(points, 12, (0, 0, 0)) + noise[1]
     views = camera_motion.estimate(x, y, (focal_px, focal_px))
@@ -389,7 +389,7 @@ def test_cameras_in_front_have_a_span():
     np.testing.assert_allclose(found.number or 0, 10 * 23 / 24, atol=0.6)
 
 
-def test_cameras_at_one_place_and_one_far_off_are_told():
+def test_cameras_at_one_place_and_one_far_off_are_reported():
     scene = ring(24, span_deg=360)
     assert coverage.spread(scene).verdict == GOOD
     near = tuple(replace(f, world_from_cam=scene.frames[0].world_from_cam) for f in scene.frames)

@@ -207,7 +207,7 @@ def test_masked_pixels_do_not_count():
     assert metrics["mean"]["ssim"] is None
 
 
-def test_a_mask_that_hides_a_whole_photo_is_told():
+def test_a_mask_that_hides_a_whole_photo_is_reported():
     hidden = HeldOutPhoto(frame("a.png"), noise(0, (12, 16, 3)), np.zeros((12, 16), dtype=bool))
     with pytest.raises(UserError, match=r"no pixels of a\.png are left to compare"):
         evaluate_model(fog(NOWHERE, Similarity.identity()), [hidden], on_image=lambda done, total: None)
@@ -227,7 +227,7 @@ def test_protocol_says_what_was_measured():
     assert "RGBA" not in protocol
 
 
-def test_nothing_held_out_is_told():
+def test_nothing_held_out_is_reported():
     with pytest.raises(UserError, match="no held-out photos to evaluate on") as caught:
         evaluate_model(fog(NOWHERE, Similarity.identity()), [], on_image=lambda done, total: None)
     assert caught.value.exit_code == BAD_INPUT

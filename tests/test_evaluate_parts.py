@@ -48,7 +48,7 @@ def test_a_quadratic_change_of_colours_is_taken_back():
     np.testing.assert_allclose(colour_aligned(picture, photo, used=used), photo, atol=1e-9)
 
 
-def test_channels_mix_and_masked_pixels_have_no_say():
+def test_channels_mix_and_masked_pixels_have_no_influence():
     rng = np.random.default_rng(0)
     photo = rng.uniform(0.3, 0.7, (20, 30, 3))
     picture = photo @ np.array([[0.8, 0.1, 0.0], [0.1, 0.9, 0.1], [0.0, 0.1, 0.8]]) + 0.02
@@ -117,7 +117,7 @@ def test_distance_and_angle_to_the_nearest_training_view():
     assert (away.distance, away.kind, away.angle_deg) == (0, "extrapolation", pytest.approx(45))
 
 
-def test_distance_is_told_in_scene_radii_whatever_the_unit():
+def test_distances_are_reported_in_scene_radii_whatever_the_unit():
     def ring(scale: float) -> list[Frame]:
         angles = np.arange(8) * np.pi / 4
         centres = [scale * 3 * np.array([math.cos(a), 0, math.sin(a)]) for a in angles]

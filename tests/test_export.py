@@ -93,7 +93,7 @@ def test_pictures_say_what_they_are(model, tmp_path):
     np.testing.assert_array_equal(listed["world_from_cam"], frame("a").world_from_cam)
 
 
-def test_only_what_is_asked_for_is_written(model, tmp_path):
+def test_only_requested_outputs_are_written(model, tmp_path):
     export(model, [frame("a.png")], tmp_path / "views", outputs=("opacity",))
     assert listing(tmp_path / "views") == ["opacity/a.png", "render.json"]
     assert "depth_meaning" not in json.loads((tmp_path / "views/render.json").read_text())
@@ -183,7 +183,7 @@ def test_one_video_per_output_with_every_frame_in_it(model, tmp_path):
     assert len(listing(tmp_path / "views/rgb")) == 5
 
 
-def test_a_file_in_the_folders_place_is_told(model, tmp_path):
+def test_a_file_in_the_folders_place_is_reported(model, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"cannot write .*views"):
         export(model, [frame("a")], tmp_path / "file" / "views")

@@ -194,7 +194,7 @@ def test_depth_without_a_meaning_is_not_read_into_a_clip(model, tmp_path):
         (DepthRequest("conditional", "z", min_opacity=0.2), "min_opacity 0.1, not 0.2"),
     ],
 )
-def test_a_folder_of_another_meaning_is_told_as_that(other, stated, model, tmp_path):
+def test_a_folder_of_another_kind_is_named_as_such(other, stated, model, tmp_path):
     export(model, ordered([frame("a")], outputs=("depth",)), tmp_path / "views")
     with pytest.raises(UserError, match=f"views contains depth with another definition: {stated}"):
         ordered([frame("a")], outputs=("depth",), depth=other).is_held_by(tmp_path / "views")

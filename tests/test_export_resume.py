@@ -321,7 +321,7 @@ def test_ctrl_c_or_sigterm_while_a_process_starts_is_kept_and_ends_it(sent, rais
 
 
 @pytest.mark.slow
-def test_what_goes_wrong_in_a_process_is_told_as_it_is_without(model, tmp_path):
+def test_errors_of_a_child_process_are_reported_as_without_one(model, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         export(model, order(), tmp_path / "views", on_rays=stop_in_frame(0, KeyboardInterrupt()))
     (unfinished,) = tmp_path.glob(".views.unfinished-*")
@@ -382,7 +382,7 @@ def test_other_videos_and_colours_of_a_finished_folder_are_made_without_renderin
     assert not list(tmp_path.glob(".views*"))
 
 
-def test_what_would_be_replaced_is_asked_for_and_what_is_added_is_not(model, tmp_path):
+def test_replacing_needs_overwrite_and_adding_does_not(model, tmp_path):
     folder = tmp_path / "views"
     export(model, order(video=None), folder)
     assert not order().is_held_by(folder)  # a video is added
@@ -451,7 +451,7 @@ def test_orders_of_playing():
     assert playing_order(2, "ping-pong") == [0, 1]
 
 
-def test_what_no_video_can_be_made_of_is_told_before_rendering(model, tmp_path, monkeypatch):
+def test_what_cannot_become_a_video_is_refused_before_rendering(model, tmp_path, monkeypatch):
     def rendered(rays: int) -> None:
         raise AssertionError("a picture was rendered")
 

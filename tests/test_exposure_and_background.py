@@ -121,7 +121,7 @@ def test_only_differences_between_photos_are_learned():
     assert one.free.grad.sum(0).abs().max() < 1e-5  # no gradient for a gain that all photos share
 
 
-def test_exif_tells_stops_between_photos(capture, tmp_path):
+def test_exif_gives_stops_between_photos(capture, tmp_path):
     stops = log_exposures(capture.frames) / math.log(2)
     assert np.diff(stops).tolist() == pytest.approx([1.0, 1.0, 1.0])
     save_photo(tmp_path / "wide.png", seconds=0.01, iso=400, f_number=2.0)  # 2 stops by ISO and 2 by the aperture

@@ -284,7 +284,7 @@ def test_model_round_trip_is_bit_exact(tmp_path):
     np.testing.assert_array_equal(loaded.training_from_scene.translation, model.training_from_scene.translation)
 
 
-def test_a_model_knows_the_digest_of_what_was_loaded_not_of_what_took_its_place(tmp_path, monkeypatch):
+def test_a_model_keeps_the_digest_of_the_loaded_file_even_if_the_file_is_replaced(tmp_path, monkeypatch):
     """A training replaces its field while another command reads it."""
     path = tmp_path / "field.safetensors"
     save_model(path, some_model())

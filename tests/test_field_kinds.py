@@ -407,7 +407,7 @@ def test_a_field_from_before_there_were_kinds_is_a_hash_grid(tmp_path):
     assert torch.equal(density_of(loaded, places(7)), density_of(field, places(7)))
 
 
-def test_a_kind_of_a_later_version_is_told():
+def test_a_kind_of_a_later_version_is_reported():
     with pytest.raises(UserError, match="unknown type of field: 'gaussians'") as caught:
         settings_from_json({"kind": "gaussians", "contraction": "l2"})
     assert caught.value.exit_code == BAD_INPUT

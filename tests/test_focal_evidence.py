@@ -67,7 +67,7 @@ def test_a_focal_length_of_another_picture(exif: Exif, focal_px: float, words: s
 
 
 @pytest.mark.parametrize("exif", [replace(CAMERA, sensor_px_per_mm=3000.0), replace(CAMERA, sensor_px_per_mm=20.0)])
-def test_a_resolution_that_no_sensor_has_tells_nothing(exif: Exif):
+def test_a_resolution_that_no_sensor_has_is_ignored(exif: Exif):
     """5472 pixels on a sensor of 1.8 or 274 mm: the tag is for another image size."""
     assert focal_evidence(exif).focal_px is None
 

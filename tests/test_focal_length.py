@@ -146,7 +146,7 @@ def test_mapping_starts_from_the_estimate_and_no_match_is_lost(job: Job):
     assert verified(job) == before
 
 
-def test_what_is_known_of_a_lens_is_left_alone(job: Job):
+def test_given_lens_parameters_are_left_alone(job: Job):
     """By definition: intrinsics from a file, reliable EXIF, a fisheye."""
     (group,) = job.groups
     for camera_group in (

@@ -131,7 +131,7 @@ def test_shots_points_and_names_by_hand(tmp_path):
         ({"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}, "arbitrary"),
     ],
 )
-def test_the_unit_is_the_metre_where_gps_said_so(tmp_path, reference, unit):
+def test_the_unit_is_the_metre_after_scaling_by_gps(tmp_path, reference, unit):
     path = write_file(tmp_path / "reconstruction.json", {**reconstruction(), "reference_lla": reference})
     assert parse_opensfm(path).unit == unit
 
@@ -167,7 +167,7 @@ def test_round_trip_reprojects_to_a_millionth_of_a_pixel(tmp_path, model):
         np.testing.assert_allclose(pixels_again, pixels, rtol=0, atol=1e-9)  # required: 1e-6
 
 
-def test_what_is_lost_is_said(tmp_path):
+def test_losses_are_reported(tmp_path):
     ratio = Camera("FULL_OPENCV", 64, 48, (50, 50, 32, 24, 0.1, 0, 0, 0, 0, 0.2, 0, 0.3))
     capture = capture_of([ratio, Camera("FOV", 64, 48, (50, 50, 32, 24, 0.5))])
     frames = (*capture.frames[:-1], Frame("m", ratio, np.eye(4), mask=Path("m.png"), split="test"))

@@ -91,7 +91,7 @@ def test_timestamps_are_the_names_where_these_are_numbers(tmp_path, names, times
     assert losses_tum(capture) == lost
 
 
-def test_what_is_lost_is_said():
+def test_losses_are_reported():
     frame = Frame("000000", CAMERA, np.eye(4), mask=Path("m.png"), split="train")
     capture = Capture((frame,), np.ones((5, 3)), (), None, "x", colours=np.zeros((5, 3), dtype=np.uint8), unit="metre")
     rest = ("1 masks", "5 points", "colours of 5 points", "the split of 1 frames", "the unit of length (metre)")
@@ -101,7 +101,7 @@ def test_what_is_lost_is_said():
 
 
 @pytest.mark.parametrize("kind", PARSERS)
-def test_without_a_camera_the_user_is_asked_for_one(tmp_path, kind):
+def test_without_a_camera_the_message_requests_one(tmp_path, kind):
     path = tmp_path / "poses.txt"
     path.write_text(TEXTS[kind])
     with pytest.raises(UserError, match=f"a {kind.upper()} trajectory contains poses but no camera") as caught:

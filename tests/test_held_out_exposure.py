@@ -36,7 +36,7 @@ def test_gains_that_drift_are_those_between_the_neighbours_and_of_the_last_beyon
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_gains_of_chance_are_told_to_be_the_mean(seed):
+def test_gains_without_evidence_are_set_to_the_mean(seed):
     """The mean squared error for independent gains is 1.5 variances from two neighbours, and 1 from the mean."""
     gains = np.random.default_rng(seed).normal(size=(60, 3))
     places = np.arange(60) * 2
@@ -53,7 +53,7 @@ def test_gains_follow_exif_as_far_as_the_tone_curve_lets_them(slope):
     assert exif_slope(np.arange(13), np.append(gains, [[5.0] * 3], axis=0), unknown) == pytest.approx(slope, abs=0.03)
 
 
-def test_exif_that_tells_less_than_neighbours_or_the_mean_is_not_followed():
+def test_exif_that_predicts_worse_than_neighbours_or_the_mean_is_not_used():
     places, rng = np.arange(40), np.random.default_rng(1)
     exif = rng.normal(size=40)
     assert exif_slope(places, rng.normal(size=(40, 3)), exif) == 0.0
@@ -110,12 +110,12 @@ def test_photos_without_exif_take_no_part_in_what_is_beyond_it():
     assert np.array_equal(nothing, np.zeros((1, 3)))
 
 
-def test_two_photos_tell_nothing_and_nobody_may_ask():
+def test_two_photos_give_no_estimate_and_are_refused():
     assert np.array_equal(gains_between(np.array([0, 2]), np.ones((2, 3)), np.array([1])), np.zeros((1, 3)))
     assert gains_between(np.arange(4), drifting(np.arange(4.0)), np.zeros(0)).shape == (0, 3)
 
 
-def test_a_training_keeps_what_its_photos_tell_of_the_held_out_ones_which_it_does_not_open(tmp_path: Path):
+def test_training_estimates_exposures_of_held_out_photos_without_opening_them(tmp_path: Path):
     """Grey photos become brighter one by one; the last but one is held out and nearly black. Its gains are nevertheless
     between those of its neighbours, which are brighter than the mean."""
     camera, frames = Camera.pinhole(16, 12, 14.0), []
@@ -184,7 +184,7 @@ def test_a_run_keeps_the_offset_to_exif_of_held_out_photos(tmp_path: Path):
     assert log_gains_of(scene.test_frames, model).mean() == pytest.approx(drift[9] + jumps[9], abs=0.15)
 
 
-def test_what_exif_tells_of_a_held_out_photo_goes_before_its_neighbours(monkeypatch):
+def test_exif_of_a_held_out_photo_takes_precedence_over_its_neighbours(monkeypatch):
     """EXIF has the exposure of one photo only; a model without a mean exposure does not use it."""
     frames = [Frame(name, Camera.pinhole(4, 4, 4.0), np.eye(4)) for name in ("a", "b", "c")]
     monkeypatch.setattr(

@@ -226,7 +226,7 @@ def jpeg_bytes() -> bytes:
     return buffer.getvalue()
 
 
-def test_unreadable_files_are_told_by_name(tmp_path):
+def test_unreadable_files_are_reported_by_name(tmp_path):
     jpeg = jpeg_bytes()
     png = io.BytesIO()
     Image.fromarray(noise(64, 64, 3)).save(png, "PNG")

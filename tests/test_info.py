@@ -32,7 +32,7 @@ def info(*arguments: str | Path) -> Result:
     return result
 
 
-def test_facts_are_told_in_lines_that_a_terminal_holds():
+def test_facts_fit_the_lines_of_a_terminal():
     facts = {
         "kind": "run",
         "unit": None,
@@ -80,7 +80,7 @@ def test_facts_are_told_in_lines_that_a_terminal_holds():
 
 
 @pytest.mark.parametrize("suffix", ALL)
-def test_a_depth_file_tells_all_that_it_knows(suffix, tmp_path):
+def test_info_shows_everything_a_depth_file_records(suffix, tmp_path):
     path, depth = tmp_path / f"a{suffix}", plain_depth()
     ALL[suffix](path, depth, FULL_META)
     printed = json.loads(info(path, "--json").stdout)
@@ -107,7 +107,7 @@ def test_a_depth_file_tells_all_that_it_knows(suffix, tmp_path):
         assert expected in text, expected
 
 
-def test_levels_tell_their_scale_and_rounding(tmp_path):
+def test_levels_state_their_scale_and_rounding(tmp_path):
     write_png16(tmp_path / "a.png", plain_depth(), META, units_per_level=2e-3)
     text = info(tmp_path / "a.png").stdout
     assert "value = level x 0.002" in text
@@ -115,7 +115,7 @@ def test_levels_tell_their_scale_and_rounding(tmp_path):
     assert "the scene has no metric scale" in text
 
 
-def test_several_maps_in_a_file_are_each_told(tmp_path):
+def test_each_map_of_a_file_is_described(tmp_path):
     depth = plain_depth()
     meta = replace(META, layers={"spread": {"convention": "standard-deviation", "opacity_floor": 0.5}})
     write_exr(tmp_path / "a.exr", {"depth": depth, "spread": depth / 10, "opacity": np.ones_like(depth)}, meta)
@@ -125,7 +125,7 @@ def test_several_maps_in_a_file_are_each_told(tmp_path):
     assert "also in the file: spread (standard-deviation)" in info(tmp_path / "a.exr").stdout
 
 
-def test_depth_of_another_program_is_told_as_what_nobody_states(tmp_path):
+def test_depth_of_another_program_is_shown_with_what_it_does_not_state(tmp_path):
     depth = plain_depth()
     tifffile.imwrite(tmp_path / "a.tif", depth)
     np.save(tmp_path / "a.npy", depth)
@@ -143,7 +143,7 @@ def test_depth_of_another_program_is_told_as_what_nobody_states(tmp_path):
     assert "often 1 mm" in info(tmp_path / "a.png").stdout
 
 
-def test_arrays_that_are_no_pictures_are_told_by_their_shape(tmp_path):
+def test_arrays_that_are_not_pictures_are_described_by_their_shape(tmp_path):
     np.savez(tmp_path / "a.npz", poses=np.zeros((5, 3, 4)), names=np.array(["a", "b"]), empty=np.zeros((0, 3)))
     printed = json.loads(info(tmp_path / "a.npz", "--json").stdout)
     assert {name: facts["shape"] for name, facts in printed["maps"].items()} == {
@@ -176,7 +176,7 @@ def test_the_comment_of_a_video_is_read_back(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".tiff", ".exr", ".npz", ".npy", ".png", ".mp4"])
-def test_a_damaged_file_is_told_in_two_lines(suffix, tmp_path, capfd):
+def test_a_damaged_file_is_reported_in_two_lines(suffix, tmp_path, capfd):
     """A file cut anywhere is refused: no half of a map, no traceback, and no messages of libraries."""
     path = tmp_path / f"a{suffix}"
     if suffix == ".mp4":

@@ -88,7 +88,7 @@ def shallow_capture() -> pycolmap.Reconstruction:
     return synthetic.observed_model(views, flat, noise_px=1.5, seed=0)
 
 
-def test_a_focal_length_that_is_left_open_stays_at_that_of_exif_and_is_said_to_be_weak():
+def test_an_undetermined_focal_length_stays_at_that_of_exif_and_is_reported_as_weak():
     model = shallow_capture()
     lenses = choose_lenses(model, seed=0, threads=1, exif_focal_px={1: 1380.0})
     assert camera_of(lenses.model).model.name == "SIMPLE_PINHOLE"

@@ -57,7 +57,7 @@ def test_a_change_of_any_source_discards_the_machine_code_of_all(compiled, chang
     assert ".nbi" in left(compiled)
 
 
-def test_machine_code_of_nobody_knows_what_is_discarded(compiled):
+def test_machine_code_of_unknown_sources_is_discarded(compiled):
     (compiled / "cache" / "sources.blake2b").unlink()
     discard_outdated(compiled.glob("*.py"), compiled / "cache")
     assert left(compiled) == {".pyc", ".blake2b"}
@@ -70,7 +70,7 @@ def test_it_is_looked_for_where_numba_keeps_it():
     assert (folder() / "sources.blake2b").is_file()
 
 
-def test_no_room_for_what_is_compiled_is_told(monkeypatch):
+def test_no_room_for_machine_code_is_reported(monkeypatch):
     def full(*arguments: object, **named: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -121,7 +121,7 @@ def test_photos_without_a_mask_are_named(photos, masks, tmp_path):
     assert white == [255, 255, 0, 255]
 
 
-def test_a_folder_without_masks_is_told(photos, masks, tmp_path):
+def test_a_folder_without_masks_is_reported(photos, masks, tmp_path):
     with pytest.raises(UserError, match="contains no mask for any photo") as error:
         laid_out(photos, masks, tmp_path / "work")
     assert "p 0.png.png or p 0.png" in error.value.hint

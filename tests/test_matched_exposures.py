@@ -49,7 +49,7 @@ def test_photos_that_share_nothing_have_no_gains():
     assert np.isnan(matched_log_gains(photos[:1], depths[:1])).all()
 
 
-def test_white_pixels_tell_nothing():
+def test_white_pixels_give_no_evidence():
     white = exposed(photo(0.0), np.full(3, 5.0))
     photos = [white, *(photo(x) for x in OFFSETS[1:3])]
     found = matched_log_gains(photos, [depth(one) for one in photos])

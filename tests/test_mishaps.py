@@ -48,7 +48,7 @@ def with_leftovers(folder: Path, before: dict[str, bytes]) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_full_disk_is_told_and_what_was_there_is_as_it_was(name, finished, capture):
+def test_a_full_disk_is_reported_and_earlier_files_stay_intact(name, finished, capture):
     words, size = WRITERS[name]
     kernels.prepare(lambda text: None)  # compiled kernels are written beside the program
     before = listing(capture.parent)

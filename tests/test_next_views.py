@@ -100,7 +100,7 @@ def test_photos_from_one_place_have_only_their_flight_as_candidates():
 
 
 @pytest.mark.usefixtures("small_photo_depths")
-def test_doctor_tells_what_photos_of_a_run_have_seen(spheres_run, tmp_path, monkeypatch):
+def test_doctor_reports_what_the_photos_of_a_run_see(spheres_run, tmp_path, monkeypatch):
     monkeypatch.setattr(candidates, "PER_PATH", 6)  # 60 on each path take 18 CPU seconds
     monkeypatch.setattr(workflow, "CANDIDATE_PX", 48)
     monkeypatch.setattr(workflow, "PICTURE_PX", 96)

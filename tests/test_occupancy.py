@@ -71,7 +71,7 @@ def grid() -> Occupancy:
     return Occupancy(SIDE, torch.device("cpu"))
 
 
-def test_a_cell_is_asked_at_a_random_point_of_its_own(grid):
+def test_each_cell_is_evaluated_at_its_own_random_point(grid):
     """Cells are indexed [z, y, x]; each point is inside its cell, and not in a corner of it."""
     field = Ramp()
     refreshed(grid, field)

@@ -244,7 +244,7 @@ def test_the_page_loads_nothing(spheres_page):
     assert len(text) < 10_000_000
 
 
-def test_what_stands_there_is_not_replaced_unasked(spheres_run, tmp_path):
+def test_existing_files_are_not_replaced_without_overwrite(spheres_run, tmp_path):
     target = tmp_path / "a.html"
     target.write_text("mine")
     with pytest.raises(UserError, match="exists") as caught:
@@ -463,7 +463,7 @@ def test_the_path_is_a_camera_path_that_render_reads(opened, tmp_path):
     opened.key(" ")
 
 
-def test_a_lost_context_is_told_and_comes_back(opened):
+def test_a_lost_context_is_reported_and_restored(opened):
     count = rested(opened)
     opened.run(
         "globalThis.lose = nerfcliPage.renderer.gl.getExtension('WEBGL_lose_context'); globalThis.lose.loseContext()"
@@ -500,7 +500,7 @@ def test_a_damaged_page_says_so(damage, message, browser, spheres_page, tmp_path
     assert message in browser.run("document.getElementById('trouble').textContent")
 
 
-def test_a_browser_without_webgl2_is_told(spheres_page, tmp_path):
+def test_a_browser_without_webgl2_is_reported(spheres_page, tmp_path):
     if find_browser() is None:
         pytest.skip("there is no Chromium on this machine to open the page with")
     with Browser(tmp_path, flags=("--disable-3d-apis",)) as browser:

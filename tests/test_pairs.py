@@ -88,7 +88,7 @@ def wrapped(longitude: float) -> float:
     return longitude - 360 if longitude > 180 else longitude
 
 
-def test_photos_that_gps_tells_apart_are_compared_with_the_nearest():
+def test_photos_that_gps_separates_are_compared_with_the_nearest():
     """On a square grid, the 20 photos nearest to an inner one are within 3 steps and include the 8 around it."""
     pairing = choose_pairs(grid(spacing_deg=0.0002))  # 22 metres
     pairs = set(pairing.pairs)
@@ -98,7 +98,7 @@ def test_photos_that_gps_tells_apart_are_compared_with_the_nearest():
     assert all(abs(i // 10 - j // 10) <= 5 and abs(i % 10 - j % 10) <= 5 for i, j in pairs)
 
 
-def test_photos_nearer_than_gps_can_tell_are_not_compared_by_it():
+def test_photos_closer_than_the_error_of_gps_are_not_compared_by_it():
     assert choose_pairs(grid(spacing_deg=0.00001)).rule == "retrieval"
 
 
@@ -146,13 +146,13 @@ def test_pairs_are_read(tmp_path: Path, text: str, pairs: set[tuple[int, int]]):
         ("# nothing", r"lists no pairs"),
     ],
 )
-def test_lines_that_are_no_pairs_are_told_with_their_number(tmp_path: Path, text: str, words: str):
+def test_lines_that_are_not_pairs_are_reported_with_their_number(tmp_path: Path, text: str, words: str):
     with pytest.raises(UserError, match=words) as caught:
         pairs_of(tmp_path, text)
     assert caught.value.exit_code == BAD_INPUT
 
 
-def test_a_file_of_pairs_that_is_not_there_is_told(tmp_path: Path):
+def test_a_file_of_pairs_that_is_not_there_is_reported(tmp_path: Path):
     with pytest.raises(UserError, match=r"cannot read the pairs in .*none.txt: No such file"):
         read_pairs(tmp_path / "none.txt", SPACED)
 

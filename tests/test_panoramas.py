@@ -398,7 +398,7 @@ def test_a_field_of_panoramas_renders_distances_along_rays(scene, tmp_path):
     assert "--depth-axis ray" in hint
 
 
-def test_doctor_knows_panoramas(photos, tmp_path):
+def test_doctor_recognizes_panoramas(photos, tmp_path):
     few = tmp_path / "four of them"
     shutil.copytree(photos, few, ignore=shutil.ignore_patterns("4.png", "5.png"))
     done = nerfcli("doctor", few, "-o", tmp_path / "page.html", "--json")

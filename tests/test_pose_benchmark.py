@@ -44,7 +44,7 @@ def test_the_same_cameras_in_another_world_are_right(benchmark):
     np.testing.assert_allclose([found.auc_1, found.auc_10], 1, atol=1e-6)
 
 
-def test_a_turn_about_their_own_axes_is_told_from_the_rest(benchmark):
+def test_rotations_about_their_own_axes_are_distinguished_from_the_rest(benchmark):
     """Closed form: every camera turned by 0.65 degrees about its own y: centres stay, all rotations are off by that."""
     poses = random_poses()
     turned = poses.copy()

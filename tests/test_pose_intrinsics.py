@@ -183,7 +183,7 @@ def test_a_photo_gets_the_camera_of_its_size_before_one_of_its_shape():
     assert only(named, photo(640, 480)) == Camera.pinhole(640, 480, 600)
 
 
-def test_what_matches_no_photo_is_told():
+def test_what_matches_no_photo_is_reported():
     small, large = Camera.pinhole(320, 240, 300), Camera.pinhole(640, 480, 500)
     with pytest.raises(UserError, match=r"c has no camera for photo photo\.jpg of 640x360: .* for 320x240, 640x480$"):
         only(Calibration(Path("c"), (small, large), {}), photo(640, 360))

@@ -146,7 +146,7 @@ def test_held_out_observations_are_a_tenth_and_off_by_the_noise():
     assert training.compute_num_observations() == noisy.compute_num_observations() - len(errors)
 
 
-def test_the_residuals_tell_the_noise():
+def test_residuals_measure_the_noise():
     _, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 512.0, 384.0, 0.05], noise_px=0.8)
     held_out.adjust(noisy, threads=1)
     assert held_out.residual_deviation_px(noisy) == pytest.approx(0.8, rel=0.05)

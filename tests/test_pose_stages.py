@@ -311,7 +311,7 @@ def test_too_much_time_ends_the_worker(photos: Path, tmp_path: Path):
     assert "to continue" in caught.value.hint
 
 
-def test_memory_is_known_for_this_process_and_machine():
+def test_memory_of_this_process_and_machine_is_measured():
     limit = default_memory_limit()
     assert limit is not None
     assert 10_000_000 < resident_bytes(os.getpid()) < limit

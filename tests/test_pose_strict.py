@@ -52,7 +52,7 @@ def test_a_held_out_photo_is_placed_and_moves_nothing_by_a_bit(solved):
     assert report.strict["placed"][name]["error_px"] < 1.5
 
 
-def test_the_scene_knows_what_was_held_out_and_how(solved):
+def test_the_scene_records_what_was_held_out_and_how(solved):
     photos, scene_dir, settings, report = solved
     images = {image.name: image for image in report.images}
     assert images["wall.png"].reason == "matches too few points of the training photos (0 inliers of 0)"

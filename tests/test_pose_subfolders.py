@@ -158,7 +158,7 @@ def test_masks_among_the_photos_are_refused(rig: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize("listed", [lambda name: name, lambda name: f"images/{name}"])
-def test_intrinsics_of_equal_names_are_told_apart_by_folder(tmp_path: Path, listed: Callable[[str], str]):
+def test_intrinsics_of_equal_names_are_distinguished_by_folder(tmp_path: Path, listed: Callable[[str], str]):
     cameras = tuple(Camera("SIMPLE_PINHOLE", 64, 48, (focal, 32.0, 24.0)) for focal in (50.0, 60.0))
     calibration = Calibration(tmp_path, cameras, {listed("left/1.png"): 0, listed("right/1.png"): 1})
     pictures = [Picture(tmp_path / "images" / side / "1.png", 64, 48, 1) for side in ("right", "left")]

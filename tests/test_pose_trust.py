@@ -518,7 +518,7 @@ def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
     assert turn.focal_px == pytest.approx(WIDE.params[0], rel=0.03)
 
 
-def test_parts_that_share_nothing_are_told_apart(tmp_path: Path):
+def test_parts_that_share_nothing_are_reported_separately(tmp_path: Path):
     far = (40.0, 0.0, 0.0)
     scene = synthetic.together(synthetic.boulder(600, seed=0), synthetic.boulder(300, seed=1, centre=far))
     views = [*synthetic.ring(6, [WIDE], seed=0, turn_deg=150), *synthetic.ring(4, [WIDE], seed=1, at=far, turn_deg=100)]
@@ -541,7 +541,7 @@ def test_every_rung_is_written_down_with_its_result(tmp_path: Path):
     assert weak.examined.model is None
 
 
-def test_a_photo_that_no_pair_holds_is_placed_by_what_the_model_knows(tmp_path: Path):
+def test_a_photo_without_verified_pairs_is_placed_by_the_points_of_the_model(tmp_path: Path):
     """It has no match with any photo; its pose is right, and the list of attempts names it."""
     views = synthetic.ring(7, [WIDE], seed=0, turn_deg=140)
     weak = solve(tmp_path, views, synthetic.boulder(500, seed=0), pairs=lambda i, j: 3 not in (i, j))
@@ -557,7 +557,7 @@ def test_a_photo_that_no_pair_holds_is_placed_by_what_the_model_knows(tmp_path: 
     assert np.degrees((turned * true.inverse()).angle()) < 0.8
 
 
-def test_a_fisheye_of_which_nothing_is_known_is_recognised(tmp_path: Path):
+def test_a_fisheye_without_metadata_is_recognized(tmp_path: Path):
     """180 degrees wide, and the mapper starts from a perspective lens; a perspective capture has no such rung."""
     scene = synthetic.together(synthetic.boulder(250, seed=0), synthetic.room(300, seed=1))
     views = synthetic.ring(6, [UNKNOWN_FISHEYE], seed=0, radius=2.0, turn_deg=100)
@@ -570,7 +570,7 @@ def test_a_fisheye_of_which_nothing_is_known_is_recognised(tmp_path: Path):
     assert camera.mean_focal_length() == pytest.approx(UNKNOWN_FISHEYE.params[0], rel=0.02)
 
 
-def test_a_focal_length_that_exif_tells_wrong_is_left_out(tmp_path: Path):
+def test_a_wrong_focal_length_in_exif_is_ignored(tmp_path: Path):
     """EXIF's is six times too long, as by a stale sensor resolution; without it, all photos are placed correctly."""
     views = synthetic.ring(8, [WIDE], seed=0, turn_deg=120)
     synthetic.write_database(tmp_path / "database.db", views, synthetic.boulder(700, seed=0), noise=Noise(), seed=0)

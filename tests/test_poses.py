@@ -217,7 +217,7 @@ def test_an_interrupt_ends_the_worker_and_leaves_no_scene(tmp_path: Path, monkey
     assert not (tmp_path / "scene" / "scene.json").exists()
 
 
-def test_a_dying_worker_is_told_with_its_last_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_last_output_of_a_dying_worker_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The message is the worker's own: it imports no library from the current directory."""
     (tmp_path / "pycolmap.py").write_text("raise RuntimeError('another library of this name')")
     monkeypatch.chdir(tmp_path)
@@ -239,7 +239,7 @@ def test_deaths_are_explained():
     ("log", "free_bytes"),
     [("", 40_960), ("RuntimeError: SQL error: database or disk is full\n", 10**9), ("No space left on device", 10**9)],
 )
-def test_a_full_disk_is_told_even_where_no_log_could_be_written(log: str, free_bytes: int):
+def test_a_full_disk_is_reported_even_where_no_log_could_be_written(log: str, free_bytes: int):
     reported = supervise.explain_death(1, "finding features (3 of 10 done)", log, free_bytes)
     assert "stopped while finding features (3 of 10 done): the disk is full" in reported.message
     assert "run the same command again to continue" in reported.hint

@@ -55,7 +55,7 @@ def test_bad_values_are_usage_errors(line: str, named: str):
         (("--quality", "fast", "--max-features", "500"), 1000, 500),
     ],
 )
-def test_a_dry_run_tells_the_plan_and_writes_nothing(
+def test_a_dry_run_prints_the_plan_and_writes_nothing(
     tmp_path: Path, options: tuple[str, ...], size: int, features: int
 ):
     photos = write_photos(tmp_path / "photos", 5)

@@ -55,7 +55,7 @@ def test_preview_clips_and_keeps_its_size_over_a_video():
         DepthMeta("conditional", "ray", "metre", 0.5),
     ],
 )
-def test_the_legend_tells_convention_axis_and_unit(other):
+def test_the_legend_states_convention_axis_and_unit(other):
     depth = np.zeros((4, 600), np.float32)
     assert (preview(depth, META, lo=0, hi=1) != preview(depth, other, lo=0, hi=1)).any()
     assert (preview(depth, META, lo=0, hi=1)[4:] != preview(depth, META, lo=0, hi=2)[4:]).any()

@@ -110,7 +110,7 @@ def test_points_behind_a_mask_are_not_looked_at(capture):
     assert min(columns) >= 6
 
 
-def test_only_training_photos_tell_where_points_are(capture):
+def test_only_training_photos_place_points(capture):
     """With the first photo held out, a single training photo sees each point, which gives no distance."""
     held_out = replace(capture, test_names=frozenset({"0.png"}))
     one = Similarity(1.0, np.eye(3), np.zeros(3))
@@ -123,7 +123,7 @@ def test_a_model_without_sightings_gives_no_tracks(spheres):
     assert tracks_in(replace(spheres, frames=spheres.train_frames[:1], test_names=frozenset())).count == 0
 
 
-def test_points_that_are_asked_for_and_not_there_are_missed(spheres, tmp_path):
+def test_missing_points_that_were_requested_are_an_error(spheres, tmp_path):
     alone = replace(spheres, frames=spheres.train_frames[:1], test_names=frozenset())
     settings = TrainSettings(budget_seconds=None, steps=1, downscale=8, components=Components(points=0.1))
     with pytest.raises(UserError, match="no 3D point could be triangulated"):

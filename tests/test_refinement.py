@@ -388,7 +388,7 @@ def steps_of(monkeypatch: pytest.MonkeyPatch, twist: float) -> list[dict[str, fl
     return calls
 
 
-def test_poses_are_damped_less_and_less_and_held_once_it_is_known_what_was_wrong(monkeypatch):
+def test_poses_are_damped_less_and_less_and_fixed_once_the_fault_is_found(monkeypatch):
     calls = steps_of(monkeypatch, 1e-9)
     refinement = PoseRefinement(random_poses(np.random.default_rng(0), 4), [Camera.pinhole(40, 30, 40.0)] * 4)
     fractions = (0.11, 0.2, 0.21, 0.35, 0.5, 0.8, 0.97)
@@ -469,7 +469,7 @@ def test_cameras_that_have_not_moved_give_the_same_rays(small):
     torch.testing.assert_close(refined.directions, drawn.directions, atol=2e-7, rtol=0)
 
 
-def test_moves_are_told_in_degrees_and_percent(small):
+def test_moves_are_reported_in_degrees_and_percent(small):
     """By hand: one photo turned by 2 degrees, another moved by 0.3 in a scene of radius 6, both 1 % longer."""
     first, second, third = small.train_frames
     turn = transform_from_twist(np.array([0, 0, 0, 0, 0, np.radians(2.0)]))
@@ -507,7 +507,7 @@ def test_frames_are_where_the_cameras_of_the_training_frame_are(small):
     assert np.array_equal(held_out[0].world_from_cam, small.test_frames[0].world_from_cam)
 
 
-def test_photos_find_back_into_a_field_that_knows_better(spheres, spheres_run):
+def test_displaced_cameras_return_to_their_places_in_a_trained_field(spheres, spheres_run):
     """With a trained field frozen and photos turned by half a degree, 20 steps bring points at the centre of the scene
     twice as near to their places in the pictures."""
     noisy = turned(spheres, 0.5)

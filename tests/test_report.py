@@ -142,7 +142,7 @@ def test_runs_are_shown_by_photos_that_all_of_them_hold_out():
     assert common_names([holding("a.png"), holding("b.png")], 8) == []
 
 
-def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
+def test_the_page_shows_the_numbers_and_embeds_the_pictures(seen):
     look, _ = seen
     text = page_html([facts()], [look], depths=[_meta()])
     for reported in (
@@ -237,7 +237,7 @@ def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     assert low < high < highest
 
 
-def test_the_page_tells_what_saw_the_photos_what_was_chosen_and_how_new_the_views_are(seen):
+def test_the_page_shows_cameras_chosen_components_and_how_new_the_views_are(seen):
     look, _ = seen
     run = facts()
     assert run.metrics is not None

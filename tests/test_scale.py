@@ -271,7 +271,7 @@ def test_the_standard_error_of_gps_is_the_spread_of_estimates():
     assert abs(np.mean(ratios) - 1) < 0.002
 
 
-def test_the_standard_error_of_gps_knows_that_neighbours_err_alike():
+def test_the_standard_error_of_gps_allows_for_correlated_errors_of_neighbours():
     """On a walk around a block, three photos in a row share one error: sqrt(3) times that of independent errors."""
     rng = np.random.default_rng(4)
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
@@ -340,7 +340,7 @@ def test_two_photos_far_apart_give_the_scale_alone_and_three_on_a_line_too():
         assert fit.estimate.standard_error == pytest.approx(expected, rel=1e-3)
 
 
-def test_what_gps_cannot_tell():
+def test_what_gps_cannot_determine():
     frames = frames_at(np.arange(9.0).reshape(3, 3))
     with pytest.raises(UserError, match="only 1 of 3 photos"):
         scale_from_gps(frames, {"000.jpg": (1.0, 2.0, None)})
@@ -475,7 +475,7 @@ def test_corners_of_a_blurred_square_are_where_its_edges_meet(seed, blur, turn):
     assert refined_corners(grey, np.full((4, 2), 60.0)) is None
 
 
-def test_markers_that_give_no_scale_are_told(tmp_path):
+def test_markers_that_give_no_scale_are_reported(tmp_path):
     sheet = sheet_of_markers([3], 120)
     frames = photos_of(tmp_path, sheet, per_unit=120.0, count=2)
     with pytest.raises(
@@ -518,7 +518,7 @@ def test_a_point_from_rays_is_exact_and_one_wrong_ray_moves_it_little(seed, wron
     assert missed.shape == (8,)
 
 
-def test_corners_through_distorted_lenses_and_how_well_their_error_is_told():
+def test_corners_through_distorted_lenses_and_how_well_their_error_is_estimated():
     """Corners seen through a fisheye and a distorted lens, exact without noise; right standard error with 0.2 px."""
     rng = np.random.default_rng(0)
     lenses = [

@@ -155,7 +155,7 @@ def test_beam_hardening_is_named(bend: float, verdict: str) -> None:
     assert found.number == pytest.approx(bend, abs=0.04)
 
 
-def test_hardening_is_not_told_from_two_materials() -> None:
+def test_hardening_is_not_distinguished_from_two_materials() -> None:
     two = (*SOLID, Ellipsoid((2, 1, 0), (2, 2, 2), 3.0))
     answer = checked("beam hardening", scan_of_phantom(phantom_circle(views=VIEWS, columns=COLUMNS), phantom=two))
     assert "not of one material" in str(answer)
@@ -175,7 +175,7 @@ def test_the_command_writes_a_page_and_holds_a_gate(tmp_path: Path) -> None:
     assert "open beam (bad)" in error_of(result)[0]
 
 
-def test_flats_tell_the_photons() -> None:
+def test_flats_determine_the_number_of_photons() -> None:
     """Known truth, within 5 %: 8000 photons a pixel at a gain of 0.25 values a photon, with read noise and drift."""
     from nerfcli.tomography.open_beam import open_beam_of
 

@@ -333,7 +333,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_damage_is_told_in_two_lines_and_nothing_is_written(name: str, tmp_path: Path) -> None:
+def test_damage_is_reported_in_two_lines_and_nothing_is_written(name: str, tmp_path: Path) -> None:
     make, options, expected = REFUSED[name]
     place = tmp_path / "in"
     place.mkdir()

@@ -14,7 +14,7 @@ from nerfcli.tomography.scan import save_scan
 
 
 @pytest.mark.parametrize("truth", ["as stated", "mirrored", "reversed", "both"])
-def test_a_mirrored_detector_is_told_from_a_fan_beam(truth: str) -> None:
+def test_a_mirrored_detector_is_recognized_with_a_fan_beam(truth: str) -> None:
     """A wrong side is worse by a large margin; mirrored and reversed together give the mirror image, which holds."""
     circle = phantom_circle()
     angles = tuple(-a for a in circle.angles) if truth in ("reversed", "both") else circle.angles
@@ -29,7 +29,7 @@ def test_a_mirrored_detector_is_told_from_a_fan_beam(truth: str) -> None:
 
 
 @pytest.mark.parametrize("truth", ["as stated", "mirrored", "reversed"])
-def test_parallel_beams_decide_nothing_and_it_is_said(truth: str) -> None:
+def test_parallel_beams_decide_nothing_and_the_reason_is_reported(truth: str) -> None:
     circle = phantom_circle(beam="parallel", span_deg=180)
     angles = tuple(-a for a in circle.angles) if truth == "reversed" else circle.angles
     real = replace(circle, angles=angles, mirrored=truth == "mirrored")

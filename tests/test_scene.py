@@ -254,7 +254,7 @@ def test_what_is_no_scene_says_what_was_looked_for(tmp_path):
         scenes.load(tmp_path / "images/a.JPG")
 
 
-def test_fingerprint_knows_names_cameras_poses_and_split_and_nothing_else(own):
+def test_the_fingerprint_depends_on_names_cameras_poses_and_split_and_nothing_else(own):
     scene = scenes.load(own)
     original = scenes.fingerprint(scene)
     assert len(original) == 64

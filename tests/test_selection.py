@@ -65,7 +65,7 @@ def reported(gain_db: float) -> float:
     return 10.0 * math.log10((1.0 + FLOOR) / (10.0 ** (-gain_db / 10.0) + FLOOR))
 
 
-def test_a_gain_is_told_as_it_is_and_kept():
+def test_a_gain_is_reported_unchanged_and_kept():
     decision = judged([trial(20.0), trial(21.0)], [trial(20.4), trial(21.6)])
     assert decision.gain_db == pytest.approx((reported(0.4) + reported(0.6)) / 2, abs=1e-9)
     # Two seeds that differ by d have a variance of d^2 / 2, their mean one of d^2 / 4; all photos gain the same.
@@ -84,7 +84,7 @@ def test_a_gain_is_told_as_it_is_and_kept():
         ([trial(20.4, seconds=2.0), trial(21.4, seconds=2.0)], "gains less than spending the same time on more steps"),
     ],
 )
-def test_what_is_not_kept_is_told_why(changed, why):
+def test_the_reason_is_given_for_what_is_not_kept(changed, why):
     decision = judged([trial(20.0), trial(21.0)], changed)
     assert (decision.kept, decision.why) == (False, why)
 
@@ -278,14 +278,14 @@ def test_points_are_taken_untried_where_there_is_no_time_for_a_start():
 
 
 @pytest.mark.parametrize("facts", [replace(POINTED, fixed=("points",)), replace(POINTED, has_alpha=True), FITTED])
-def test_points_are_left_alone_where_the_user_decides_alpha_tells_or_there_are_none(facts):
+def test_points_are_not_tried_where_the_user_decides_alpha_is_given_or_there_are_none(facts):
     scripted = Scripted(lambda c: 0.0)
     assert chosen_by(scripted, facts=facts).components.points == 0.0
     assert len(scripted.begun) == 1
 
 
 @pytest.mark.parametrize(("misses", "tells"), [(0.3, True), (0.7, False)])
-def test_points_are_asked_only_where_the_cameras_fit(misses, tells):
+def test_points_are_used_only_where_the_cameras_fit(misses, tells):
     facts = replace(FITTED, cameras=CameraCheck(0.0, 0.001, (misses, misses), 1000))
     assert may_use_points(Components(), facts) is tells
     assert may_use_points(Components(), FITTED)
@@ -368,7 +368,7 @@ def test_a_decision_says_in_words_what_was_and_what_was_not_tried():
     assert tried.in_words() == "view=3: +0.50 dB (± 0.10), 2 % less time: kept, gains"
 
 
-def test_cameras_are_tried_where_photos_do_not_agree_or_nobody_knows():
+def test_cameras_are_tried_where_photos_disagree_or_give_no_evidence():
     """Known cameras are not tried; for unknown ones, matched features may say that they fit, or that they do not."""
 
     def tried(facts: Facts) -> list[object]:

@@ -63,7 +63,7 @@ def stripes(places: Tensor, directions: Tensor) -> Tensor:
     return 0.5 + 0.4 * torch.sin(4.0 * on_wall[:, :1]).sign().expand(-1, 3)
 
 
-def test_directions_tell_the_colours_of_a_sky_and_not_those_of_surfaces():
+def test_directions_predict_the_colours_of_a_sky_but_not_of_surfaces():
     one, painted = explained_by_direction(*seen_by_photos(lambda places, directions: gradient(directions)))
     assert painted > max(25.0, one + 6.0)
     one, painted = explained_by_direction(*seen_by_photos(stripes))
@@ -71,20 +71,20 @@ def test_directions_tell_the_colours_of_a_sky_and_not_those_of_surfaces():
 
 
 @pytest.mark.parametrize("level", [0.5, 0.8, 1.0, 0.0])
-def test_a_sky_of_one_colour_is_told_by_directions_too(level):
+def test_a_sky_of_one_colour_is_recognized_by_directions_too(level):
     """Overcast, burnt out or black; noise of a small camera, 2 % of the range, is 34 dB."""
     seen = seen_by_photos(lambda places, directions: torch.full((len(places), 3), level))
     assert min(explained_by_direction(*seen)) > 30.0
 
 
-def test_directions_that_nobody_has_told_have_the_one_colour():
+def test_directions_without_evidence_have_the_single_colour():
     """Photos that look right are explained by those that look left, which saw none of their directions."""
     directions, colours, photos = seen_by_photos(lambda places, directions: torch.full((len(places), 3), 0.9))
     directions[:, 0] = directions[:, 0].abs() * (1 - 2 * (photos % 2))
     assert min(explained_by_direction(directions, colours, photos)) > 25.0
 
 
-def test_too_few_pixels_tell_nothing():
+def test_too_few_pixels_give_no_estimate():
     directions, colours, photos = seen_by_photos(stripes)
     few = torch.cat([torch.nonzero(photos % 2 == 0)[:, 0], torch.nonzero(photos % 2 == 1)[:11, 0]])
     none = torch.zeros(0, dtype=torch.long)
@@ -92,7 +92,7 @@ def test_too_few_pixels_tell_nothing():
         assert explained_by_direction(directions[chosen], colours[chosen], photos[chosen]) == (math.inf, math.inf)
 
 
-def test_it_is_told_the_same_where_no_gradients_are_kept():
+def test_the_result_is_the_same_without_gradients():
     with torch.no_grad():
         result = explained_by_direction(*seen_by_photos(stripes))
     assert result == explained_by_direction(*seen_by_photos(stripes))

@@ -102,12 +102,12 @@ NOTHING = {
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("case", NOTHING)
-def test_nothing_is_said_where_nothing_tells_the_depth(case):
+def test_no_depth_error_is_reported_without_evidence_of_depth(case):
     photos = NOTHING[case]()
     assert [len(depth.pixels) for depth in found(photos)] == [0] * len(photos)
 
 
-def test_a_camera_that_only_moved_forward_tells_nothing_and_does_no_harm():
+def test_a_camera_that_only_moved_forward_gives_no_evidence_and_does_no_harm():
     photos = [photo(0.0) for _ in range(3)]
     for index, one in enumerate(photos):
         one.frame.world_from_cam[2, 3] = 0.3 * index

@@ -561,7 +561,7 @@ def test_wrong_usage_of_export(options, message, finished):
     assert message in re.sub(r"\s+", " ", result.stderr)
 
 
-def test_what_cannot_be_exported_is_told_in_two_lines(blocked, tmp_path):
+def test_what_cannot_be_exported_is_refused_in_two_lines(blocked, tmp_path):
     away = ("--box=90,90,90,91,91,91", "--voxel-size", "0.1", "--max-size", "32")
     for to in ("mesh", "points"):
         result = nerfcli("export", blocked, "--to", to, *away, "-o", tmp_path / "a.ply")

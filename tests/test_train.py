@@ -390,7 +390,7 @@ def test_ctrl_c_waits_for_the_end_of_the_step(views, straight, tmp_path, monkeyp
     assert weights(tmp_path / "run") == weights(straight[0])
 
 
-def test_resume_without_a_checkpoint_is_told(views, tmp_path):
+def test_resume_without_a_checkpoint_is_reported(views, tmp_path):
     with pytest.raises(UserError, match=r"state\.safetensors does not exist"):
         fit(views, tmp_path / "run", FEW, resume=True)
 
@@ -409,7 +409,7 @@ def test_the_first_limit_that_is_reached_ends_the_training(views, tmp_path):
     assert [p.step for p in progress] == [1, 2]
 
 
-def test_the_log_tells_speed_memory_and_held_out_psnr(spheres, tmp_path):
+def test_the_log_records_speed_memory_and_held_out_psnr(spheres, tmp_path):
     progress = fit(spheres, tmp_path / "run", replace(FEW, steps=2))
     log = read_log(tmp_path / "run")
     assert [entry["step"] for entry in log if "heldout_psnr" in entry] == [1, 2]
@@ -421,7 +421,7 @@ def test_the_log_tells_speed_memory_and_held_out_psnr(spheres, tmp_path):
     assert 2**26 < last["peak_memory_bytes"] < 2**34
 
 
-def test_a_scene_without_training_photos_is_told(spheres, tmp_path):
+def test_a_scene_without_training_photos_is_reported(spheres, tmp_path):
     names = frozenset(frame.name for frame in spheres.frames)
     with pytest.raises(UserError, match="has no training photo"):
         fit(replace(spheres, test_names=names), tmp_path / "run", FEW)
@@ -518,7 +518,7 @@ def test_a_run_that_is_moved_alone_finds_its_photos(tmp_path, spheres):
     assert missing.is_relative_to(moved)
 
 
-def test_a_folder_that_is_no_run_is_told(tmp_path):
+def test_a_folder_that_is_no_run_is_reported(tmp_path):
     with pytest.raises(UserError, match=r"is not a run folder: it has no cameras\.json"):
         read_cameras(tmp_path)
     with pytest.raises(UserError, match=r"is not a run folder: it has no config\.json"):

@@ -212,7 +212,7 @@ def test_narrow_captures_lie_in_contracted_space_behind_a_ball_around_the_camera
         assert extent.before("black", sky_known=False).marching == marching
 
 
-def test_points_tell_a_narrow_baseline_and_rays_begin_before_them():
+def test_points_reveal_a_narrow_baseline_and_rays_begin_before_them():
     rng = np.random.default_rng(0)
     points = rng.uniform((-0.3, -0.3, 4.0), (0.3, 0.3, 9.0), (3000, 3))
     scene = scene_of(side_by_side(-0.5, 0.0, 0.5), points)
@@ -320,7 +320,7 @@ def test_masks_shrink_to_pixels_that_are_used_whole(tmp_path):
     np.testing.assert_array_equal(photo.used, expected)
 
 
-def test_photos_that_do_not_fit_their_camera_are_told(tmp_path):
+def test_photos_that_do_not_fit_their_camera_are_reported(tmp_path):
     write_png(tmp_path / "photo.png", np.zeros((30, 40, 3), dtype=np.uint8))
     write_png(tmp_path / "small.png", np.zeros((15, 20, 3), dtype=np.uint8))
     frame = ring()[0]
@@ -465,6 +465,6 @@ def test_a_limit_of_memory_is_that_of_the_gpu(monkeypatch, tmp_path):
         prepare(scene_of(ring()), settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
 
 
-def test_a_full_disk_is_told_before_anything_is_written_to_it(tmp_path):
+def test_a_full_disk_is_reported_before_anything_is_written(tmp_path):
     with pytest.raises(UserError, match="cannot write"):
         InFiles(tmp_path, 1).array((2**55,), np.uint8)

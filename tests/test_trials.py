@@ -177,7 +177,7 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
     assert found.tolist() == pytest.approx([math.exp(-sigma * (min(distance, 1.4) - 0.2))] * 50, rel=1e-5)
 
 
-def test_trials_see_through_the_lens_that_is_known_before(spheres):
+def test_trials_use_the_lens_found_before(spheres):
     """Matches give focal lengths 5 % longer: learned lenses start from these, so their rays are closer together."""
     album = load_album(spheres.train_frames, factor=4, threads=1, storage=IN_MEMORY)
     extent = choose_extent(spheres, SETTINGS, fills_frame=False)

@@ -102,7 +102,7 @@ def test_the_unit_ball_follows_what_is_found(photos):
     assert np.abs(on_wall).max() < 1
 
 
-def test_depth_bounds_tell_enough_but_where_a_box_is_asked_for(photos):
+def test_depth_bounds_are_enough_unless_a_box_is_requested(photos):
     bounded = replace(scene_of(photos), depth_bounds=np.array([[1.0, 4.0]] * len(photos)))
     assert not lacks_depth(bounded, SETTINGS, fills_frame=True)
     assert lacks_depth(bounded, replace(SETTINGS, contraction="none"), fills_frame=True)
@@ -168,7 +168,7 @@ def test_places_of_numbers_are_those_that_are_equal(numbers, count):
     ]
 
 
-def test_photos_that_do_not_agree_tell_nothing():
+def test_photos_that_disagree_give_no_evidence():
     """Rays that meet behind a camera, miss each other, meet at 0.1 degrees, or are of one photo only; and no rays."""
     centres = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     points = np.array(

@@ -237,7 +237,7 @@ def test_a_launch_gives_the_driver_what_the_kernel_expects(device, kernel_cache)
     assert fake.calls == [*once, "cuLaunchKernel", "cuLaunchKernel"]
 
 
-def test_much_shared_memory_is_asked_for(device):
+def test_large_shared_memory_is_requested(device):
     fake = FakeDriver()
     device(fake)
     built = Cubin("kernel", b"code", "", "Q", 8, 60_000)
@@ -355,7 +355,7 @@ def test_the_cache_is_bounded_and_what_was_used_least_recently_goes_first(monkey
 @pytest.mark.parametrize(
     "parameters", [".param .u64 a", ".param .u64 a, .param .u64 b, .param .u32 c", ".param .u32 a"]
 )
-def test_parameters_that_nobody_expects_are_refused(parameters):
+def test_unexpected_parameters_are_refused(parameters):
     """A later Triton might add parameters; then its own launcher is used."""
     with pytest.raises(UnexpectedCodeError, match="its parameters are"):
         cubin._formats(f".visible .entry kernel({parameters})", ("*fp32", "i64"))

@@ -293,7 +293,7 @@ class TestDoctor:
         subject = find_subject(folder)
         return examine(subject, threads=1, progress=lambda done, what: None)
 
-    def test_turntable_is_named_and_nothing_is_said_of_the_camera(self, capture: Turntable, tmp_path: Path) -> None:
+    def test_a_turntable_is_named_and_the_camera_is_not_blamed(self, capture: Turntable, tmp_path: Path) -> None:
         """The camera stood still, so "only turned, or hardly moved" would be the wrong advice."""
         write(capture, tmp_path)
         diagnosis = self.examined(tmp_path / "images")

@@ -242,7 +242,7 @@ def test_verdicts_follow_the_rules_of_the_protocol(changes, expected):
     assert statistics.verdict(statistics.Summary(**{**vars(GOOD), **changes})) == expected
 
 
-def test_uncertainty_of_another_replicate_tells_nothing():
+def test_uncertainty_of_another_replicate_predicts_nothing():
     """The negative control: AUSE of a random order."""
     rng = np.random.default_rng(0)
     errors = [rng.exponential(size=20_000), rng.exponential(size=15_000)]

@@ -109,7 +109,7 @@ def test_quality_follows_crf(tmp_path):
 
 
 @pytest.mark.parametrize(("plays", "reported"), [(0, 0), (1, None), (3, 2)])
-def test_a_gif_tells_the_player_how_often_it_plays(tmp_path, plays, reported):
+def test_a_gif_states_how_often_it_is_played(tmp_path, plays, reported):
     """Pillow reads the Netscape extension: the number of repetitions, 0 for ever, none for once."""
     write(tmp_path / "a.gif", smooth_frames(2, height=8, width=8), kind="gif", plays=plays)
     with Image.open(tmp_path / "a.gif") as image:
@@ -194,7 +194,7 @@ def test_frames_must_be_alike(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_place_that_cannot_be_written_is_told(tmp_path):
+def test_a_place_that_cannot_be_written_is_reported(tmp_path):
     (tmp_path / "a.mp4").mkdir()
     with pytest.raises(UserError, match=r"cannot write .*a\.mp4: Is a directory"):
         write(tmp_path / "a.mp4", [np.zeros((4, 6, 3), np.uint8)])
@@ -228,7 +228,7 @@ def test_all_encoders_are_in_the_ffmpeg_that_comes_along():
     check_encoders(FORMATS)
 
 
-def test_a_missing_encoder_is_told_with_what_there_is(broken_ffmpeg):
+def test_a_missing_encoder_is_reported_with_those_available(broken_ffmpeg):
     broken_ffmpeg("echo ' V....D libx264 H.264'; echo ' V....D gif GIF'")
     check_encoders(["mp4", "gif"])
     with pytest.raises(UserError, match=r"cannot write h265 videos: .*ffmpeg has no encoder libx265") as caught:
@@ -239,7 +239,7 @@ def test_a_missing_encoder_is_told_with_what_there_is(broken_ffmpeg):
         check_encoders(["mp4"])
 
 
-def test_a_missing_ffmpeg_is_told(tmp_path, monkeypatch):
+def test_a_missing_ffmpeg_is_reported(tmp_path, monkeypatch):
     def nothing():
         raise RuntimeError("No ffmpeg exe could be found.")
 

@@ -96,7 +96,7 @@ def test_a_camera_that_stands_still_gets_no_frames_for_it(tmp_path):
     assert distances.min() > 0.9 * MOVED_FRACTION
 
 
-def test_a_camera_that_never_moves_is_told(tmp_path):
+def test_a_camera_that_never_moves_is_reported(tmp_path):
     path = encode(tmp_path / "still.mp4", pan([0.0] * 30))
     with pytest.raises(UserError, match="has only 1 different frames; at least 4") as error:
         extract(path, tmp_path / "frames", count=10)
@@ -104,7 +104,7 @@ def test_a_camera_that_never_moves_is_told(tmp_path):
     assert not (tmp_path / "frames").exists()
 
 
-def test_frames_are_kept_and_not_replaced_unasked(clip, tmp_path):
+def test_frames_are_kept_and_not_replaced_without_overwrite(clip, tmp_path):
     folder = tmp_path / "frames"
     extract(clip, folder, count=8)
     before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
@@ -135,7 +135,7 @@ def test_a_folder_of_something_else_is_never_replaced(clip, tmp_path):
     assert (tmp_path / "letters.txt").read_text() == "dear"
 
 
-def test_fewer_frames_than_asked(clip, tmp_path):
+def test_fewer_frames_than_requested(clip, tmp_path):
     notes = extract(clip, tmp_path / "frames", count=41)
     assert f"{clip.name} has only 40 frames, but --frames is 41: using all of them" in notes
     extract(clip, tmp_path / "all")  # without a number: all frames that differ
@@ -143,7 +143,7 @@ def test_fewer_frames_than_asked(clip, tmp_path):
 
 
 @given(data=st.data(), total=st.integers(1, 40))
-def test_as_many_rising_numbers_as_asked_for(data, total):
+def test_chosen_frames_are_as_many_as_requested_and_in_order(data, total):
     """For any measures, including infinite motion and equal sharpness."""
     moved = data.draw(st.lists(st.sampled_from([0.0, 0.004, 0.01, 0.3, np.inf]), min_size=total, max_size=total))
     sharp = data.draw(st.lists(st.integers(0, 3), min_size=total, max_size=total))

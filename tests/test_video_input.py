@@ -144,7 +144,7 @@ def test_frames_come_one_at_a_time(clip):
 
 
 @pytest.mark.parametrize("name", ["front.mp4", "front.mkv"])
-def test_a_video_that_is_cut_short_is_told(clip, tmp_path, name):
+def test_a_truncated_video_is_reported(clip, tmp_path, name):
     whole = tmp_path / f"whole-{name}"
     ffmpeg("-i", str(clip), "-c", "copy", "-movflags", "+faststart", str(whole))
     content = whole.read_bytes()
@@ -170,7 +170,7 @@ def test_a_video_without_its_index_is_cut_short(clip, tmp_path):
         open_video(tmp_path / "cut.mp4")
 
 
-def test_what_is_no_video_is_told(tmp_path):
+def test_what_is_no_video_is_reported(tmp_path):
     ffmpeg("-f", "lavfi", "-i", "sine=duration=0.2", str(tmp_path / "sound.m4a"))
     Image.new("RGB", (32, 32)).save(tmp_path / "photo.jpg")
     (tmp_path / "notes.txt").write_text("no video\n" * 100)

@@ -287,7 +287,7 @@ def test_only_this_machine_can_reach_the_server_by_default(served):
     assert len(served.server.token) >= 20
 
 
-def test_what_is_not_there_and_what_makes_no_sense_is_told(served):
+def test_missing_and_meaningless_inputs_are_reported(served):
     assert served.refusal("nothing")[0] == 404
     assert served.refusal("photo?n=1000&px=100")[0] == 404
     assert served.refusal("photo?n=x")[0] == 400
@@ -365,7 +365,7 @@ def test_a_second_client_is_counted_and_goes(served):
 # Addresses
 
 
-def test_a_port_that_is_taken_is_told_or_passed_over(finished):
+def test_a_port_in_use_is_reported_or_skipped(finished):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -378,7 +378,7 @@ def test_a_port_that_is_taken_is_told_or_passed_over(finished):
         assert one.port < two.port
 
 
-def test_an_address_that_is_not_ours_is_told(finished):
+def test_an_address_of_another_machine_is_refused(finished):
     error, _ = error_of(nerfcli("view", finished, "--host", "192.0.2.1", "--no-browser"))
     assert error.startswith("Error: cannot listen on 192.0.2.1")
 
@@ -400,7 +400,7 @@ def test_ctrl_c_ends_the_server(finished):
 # During a training
 
 
-def test_a_server_that_nobody_looks_at_has_not_imported_what_renders(finished):
+def test_a_server_without_viewers_has_not_imported_the_renderer(finished):
     program = (
         "import sys; from pathlib import Path; from types import SimpleNamespace\n"
         "from nerfcli.workflows import view_worker\nfrom nerfcli.workflows.view import RunData\n"
@@ -512,7 +512,7 @@ def test_pause_and_stop_reach_the_training(capture, at_once):
     assert read_status(run) is None
 
 
-def test_a_viewer_that_died_during_a_pause_holds_nobody_up(capture, at_once, monkeypatch):
+def test_a_viewer_that_died_during_a_pause_delays_nothing(capture, at_once, monkeypatch):
     monkeypatch.setattr(training_side, "VIEWER_SECONDS", 0.3)
     run = capture.with_name("watched")
 

@@ -261,7 +261,7 @@ def render(
     if is_of_scan(run, outputs=outputs, slices=slices):
         for_each_input(run, render_one_scan, command="render")
         return
-    chosen = some_of(outputs or "rgb,depth,opacity", OUTPUTS, "--outputs")
+    chosen = some_of("rgb,depth,opacity" if outputs is None else outputs, OUTPUTS, "--outputs")
     if not is_convention(depth):
         choices = f"{', '.join(CONVENTIONS)} or quantile:Q with 0 < Q < 1"
         raise typer.BadParameter(f"{depth!r}; choose {choices}", param_hint="--depth")

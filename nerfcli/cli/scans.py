@@ -137,7 +137,7 @@ def scan_pictures(outputs: str | None, slices: list[str] | None, *, views: str) 
     from nerfcli.tomography.result import OUTPUTS
     from nerfcli.workflows.tomography_files import render_scan
 
-    chosen = some_of(outputs or "projection", OUTPUTS, "--outputs")
+    chosen = some_of("projection" if outputs is None else outputs, OUTPUTS, "--outputs")
     one_of(views, ("test", "train"), "--cameras")
     return functools.partial(render_scan, outputs=chosen, views=views, slices=slices_of(slices or []))
 
