@@ -65,6 +65,7 @@ class _Encoded:
     gradient_size: list[list[list[float]]]
 
 
+@functools.cache
 def _exact(points: tuple[Point, ...], grids: _Grids, *, times: int) -> _Encoded:
     """Interpolate trilinearly in exact fractions; the gradient counts every point `times` times."""
     table = hash_table(len(grids.resolutions))
