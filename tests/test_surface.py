@@ -395,6 +395,20 @@ def test_damaged_las_files_are_refused(suffix, tmp_path):
             describe(path)
 
 
+def test_las_files_with_impossible_counts_are_refused(tmp_path):
+    """Of records in the header, and of chunks in the table at the end: laspy would not end, lazrs would abort."""
+    pytest.importorskip("laspy", reason="an extra")
+    columns: dict[str, np.ndarray] = dict(zip("xyz", np.random.default_rng(0).random((3, 500)), strict=True))
+    path = tmp_path / "a.laz"
+    write_las(path, columns | dict.fromkeys(("red", "green", "blue"), np.zeros(500, np.uint8)), description={})
+    whole = path.read_bytes()
+    table = int.from_bytes(whole[(start := int.from_bytes(whole[96:100], "little")) : start + 8], "little")
+    for place, what in ((100, "variable-length records"), (table + 4, "chunks")):
+        path.write_bytes(whole[:place] + b"\xff\xff\xff\x7f" + whole[place + 4 :])
+        with pytest.raises(UserError, match=f"2147483647 {what}"):
+            describe(path)
+
+
 def test_a_mesh_without_vertices_is_refused(tmp_path):
     (tmp_path / "a.obj").write_text("# nothing\n")
     with pytest.raises(UserError, match="has no vertices"):

@@ -5,6 +5,7 @@ laspy writes and reads them, lazrs compresses .laz: `pip install 'nerfcli[las]'`
 
 import importlib
 import json
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -91,13 +92,14 @@ def las_facts(path: Path) -> dict[str, Any]:
     """
     laspy = las_module()
     try:
+        _check_records(path)
         with laspy.open(path) as file:
             header = file.header
             if header.point_count:  # the last point is there only if the file is whole
                 file.seek(header.point_count - 1)
                 if len(file.read_points(1)) != 1:
                     raise ValueError(f"its header says {header.point_count} points")
-    except (laspy.LaspyException, OSError, ValueError, RuntimeError) as error:
+    except (laspy.LaspyException, OSError, ValueError, RuntimeError, ArithmeticError, struct.error) as error:
         raise UserError(f"{path} is damaged or not a LAS file: {error}", "copy or export it once more") from error
     described = next((vlr.record_data for vlr in header.vlrs if vlr.user_id == KEY), b"{}")
     return json.loads(described) | {
@@ -108,3 +110,20 @@ def las_facts(path: Path) -> dict[str, Any]:
         "low": header.mins.tolist(),
         "high": header.maxs.tolist(),
     }
+
+
+def _check_records(path: Path) -> None:
+    """Refuse counts that the file cannot hold: of records, laspy reads for hours; of chunks, lazrs ends the process."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        start, records = struct.unpack("<II", file.read(104)[96:])
+        if records * 54 > size:  # the size of a record without content
+            raise ValueError(f"its header says {records} variable-length records")
+        if path.suffix.lower() == ".laz":
+            file.seek(start)
+            (table,) = struct.unpack("<q", file.read(8))
+            if table > 0:
+                file.seek(table)
+                _, chunks = struct.unpack("<II", file.read(8))
+                if chunks > size:
+                    raise ValueError(f"its table says {chunks} chunks")

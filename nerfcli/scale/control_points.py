@@ -133,15 +133,15 @@ def _in_degrees(system: str, path: Path) -> bool:
 
 def _sighting(line: str, where: str) -> tuple[str, tuple[float, float, float], np.ndarray, str]:
     """Parse a line into the name and the coordinates of the point, the pixel and the photo."""
-    words = line.split()
+    fields = line.split()
     try:
-        x, y, height, pixel_x, pixel_y = (float(word) for word in words[:5])
-        photo = words[5]
+        x, y, height, pixel_x, pixel_y = map(float, fields[:5])
+        photo = fields[5]
     except (ValueError, IndexError) as error:
         raise UserError(f"{where} is not a control point: {line[:60]!r}", f"expected {HEADER}") from error
     if not np.isfinite([x, y, height, pixel_x, pixel_y]).all():
         raise UserError(
             f"{where}: not all numbers are finite", "control points need a height; remove those whose height is unknown"
         )
-    name = words[6] if len(words) > 6 else f"{words[0]},{words[1]}"
+    name = fields[6] if len(fields) > 6 else f"{fields[0]},{fields[1]}"
     return name, (x, y, height), np.array([pixel_x, pixel_y]), photo
