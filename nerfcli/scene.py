@@ -224,7 +224,8 @@ def _load(path: Path) -> Scene:
         raise UserError(f"{path} does not exist", "give a scene folder, such as one written by nerfcli poses")
     if path.is_file():
         if path.suffix.lower() != ".json":
-            raise UserError(f"{path} is a file, not a scene", "give a scene folder, or its transforms.json")
+            advice = "give a scene folder, or its transforms.json; nerfcli poses makes a scene from photos or a video"
+            raise UserError(f"{path} is a file, not a scene", advice)
         if path.name != SCENE_FILE:
             return _scene(path.parent, read_transforms(path, _measure))
         path = path.parent
@@ -361,7 +362,8 @@ def _no_scene(path: Path) -> UserError:
     if folder := photo_folder(path):
         return UserError(
             f"{folder} has {len(list_images(folder))} photos but no poses; looked for {looked_for}",
-            f"estimate them with: nerfcli poses {in_shell(folder)}",
+            f"estimate them with: nerfcli poses {in_shell(folder)}; or convert poses in another format with: nerfcli "
+            f"convert {in_shell(path)} SCENE --to nerfcli",
         )
     return UserError(
         f"{path} is not a scene; looked for {looked_for}",

@@ -229,8 +229,13 @@ def test_intrinsics_for_another_size(tmp_path):
     """Intrinsics for twice the resolution, principal point off the middle, in a file with the size of the photos."""
     double = Camera("PINHOLE", 640, 480, (1000.0, 1010.0, 642.5, 477.0))
     source = npz_of(tmp_path, capture_of([double]))
-    assert nerfcli("convert", source, tmp_path / "out", "--to", "colmap", "--from-size", "2").exit_code == 0
+    result = nerfcli("convert", source, tmp_path / "out", "--to", "colmap", "--from-size", "2")
+    assert result.exit_code == 0
+    assert "principal point" not in result.stderr
     assert load(tmp_path / "out", UserInputs(), ConventionOverrides())[2].frames[0].camera == PINHOLE
+    warned = nerfcli("convert", source, tmp_path / "as-it-is", "--to", "colmap").stderr
+    assert "principal point of" in " ".join(warned.split())
+    assert "--from-size" in warned
 
 
 def test_the_world_frame_and_its_scale(tmp_path):
@@ -571,7 +576,7 @@ def test_the_message_lists_what_was_looked_for(tmp_path):
         recognise(tmp_path)
     for form in FORMATS:
         assert form.parse is None or form.looked_for in caught.value.hint
-    assert len(caught.value.hint) < 250
+    assert len(caught.value.hint) < 300
 
 
 def test_trajectories_need_a_camera(tmp_path):

@@ -249,7 +249,8 @@ def test_what_is_no_scene_says_what_was_looked_for(tmp_path):
     write_image(tmp_path / "images/a.JPG")
     with pytest.raises(UserError, match=r"images has 1 photos but no poses") as caught:
         scenes.load(tmp_path)
-    assert caught.value.hint == f"estimate them with: nerfcli poses {tmp_path / 'images'}"
+    other = f"or convert poses in another format with: nerfcli convert {tmp_path} SCENE --to nerfcli"
+    assert caught.value.hint == f"estimate them with: nerfcli poses {tmp_path / 'images'}; {other}"
     with pytest.raises(UserError, match="is a file, not a scene"):
         scenes.load(tmp_path / "images/a.JPG")
 

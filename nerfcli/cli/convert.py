@@ -80,7 +80,9 @@ def convert(
     images: Annotated[Path | None, typer.Option(help="Folder of the photos, if IN does not point to them.")] = None,
     intrinsics: Annotated[
         Path | None,
-        typer.Option(help="File with the camera for tum and kitti: cameras.txt, a JSON camera, or a capture."),
+        typer.Option(
+            help="File with the camera for tum, kitti and pose-files: cameras.txt, a JSON camera, or a capture."
+        ),
     ] = None,
     world_up: Annotated[
         str | None, typer.Option(help="Rotate the world so that this axis points up: x, y, z, -x, -y or -z.")
@@ -143,8 +145,10 @@ def convert(
 
     \b
     Formats read:     nerfcli, colmap, transforms (nerfstudio, instant-ngp), blender, llff, opensfm, metashape,
-                      reality-capture, bundler, tum, kitti, npz, camera-path (nerfstudio's viewer), run (a folder
-                      written by nerfcli train, with its refined cameras); detected from the files
+                      reality-capture, alicevision (Meshroom), bundler, polycam, record3d, mvsnet (also BlendedMVS),
+                      neus (also IDR), pose-files (a matrix per photo, as in ScanNet, 7-Scenes, NSVF), tum, kitti, npz,
+                      camera-path (nerfstudio's viewer), run (a folder written by nerfcli train, with its refined
+                      cameras); detected from the files
     Formats written:  nerfcli (a scene folder), colmap, colmap-text, transforms (nerfstudio, instant-ngp), blender,
                       llff, opensfm, tum, kitti, npz (everything), ply (points only)
 

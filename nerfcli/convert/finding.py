@@ -3,13 +3,25 @@
 A folder is recognised by the names of files in it, a file by its suffix and its beginning.
 """
 
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+from nerfcli.cameras.formats.alicevision import FILES as ALICEVISION_FILES
+from nerfcli.cameras.formats.alicevision import is_alicevision
 from nerfcli.cameras.formats.bundler import BEGINS as BUNDLER_BEGINS
 from nerfcli.cameras.formats.camera_path import is_camera_path
 from nerfcli.cameras.formats.colmap import is_model
 from nerfcli.cameras.formats.fields import read_json_object
+from nerfcli.cameras.formats.mvsnet import CAMERA_FILES, CAMERA_FOLDER
+from nerfcli.cameras.formats.neus import FILES as NEUS_FILES
+from nerfcli.cameras.formats.neus import FIRST as NEUS_FIRST
+from nerfcli.cameras.formats.polycam import KEYFRAMES, polycam_folders
+from nerfcli.cameras.formats.pose_files import POSE_FOLDERS, is_pose, pose_files
+from nerfcli.cameras.formats.record3d import FILES as RECORD3D_FILES
+from nerfcli.cameras.formats.record3d import is_record3d
+from nerfcli.errors import UserError
 from nerfcli.scene import SCENE_FILE
 
 MODEL_FILES = tuple(
@@ -83,15 +95,61 @@ def find_json(path: Path, *, opening: str, name: str) -> Path | None:
         return path if stream.read(1000).lstrip().startswith(opening) else None
 
 
+def find_alicevision(path: Path) -> Path | None:
+    """Find a file .sfm, or a .json that is a reconstruction of AliceVision."""
+    found = by_suffix(".sfm", *ALICEVISION_FILES)(path)
+    if found is None and path.is_file() and path.suffix.lower() == ".json":
+        return path if _has_keys(path, b'"featuresFolders"', is_alicevision) else None
+    return found
+
+
+def find_record3d(path: Path) -> Path | None:
+    """Find the file metadata.json, or metadata, of a capture by Record3D."""
+    found = path if path.is_file() and path.name in RECORD3D_FILES else named(*RECORD3D_FILES)(path)
+    return found if found is not None and _has_keys(found, b'"poses"', is_record3d) else None
+
+
+def _has_keys(path: Path, text: bytes, test: Callable[[dict[str, Any]], bool]) -> bool:
+    """Return whether a JSON object passes a test; it is parsed only if it contains a text."""
+    try:
+        return text in path.read_bytes() and test(read_json_object(path))
+    except UserError:  # damaged, or another program's file of this name
+        return False
+
+
+def find_polycam(path: Path) -> Path | None:
+    """Find the folder that holds the keyframes of Polycam, or the one that they are in."""
+    folder = path.parent if path.name == KEYFRAMES else path
+    return folder if polycam_folders(folder) is not None else None
+
+
+def find_neus(path: Path) -> Path | None:
+    """Find a file .npz with the projections of IDR and NeuS, or a folder's file with one of their names."""
+    found = named(*NEUS_FILES)(path) if path.is_dir() else path
+    if found is None or found.suffix.lower() != ".npz" or not zipfile.is_zipfile(found):
+        return None
+    with zipfile.ZipFile(found) as archive:
+        return found if f"{NEUS_FIRST}.npy" in archive.namelist() else None
+
+
+def find_mvsnet(path: Path) -> Path | None:
+    """Find the folder that holds cams/ of MVSNet."""
+    return path if any((path / CAMERA_FOLDER).glob(CAMERA_FILES)) else None
+
+
+def find_pose_files(path: Path) -> Path | None:
+    """Find a folder with a text file for each pose, or the one that the folder of these files is in."""
+    folder = path.parent if path.name in POSE_FOLDERS else path
+    files = pose_files(folder) if folder.is_dir() else []
+    return folder if files and is_pose(files[0]) else None
+
+
 def find_camera_path(path: Path) -> Path | None:
     """Find a JSON file that has the key camera_path and no frames, or the file camera_path.json of a folder."""
     found = find_json(path, opening="{", name="camera_path.json")
     if found is None or path.is_dir():
         return found
-    # First searched as text, so that a large transforms.json is not parsed twice.
-    if b'"camera_path"' not in found.read_bytes():
-        return None
-    return found if is_camera_path(read_json_object(found)) else None
+    return found if _has_keys(found, b'"camera_path"', is_camera_path) else None
 
 
 def find_lines(path: Path, *, columns: int) -> Path | None:

@@ -6,24 +6,29 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.alicevision import parse_alicevision
 from nerfcli.cameras.formats.archive import losses_npz, parse_npz, write_npz
 from nerfcli.cameras.formats.blender import losses_blender, parse_blender, write_blender
 from nerfcli.cameras.formats.bundler import parse_bundler
 from nerfcli.cameras.formats.camera_path import parse_camera_path
-from nerfcli.cameras.formats.colmap import parse_colmap
 from nerfcli.cameras.formats.colmap_write import (
     losses_colmap,
     losses_colmap_text,
     write_colmap_binary,
     write_colmap_text,
 )
-from nerfcli.cameras.formats.llff import IMAGE_FOLDERS, losses_llff, parse_llff, write_llff
+from nerfcli.cameras.formats.llff import losses_llff, parse_llff, write_llff
 from nerfcli.cameras.formats.metashape import parse_metashape
+from nerfcli.cameras.formats.mvsnet import parse_mvsnet
+from nerfcli.cameras.formats.neus import parse_neus
 from nerfcli.cameras.formats.opensfm import losses_opensfm, parse_opensfm, write_opensfm
 from nerfcli.cameras.formats.ply import losses_ply, write_ply
+from nerfcli.cameras.formats.polycam import parse_polycam
+from nerfcli.cameras.formats.pose_files import parse_pose_files
 from nerfcli.cameras.formats.reality_capture import parse_reality_capture
+from nerfcli.cameras.formats.record3d import parse_record3d
 from nerfcli.cameras.formats.run_cameras import find_run, parse_run
-from nerfcli.cameras.formats.scene_json import SCENE_FILE, read_description
+from nerfcli.cameras.formats.scene_json import SCENE_FILE
 from nerfcli.cameras.formats.trajectories import (
     losses_kitti,
     losses_tum,
@@ -41,6 +46,7 @@ from nerfcli.cameras.frame import Capture
 from nerfcli.convert.finding import (
     MODEL_FILES,
     by_suffix,
+    find_alicevision,
     find_blender,
     find_bundler,
     find_camera_path,
@@ -48,13 +54,18 @@ from nerfcli.convert.finding import (
     find_lines,
     find_llff,
     find_model,
+    find_mvsnet,
+    find_neus,
+    find_polycam,
+    find_pose_files,
+    find_record3d,
     find_scene,
 )
-from nerfcli.convert.scene_folder import SCENE_FILES, losses_scene, write_scene
+from nerfcli.convert.model_photos import parse_model
+from nerfcli.convert.scene_folder import SCENE_FILES, losses_scene, parse_scene, write_scene
 from nerfcli.convert.stored_pixels import STORED, UPRIGHT, measure
 from nerfcli.errors import UserError, in_shell
 from nerfcli.media.images import list_images
-from nerfcli.media.masks import find_mask
 
 
 @dataclass(frozen=True)
@@ -152,44 +163,13 @@ def with_photos(capture: Capture, folder: Path) -> Capture:
     return replace(capture, frames=tuple(frames))
 
 
-def _parse_scene(path: Path, given: UserInputs) -> Capture:
-    described = read_description(path)
-    capture = parse_colmap(described.model_dir, given.images or described.image_folder)
-    frames = described.described(capture.frames, find_mask)
-    return replace(
-        capture,
-        frames=frames,
-        unit=described.unit,
-        unit_source=described.unit_source,
-        depth_bounds=described.bounds_of(frames),
-        pixels=UPRIGHT,
-    )
-
-
-def _parse_model(path: Path, given: UserInputs) -> Capture:
-    """Read a COLMAP model, with its photos in the first folder in which its names lead to one.
-
-    The folders tried are the given one; or images/ and the like in the model's folder or up to three folders above it,
-    then these folders themselves.
-    """
-    capture = parse_colmap(path)
-    homes = (path, *path.resolve().parents[:3])
-    folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
-    places = [given.images] if given.images is not None else [*folders, *homes]
-    leading = [place for place in places if any((place / frame.name).is_file() for frame in capture.frames[:100])]
-    place = next(iter([*leading, *folders]), None)
-    if place is None:
-        return capture
-    return replace(capture, frames=tuple(replace(frame, image=place / frame.name) for frame in capture.frames))
-
-
 FORMATS = (
     Format(
         "nerfcli",
         "a scene folder of nerfcli: a COLMAP model in sparse/0, and scene.json",
         SCENE_FILE,
         find_scene,
-        _parse_scene,
+        lambda path, given: parse_scene(path, images=given.images),
         pixels=UPRIGHT,
         files=SCENE_FILES,
         write=write_scene,
@@ -200,7 +180,7 @@ FORMATS = (
         "a COLMAP model, binary; read also as text",
         "sparse/0/cameras.bin or .txt",
         find_model,
-        _parse_model,
+        lambda path, given: parse_model(path, images=given.images),
         files=MODEL_FILES,
         write=write_colmap_binary,
         losses=losses_colmap,
@@ -210,7 +190,7 @@ FORMATS = (
         "a COLMAP model as text",
         "sparse/0/cameras.bin or .txt",
         find_model,
-        _parse_model,
+        lambda path, given: parse_model(path, images=given.images),
         files=MODEL_FILES,
         write=write_colmap_text,
         losses=losses_colmap_text,
@@ -231,6 +211,13 @@ FORMATS = (
         lambda path, given: parse_camera_path(path),
         axes="opengl",
         open_axes=True,
+    ),
+    Format(
+        "alicevision",
+        "cameras.sfm or sfm.json of AliceVision and Meshroom (read)",
+        ".sfm",
+        find_alicevision,
+        lambda path, given: parse_alicevision(path, images=given.images),
     ),
     Format(
         "transforms",
@@ -302,6 +289,43 @@ FORMATS = (
         find_bundler,
         lambda path, given: parse_bundler(path, measure, images=given.images),
         axes="opengl",
+    ),
+    Format(
+        "polycam",
+        "raw data of Polycam (read)",
+        "keyframes/",
+        find_polycam,
+        lambda path, given: parse_polycam(path, list_images, images=given.images),
+        axes="opengl",
+    ),
+    Format(
+        "record3d",
+        "an unpacked capture of Record3D (read)",
+        "metadata.json",
+        find_record3d,
+        lambda path, given: parse_record3d(path, list_images, images=given.images),
+        axes="opengl",
+    ),
+    Format(
+        "mvsnet",
+        "cams/ of MVSNet and BlendedMVS (read)",
+        "cams/",
+        find_mvsnet,
+        lambda path, given: parse_mvsnet(path, measure, list_images, images=given.images),
+    ),
+    Format(
+        "neus",
+        "cameras_sphere.npz of IDR and NeuS (read)",
+        ".npz",
+        find_neus,
+        lambda path, given: parse_neus(path, measure, list_images, images=given.images),
+    ),
+    Format(
+        "pose-files",
+        "a matrix per photo in text files, as in ScanNet, 7-Scenes and NSVF (read)",
+        "pose/*.txt",
+        find_pose_files,
+        lambda path, given: parse_pose_files(path, measure, list_images, camera=given.camera, images=given.images),
     ),
     Format(
         "tum",

@@ -1,4 +1,4 @@
-"""Writing a capture as a nerfcli scene: sparse/0 and scene.json, as `nerfcli poses` writes them."""
+"""Read and write a nerfcli scene as a capture: sparse/0 and scene.json, as `nerfcli poses` writes them."""
 
 import os
 from collections.abc import Mapping
@@ -7,11 +7,34 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli import __version__, scene
+from nerfcli.cameras.formats.colmap import parse_colmap
 from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.formats.scene_json import read_description
 from nerfcli.cameras.frame import Capture
+from nerfcli.convert.stored_pixels import UPRIGHT
 from nerfcli.errors import UserError
+from nerfcli.media.masks import find_mask
 
 SCENE_FILES = (scene.SCENE_FILE, *(f"{scene.MODEL_FOLDER}/{name}.bin" for name in ("cameras", "images", "points3D")))
+
+
+def parse_scene(path: Path, *, images: Path | None = None) -> Capture:
+    """Read the scene in a folder, with the photos of another folder if one is given.
+
+    Raises:
+        UserError: scene.json or the model is damaged.
+    """
+    described = read_description(path)
+    capture = parse_colmap(described.model_dir, images or described.image_folder)
+    frames = described.described(capture.frames, find_mask)
+    return replace(
+        capture,
+        frames=frames,
+        unit=described.unit,
+        unit_source=described.unit_source,
+        depth_bounds=described.bounds_of(frames),
+        pixels=UPRIGHT,
+    )
 
 
 def losses_scene(capture: Capture) -> tuple[str, ...]:

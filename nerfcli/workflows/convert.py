@@ -56,6 +56,8 @@ def convert_capture(
     notify(f"{found}: {form.name}, {contents(capture)}")
     for text in describe_rescaling(other_sizes(capture)):
         notify(f"{text.removesuffix(': rescaled')}; written to {to} unchanged")
+    if text := _describe_outside(capture):
+        warn(text)
     moved = in_world_frame(capture, world)
     scale = moved.scale
     if scale is not None:
@@ -83,6 +85,21 @@ def convert_capture(
     if done.loss_px > wanted.tolerance_px:
         warn(f"dropping lens parameters shifts pixels by up to {done.loss_px:.3g} px")
     return Converted(done, _record(done, to) | frame)
+
+
+def _describe_outside(capture: Capture) -> str | None:
+    """Say which photos have their principal point outside; None if there are none."""
+    outside = []
+    for frame in capture.frames:
+        x, y = frame.camera.principal_point
+        if not (0 <= x <= frame.camera.width and 0 <= y <= frame.camera.height):
+            outside.append(frame.name)
+    if not outside:
+        return None
+    return (
+        f"the principal point of {len(outside)} photos, such as {outside[0]}, is outside the picture; if the "
+        "intrinsics are for larger pictures, say so with --from-size (--detect finds the factor)"
+    )
 
 
 def _origin_of(path: Path, form: str) -> Origin | None:

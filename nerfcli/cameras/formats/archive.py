@@ -98,7 +98,7 @@ def parse_npz(path: Path) -> Capture:
     Raises:
         UserError: the file is missing, damaged or of another kind; the file and the array are named.
     """
-    arrays = _Arrays(path)
+    arrays = Arrays(path)
     version = arrays.numbers("version", (), integer=True)
     if int(version) != ARCHIVE_VERSION:
         raise UserError(f"{path}: unknown version {int(version)}, expected {ARCHIVE_VERSION}", "update nerfcli")
@@ -148,8 +148,12 @@ def parse_npz(path: Path) -> Capture:
     )
 
 
-class _Arrays:
-    """The arrays of an .npz file, checked for type and shape as they are taken out."""
+class Arrays:
+    """The arrays of an .npz file, checked for type and shape as they are taken out.
+
+    Raises:
+        UserError: the file, or an array that is taken out, is missing or damaged; it is named.
+    """
 
     def __init__(self, path: Path):
         self.path = path
@@ -217,7 +221,7 @@ class _Arrays:
             raise self.damaged(name, str(error)) from error
 
 
-def _cameras(arrays: _Arrays) -> list[Camera]:
+def _cameras(arrays: Arrays) -> list[Camera]:
     models = arrays.texts("camera_models")
     sizes = arrays.numbers("camera_sizes", (len(models), 2), integer=True).tolist()
     params = arrays.numbers("camera_params", (len(models), None))
@@ -231,14 +235,14 @@ def _cameras(arrays: _Arrays) -> list[Camera]:
     return cameras
 
 
-def _pixels(arrays: _Arrays) -> str:
+def _pixels(arrays: Arrays) -> str:
     pixels = arrays.text("pixels") if "pixels" in arrays else "stored"
     if pixels not in ("stored", "upright"):
         raise arrays.damaged("pixels", f"{pixels!r}, expected stored or upright")
     return pixels
 
 
-def _colours(arrays: _Arrays, num_points: int) -> np.ndarray | None:
+def _colours(arrays: Arrays, num_points: int) -> np.ndarray | None:
     if "colours" not in arrays:
         return None
     colours = arrays.numbers("colours", (num_points, 3), integer=True)
@@ -247,7 +251,7 @@ def _colours(arrays: _Arrays, num_points: int) -> np.ndarray | None:
     return colours.astype(np.uint8)
 
 
-def _depth_bounds(arrays: _Arrays, num_frames: int) -> np.ndarray | None:
+def _depth_bounds(arrays: Arrays, num_frames: int) -> np.ndarray | None:
     if "depth_bounds" not in arrays:
         return None
     bounds = arrays.numbers("depth_bounds", (num_frames, 2))
@@ -256,7 +260,7 @@ def _depth_bounds(arrays: _Arrays, num_frames: int) -> np.ndarray | None:
     return bounds
 
 
-def _observations(arrays: _Arrays, num_frames: int, *, num_points: int) -> Observations | None:
+def _observations(arrays: Arrays, num_frames: int, *, num_points: int) -> Observations | None:
     if "observation_pixels" not in arrays:
         return None
     pixels = arrays.numbers("observation_pixels", (None, 2))

@@ -3,11 +3,30 @@
 Notation: focal lengths fx, fy and principal point cx, cy in pixels; k radial, p tangential, in OpenCV's order.
 """
 
+import numpy as np
+
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import malformed
 from nerfcli.cameras.formats.limits import checked_camera
 
 Pair = tuple[float, float]
+
+# Skew counts as rounding if it shifts the bottom of the picture by at most this much against its top.
+_NEGLIGIBLE_SKEW_PX = 0.02
+
+
+def camera_of_matrix(matrix: np.ndarray, size: tuple[int, int], where: str) -> Camera:
+    """Return the perspective camera without distortion of a matrix (3, 3) of intrinsics: fx, s, cx; 0, fy, cy; 0, 0, 1.
+
+    Raises:
+        UserError: the matrix is not of this form, its skew s is not 0, or a number is invalid; `where` is named.
+    """
+    (fx, skew, cx), (lower, fy, cy), last = matrix.tolist()
+    if lower != 0 or last != [0, 0, 1]:
+        raise malformed(where, "is not a matrix of intrinsics", "expected the rows fx 0 cx, 0 fy cy, 0 0 1")
+    if not abs(skew) * size[1] <= _NEGLIGIBLE_SKEW_PX * abs(fy):
+        raise malformed(where, f"its skew is {skew:g} px", "skew is not supported: no camera model here has it")
+    return checked_camera("PINHOLE", *size, (fx, fy, cx, cy), where=where)
 
 
 def brown_camera(

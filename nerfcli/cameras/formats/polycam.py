@@ -1,0 +1,66 @@
+"""Raw data of Polycam's LiDAR captures (export "Raw data" in developer mode), read only.
+
+keyframes/corrected_cameras/ID.json belongs to keyframes/corrected_images/ID.jpg: t_00 to t_23 are the first three rows
+of world_from_cam with OpenGL axes, in metres, the world's y axis up; fx, fy, cx, cy are in pixels of a picture of width
+and height. Corrected photos are undistorted, and their poses are those after loop closure; captures too large for that
+have cameras/ and images/ only.
+Source: PolyCam/polyform README.md, "Polycam's data format", and polyform/convertors/instant_ngp.py.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.conventions import opencv_from_opengl_pose
+from nerfcli.cameras.formats.fields import check_unique_names, number, read_json_object, size_of
+from nerfcli.cameras.formats.lenses import camera_of_matrix
+from nerfcli.cameras.formats.photo_names import PhotoOfStem, photos_missing
+from nerfcli.cameras.formats.rigid_poses import rigid_pose
+from nerfcli.cameras.frame import Capture, Frame
+
+FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
+KEYFRAMES = "keyframes"
+
+_POSE = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
+
+
+def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
+    """Return the folders of cameras and photos of a capture's folder; None if it is not one of Polycam's."""
+    home = folder / KEYFRAMES
+    pairs = [(home / cameras, home / images) for cameras, images in FOLDERS if any((home / cameras).glob("*.json"))]
+    return next((pair for pair in pairs if pair[1].is_dir()), pairs[0] if pairs else None)
+
+
+def parse_polycam(folder: Path, list_images: Callable[[Path], list[Path]], *, images: Path | None = None) -> Capture:
+    """Read the keyframes of a capture; the unit is the metre, by LiDAR.
+
+    Args:
+        folder: holds keyframes/.
+        list_images: returns the image files of a folder, sorted by name.
+        images: the folder of the photos, if it is another one.
+
+    Raises:
+        UserError: a file is damaged (file and field are named), or no photo is on disk.
+    """
+    found = polycam_folders(folder)
+    assert found is not None
+    photos = PhotoOfStem(images or found[1], list_images)
+    frames, missing = [], []
+    for file in sorted(found[0].glob("*.json"), key=lambda file: (len(file.stem), file.stem)):
+        where, record = str(file), read_json_object(file)
+        fx, fy, cx, cy, *pose = (number(record, key, where) for key in ("fx", "fy", "cx", "cy", *_POSE))
+        size = size_of(number(record, "width", where), number(record, "height", where), where)
+        camera = camera_of_matrix(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), size, where)
+        image = photos.find(file.stem)
+        if image is None:
+            missing.append(file.stem)
+            continue
+        world_from_cam = opencv_from_opengl_pose(rigid_pose(np.array(pose).reshape(3, 4), where))
+        frames.append(Frame(image.name, camera, world_from_cam, image=image))
+    if not frames:
+        raise photos_missing(missing, photos.folder, str(folder))
+    check_unique_names((frame.name for frame in frames), folder)
+    return Capture(
+        tuple(frames), np.zeros((0, 3)), tuple(missing), None, "polycam", unit="metre", unit_source="LiDAR (Polycam)"
+    )

@@ -1,0 +1,91 @@
+"""Captures of the app Record3D, unpacked or exported as "EXR + RGB": metadata.json beside rgb/0.jpg, rgb/1.jpg, ...
+
+poses: a list of qx, qy, qz, qw, x, y, z for each frame: world_from_cam with OpenGL axes, in metres, the world's y axis
+up. perFrameIntrinsicCoeffs: fx, fy, cx, cy of each frame; K, column by column, is that of all frames where they are
+absent. w and h: the size of the pictures that these numbers are for. Read only.
+Source: nerfstudio process_data/record3d_utils.py; record3d.app, "Format of .r3d files".
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.conventions import opencv_from_opengl_pose
+from nerfcli.cameras.formats.fields import malformed, number, read_json_object, shown, size_of, vector
+from nerfcli.cameras.formats.lenses import camera_of_matrix
+from nerfcli.cameras.formats.photo_names import PhotoOfStem, photos_missing
+from nerfcli.cameras.frame import Capture, Frame
+
+FILES = ("metadata.json", "metadata")
+IMAGE_FOLDERS = ("rgb", "rgbd", "images")
+
+_POSES, _INTRINSICS = "poses", "perFrameIntrinsicCoeffs"
+# Largest deviation of a quaternion's length from 1: files print 7 digits, so more is a mistake, not rounding.
+_MAX_DEVIATION = 1e-2
+
+
+def is_record3d(content: dict[str, Any]) -> bool:
+    """Return whether a JSON object has the keys of a capture by Record3D."""
+    return all(key in content for key in (_POSES, "K", "w", "h"))
+
+
+def parse_record3d(path: Path, list_images: Callable[[Path], list[Path]], *, images: Path | None = None) -> Capture:
+    """Read the frames of a capture; the unit is the metre, by LiDAR or ARKit.
+
+    Args:
+        path: metadata.json, or metadata as in an unpacked .r3d file.
+        list_images: returns the image files of a folder, sorted by name.
+        images: the folder of the photos; by default rgb/, rgbd/ or images/ beside the file.
+
+    Raises:
+        UserError: the file is damaged (file and field are named), or no photo is on disk.
+    """
+    content = read_json_object(path)
+    where = str(path)
+    size = size_of(number(content, "w", where), number(content, "h", where), where)
+    poses = content.get(_POSES)
+    if not isinstance(poses, list) or not poses:
+        raise malformed(where, f"{_POSES} is {shown(poses)}", "expected a list of poses")
+    places = (path.parent / name for name in IMAGE_FOLDERS)
+    photos = PhotoOfStem(images or next((place for place in places if place.is_dir()), path.parent), list_images)
+    intrinsics = _intrinsics(content, len(poses), where)
+    frames, missing = [], []
+    for index, pose in enumerate(poses):
+        world_from_cam = opencv_from_opengl_pose(_pose(pose, f"{where}: {_POSES}[{index}]"))
+        image = photos.find(str(index))
+        if image is None:
+            missing.append(str(index))
+        else:
+            frames.append(Frame(image.name, _camera(intrinsics[index], size, where), world_from_cam, image=image))
+    if not frames:
+        raise photos_missing(missing, photos.folder, where)
+    return Capture(
+        tuple(frames), np.zeros((0, 3)), tuple(missing), None, "record3d", unit="metre", unit_source="ARKit (Record3D)"
+    )
+
+
+def _pose(value: Any, where: str) -> np.ndarray:
+    row = vector({"pose": value}, "pose", 7, where)
+    length = np.linalg.norm(row[:4])
+    if abs(length - 1.0) > _MAX_DEVIATION:
+        raise malformed(where, f"its quaternion has length {length:.4g}", "expected length 1")
+    return rigid.from_parts(rigid.rotation_from_quaternion(row[[3, 0, 1, 2]]), row[4:])
+
+
+def _intrinsics(content: dict[str, Any], count: int, where: str) -> np.ndarray:
+    """Return fx, fy, cx, cy of each frame, (count, 4)."""
+    rows = content.get(_INTRINSICS)
+    if not rows:
+        return np.tile(vector(content, "K", 9, where)[[0, 4, 6, 7]], (count, 1))
+    if not isinstance(rows, list) or len(rows) != count:
+        raise malformed(where, f"{_INTRINSICS} is {shown(rows)}", f"expected a list of {count}, one for each pose")
+    return np.array([vector({"row": row}, "row", 4, f"{where}: {_INTRINSICS}[{i}]") for i, row in enumerate(rows)])
+
+
+def _camera(row: np.ndarray, size: tuple[int, int], where: str) -> Camera:
+    fx, fy, cx, cy = row.tolist()
+    return camera_of_matrix(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), size, where)
