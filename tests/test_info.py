@@ -12,6 +12,9 @@ import pytest
 import tifffile
 from depth_maps import ALL, FULL_META, META, plain_depth
 from PIL import Image
+from test_format_alicevision import content
+from test_format_alicevision import write as write_alicevision
+from test_format_folders import WRITERS
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
@@ -233,3 +236,17 @@ def test_a_text_file_of_a_run_shows_the_run(finished, capture):
         assert {**of_file, "path": whole["path"]} == whole
     (capture / "metrics.json").write_text("{}")  # not of a run
     assert "has no list of frames" in info(capture / "metrics.json").stderr
+
+
+@pytest.mark.parametrize("name", ["alicevision", "pose-files", "neus"])
+def test_captures_of_other_programs_show_their_cameras_and_how_to_train_on_them(name, tmp_path):
+    if name == "alicevision":
+        path = write_alicevision(tmp_path, content())
+    else:
+        path = WRITERS[name](tmp_path)
+    shown = info(tmp_path if name == "pose-files" else path).stdout.splitlines()
+    photos = {"alicevision": ("0", "2"), "pose-files": ("3", "0"), "neus": ("3", "0")}[name]
+    assert shown[1:4] == [f"  kind: {name}", f"  photos: {photos[0]}", f"  missing photos: {photos[1]}"]
+    assert any("focal" in line for line in shown)
+    assert shown[-1].startswith("  to train: nerfcli convert ")
+    assert shown[-1].endswith(" SCENE --to nerfcli")

@@ -26,7 +26,7 @@ def info(
     """Show what a scene, a run or one of their files contains.
 
     \b
-    scene       cameras, photos, missing files, split, unit
+    scene       cameras, photos, missing files, split, unit; also of captures that nerfcli convert makes a scene
     run         settings, time, metrics, how far refined cameras moved; bytes of weights and optimizer, operations and
                 memory traffic per sample and picture, next to other types of field of the same size
     depth file  (TIFF, EXR, NPZ, NPY, PNG; also pictures, videos and folders of renders) definition, axis, unit and its

@@ -1,12 +1,15 @@
-"""Describe a folder or file as plain values: scenes, runs, renders, depth, pictures, videos, training states.
+"""Describe a folder or file as plain values: scenes, captures, runs, renders, depth, pictures, training states.
 
 Imports are local, so that a depth file can be described without importing torch.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from nerfcli.errors import UserError
+from nerfcli.cameras.camera import by_lens
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import UserError, in_shell
 from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
 from nerfcli.media.geotiff import map_facts
 from nerfcli.media.model_facts import SUFFIXES as MODEL_SUFFIXES
@@ -14,9 +17,16 @@ from nerfcli.media.model_facts import model_facts, volume_facts
 from nerfcli.tomography.result import is_reconstruction, load_reconstruction
 from nerfcli.tomography.volume_files import is_volume_file, map_of, read_volume
 
+# Formats that only `nerfcli convert` reads, and the suffixes of their files; "" is that of a folder.
+_CAPTURES = (
+    *("alicevision", "opensfm", "metashape", "reality-capture", "bundler"),
+    *("polycam", "record3d", "mvsnet", "neus", "pose-files"),
+)
+_CAPTURE_SUFFIXES = ("", ".sfm", ".json", ".xml", ".csv", ".out", ".npz")
+
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Return the facts of a scan, a reconstruction, a run, renders, a single file of data, or else of a scene.
+    """Return the facts of a scan, a reconstruction, a capture, a run, renders, a file of data, or else of a scene.
 
     Raises:
         UserError: the path is none of these, or damaged.
@@ -37,6 +47,8 @@ def describe(path: str | Path) -> dict[str, Any]:
         from nerfcli.workflows.describe_run import describe_tensors
 
         return describe_tensors(folder)
+    if folder.suffix.lower() in _CAPTURE_SUFFIXES and (facts := _describe_capture(folder)) is not None:
+        return facts
     if folder.suffix.lower() in (*MODEL_SUFFIXES, ".npz") and (folder.is_file() or folder.suffix.lower() != ".npz"):
         facts = model_facts(folder)
         if facts is not None:
@@ -95,18 +107,34 @@ def _describe_reconstruction(run: Path) -> dict[str, Any]:
     }
 
 
-def _describe_scene(folder: Path) -> dict[str, Any]:
-    from nerfcli import scene as scenes
-    from nerfcli.cameras.camera import by_lens
-    from nerfcli.cameras.orientation import describe_rescaling
+def _describe_capture(path: Path) -> dict[str, Any] | None:
+    """Return the facts of a capture that only `nerfcli convert` reads; None if the path is something else."""
+    from nerfcli.convert.formats import UserInputs, format_named
+    from nerfcli.scene import is_scene
 
-    scene = scenes.load(folder)
-    lenses = by_lens([frame.camera for frame in scene.frames])
+    if path.is_dir() and is_scene(path):
+        return None
+    for form in map(format_named, _CAPTURES):
+        found = form.find(path)
+        if found is not None and form.parse is not None:
+            capture = form.parse(found, UserInputs())
+            there = sum(frame.image is not None and frame.image.is_file() for frame in capture.frames)
+            return {
+                "kind": form.name,
+                "photos": there,
+                "missing": len(capture.frames) + len(capture.missing) - there,
+                **_camera_facts(capture.frames),
+                "points": len(capture.points),
+                "unit": capture.unit,
+                "unit_source": capture.unit_source,
+                "to_train": f"nerfcli convert {in_shell(path)} SCENE --to nerfcli",
+            }
+    return None
+
+
+def _camera_facts(frames: Iterable[Frame]) -> dict[str, Any]:
+    lenses = by_lens([frame.camera for frame in frames])
     return {
-        "kind": scene.kind,
-        "photos": len(scene.frames),
-        "held_out": len(scene.test_frames),
-        "missing": len(scene.missing),
         "cameras": [
             f"{lens.model} {lens.width}x{lens.height} "
             + ("all directions" if lens.is_spherical else f"focal {lens.focal_px:.1f} px")
@@ -114,6 +142,20 @@ def _describe_scene(folder: Path) -> dict[str, Any]:
             for lens, cameras in list(lenses.items())[:5]
         ],
         "camera_count": len(lenses),
+    }
+
+
+def _describe_scene(folder: Path) -> dict[str, Any]:
+    from nerfcli import scene as scenes
+    from nerfcli.cameras.orientation import describe_rescaling
+
+    scene = scenes.load(folder)
+    return {
+        "kind": scene.kind,
+        "photos": len(scene.frames),
+        "held_out": len(scene.test_frames),
+        "missing": len(scene.missing),
+        **_camera_facts(scene.frames),
         "rescaled": describe_rescaling(scene.rescaled),
         "points": len(scene.points),
         "unit": scene.unit,
