@@ -1,7 +1,7 @@
 """Which convention a capture follows, found out from captures whose convention was broken on purpose."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from nerfcli.convert import matches
 from nerfcli.convert.axes import Convention, expressed, for_picture, opencv_from_axes, poses_of, reinterpreted
 from nerfcli.convert.detect import Detection, detect
 from nerfcli.convert.evidence import Intrinsics, MatchEvidence
-from nerfcli.convert.matches import match_neighbours
+from nerfcli.convert.matches import LEAST_MOVE, match_neighbours
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.multiview.features import Features, Matches, find_features
 
@@ -178,8 +178,14 @@ def test_points_alone_identify_axes(tmp_path):
 CARDS = ((-1.2, -0.9, 2.4, 1.8, 1.0), (-0.5, -0.4, 1.0, 0.8, 0.3))
 
 
-def photograph(folder: Path, *, count: int, camera: Camera) -> Capture:
-    """Make photos of a textured card in front of a larger one (x, y, width, height, z of each) by homographies."""
+def photograph(
+    folder: Path, *, times: Sequence[float], camera: Camera, shake: float = 0.15, name: str = "{:02d}.png"
+) -> Capture:
+    """Make photos of a textured card in front of a larger one (x, y, width, height, z of each) by homographies.
+
+    The camera moves along a path of about its distance from the cards, in a time of 1, and looks at their middle, or
+    past it by `shake`.
+    """
     folder.mkdir(parents=True)
     rng = np.random.default_rng(0)
     textures = []
@@ -191,9 +197,9 @@ def photograph(folder: Path, *, count: int, camera: Camera) -> Capture:
     fx, fy, cx, cy = camera.params
     matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])  # OpenCV's pixel centres are whole numbers
     frames = []
-    for index in range(count):
-        centre = np.array([np.sin(1.5 * index), 0.6 * np.cos(2.0 * index), -2.6 + 0.2 * np.cos(index)]) * (0.8, 0.8, 1)
-        pose = rigid.look_at(centre, rng.normal(0, 0.15, 3), np.array([0.2 * np.sin(index), -1.0, 0.0]))
+    for index, time in enumerate(times):
+        centre = np.array([np.sin(1.5 * time), 0.6 * np.cos(2.0 * time), -2.6 + 0.2 * np.cos(time)]) * (0.8, 0.8, 1)
+        pose = rigid.look_at(centre, rng.normal(0, 1, 3) * shake, np.array([0.2 * np.sin(time), -1.0, 0.0]))
         cam_from_world = rigid.inverse(pose)
         picture = np.zeros((camera.height, camera.width), np.float32)
         for texture, (x, y, width, height, z) in zip(textures, CARDS, strict=True):
@@ -205,9 +211,9 @@ def photograph(folder: Path, *, count: int, camera: Camera) -> Capture:
             size = (camera.width, camera.height)
             seen = cv2.warpPerspective(texture, homography, size, flags=cv2.INTER_LINEAR, borderValue=-1.0)
             picture = np.where(seen >= 0, seen, picture)
-        name = f"{index:02d}.png"
-        Image.fromarray(np.clip(picture, 0, 255).astype(np.uint8)).save(folder / name)
-        frames.append(Frame(name, camera, pose, image=folder / name))
+        image = folder / name.format(index)
+        Image.fromarray(np.clip(picture, 0, 255).astype(np.uint8)).save(image)
+        frames.append(Frame(image.name, camera, pose, image=image))
     return Capture(tuple(frames), np.zeros((0, 3)), (), None, "transforms")
 
 
@@ -229,7 +235,9 @@ def _features_found_once() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def photographed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return photograph(tmp_path_factory.mktemp("cards") / "images", count=6, camera=Camera.pinhole(480, 360, 420.0))
+    return photograph(
+        tmp_path_factory.mktemp("cards") / "images", times=range(6), camera=Camera.pinhole(480, 360, 420.0)
+    )
 
 
 def test_matches_lie_where_both_photos_show_the_same_place(photographed):
@@ -239,6 +247,25 @@ def test_matches_lie_where_both_photos_show_the_same_place(photographed):
     evidence = MatchEvidence(pairs, cameras, 6)
     errors = evidence.errors_px(evidence.directions(Intrinsics()), poses_of(photographed))
     assert np.median(errors) < 0.035
+
+
+def test_frames_of_a_video_are_compared_with_later_ones(tmp_path):
+    """Neighbours move by 1 % of the picture, which says nothing about intrinsics. Then the camera becomes faster, and
+    nothing matches the last photo, which is black.
+    """
+    times = [*(0.03 * index for index in range(11)), 0.9, 1.6]
+    capture = photograph(tmp_path / "i", times=times, camera=Camera.pinhole(480, 360, 420.0), shake=0, name="{}.png")
+    Image.new("L", (480, 360)).save(tmp_path / "i/12.png")
+    in_order_of_text = tuple(sorted(capture.frames, key=lambda frame: frame.name))  # 0, 1, 10, 11, 12, 2, ...
+    pairs, _ = match_neighbours(in_order_of_text, progress=silent)
+    seen = [tuple(int(Path(in_order_of_text[index].name).stem) for index in pair.photos) for pair in pairs]
+    assert [first for first, _ in seen] == list(range(11))
+    moves = [np.median(np.linalg.norm(pair.pixels[1] - pair.pixels[0], axis=1)) / 480 for pair in pairs]
+    assert min(moves[:4]) >= LEAST_MOVE  # later ones reach the black photo first
+    assert dict(seen)[10] == 11
+    found = detect(replace(capture, frames=in_order_of_text), axes="opencv", progress=silent)
+    assert verdicts(found)["image size"] == "holds"
+    assert found.convention == Convention("opencv")
 
 
 def test_matches_are_found_where_opencvs_best_estimator_gives_up(photographed, monkeypatch):

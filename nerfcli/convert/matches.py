@@ -16,6 +16,8 @@ from nerfcli.multiview.features import Features, Matches, find_features, mutual_
 LONGER_SIDE_PX = 1000
 MOST_FEATURES = 3000
 MOST_PAIRS = 24
+# Fraction of the longer side by which matched features should move: less is explained by any poses.
+LEAST_MOVE = 0.04
 
 # Fewer matches than this may agree on a common epipolar geometry by chance.
 _LEAST_MATCHES = 20
@@ -25,32 +27,51 @@ _EPIPOLAR_PX = 2.0
 def match_neighbours(
     frames: tuple[Frame, ...], *, progress: Callable[[float, str], None]
 ) -> tuple[list[Matches], dict[int, Camera]]:
-    """Match photos that follow each other in the order of names; return matches and the cameras for the photos' sizes.
+    """Match photos with later ones in the order of names; return matches and the cameras for the photos' sizes.
 
-    The matches of a pair agree on a common epipolar geometry, estimated without poses or focal lengths. Pairs with few
-    such matches are left out, as are frames whose photo is not on disk.
+    A photo's partner is the next or next but one; or so much later that matched features move by `LEAST_MOVE`, as in a
+    video, whose neighbours are too close together for poses to matter. The matches of a pair agree on a common epipolar
+    geometry, estimated without poses or focal lengths. Pairs with few such matches are left out, as are frames whose
+    photo is not on disk.
 
     Raises:
         UserError: a photo cannot be read or has another shape than its camera.
     """
     present = [i for i, frame in enumerate(frames) if frame.image is not None and frame.image.is_file()]
-    present.sort(key=lambda index: frames[index].name)
-    steps = [(place, place + 1 + place % 2) for place in range(len(present) - 1)]  # next and next but one, in turn
-    steps = [(present[a], present[b]) for a, b in steps if b < len(present)]
-    chosen = (
-        [steps[k] for k in np.unique(np.linspace(0, len(steps) - 1, MOST_PAIRS).round().astype(int))] if steps else []
-    )
+    present.sort(key=lambda index: (len(frames[index].name), frames[index].name))  # 9.jpg before 10.jpg
     photos: dict[int, tuple[Camera, Features]] = {}
-    pairs = []
-    for done, (first, second) in enumerate(chosen):
-        progress(done / len(chosen), f"photo {done} of {len(chosen)}")
-        for index in (first, second):
-            if index not in photos:
-                photos[index] = _photo(frames[index])
-        matched = _matched(photos[first], photos[second])
-        if matched is not None:
-            pairs.append(Matches((first, second), matched))
+
+    def photo(place: int) -> tuple[Camera, Features]:
+        if present[place] not in photos:
+            photos[present[place]] = _photo(frames[present[place]])
+        return photos[present[place]]
+
+    starts = np.unique(np.linspace(0, len(present) - 2, MOST_PAIRS).round().astype(int)) if len(present) > 1 else ()
+    pairs, stride = [], 1
+    for done, start in enumerate(starts):
+        progress(done / len(starts), f"photo {done} of {len(starts)}")
+        found = None
+        while True:
+            partner = min(start + stride * (1 + start % 2), len(present) - 1)
+            matched = _matched(photo(start), photo(partner))
+            if matched is None and found is None and stride > 1:
+                stride //= 2  # the camera has become faster
+                continue
+            if matched is None:
+                break
+            found = Matches((present[start], present[partner]), matched)
+            if partner == len(present) - 1 or _move(matched, photo(start)[0]) >= LEAST_MOVE:
+                break
+            stride *= 2
+        if found is not None:
+            pairs.append(found)
     return pairs, {index: camera for index, (camera, _) in photos.items()}
+
+
+def _move(matched: tuple[np.ndarray, np.ndarray], camera: Camera) -> float:
+    """Return the median movement of matched features from photo to photo, as a fraction of the longer side."""
+    moves = np.linalg.norm(matched[1] - matched[0], axis=1)
+    return float(np.median(moves)) / max(camera.width, camera.height)
 
 
 def _photo(frame: Frame) -> tuple[Camera, Features]:
