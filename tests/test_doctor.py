@@ -161,6 +161,20 @@ def test_mixed_lenses_and_zooms_are_reported_but_not_a_phone_on_its_side(clean):
         assert (found.verdict, found.names) == (LOOK, ("00.jpg",)), odd
 
 
+def test_only_photos_with_an_orientation_in_exif_are_said_to_be_turned(clean):
+    landscape = clean.facts[0].exif
+    portrait = replace(landscape, width=landscape.height, height=landscape.width)
+
+    def orientation(exif: Exif) -> Finding:
+        return inventory.orientation([replace(clean.facts[0], exif=exif), *clean.facts[1:]])
+
+    assert orientation(landscape).advice == ""
+    stored, tagged = orientation(portrait), orientation(replace(portrait, orientation=6))
+    assert (stored.verdict, stored.names, tagged.verdict) == (LOOK, ("00.jpg",), LOOK)
+    assert stored.advice == "nothing to do: the two get separate cameras"
+    assert tagged.advice == "nothing to do: nerfcli turns photos upright; other programs may ignore the tag"
+
+
 def test_each_folder_has_a_camera_of_its_own(clean):
     exif = replace(clean.facts[0].exif, make="Maker", model="One", focal_mm=4.0, focal_35mm=28.0)
     other = replace(exif, model="Two")
@@ -189,6 +203,8 @@ def test_exif_of_another_picture_is_named(clean):
 
     assert focal_length(exif, resized).verdict == GOOD
     assert focal_length(exif, resized).summary == "0.81 times the longer side, from EXIF (2 photos)"
+    assert focal_length(replace(exif, focal_35mm=None)).summary.startswith("in EXIF in millimetres, without the size")
+    assert focal_length(replace(exif, focal_mm=None, focal_35mm=None)).summary.startswith("not in EXIF")
     found = focal_length(resized, cropped)
     assert (found.verdict, found.names) == (LOOK, ("01.jpg",))
     assert "EXIF is for 4032x2268 pixels" in found.summary
@@ -417,8 +433,11 @@ def test_weakly_determined_intrinsics_of_a_scene_are_named(tmp_path):
     assert bad is not None
     assert (good.verdict, good.number) == (GOOD, 0.2)
     assert (bad.verdict, bad.number) == (LOOK, 4.0)
-    assert "weakly determined: focal length ± 4 %" in bad.summary
+    assert "weakly determined: focal length ± 4 %, distortion ± 3 px at the corners" in bad.summary
     assert "--intrinsics" in bad.advice
+    undistorted = found({"uncertainty": firm | {"distortion_border_px": None}})
+    assert undistorted is not None
+    assert undistorted.summary == "focal length ± 0.2 %"
 
 
 def test_missing_photos_and_masks_that_only_some_have_are_named():
@@ -466,6 +485,17 @@ def test_nothing_readable_is_a_finding_too(tmp_path):
     diagnosis = examine(find_subject(tmp_path), threads=1, progress=lambda fraction, detail: None)
     assert [f.verdict for f in diagnosis.findings] == [BAD, BAD]
     assert "a.jpg" in page_html(diagnosis)
+
+
+def test_a_video_is_sent_to_the_command_that_extracts_its_frames(tmp_path):
+    video = tmp_path / "my walk.MP4"
+    video.write_bytes(b"\0\0\0\x18ftypmp42")
+    for subfolders in (False, True):
+        with pytest.raises(
+            UserError, match=r"my walk\.MP4 is a file, neither a folder of photos nor a scene"
+        ) as caught:
+            find_subject(video, subfolders=subfolders)
+        assert f"nerfcli poses '{video}' writes its frames to a folder" in str(caught.value.hint)
 
 
 def test_the_page_needs_nothing_else_and_shows_each_photo_once(clean):

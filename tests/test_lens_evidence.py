@@ -95,9 +95,11 @@ def test_an_undetermined_focal_length_stays_at_that_of_exif_and_is_reported_as_w
     assert camera_of(lenses.model).params.tolist() == [1380.0, 400.0, 300.0]
     assert lenses.uncertainty[1]["weak"]
     assert lenses.uncertainty[1]["focal_percent"] > 3
+    assert lenses.uncertainty[1]["distortion_border_px"] is None  # the lens has none: not a distortion known exactly
     firm = choose_lenses(ring_model("SIMPLE_RADIAL", (800.0, 512.0, 384.0, 0.05)), seed=0, threads=1)
     assert not firm.uncertainty[1]["weak"]
     assert firm.uncertainty[1]["focal_percent"] < 0.3
+    assert 0 < firm.uncertainty[1]["distortion_border_px"] < 1
 
 
 def test_too_few_observations_have_a_reason():

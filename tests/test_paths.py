@@ -206,6 +206,22 @@ def test_a_path_before_a_forward_facing_capture_stays_where_the_cameras_were(mak
     assert steps.max() < 1.002 * steps.min()
 
 
+def test_an_orbit_of_a_walk_past_the_focus_stays_before_it():
+    """Ten cameras look at the focus on their way to it; the last three, behind it, look at other things."""
+    along = np.concatenate([np.linspace(-8, -2, 10), [1.0, 2.0, 3.0]])
+    centres = np.stack([np.sin(3 * along), along, np.zeros(13)], axis=1)
+    targets = np.where(along[:, None] < 0, np.zeros(3), [10.0, 50.0, 0.0])
+    frames = frames_at(centres, targets)
+    np.testing.assert_allclose(focus_point(frames), 0, atol=1e-3)
+    path = centres_of(orbit(frames, count=60))
+    azimuth = np.arctan2(path[:, 0], -path[:, 1])
+    widest = np.arctan2(centres[:10, 0], -centres[:10, 1])
+    assert widest.min() < azimuth.min() < azimuth.max() < widest.max()
+    # From so few that the angles say nothing, the path is that of all cameras.
+    away = frames_at(centres, np.where(along[:, None] < -7.5, np.zeros(3), [10.0, 50.0, 0.0]))
+    assert np.ptp(centres_of(orbit(away, count=60)), axis=0).max() > 1
+
+
 def test_a_sway_over_cameras_that_look_straight_down_stays_above():
     centres = np.array([[x, y, 5.0] for x in range(5) for y in range(5)])
     frames = frames_at(centres, np.array([2.0, 2, -100]), up=np.array([0, 1.0, 0]))

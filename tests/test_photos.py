@@ -158,10 +158,10 @@ def test_photos_share_a_camera_when_all_optics_and_the_size_agree():
 @pytest.mark.parametrize(
     ("evidence", "words"),
     [
-        (Evidence(83, 0, None, 0), "too few features (83)"),
-        (Evidence(4000, 12, "a.jpg", 0), "matches no other photo well (best 12 verified matches)"),
-        (Evidence(4000, 41, "a.jpg", 0), "rejected by the mapper (41 verified matches with a.jpg)"),
-        (Evidence(4000, 41, "a.jpg", 7), "in another model of 7 photos"),
+        (Evidence(83, 0, None, 0, (40, 30)), "too few features (83 in 40x30 pixels)"),
+        (Evidence(4000, 12, "a.jpg", 0, (40, 30)), "matches no other photo well (best 12 verified matches)"),
+        (Evidence(4000, 41, "a.jpg", 0, (40, 30)), "rejected by the mapper (41 verified matches with a.jpg)"),
+        (Evidence(4000, 41, "a.jpg", 7, (40, 30)), "in another model of 7 photos"),
     ],
 )
 def test_reasons(evidence: Evidence, words: str):
@@ -169,7 +169,7 @@ def test_reasons(evidence: Evidence, words: str):
 
 
 def test_the_dominant_reason_brings_its_advice():
-    few, alone = Evidence(10, 0, None, 0), Evidence(4000, 3, "a", 0)
+    few, alone = Evidence(10, 0, None, 0, (40, 30)), Evidence(4000, 3, "a", 0, (40, 30))
     kind, advice = dominant([reason(few), reason(alone), reason(alone), "unreadable: damaged"])
     assert kind == "matches no other photo well"
     assert "overlap" in advice

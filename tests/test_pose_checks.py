@@ -363,6 +363,19 @@ def test_closing_notes_name_components_and_checks(estimated: tuple[Path, PosesRe
     ]
 
 
+def test_a_lens_without_distortion_has_no_uncertainty_of_it(estimated: tuple[Path, PosesReport]):
+    _, report = estimated
+    certain = {"weak": True, "focal_percent": 15.34, "distortion_border_px": None}
+
+    def note(uncertainty: Mapping[str, object]) -> str:
+        return closing_notes(replace(report, cameras=({"images": 4, "uncertainty": uncertainty},)))[0]
+
+    start = "intrinsics are weakly determined (camera with 4 photos: focal length ± 15.3 %"
+    assert note(certain) == f"{start}): give --intrinsics"
+    distorted = note({**certain, "distortion_border_px": 3.0})
+    assert distorted == f"{start}, distortion ± 3.0 px at the corners): give --intrinsics"
+
+
 def test_photos_without_features_and_a_failing_search_for_motions_end_nothing(
     job: Job, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
@@ -386,6 +399,33 @@ def test_reasons_name_the_users_photos(job: Job, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(examine, "leave_out_contradicting", lambda model, pairs: (model, {3: reason}))
     found = examine.examine([mapped_model(job)], named, lambda *progress: None)
     assert found.left_out == {2: "contradicts the rest: its 28.5 matches with frame_00002.jpg cannot be"}
+
+
+def test_a_refusal_speaks_of_as_many_photos_as_are_missing(photos: Path, estimated: tuple[Path, PosesReport]):
+    _, report = estimated
+    there = [replace(image, registered=True, reason=None) for image in report.images[:4]]
+    missing = replace(there[0], registered=False, reason="matches no other photo well (best 0 verified matches)")
+
+    def said(registered: int) -> str:
+        images = (*there[:registered], *[missing] * (4 - registered))
+        refused = refusal(replace(report, registered=registered, total=4, images=images, parts=(4,)), photos)
+        return str(refused)
+
+    assert "only 3 of 4 photos registered" in said(3)
+    assert "; the other: matches no other photo well" in said(3)
+    assert "; most of the others: matches no other photo well" in said(2)
+    assert "; most of them: matches no other photo well" in said(0)
+
+
+def test_only_parts_that_are_large_enough_are_worth_processing(photos: Path, estimated: tuple[Path, PosesReport]):
+    _, report = estimated
+
+    def hint(*parts: int) -> str | None:
+        refused = refusal(replace(report, registered=3, total=sum(parts), parts=parts), photos)
+        return refused.hint if refused else None
+
+    assert hint(3, 3) == "take photos that connect the parts"
+    assert hint(5, 4) == "take photos that connect the parts, or process each part separately"
 
 
 def test_a_smaller_component_needs_no_share_of_all_photos(photos: Path, estimated: tuple[Path, PosesReport]):

@@ -109,7 +109,7 @@ def test_every_file_is_registered_or_has_its_reason(solved: Solved):
     assert sorted(images) == sorted([*NAMES, "notes.jpg", "wall.png"])
     assert all(images[name].registered and images[name].reason is None for name in NAMES)
     assert images["notes.jpg"].reason == "unreadable: not a readable picture"
-    assert images["wall.png"].reason == "too few features (0)"
+    assert images["wall.png"].reason == "too few features (0 in 480x360 pixels)"
     assert (solved.report.registered, solved.report.total) == (7, 9)
     assert "notes.jpg is skipped: not a readable picture" in solved.notes
 

@@ -28,6 +28,8 @@ _CURVE_SAMPLES = 8192
 
 # Fraction of the cameras' spread that a path uses: nothing was observed from beyond its rim.
 _INSIDE = 0.8
+# With fewer cameras that view the focus, their angles about it say little, and those of all cameras are used.
+_FEWEST_VIEWING = 3
 
 
 def orbit(
@@ -53,16 +55,19 @@ def orbit(
     up = up_direction(frames) if up is None else np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     offsets = centres_of(frames) - focus
     distances = np.linalg.norm(offsets, axis=1)
-    offsets, distances = offsets[distances > 0], distances[distances > 0]
-    if len(offsets) == 0:
+    elsewhere = distances > 0
+    if not elsewhere.any():
         raise UserError(
             "all cameras are in one place and look outwards: there is nothing to orbit",
             "use --cameras interpolate, the path through the photos",
         )
     if surrounds(frames, up):
-        curve = _ring(offsets, distances, up)
+        curve = _ring(offsets[elsewhere], distances[elsewhere], up)
     else:
-        curve = _frontal_ellipse(offsets, distances, up)
+        viewing = _show(frames, focus) & elsewhere
+        # Who walks past the focus photographs other things from behind it.
+        kept = viewing if viewing.sum() >= _FEWEST_VIEWING else elsewhere
+        curve = _frontal_ellipse(offsets[kept], distances[kept], up)
     centres = focus + _equal_steps(curve, count)
     return _looking_at(frames, centres, focus, up=up, name="orbit")
 
@@ -163,6 +168,15 @@ def interpolate(frames: Sequence[Frame], *, count: int) -> tuple[Frame, ...]:
     _check(frames, count)
     poses = fly(np.stack([frame.world_from_cam for frame in frames]), count)
     return tuple(_path_frame(frames[0], pose, f"flight_{i:04d}") for i, pose in enumerate(poses))
+
+
+def _show(frames: Sequence[Frame], point: np.ndarray) -> np.ndarray:
+    """Return which frames have a point (3,) in their pictures, (frames,) bool; what may stand before it is ignored."""
+    shown = np.zeros(len(frames), dtype=bool)
+    for index, frame in enumerate(frames):
+        (pixel,), (valid,) = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), point[None]))
+        shown[index] = valid and (pixel >= 0).all() and (pixel <= (frame.camera.width, frame.camera.height)).all()
+    return shown
 
 
 def _check(frames: Sequence[Frame], count: int) -> None:

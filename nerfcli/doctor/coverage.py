@@ -150,8 +150,10 @@ def intrinsics(scene: Scene) -> Finding | None:
         return None
     weak = [one for one in certain if one["weak"]]
     focal = max(one["focal_percent"] for one in certain)
-    border_px = max(one["distortion_border_px"] for one in certain)
-    accuracy = f"focal length ± {focal:.2g} %, distortion ± {border_px:.2g} px at the corners"
+    borders_px = [one["distortion_border_px"] for one in certain if one["distortion_border_px"] is not None]
+    accuracy = f"focal length ± {focal:.2g} %"
+    if borders_px:
+        accuracy += f", distortion ± {max(borders_px):.2g} px at the corners"
     return Finding(
         "intrinsics",
         LOOK if weak else GOOD,

@@ -129,6 +129,8 @@ def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
         summary = "not needed for panoramas of the whole sphere"
     elif fractions:
         summary = f"{np.median(fractions):.2f} times the longer side, from EXIF ({several(len(fractions), 'photo')})"
+    elif any(photo.exif.focal_mm is not None for photo, _ in found):
+        summary = "in EXIF in millimetres, without the size of the sensor; structure from motion will estimate it"
     else:
         summary = "not in EXIF; structure from motion will estimate it"
     return Finding(
@@ -153,13 +155,17 @@ def orientation(photos: Sequence[PhotoFacts]) -> Finding:
     fewer = min(portrait, landscape, key=len)
     kind = "portrait" if fewer is portrait else "landscape"
     tags = ", ".join(f"{tag} ({number})" for tag, number in sorted(turned.items()))
+    by_tag = any(tag >= 5 for tag in turned)  # of these, width and height are swapped
+    advice = (
+        "nerfcli turns photos upright; other programs may ignore the tag" if by_tag else "the two get separate cameras"
+    )
     return Finding(
         "orientation",
         LOOK if fewer else GOOD,
         f"{len(portrait)} portrait, {len(landscape)} landscape; EXIF orientation {tags}",
         len(fewer),
         "look from 1 photo with another orientation",
-        "nothing to do: nerfcli turns photos upright; other programs may ignore the tag" if fewer else "",
+        f"nothing to do: {advice}" if fewer else "",
         tuple((name, kind) for name in fewer),
     )
 

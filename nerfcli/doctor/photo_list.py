@@ -5,7 +5,7 @@ from pathlib import Path
 
 from nerfcli import scene as scenes
 from nerfcli.doctor.photo_facts import Source
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, in_shell
 from nerfcli.media.photo_folders import list_photos, list_unsupported, name_in, where_photos_may_be
 
 
@@ -35,10 +35,16 @@ def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
     A folder with photos and the files of a scene counts as a scene.
 
     Raises:
-        UserError: the path does not exist, has no photos, or is a scene with malformed files, or one with `subfolders`.
+        UserError: the path does not exist, is a video, has no photos, or is a scene with malformed files, or one with
+            `subfolders`.
     """
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a folder of photos, or a scene folder")
+    if path.is_file() and path.suffix.lower() != ".json":
+        raise UserError(
+            f"{path} is a file, neither a folder of photos nor a scene",
+            f"if it is a video, nerfcli poses {in_shell(path)} writes its frames to a folder that can be given here",
+        )
     if path.is_file() or scenes.is_scene(path):
         if subfolders:
             raise UserError(f"{path}: --subfolders is for photos, and this is a scene", "leave --subfolders out")

@@ -97,7 +97,8 @@ def make_report(
             images[name] = ImageReport(name, True, None, orientation, blur.get(str(number)))
         else:
             elsewhere = max((len(model) for model in models[1:] if number in model), default=0)
-            evidence = Evidence(**result["evidence"][number], other_model_size=elsewhere)
+            size_px = photo.exif.width, photo.exif.height
+            evidence = Evidence(**result["evidence"][number], other_model_size=elsewhere, size_px=size_px)
             why = result["left_out"].get(str(number)) or reason(evidence)
             images[name] = ImageReport(name, False, why, orientation)
     return PosesReport(
@@ -149,9 +150,11 @@ def closing_notes(report: PosesReport) -> list[str]:
         worst = max(weak, key=lambda camera: camera["uncertainty"]["focal_percent"])
         certain, images = worst["uncertainty"], worst["images"]
         which = f"{len(weak)} cameras; the worst, with" if len(weak) > 1 else "camera with"
+        accuracy = f"focal length ± {certain['focal_percent']:.1f} %"
+        if certain["distortion_border_px"] is not None:
+            accuracy += f", distortion ± {certain['distortion_border_px']:.1f} px at the corners"
         notes.append(
-            f"intrinsics are weakly determined ({which} {images} photo{'' if images == 1 else 's'}: focal length ± "
-            f"{certain['focal_percent']:.1f} %, distortion ± {certain['distortion_border_px']:.1f} px at the corners): "
+            f"intrinsics are weakly determined ({which} {images} photo{'' if images == 1 else 's'}: {accuracy}): "
             "give --intrinsics"
         )
     stabilised = report.principal_points
@@ -196,8 +199,12 @@ def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:
     if sum(report.parts[1:]) > _MUCH_APART * report.total:
         sizes = " + ".join(str(size) for size in report.parts)
         text = f"{placed}: they form parts of {sizes} photos with few matches between them (disconnected)"
-        return UserError(text, "take photos that connect the parts, or process each part separately", TOO_FEW_PHOTOS)
+        advice = "take photos that connect the parts"
+        if report.parts[1] >= MIN_PHOTOS:
+            advice += ", or process each part separately"
+        return UserError(text, advice, TOO_FEW_PHOTOS)
     reasons = [image.reason for image in report.images if image.reason]
     kind, advice = dominant(reasons)
     example = next(text for text in reasons if text.startswith(kind))
-    return UserError(f"{placed}; most of the others: {example}", advice, TOO_FEW_PHOTOS)
+    others = "the other" if len(reasons) == 1 else "most of the others" if report.registered else "most of them"
+    return UserError(f"{placed}; {others}: {example}", advice, TOO_FEW_PHOTOS)

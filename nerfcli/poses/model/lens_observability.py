@@ -174,9 +174,9 @@ def uncertainty(
 
     Returns:
         {"focal_percent", "principal_point_px": its uncertainty if it were free, "principal_point_free",
-        "distortion_border_px": uncertainty of distortion at the corner, "weak": whether focal length or distortion are
-        uncertain enough for a warning, "reason": None}. If the lens cannot be examined in this way or the observations
-        are too few, "reason" says so and the numbers and "weak" are None.
+        "distortion_border_px": uncertainty of distortion at the corner, None for a lens without distortion, "weak":
+        whether focal length or distortion are uncertain enough for a warning, "reason": None}. If the lens cannot be
+        examined in this way or the observations are too few, "reason" says so and the numbers and "weak" are None.
     """
     camera = model.cameras[camera_id] if lens_of is None else _of_lens(model, camera_id, lens_of)
     nothing = {"focal_percent": None, "principal_point_px": None, "distortion_border_px": None}
@@ -193,13 +193,14 @@ def uncertainty(
     except (UndeterminedError, np.linalg.LinAlgError) as error:
         return nothing | {"reason": str(error)}
     focal = found.deviation("f") / camera.mean_focal_length()
-    border = max((_border_px(evidence, found, name) for name in free if name[0] in "kp"), default=0.0)
+    border = max((_border_px(evidence, found, name) for name in free if name[0] in "kp"), default=None)
+    harmless = _WEAK_BORDER * np.hypot(camera.width, camera.height) / 2
     return {
         "focal_percent": 100 * focal,
         "principal_point_px": [freed.deviation(name) for name in _PRINCIPAL_POINT],
         "distortion_border_px": border,
         "principal_point_free": principal_point,
-        "weak": bool(focal > _WEAK_FOCAL or border > _WEAK_BORDER * np.hypot(camera.width, camera.height) / 2),
+        "weak": bool(focal > _WEAK_FOCAL or (border is not None and border > harmless)),
         "reason": None,
     }
 

@@ -18,12 +18,14 @@ class Evidence:
 
     features: keypoints found in it. best_matches: the most geometrically verified matches with any one photo,
     best_partner: that photo's name. other_model_size: number of photos in another model with this photo, 0 without one.
+    size_px: width and height.
     """
 
     features: int
     best_matches: int
     best_partner: str | None
     other_model_size: int
+    size_px: tuple[int, int]
 
 
 def reason(evidence: Evidence) -> str:
@@ -31,7 +33,8 @@ def reason(evidence: Evidence) -> str:
     if evidence.other_model_size:
         return f"in another model of {evidence.other_model_size} photos"
     if evidence.features < FEW_FEATURES:
-        return f"too few features ({evidence.features})"
+        width, height = evidence.size_px
+        return f"too few features ({evidence.features} in {width}x{height} pixels)"
     if evidence.best_matches < FEW_MATCHES:
         return f"matches no other photo well (best {evidence.best_matches} verified matches)"
     return f"rejected by the mapper ({evidence.best_matches} verified matches with {evidence.best_partner})"
@@ -39,13 +42,13 @@ def reason(evidence: Evidence) -> str:
 
 _ADVICE = {
     "unreadable": "convert the files to JPEG or copy them again",
-    "too few features": "take sharper photos of a textured scene",
+    "too few features": "use the original files if these were made smaller, or take sharper photos of a textured scene",
     "matches no other photo well": "take photos with more overlap, two thirds from one to the next",
     "in another model": "take photos that connect the parts of the scene",
     "contradicts the rest": "take photos with more overlap around this one, or remove it",
     "matches too few points": "hold out photos that overlap with training photos, see --holdout",
     NO_TRAINING_PHOTO: "hold out only photos of cameras that also took training photos, see --holdout",
-    "rejected by the mapper": "take photos with more overlap and while moving sideways, or allow more features",
+    "rejected by the mapper": "take photos with more overlap and while moving sideways, or raise --max-features",
 }
 
 
