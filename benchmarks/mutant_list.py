@@ -631,7 +631,7 @@ GROUPS: tuple[Group, ...] = (
             Mutant("bend = 2 * self._factor_slope", "bend = self._factor_slope"),
             Mutant("diagonal + bend * y * y", "diagonal + bend * x * x"),
             Mutant("-plane * factor * square**i", "plane * factor * square**i"),
-            Mutant("6 * _size(self.tangential)", "0 * _size(self.tangential)"),
+            Mutant("6 * _size(distortion.tangential)", "0 * _size(distortion.tangential)"),
             Mutant("real.min(initial=np.inf)", "real.max(initial=0.0)"),
             Mutant("~(goals >= heights[-1])", "goals >= 0"),
             Mutant("close & (_radius(plane) < self.reach)", "close"),

@@ -86,9 +86,20 @@ def attenuation_of_voxels(
     for dz in offsets:
         for dy in offsets:
             for dx in offsets:
-                grid = np.stack(np.meshgrid(z + dz, y + dy, x + dx, indexing="ij")[::-1], axis=-1)
-                total += attenuation_at(phantom, grid)
+                total += _attenuation_on_grid(phantom, x + dx, y + dy, z + dz)
     return total / samples**3
+
+
+def _attenuation_on_grid(phantom: Phantom, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """(Z, Y, X) attenuation at the points of a grid; a solid is sought only in the box around its largest ball."""
+    total = np.zeros((len(z), len(y), len(x)))
+    for solid in phantom:
+        radius = 1.001 * max(solid.semi_axes)
+        near = [np.abs(axis - c) <= radius for axis, c in zip((x, y, z), solid.centre, strict=True)]
+        own = [axis[kept] for axis, kept in zip((x, y, z), near, strict=True)]
+        points = np.stack(np.meshgrid(*own[::-1], indexing="ij")[::-1], axis=-1)
+        total[np.ix_(*near[::-1])] += solid.attenuation * solid.holds(points)
+    return total
 
 
 def bean(scale: float = 1.0) -> list[Ellipsoid]:

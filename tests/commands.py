@@ -38,6 +38,6 @@ def listing(folder: Path) -> dict[str, bytes]:
 def started(*arguments: str | Path) -> subprocess.Popen[str]:
     """Start a command that reacts to Ctrl-C as in a terminal, even if a suite in the background ignores SIGINT."""
     program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    program += "from nerfcli.cli import main; main()"
+    program += "from nerfcli.__main__ import start; start()"
     command = [sys.executable, "-c", program, *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

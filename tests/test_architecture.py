@@ -166,8 +166,11 @@ def source(path: Path) -> Source:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
             found.imports.append(node)
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name | ast.Attribute):
-            found.calls.append((node.lineno, ast.unparse(node.func)))
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            found.calls.append((node.lineno, node.func.id))
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            if isinstance(node.func.value, ast.Name):
+                found.calls.append((node.lineno, f"{node.func.value.id}.{node.func.attr}"))
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             found.constants.add(node.value)
     return found

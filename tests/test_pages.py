@@ -47,7 +47,9 @@ def test_titles_and_cells_are_text():
 @examples(60)
 @given(
     st.recursive(
-        st.text() | st.integers() | st.none(), lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner)
+        st.text() | st.integers() | st.none(),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+        max_leaves=25,
     )
 )
 def test_data_reads_back_as_it_was_and_cannot_end_its_element(content):

@@ -41,9 +41,10 @@ SMALL = TrainSettings(
     budget_seconds=None, steps=200, log2_rows=12, first_samples_per_step=2**11, samples_per_step=2**11, threads=1
 )
 TRAININGS = """
-import atexit, math, sys
+import atexit, gc, math, sys
 from dataclasses import replace
 from pathlib import Path
+atexit.register(gc.freeze)  # as in `nerfcli.__main__`
 sys.path.insert(0, {tests!r})
 from test_ranks import SPHERES, SMALL, VARIANTS, settings_with, torch, train_until
 from nerfcli.fit.fitting import Fitting
@@ -156,7 +157,7 @@ def test_a_number_that_is_not_finite_in_one_process_takes_all_of_them_back(by_tw
 def killed(tmp_path: Path, victims: Sequence[int], sent: signal.Signals) -> list[tuple[int, str, list[str]]]:
     """Train with two ranks, send some of them a signal after some steps, and return what `ended` does."""
     run = tmp_path / "run"
-    program = "from nerfcli.cli import main; main()"
+    program = "from nerfcli.__main__ import start; start()"
     options = ("--steps", "4000", "--model", "default", "--batch", "1024", "--log2-rows", "10", "--threads", "1")
     processes = two_ranks(program, "train", SPHERES, "-o", run, *options)
     deadline = time.monotonic() + 60

@@ -31,7 +31,7 @@ from nerfcli.kernels.triton_cuda.cubin import Cubin, UnexpectedCodeError, compil
 from nerfcli.kernels.triton_cuda.launch import Variant
 
 HERE = Path(__file__).parent
-CUOBJDUMP = Path(nvidia.__file__).parent / "bin" / "cuobjdump"
+CUOBJDUMP, NVDISASM = (Path(nvidia.__file__).parent / "bin" / name for name in ("cuobjdump", "nvdisasm"))
 # Shared memory of an Ampere, Ada or Blackwell desktop card, in bytes per program.
 MOST_SHARED = 99 * 1024
 
@@ -82,12 +82,39 @@ def test_kernels_agree_with_the_reference_in_the_interpreter(interpreted):
     assert interpreted.code == 0, interpreted.output
 
 
-def machine_code(path: Path) -> tuple[str, int]:
-    """Return a kernel's instructions, and how many bytes of a thread's registers are spilled to memory."""
-    done = subprocess.run([CUOBJDUMP, "-res-usage", "-sass", path], capture_output=True, text=True, check=True)
-    uses = re.search(r"STACK:(\d+)", done.stdout)
-    assert uses, done.stdout[:500]
-    return done.stdout, int(uses[1])
+def spilled_bytes(path: Path) -> int:
+    """Return how many bytes of a thread's registers are spilled to memory."""
+    text = subprocess.run([CUOBJDUMP, "-res-usage", path], capture_output=True, text=True, check=True).stdout
+    found = re.search(r"STACK:(\d+)", text)
+    assert found, text[:500]
+    return int(found[1])
+
+
+def instructions_of(paths: list[Path]) -> list[str]:
+    """Return the instructions of each kernel, of one generation. The disassembler starts in 0.4 s: once for all."""
+    extracted: list[tuple[int, bytes]] = []
+    architectures = set()
+    for number, path in enumerate(paths):
+        folder = path.with_name(f"{path.stem}-instructions")
+        folder.mkdir()
+        subprocess.run([CUOBJDUMP, "-xtext", "all", path], capture_output=True, check=True, cwd=folder)
+        for part in folder.iterdir():
+            extracted.append((number, part.read_bytes()))
+            architectures.add(part.name.rsplit(".", 3)[1].replace("sm_", "SM"))
+    (architecture,) = architectures
+    together = paths[0].with_name("instructions")
+    together.write_bytes(b"".join(content for _, content in extracted))
+    command = [NVDISASM, "--binary", architecture, together]
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    of_address = {int(found[1], 16): line for line in lines if (found := re.match(r"\s*/\*([0-9a-f]+)\*/", line))}
+    texts, start = [""] * len(paths), 0
+    for number, content in extracted:
+        own = [line for address, line in of_address.items() if start <= address < start + len(content)]
+        assert len(own) * 16 == len(content)  # all are read: an instruction has 128 bits
+        texts[number] += "\n".join(own)
+        start += len(content)
+    assert all(texts)
+    return texts
 
 
 @pytest.mark.gpu
@@ -115,23 +142,25 @@ ALL, EACH, HOTTEST = "all", "each", "hottest"
 def test_kernels_compile_within_the_limits_of_each_generation(interpreted, kernel_cache, capability, which, tmp_path):
     """Check what the interpreter cannot: types, shared memory, spilled registers, vector instructions, tensor cores."""
     assert len(interpreted.variants) > 40, interpreted.output
-    path, sizes = tmp_path / "kernel.cubin", set()
+    disassembled: list[tuple[Variant, Path]] = []
+    sizes = set()
     chosen = {ALL: list, EACH: each, HOTTEST: hottest}[which](interpreted.variants)
-    for variant in chosen:
+    for number, variant in enumerate(chosen):
         built = compiled(variant, capability)
-        name, constants = variant.kernel.fn.__name__, dict(variant.constants)
+        name, path = variant.kernel.fn.__name__, tmp_path / f"{number}.cubin"
         assert built.shared_bytes <= MOST_SHARED, name
         path.write_bytes(built.code)
         if built.formats not in sizes:
             # The driver refuses a launch whose buffer has another size than the parameters.
             assert parameter_bytes(path) == struct.calcsize(f"@{built.formats}"), name
             sizes.add(built.formats)
-        networks_backward = name == "_backward" and "H" in constants
-        if not (networks_backward or name in ("_encode", "_encode_backward", "_points_backward")):
-            continue
-        text, spilled = machine_code(path)
-        if networks_backward:  # all sums of the weights' gradients are in registers
-            assert spilled <= (160 if constants["H"] == 32 else 700)
+        if is_network_s_backward(variant) or name in ("_encode", "_encode_backward", "_points_backward"):
+            disassembled.append((variant, path))
+    texts = instructions_of([path for _, path in disassembled])
+    for (variant, path), text in zip(disassembled, texts, strict=True):
+        name, spilled = variant.kernel.fn.__name__, spilled_bytes(path)
+        if is_network_s_backward(variant):  # all sums of the weights' gradients are in registers
+            assert spilled <= (160 if dict(variant.constants)["H"] == 32 else 700)
             assert len(re.findall(r"HGMMA|HMMA", text)) > 30
         else:
             assert spilled == 0, name
@@ -140,6 +169,10 @@ def test_kernels_compile_within_the_limits_of_each_generation(interpreted, kerne
         if name == "_encode":
             width = 64 if "*fp16" in variant.types[2] else 128
             assert len(re.findall(rf"LDG\.E\.{width}", text)) >= 8, name
+
+
+def is_network_s_backward(variant: Variant) -> bool:
+    return variant.kernel.fn.__name__ == "_backward" and "H" in dict(variant.constants)
 
 
 def each(variants: list[Variant]) -> list[Variant]:

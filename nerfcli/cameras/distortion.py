@@ -10,7 +10,7 @@ the coordinates first.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -45,19 +45,7 @@ class Distortion:
         smallest root of g' = w, of g / rho = w, or at the pole B = 0, whichever comes first. Without the other terms
         that is exactly where the radius turns back or becomes infinite.
         """
-        top, bottom = _in_rho(self.radial), _in_rho(self.divisor)
-        loss = np.array([0.0, 6 * _size(self.tangential) + 2 * _size(self.prism), 0.0, 4 * _size(self.prism_fourth)])
-        square = polynomial.polymul(bottom, bottom)
-        g = polynomial.polymulx(top)
-        slope = polynomial.polysub(
-            polynomial.polymul(polynomial.polyder(g), bottom), polynomial.polymul(g, polynomial.polyder(bottom))
-        )
-        margins = [
-            bottom,
-            polynomial.polysub(slope, polynomial.polymul(loss, square)),
-            polynomial.polysub(polynomial.polymul(top, bottom), polynomial.polymul(loss, square)),
-        ]
-        return min(_first_root(margin) for margin in margins)
+        return _reach(self)
 
     def apply(self, plane: np.ndarray) -> np.ndarray:
         """Return F at points (2, N)."""
@@ -240,6 +228,26 @@ class Distortion:
         if not np.isfinite(self.reach):
             return plane
         return plane * np.minimum(1.0, self.reach * (1 - 1e-12) / np.maximum(_radius(plane), 1e-300))
+
+
+# The photos of a capture have cameras of their own with the same few lenses.
+@lru_cache(maxsize=256)
+def _reach(distortion: Distortion) -> float:
+    """Return `Distortion.reach`."""
+    top, bottom = _in_rho(distortion.radial), _in_rho(distortion.divisor)
+    others = 6 * _size(distortion.tangential) + 2 * _size(distortion.prism)
+    loss = np.array([0.0, others, 0.0, 4 * _size(distortion.prism_fourth)])
+    square = polynomial.polymul(bottom, bottom)
+    g = polynomial.polymulx(top)
+    slope = polynomial.polysub(
+        polynomial.polymul(polynomial.polyder(g), bottom), polynomial.polymul(g, polynomial.polyder(bottom))
+    )
+    margins = [
+        bottom,
+        polynomial.polysub(slope, polynomial.polymul(loss, square)),
+        polynomial.polysub(polynomial.polymul(top, bottom), polynomial.polymul(loss, square)),
+    ]
+    return min(_first_root(margin) for margin in margins)
 
 
 def _in_rho(coefficients: tuple[float, ...]) -> np.ndarray:

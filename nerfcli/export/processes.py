@@ -1,5 +1,7 @@
 """Distribute frames over processes, one frame at a time; a crashed process is reported and its frame rendered again."""
 
+import atexit
+import gc
 import multiprocessing
 import signal
 import traceback
@@ -131,6 +133,7 @@ class _Failure:
 
 def _serve(connection: Any, model: Model, order: Order, unfinished: UnfinishedFrames, threads: int) -> None:
     """Render the frames whose indices are received, until the connection is closed."""
+    atexit.register(gc.freeze)  # as in `nerfcli.__main__`
     torch.set_num_threads(threads)
     signal.signal(signal.SIGTERM, _leave)
     if hasattr(signal, "pthread_sigmask"):

@@ -121,15 +121,15 @@ def groups() -> tuple[Group, ...]:
 
 def deepest_ray(rays: list[Segments], precision: Precision) -> tuple[int, float]:
     """Return the largest number of intervals on a ray that light reaches, and the largest optical depth it passes."""
-    counts, depths = [0], [0.0]
+    counts, depths, deepest = [0], [0.0], precision.deepest
     for ray in rays:
         depth, count = 0.0, 0
         for sigma, length in zip(ray.density, ray.lengths, strict=True):
-            if depth > precision.deepest:
+            if depth > deepest:
                 break
             depth, count = depth + sigma * length, count + 1
         counts.append(count)
-        depths.append(min(depth, precision.deepest))
+        depths.append(min(depth, deepest))
     return max(counts), max(depths)
 
 
