@@ -181,10 +181,15 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --direction reverse", "--direction: it works with --video"),
         ("render x --crf 5", "--crf: it works with --video"),
         ("render x --background-distance 5", "it works with --depth background"),
+        ("render x --level 0.8", "--level: it works with --outputs lower,upper"),
+        ("render x --depth-tolerance 0.1 --outputs lower", "--depth-tolerance: it works with --outputs confidence"),
+        ("render x --outputs depth --rgba", "--rgba: it works with --outputs rgb"),
         ("train x --vary photos", "--vary: it works with --members"),
         ("render x --cameras-only --dry-run", "it renders nothing; remove --dry-run"),
         ("report x --depth expected", "'expected'; choose conditional, moment, max-weight, median or quantile:Q"),
         ("export x --to page --faces 100", "--faces: it is for meshes"),
+        ("export x --to page --voxel-size 0.1", "--voxel-size: it is for all but pages"),
+        ("export x --to volume --max-size 64", "--max-size: it is for all but pages and volumes"),
         ("export x --to volume --water 0.2", "--water: it is for X-ray scans"),
         ("export x --to points --format laz -o x.ply", "'laz' contradicts -o x.ply"),
         ("train x y", "(y); give one, or several on standard input: ls -d *-scene/ | nerfcli train -"),
@@ -862,8 +867,8 @@ def test_ctrl_c_and_sigterm_save_a_checkpoint_and_say_how_to_go_on(stopped, exit
     assert stdout == ""
     assert not any(word in stderr for word in ("Traceback", "stack trace"))
     saved, ended = stderr.splitlines()[-2:]
-    go_on = f"nerfcli train {shlex.quote(str(capture))} -o {shlex.quote(str(run))} --resume"
-    assert saved == f"checkpoint saved; continue with: {go_on}"
+    # The command without its other options would continue to another budget, with other components.
+    assert saved == f"checkpoint saved in {run}; to continue, add --resume to the same command"
     assert ended.endswith("; completed work is kept.")
     assert {path.name for path in run.iterdir()} >= {"config.json", "field.safetensors", "state.safetensors"}
     assert not list(run.rglob("*partial*"))

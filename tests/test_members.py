@@ -166,22 +166,32 @@ def test_tasks_of_an_array_job_train_one_member_each(capture):
     assert nerfcli(*task, "4/3").exit_code == USAGE
 
 
-def test_an_interrupted_member_is_resumed_by_the_same_command(capture, monkeypatch):
+@pytest.fixture
+def interrupted_at_step_4(monkeypatch):
+    """Run a command in which Ctrl-C comes at step 4 of the training with a seed."""
+
+    def run(seed, *command):
+        advance = Fitting.advance
+
+        def interrupted(fitting, *arguments, **options):
+            if fitting.settings.seed == seed and fitting.step == 4:
+                raise KeyboardInterrupt
+            return advance(fitting, *arguments, **options)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(Fitting, "advance", interrupted)
+            result = nerfcli(*command)
+        assert result.exit_code == 130
+        assert "the same command continues" in result.stderr
+        assert "--resume" not in result.stderr
+
+    return run
+
+
+def test_an_interrupted_member_is_resumed_by_the_same_command(capture, interrupted_at_step_4):
     run = capture.with_name("r")
     command = ("train", capture, *QUICK, "--steps", "8", "-o", run, "--members", "2")
-    advance = Fitting.advance
-
-    def interrupted(fitting, *arguments, **options):
-        if fitting.settings.seed == 2 and fitting.step == 4:
-            raise KeyboardInterrupt
-        return advance(fitting, *arguments, **options)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Fitting, "advance", interrupted)
-        result = nerfcli(*command)
-    assert result.exit_code == 130
-    assert "the same command continues" in result.stderr
-    assert "--resume" not in result.stderr
+    interrupted_at_step_4(2, *command)
     assert error_of(nerfcli("evaluate", run, "--members"))[0].endswith("members/2 was interrupted")
     first = (run / "members" / "1" / "field.safetensors").read_bytes()
     again = nerfcli(*command)
@@ -190,6 +200,16 @@ def test_an_interrupted_member_is_resumed_by_the_same_command(capture, monkeypat
     assert (run / "members" / "1" / "field.safetensors").read_bytes() == first
     members = members_of(Run(run))
     assert [member.log[-1]["step"] for member in members] == [8, 8]
+
+
+def test_a_run_that_was_interrupted_before_its_members_is_resumed_by_the_same_command(capture, interrupted_at_step_4):
+    run = capture.with_name("r")
+    command = ("train", capture, *QUICK, "--steps", "8", "-o", run, "--members", "2")
+    interrupted_at_step_4(0, *command)
+    again = nerfcli(*command)
+    assert again.exit_code == 0, again.stderr
+    assert "resumed at step 4" in again.stderr
+    assert [one.log[-1]["step"] for one in [Run(run), *members_of(Run(run))]] == [8, 8, 8]
 
 
 def test_members_keep_to_the_memory_of_the_run(capture):

@@ -184,3 +184,21 @@ def test_a_full_disk_behind_stdout_is_an_error_of_two_lines(options, capture):
     assert done.returncode == BAD_INPUT
     assert [line.split(":")[0] for line in done.stderr.splitlines()] == ["Error", "Hint"]
     assert "disk is full" in done.stderr
+
+
+def test_a_closed_stdin_holds_no_paths():
+    """As with `<&-`, and for some services."""
+    command = [sys.executable, "-m", "nerfcli", "info", "-"]
+    done = subprocess.run(
+        ["sh", "-c", '"$@" <&-', "sh", *command], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stdout) == (BAD_INPUT, "")
+    assert done.stderr.startswith("Error: no paths on standard input\nHint:  ")
+
+
+def test_a_path_that_stdout_cannot_encode_is_escaped(capture, tmp_path):
+    given = capture.rename(tmp_path / "k\u00fcche")
+    command = [sys.executable, "-m", "nerfcli", "convert", given, tmp_path / "\u00fc.json", "--to", "transforms"]
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, env=environment)
+    assert (done.returncode, done.stdout) == (0, f"{tmp_path}/\\xfc.json\n"), done.stderr

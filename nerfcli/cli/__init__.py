@@ -3,6 +3,7 @@
 import os
 import sys
 from contextlib import suppress
+from io import TextIOWrapper
 
 import typer
 
@@ -94,6 +95,7 @@ def main() -> None:
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     keep_freed_memory()
     install_handlers()
+    _escape_what_stdout_cannot_encode()
     try:
         app(prog_name="nerfcli")  # not "python -m nerfcli", for which no shell has completion
     except SystemExit as ended:
@@ -103,3 +105,9 @@ def main() -> None:
         with suppress(OSError):
             sys.stdout.flush()
         os._exit(ended.code)
+
+
+def _escape_what_stdout_cannot_encode() -> None:
+    """Print a character that the encoding of stdout lacks as an escape, as Python does on stderr, not as a bug."""
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")

@@ -61,7 +61,7 @@ def example_of_many(command: str) -> str:
 
 def stdin_paths() -> Iterator[Path]:
     """Yield the lines of standard input as paths, each as soon as it is complete; skip empty lines."""
-    while line := sys.stdin.readline():
+    while line := sys.stdin.readline() if sys.stdin is not None else "":  # None where the parent process has closed it
         if text := line.rstrip("\r\n"):
             yield Path(text)
 

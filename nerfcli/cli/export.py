@@ -121,10 +121,15 @@ def export(
     finite(voxel_size, "--voxel-size")
     if voxel_size is not None and voxel_size <= 0:
         raise typer.BadParameter(f"{voxel_size:g} is not a positive size", param_hint="--voxel-size")
-    unused = {"--faces": faces is not None and to != "mesh", "--water": water is not None}
-    if option := next((name for name, is_given in unused.items() if is_given), None):
-        suited = "meshes" if option == "--faces" else "X-ray scans"
-        raise typer.BadParameter(f"it is for {suited}; remove it", param_hint=option)
+    unused = {
+        "--faces": (faces is not None and to != "mesh", "meshes"),
+        "--voxel-size": (voxel_size is not None and to == "page", "all but pages"),
+        "--max-size": (max_size != SurfaceSettings.max_size and to in ("page", "volume"), "all but pages and volumes"),
+        "--water": (water is not None, "X-ray scans"),
+    }
+    for option, (is_unused, suited) in unused.items():
+        if is_unused:
+            raise typer.BadParameter(f"it is for {suited}; remove it", param_hint=option)
     if suffix is not None and output is not None and run != STDIN and output.suffix.lower() not in ("", suffix):
         raise typer.BadParameter(f"{form!r} contradicts -o {output}; remove one of them", param_hint="--format")
     settings = SurfaceSettings(

@@ -301,6 +301,12 @@ def render(
         "--video-layout": (video_layout != "separate" and not writes_video, "--video"),
         "--direction": (direction != "forward" and not writes_video, "--video"),
         "--background-distance": (background_distance is not None and depth != "background", "--depth background"),
+        "--level": (level != DepthRequest.level and not {"lower", "upper"} & set(chosen), "--outputs lower,upper"),
+        "--depth-tolerance": (
+            depth_tolerance != DepthRequest.depth_tolerance and "confidence" not in chosen,
+            "--outputs confidence",
+        ),
+        "--rgba": (rgba and "rgb" not in chosen, "--outputs rgb"),
     }
     for option, (is_unused, needed) in unused.items():
         if is_unused:

@@ -195,7 +195,7 @@ def train(
     from nerfcli.torchrun import is_first, is_one_of_several, local_rank_and_size
     from nerfcli.workflows.blocks import block_settings, train_blocks
     from nerfcli.workflows.members import VARIED, member_settings, train_members
-    from nerfcli.workflows.train import train_scene
+    from nerfcli.workflows.train import train_or_continue, train_scene
     from nerfcli.workflows.train_plan import plan_training
 
     if budget is None and steps is None:
@@ -295,13 +295,29 @@ def train(
             )
 
     def train_one_scene(folder: Path, run: Path) -> None:
+        with console.progress(f"train {folder.name}") as update:
+            train_scene(
+                folder,
+                run,
+                photo_settings(),
+                memory_bytes=memory_of_process(),
+                resume=resume,
+                overwrite=overwrite,
+                holdout=rule,
+                view=view,
+                notify=console.note,
+                warn=console.warn,
+                progress=update,
+            )
+
+    def train_with_members(folder: Path, run: Path) -> None:
         if member is not None and folder.exists() and not Run(run).is_complete(photo_settings()):
             raise UserError(
                 f"{run} is not complete, and --members {members} trains one of its members",
                 "train it first, with the same options without --members",
             )
         with console.progress(f"train {folder.name}") as update:
-            trained = train_scene(
+            train_or_continue(
                 folder,
                 run,
                 photo_settings(),
@@ -309,16 +325,13 @@ def train(
                 resume=resume and member is None,
                 overwrite=overwrite and member is None,
                 holdout=rule,
-                view=view,
                 notify=console.note,
                 warn=console.warn,
                 progress=update,
             )
-        if not member_count:
-            return
         with console.progress(f"members of {folder.name}") as update:
             train_members(
-                trained,
+                Run(run),
                 member_count,
                 only=member,
                 vary=vary,
@@ -359,6 +372,8 @@ def train(
             return
         elif count:
             run = train_in_blocks(folder, run)
+        elif member_count:
+            train_with_members(folder, run)
         else:
             train_one_scene(folder, run)
         if is_first():

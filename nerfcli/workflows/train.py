@@ -7,7 +7,7 @@ from pathlib import Path
 from nerfcli import scene as scenes
 from nerfcli.atomic import clear_leftovers
 from nerfcli.cameras.orientation import describe_rescaling
-from nerfcli.errors import UserError, in_shell
+from nerfcli.errors import UserError
 from nerfcli.exclusive import exclusive
 from nerfcli.runs.blocks import divide
 from nerfcli.runs.config import split_hash
@@ -84,8 +84,7 @@ def train_scene(
         )
     except KeyboardInterrupt:
         if (run / STATE).exists():
-            paths = f"{in_shell(folder)} -o {in_shell(run)}"
-            notify(f"checkpoint saved; continue with: nerfcli train {paths} --resume")
+            notify(f"checkpoint saved in {run}; to continue, add --resume to the same command")
         raise
 
 
