@@ -1,9 +1,12 @@
 """Backends: whole operations on rays against the reference in float64, in every branch; and which backend is taken."""
 
+import importlib
 import math
+import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -441,6 +444,28 @@ def test_without_numba_the_reference_is_taken_with_one_warning(without_numba, re
     assert names == ["reference"] * 3
     (warning,) = recwarn
     assert "Numba does not work on this machine" in str(warning.message)
+
+
+@pytest.mark.parametrize("swallowed", [ImportError, None])
+def test_ctrl_c_while_numba_is_imported_is_not_lost(swallowed, monkeypatch, recwarn):
+    """Numba's C code may clear the exception of an interrupt, or fail for it and be taken for a broken installation."""
+    imported = importlib.import_module
+
+    def interrupted(name: str) -> ModuleType:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            if swallowed is not None:
+                raise swallowed from None
+        return imported(name)
+
+    kernels._numba_cpu.cache_clear()
+    monkeypatch.setattr(importlib, "import_module", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        kernels.backend_for(CPU, torch.float32)
+    monkeypatch.setattr(importlib, "import_module", imported)
+    assert kernels.backend_for(CPU, torch.float32).name == "numba_cpu"
+    assert not recwarn.list
 
 
 @pytest.mark.filterwarnings("ignore:Numba does not work on this machine")

@@ -184,6 +184,9 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --level 0.8", "--level: it works with --outputs lower,upper"),
         ("render x --depth-tolerance 0.1 --outputs lower", "--depth-tolerance: it works with --outputs confidence"),
         ("render x --outputs depth --rgba", "--rgba: it works with --outputs rgb"),
+        ("render x --count 20", "--count: it works with --cameras orbit, ellipse, spiral, interpolate"),
+        ("train x --field voxels --levels 4", "--levels: it works with --field hash"),
+        ("train x --field mlp --log2-rows 12", "--log2-rows: it works with --field hash"),
         ("train x --vary photos", "--vary: it works with --members"),
         ("render x --cameras-only --dry-run", "it renders nothing; remove --dry-run"),
         ("report x --depth expected", "'expected'; choose conditional, moment, max-weight, median or quantile:Q"),
@@ -696,7 +699,8 @@ def test_renders_are_kept_refused_and_overwritten(finished, tmp_path):
 
 @pytest.mark.parametrize("cameras", ["train", "orbit", "ellipse", "spiral", "interpolate"])
 def test_cameras_to_render_from(cameras, finished):
-    arguments = ("--cameras", cameras, "--count", "3", "--outputs", "rgb", "--max-size", "10", "--video")
+    count = () if cameras == "train" else ("--count", "3")
+    arguments = ("--cameras", cameras, *count, "--outputs", "rgb", "--max-size", "10", "--video")
     result = nerfcli("render", finished, *arguments)
     folder = finished / "renders" / cameras
     assert (result.exit_code, result.stdout) == (0, f"{folder / 'rgb.mp4'}\n")

@@ -262,7 +262,7 @@ def test_frames_of_a_video_are_compared_with_later_ones(tmp_path):
     assert [first for first, _ in seen] == list(range(11))
     moves = [np.median(np.linalg.norm(pair.pixels[1] - pair.pixels[0], axis=1)) / 480 for pair in pairs]
     assert min(moves[:4]) >= LEAST_MOVE  # later ones reach the black photo first
-    assert dict(seen)[10] == 11
+    assert seen[10][1] == 11
     found = detect(replace(capture, frames=in_order_of_text), axes="opencv", progress=silent)
     assert verdicts(found)["image size"] == "holds"
     assert found.convention == Convention("opencv")

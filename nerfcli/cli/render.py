@@ -236,7 +236,7 @@ def render(
     from nerfcli.runs.run import Run, load_run
     from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.render import RENDERS, folder_name, render_run
-    from nerfcli.workflows.views import Views, chosen_frames, file_fps, usual_axis, write_frames
+    from nerfcli.workflows.views import PATHS, Views, chosen_frames, file_fps, usual_axis, write_frames
 
     console = Console(quiet=quiet, json_lines=json)
 
@@ -307,6 +307,7 @@ def render(
             "--outputs confidence",
         ),
         "--rgba": (rgba and "rgb" not in chosen, "--outputs rgb"),
+        "--count": (count != Views.count and cameras not in PATHS, f"--cameras {', '.join(PATHS)}"),
     }
     for option, (is_unused, needed) in unused.items():
         if is_unused:

@@ -208,6 +208,14 @@ def train(
         raise typer.BadParameter(
             f"it cannot be combined with {option}, which is about one field", param_hint="--members"
         )
+    usual = TrainSettings()
+    of_hash = {
+        "--log2-rows": log2_rows is not None,
+        "--levels": levels != usual.levels,
+        "--width": width != usual.width,
+    }
+    if field not in (None, "hash") and (option := next((name for name, given in of_hash.items() if given), None)):
+        raise typer.BadParameter("it works with --field hash; for other fields, give --field-memory", param_hint=option)
     only, count = one_or_all(blocks, "--blocks")
     member, member_count = one_or_all(members, "--members")
     if count and (members is not None or view):

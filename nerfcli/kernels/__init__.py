@@ -4,6 +4,7 @@ A backend is chosen once per training or model, from the device and the precisio
 """
 
 import functools
+import importlib
 import warnings
 from collections.abc import Callable
 from types import ModuleType
@@ -11,6 +12,7 @@ from types import ModuleType
 import torch
 
 from nerfcli.errors import UserError
+from nerfcli.interrupts import deferred_interrupts
 from nerfcli.kernels.contraction import CONTRACTIONS, contract, contract_to_cube, grid_coordinates
 from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import (
@@ -194,13 +196,21 @@ def _warn_of_slow_gpu(reason: str) -> None:
 
 @functools.cache
 def _numba_cpu() -> ModuleType | None:
-    """Return the CPU kernels, or None with one warning where Numba does not work."""
-    try:
-        from nerfcli.kernels import numba_cpu
-    except ImportError as error:
+    """Return the CPU kernels, or None with one warning where Numba does not work.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C or SIGTERM came meanwhile. Raised at once, C code of Numba might swallow it, or fail.
+    """
+    kernels, failure = None, None
+    with deferred_interrupts() as interrupts:
+        try:
+            kernels = importlib.import_module("nerfcli.kernels.numba_cpu")
+        except ImportError as error:
+            failure = error
+    interrupts.raise_if_pending()
+    if failure is not None:
         warnings.warn(
-            f"Numba does not work on this machine ({error}); using plain torch instead, which is much slower",
+            f"Numba does not work on this machine ({failure}); using plain torch instead, which is much slower",
             stacklevel=3,
         )
-        return None
-    return numba_cpu
+    return kernels
