@@ -7,10 +7,11 @@ import pytest
 from PIL import ExifTags, Image
 from test_photos import NO_EXIF, photo
 
+from nerfcli.media.digital_zoom import with_digital_zoom
 from nerfcli.media.exif import Exif, read_exif
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.poses.engine.database import camera_of_group
-from nerfcli.poses.input.photos import Photos, camera_groups
+from nerfcli.poses.input.photos import Photos, camera_groups, find_photos
 from nerfcli.poses.model.cameras import group_photos
 
 # A full-frame camera with a lens of 50 mm, by its own numbers: 50 / 36 * 5472 = 7600 pixels.
@@ -92,6 +93,49 @@ def test_the_recorded_size_and_resolution_are_read(tmp_path: Path):
     Image.new("RGB", (60, 40)).save(tmp_path / "b.jpg", exif=exif)
     odd = read_exif(tmp_path / "b.jpg")
     assert (odd.taken_px, odd.sensor_px_per_mm) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("equivalents", "zooms", "expected"),
+    [
+        ((23, 23, 23), (1.0, 1.09, 2.41), (23, 25.07, 55.43)),  # Samsung leaves digital zoom out
+        ((26, 28, 52), (1.0, 1.09, 2.0), (26, 28, 52)),  # Apple includes it, in whole millimetres
+        ((23, 23, 23), (2.0, 2.0, 2.0), (23, 23, 23)),  # one zoom alone does not tell
+        ((23, 23, 23), (1.0, 1.02, 1.01), (23, 23, 23)),  # nor do zooms within the rounding
+        ((23, 23, 23), (None, None, None), (23, 23, 23)),
+        ((None, None, None), (1.0, 1.5, 2.0), (None, None, None)),
+    ],
+)
+def test_digital_zoom_counts_once(equivalents, zooms, expected):
+    taken = [
+        replace(PHONE, focal_35mm=equivalent, digital_zoom=zoom)
+        for equivalent, zoom in zip(equivalents, zooms, strict=True)
+    ]
+    other = replace(PHONE, model="Q", focal_35mm=40.0, digital_zoom=3.0)
+    *found, last = with_digital_zoom([*taken, other])
+    assert [exif.focal_35mm for exif in found] == [None if one is None else pytest.approx(one) for one in expected]
+    assert [exif.focal_mm for exif in found] == pytest.approx([4.0 * (zoom or 1.0) for zoom in zooms])
+    assert (last.focal_35mm, last.focal_mm) == (40.0, 12.0)
+
+
+@pytest.mark.parametrize(("ratio", "zoom"), [(1.44, 1.44), (0, None), (0.5, None), (1000, None), (None, None)])
+def test_photos_with_other_digital_zooms_have_other_cameras(ratio, zoom, tmp_path):
+    for index in range(5):
+        exif, tags = Image.Exif(), ExifTags.Base
+        camera = exif.get_ifd(ExifTags.IFD.Exif)
+        camera[tags.FocalLength], camera[tags.FocalLengthIn35mmFilm] = 5.4, 23
+        if index != 4:
+            camera[tags.DigitalZoomRatio] = 1.0
+        elif ratio is not None:
+            camera[tags.DigitalZoomRatio] = ratio
+        Image.new("RGB", (80, 60)).save(tmp_path / f"{index}.jpg", exif=exif)
+    found = find_photos(tmp_path)
+    assert read_exif(tmp_path / "4.jpg").digital_zoom == zoom
+    groups = group_photos(found, model="auto").groups
+    assert [len(group.photos) for group in groups] == ([4, 1] if zoom else [5])
+    assert [group.focal_px for group in groups] == pytest.approx(
+        [23 / 43.27 * 100 * (z or 1) for z in (1, zoom)][: len(groups)]
+    )
 
 
 def test_cameras_start_from_exif_only_where_it_holds():

@@ -11,6 +11,7 @@ import numpy as np
 
 from nerfcli.doctor import brightness, sharpness
 from nerfcli.errors import UserError
+from nerfcli.media.digital_zoom import with_digital_zoom
 from nerfcli.media.exif import Exif, read_exif
 from nerfcli.media.images import downscale, read_image
 from nerfcli.media.panoramas import MOST_OF_A_CAMERA, is_panorama
@@ -102,6 +103,8 @@ def read_all(
             else:
                 unreadable[sources[index].name] = found
             progress(index + 1)
+    exifs = with_digital_zoom([photo.exif for photo in facts])
+    facts = [replace(photo, exif=exif) for photo, exif in zip(facts, exifs, strict=True)]
     if sum(photo.is_panorama for photo in facts) > MOST_OF_A_CAMERA * len(facts):
         facts = [replace(photo, is_panorama=photo.exif.width == 2 * photo.exif.height) for photo in facts]
     return facts, unreadable

@@ -13,6 +13,7 @@ from nerfcli.media.images import exif_entries, opened, orientation_of, upright_s
 
 # Values of EXIF's FocalPlaneResolutionUnit; 4 and 5 are not standard, but some cameras write them.
 _RESOLUTION_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_MOST_ZOOM = 100.0
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,8 @@ class Exif:
     width and height are those of the upright picture. gps is (latitude_deg, longitude_deg, altitude in metres
     or None), north and east positive. taken is the time of the shot in seconds of the camera's own clock, comparable
     between photos of one camera. taken_px is the (width, height) that EXIF records for the picture, as the camera
-    stored it; sensor_px_per_mm is the number of its pixels per millimetre of the sensor.
+    stored it; sensor_px_per_mm is the number of its pixels per millimetre of the sensor. digital_zoom is 1 or more, see
+    `digital_zoom.with_digital_zoom`.
     """
 
     make: str | None
@@ -41,6 +43,7 @@ class Exif:
     f_number: float | None = None
     taken_px: tuple[int, int] | None = None
     sensor_px_per_mm: float | None = None
+    digital_zoom: float | None = None
 
 
 def read_exif(path: Path) -> Exif:
@@ -71,6 +74,7 @@ def read_exif(path: Path) -> Exif:
         f_number=_positive(camera.get(ExifTags.Base.FNumber)),
         taken_px=_recorded_size(camera),
         sensor_px_per_mm=_sensor_resolution(camera),
+        digital_zoom=_zoom(camera.get(ExifTags.Base.DigitalZoomRatio)),
     )
 
 
@@ -96,6 +100,11 @@ def _number(value: Any) -> float | None:
 def _positive(value: Any) -> float | None:
     number = _number(value)
     return number if number is not None and number > 0 else None
+
+
+def _zoom(value: Any) -> float | None:
+    zoom = _number(value)
+    return zoom if zoom is not None and 1 <= zoom <= _MOST_ZOOM else None
 
 
 def _recorded_size(camera: dict[int, Any]) -> tuple[int, int] | None:

@@ -3,10 +3,11 @@
 import math
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
+from nerfcli.media.digital_zoom import with_digital_zoom
 from nerfcli.media.exif import Exif, read_exif
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import read_image
@@ -85,7 +86,9 @@ def find_photos(
                 progress(index + 1, len(paths))
     if len(photos) < MIN_PHOTOS:
         raise UserError(_too_few(folder, photos, unreadable), _more_photos_hint(unreadable), TOO_FEW_PHOTOS)
-    return Photos(folder=folder, photos=tuple(photos), unreadable=unreadable)
+    exifs = with_digital_zoom([photo.exif for photo in photos])
+    zoomed = tuple(replace(photo, exif=exif) for photo, exif in zip(photos, exifs, strict=True))
+    return Photos(folder=folder, photos=zoomed, unreadable=unreadable)
 
 
 def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
@@ -100,7 +103,6 @@ def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
         exif = photo.exif
         evidence = focal_evidence(exif)
         crop = evidence.whole_px if evidence.doubt else None
-        # The 35 mm equivalent also tells digital zoom, which leaves the focal length in millimetres as it is.
         optics = (exif.make, exif.model, exif.lens, _same_as(exif.focal_mm, focals), _same_as(exif.focal_35mm, focals))
         key = (PurePosixPath(photo.name).parent, *optics, crop, photo.width, photo.height)
         groups.setdefault(key, []).append(photo.name)
