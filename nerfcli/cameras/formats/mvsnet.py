@@ -75,5 +75,12 @@ def _read(file: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, float] | Non
     pose = np.array(numbers(words[1:17], 16, f"{file}: extrinsic")).reshape(4, 4)
     matrix = np.array(numbers(words[18:27], 9, f"{file}: intrinsic")).reshape(3, 3)
     depths = numbers(words[27:], len(words) - 27, f"{file}: depths")
-    far = {3: lambda: depths[0] + depths[1] * depths[2], 4: lambda: depths[3]}.get(len(depths), lambda: 0.0)()
-    return rigid_pose(pose, f"{file}: extrinsic"), matrix, (depths[0], far) if depths and 0 < depths[0] < far else None
+    return rigid_pose(pose, f"{file}: extrinsic"), matrix, _bounds(depths)
+
+
+def _bounds(depths: list[float]) -> tuple[float, float] | None:
+    """Return nearest and farthest z; None if the farthest is not stated, or they are not in order."""
+    if len(depths) < 3:
+        return None
+    near, far = depths[0], depths[3] if len(depths) == 4 else depths[0] + depths[1] * depths[2]
+    return (near, far) if 0 < near < far else None

@@ -77,6 +77,7 @@ def parse_pose_files(
     files = pose_files(folder)
     photos = PhotoOfStem(_image_folder(folder, files, images, list_images), list_images)
     camera_of_size = _cameras(folder, camera)
+    names_give_splits = all(file.name[:2] in _SPLITS for file in files)
     frames, missing = [], []
     for file in files:
         world_from_cam = _pose(file)
@@ -85,10 +86,9 @@ def parse_pose_files(
         if image is None:
             missing.append(stem)
         elif world_from_cam is not None:
-            size = stored_size(image, measure)
-            frames.append(
-                Frame(image.name, camera_of_size(size), world_from_cam, image=image, split=_split(files, stem))
-            )
+            own_camera = camera_of_size(stored_size(image, measure))
+            split = _SPLITS[stem[:2]] if names_give_splits else None
+            frames.append(Frame(image.name, own_camera, world_from_cam, image=image, split=split))
     if len(missing) == len(files):
         raise photos_missing(missing, photos.folder, str(folder))
     check_unique_names((frame.name for frame in frames), folder)
@@ -112,11 +112,6 @@ def _pose(file: Path) -> np.ndarray | None:
     if len(words) not in (12, 16):
         raise malformed(str(file), f"has {len(words)} numbers", _EXPECTED)
     return rigid_pose(np.array(numbers(words, len(words), str(file))).reshape(-1, 4), str(file))
-
-
-def _split(files: Sequence[Path], stem: str) -> str | None:
-    """Return the split of a photo in NSVF's naming, where all names begin with 0_, 1_ or 2_."""
-    return _SPLITS[stem[:2]] if all(file.name[:2] in _SPLITS for file in files) else None
 
 
 def _cameras(folder: Path, camera: Camera | None) -> Callable[[tuple[int, int]], Camera]:
