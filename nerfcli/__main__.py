@@ -7,7 +7,8 @@ import atexit
 import gc
 import sys
 
-from nerfcli.errors import INTERRUPTED
+from nerfcli.errors import INTERRUPTED, TERMINATED
+from nerfcli.interrupts import Terminated
 
 # Instead of 10. A full collection visits every object that the imports of torch and numba create, and with the default,
 # dozens of them took a quarter of the import time; young garbage is collected as often as before.
@@ -23,6 +24,9 @@ def start() -> None:
         from nerfcli.cli import main
 
         main()
+    except Terminated:
+        sys.stderr.write("Ended by SIGTERM; nothing was begun.\n")
+        raise SystemExit(TERMINATED) from None
     except KeyboardInterrupt:
         sys.stderr.write("Interrupted; nothing was begun.\n")
         raise SystemExit(INTERRUPTED) from None

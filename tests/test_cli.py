@@ -542,10 +542,32 @@ def test_a_finished_training_is_kept_another_one_refused_and_overwritten_on_dema
     assert "resumed at step 1" in longer.stderr
 
 
-def test_resume_needs_a_run_of_the_same_scene(capture, finished, tmp_path):
-    result = nerfcli("train", capture, *QUICK, "--resume", "-o", tmp_path / "nothing")
+@pytest.mark.parametrize("left", [None, (), ("cameras.json", "config.json")])
+def test_resume_starts_what_was_ended_before_its_first_checkpoint(left, capture, finished, tmp_path):
+    """A script that a scheduler starts again gives --resume each time."""
+    run = tmp_path / "run"
+    if left is not None:
+        run.mkdir()
+        (run / ".train.lock").touch()
+        for name in left:
+            shutil.copy(finished / name, run)
+    result = nerfcli("train", capture, *QUICK, "--resume", "-o", run)
+    assert (result.exit_code, result.stdout) == (0, f"{run}\n")
+    assert f"{run} has no checkpoint to resume; the training starts from the beginning" in result.stderr
+    assert [entry["step"] for entry in read_log(run)] == [1]
+
+
+def test_resume_does_not_start_a_training_in_a_folder_with_other_files(capture, tmp_path):
+    (tmp_path / "diary").mkdir()
+    (tmp_path / "diary" / "monday.txt").write_text("rain")
+    result = nerfcli("train", capture, *QUICK, "--resume", "-o", tmp_path / "diary")
     assert result.exit_code == BAD_INPUT
-    assert "nothing to resume" in error_of(result)[0]
+    assert "exists and is not a run folder" in error_of(result)[0]
+    assert "from the beginning" not in result.stderr
+    assert listing(tmp_path / "diary") == {"monday.txt": b"rain"}
+
+
+def test_resume_needs_a_run_of_the_same_scene(capture, finished, tmp_path):
     other = tmp_path / "other"
     shutil.copytree(capture, other)
     listed = json.loads((other / "transforms_train.json").read_text())

@@ -366,7 +366,8 @@ def test_intrinsics_for_another_size_are_reported_once(command, tmp_path):
     if command == "info":
         said = " ".join(json.loads(nerfcli("info", tmp_path, "--json").stdout)["rescaled"])
     elif command == "train":
-        said = nerfcli("train", tmp_path, "--resume", "-o", tmp_path / "run").stderr  # it fails, as there is no run
+        (tmp_path / "run").touch()  # it fails, as this is no folder
+        said = nerfcli("train", tmp_path, "-o", tmp_path / "run").stderr
     else:
         said = nerfcli("convert", tmp_path, tmp_path / "out", "--to", "colmap").stderr
     assert said.count("5 photos are 640x480, but the intrinsics are for 1280x960") == 1

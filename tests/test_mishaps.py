@@ -19,8 +19,9 @@ from full_disk import files_of_at_most
 from nerfcli import atomic, kernels, scene
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, TERMINATED
 from nerfcli.exclusive import exclusive
-from nerfcli.interrupts import install_handlers
+from nerfcli.interrupts import Terminated, install_handlers
 from nerfcli.runs.files import LOCK, PHOTO_DEPTHS
+from nerfcli.workflows import describe
 
 ONE_STEP = ("--steps", "1", "--downscale", "8", "--log2-rows", "10", "--threads", "2")
 FEW = ("--cameras", "test", "--max-size", "16", "--threads", "2")
@@ -175,11 +176,48 @@ start()
     assert ended.stderr.splitlines() == ["Interrupted; nothing was begun."]
 
 
+@pytest.mark.parametrize(("came", "code"), [(KeyboardInterrupt, INTERRUPTED), (Terminated, TERMINATED)])
+def test_an_interrupt_that_c_code_reports_as_a_failure_is_one(came, code, capture, monkeypatch):
+    """Regression: Ctrl-C while pycolmap was imported ended with a traceback, which blamed the installation."""
+
+    def imported(path):
+        try:
+            raise ImportError("initialization failed") from came()
+        except ImportError as error:
+            raise RuntimeError("Cannot import the C++ backend") from error
+
+    monkeypatch.setattr(describe, "describe", imported)
+    result = nerfcli("info", capture)
+    assert (result.exit_code, result.stdout) == (code, "")
+    assert result.stderr.endswith("; completed work is kept.\n")
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_sigterm_before_a_command_begins_ends_with_its_own_code():
+    """Regression: it ended silently, with the code of Ctrl-C."""
+    program = """
+import os, signal, sys
+from nerfcli.__main__ import start
+from nerfcli.cli import usage
+
+def terminated(self, ctx, args):
+    os.kill(os.getpid(), signal.SIGTERM)
+    signal.pause()
+
+usage.Command.parse_args = terminated
+sys.argv = ["nerfcli", "info", "photos"]
+start()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
+    assert (ended.returncode, ended.stderr) == (TERMINATED, "Ended by SIGTERM; completed work is kept.\n")
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-@pytest.mark.parametrize("options", [(), ("--json",)])
+@pytest.mark.parametrize("options", [("info",), ("info", "--json"), ("--help",), ("info", "--help")])
 def test_a_full_disk_behind_stdout_is_an_error_of_two_lines(options, capture):
+    paths = [] if "--help" in options else [capture]
     with Path("/dev/full").open("w") as full:
-        command = [sys.executable, "-m", "nerfcli", "info", capture, *options]
+        command = [sys.executable, "-m", "nerfcli", *options, *paths]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == BAD_INPUT
     assert [line.split(":")[0] for line in done.stderr.splitlines()] == ["Error", "Hint"]

@@ -14,12 +14,14 @@ from typer.testing import CliRunner
 
 from nerfcli.cli import app
 from nerfcli.errors import UserError
+from nerfcli.interrupts import Terminated
 from nerfcli.media.images import read_image
 from nerfcli.tomography.grid import centred_grid
 from nerfcli.tomography.marks import UNSEEN
-from nerfcli.tomography.result import load_reconstruction
+from nerfcli.tomography.result import ReconstructionSettings, load_reconstruction
 from nerfcli.tomography.scan import save_scan
 from nerfcli.tomography.volume_files import VolumeFile, read_volume, write_volume
+from nerfcli.workflows.tomography import train_scan
 from nerfcli.workflows.tomography_files import export_scan, slice_of
 
 
@@ -187,10 +189,46 @@ def test_resume_goes_on_from_the_volume(bean_run: Path, tmp_path: Path) -> None:
     scan, run = bean_run.with_name("bean"), tmp_path / "run"
     fixed = ("--with", "centre=0", "--with", "tilt=0", "--with", "tv=1", "-o", run)
     assert call("train", scan, "--steps", "2", *fixed)[0] == 0
-    first = load_reconstruction(run)
+    assert load_reconstruction(run).passes == 2
     code, _, err = call("train", scan, "--steps", "5", "--resume", *fixed)
     assert code == 0, err
-    assert load_reconstruction(run).passes > first.passes
+    assert load_reconstruction(run).passes == 5
+    before = (run / "reconstruction.json").read_bytes()
+    again = call("train", scan, "--steps", "5", "--resume", *fixed)[2]
+    assert "is kept: it is complete" in again
+    assert (run / "reconstruction.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("field", ["voxels", "hash"])
+def test_an_interrupted_fit_is_not_complete_and_resume_goes_on_from_it(
+    field: str, bean_run: Path, tmp_path: Path
+) -> None:
+    """Regression: the same command kept it as complete, and SIGTERM ended with the code of Ctrl-C."""
+    scan, run, notes = bean_run.with_name("bean"), tmp_path / "run", list[str]()
+    settings = ReconstructionSettings(passes=3, field=field, strength=1.0, centre=0.0, tilt=0.0, air=False)
+
+    def terminate_in_second_pass(fraction: float, words: str) -> None:
+        if fraction > 0.5:
+            raise Terminated
+
+    with pytest.raises(Terminated):
+        train_scan(scan, run, settings, notify=notes.append, progress=terminate_in_second_pass)
+    interrupted = load_reconstruction(run)
+    assert (interrupted.passes, interrupted.complete) == (2 if field == "hash" else 1, False)
+    saved = f"the volume of pass {interrupted.passes} is saved in {run}"
+    assert notes == [f"{saved}; to continue, add --resume to the same command"]
+
+    fixed = ("--field", field, "--with", "centre=0", "--with", "tilt=0", "--with", "tv=1", "--without", "air")
+    command = ("train", scan, "--steps", "3", *fixed, "-o", run)
+    code, out, err = call(*command)
+    assert (code, out) == (3, "")
+    assert err.startswith(f"Error: {run} holds a fit that was interrupted after pass {interrupted.passes}\n")
+    code, out, err = call(*command, "--resume")
+    assert (code, out) == (0, f"{run}\n"), err
+    result = load_reconstruction(run)
+    assert (result.passes, result.complete) == (3, True)
+    assert result.seconds > interrupted.seconds
+    assert "is kept: it is complete" in call(*command)[2]
 
 
 def test_hash_grids_are_trained_resumed_evaluated_rendered_and_exported(bean_run: Path, tmp_path: Path) -> None:

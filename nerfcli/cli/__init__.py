@@ -24,12 +24,13 @@ from nerfcli.cli import (
     train,
     view,
 )
-from nerfcli.cli.usage import Command
+from nerfcli.cli.usage import Command, Program
 from nerfcli.errors import INTERRUPTED, TERMINATED
 from nerfcli.interrupts import install_handlers
 from nerfcli.memory import keep_freed_memory
 
 app = typer.Typer(
+    cls=Program,
     no_args_is_help=True,
     rich_markup_mode=None,  # plain text: half the start-up time, and readable in a pipe
     pretty_exceptions_enable=False,

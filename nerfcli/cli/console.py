@@ -155,7 +155,7 @@ def command(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
-            with out_of_memory_explained():
+            with _interrupts_unwrapped(), out_of_memory_explained():
                 return function(*args, **kwargs)
         except UserError as error:
             report_error(error)
@@ -185,6 +185,25 @@ def command(function: Callable[P, R]) -> Callable[P, R]:
 def _discard_stdout() -> None:
     """Send what is left to write to nowhere, so that Python does not fail when it closes stdout."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def _interrupts_unwrapped() -> Iterator[None]:
+    """Raise the interrupt that caused an exception, if one did.
+
+    C code that an interrupt reaches may fail because of it; pycolmap then reports a broken installation.
+    """
+    try:
+        yield
+    except typer.Exit:
+        raise
+    except Exception as error:
+        cause = error.__cause__
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__
+        if cause is None:
+            raise
+        raise cause from None
 
 
 @contextmanager

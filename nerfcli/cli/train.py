@@ -105,7 +105,8 @@ def train(
         ),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue from the last checkpoint to the new total.")
+        bool,
+        typer.Option("--resume", help="Continue from the last checkpoint to the new total; without one, start."),
     ] = False,
     view: Annotated[
         bool, typer.Option("--view", help="Show the field in a browser while it trains; see nerfcli view.")

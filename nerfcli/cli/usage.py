@@ -1,11 +1,12 @@
-"""Usage errors that explain the correct usage."""
+"""Parsing of the command line: usage errors that explain the correct usage, and what ends the program meanwhile."""
 
 from typing import Any
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from nerfcli.cli.batch import example_of_many
+from nerfcli.cli.console import command
 
 # The class of click, or of typer's own copy of click, depending on the version of typer.
 _UsageError: Any = typer.BadParameter.__bases__[0]
@@ -19,6 +20,23 @@ _WRONG_VALUES = {
     "greater_than_equal": "is too small; give at least {ge:.10g}",
     "less_than_equal": "is too large; give at most {le:.10g}",
 }
+
+
+class Program(TyperGroup):
+    """The program; what interrupts it before a command begins, or its help, ends it as it ends a command.
+
+    Otherwise typer ends it with the code of Ctrl-C after a SIGTERM, and with a traceback if stdout is full.
+    """
+
+    @command
+    def make_context(self, *args: Any, **extra: Any) -> Any:
+        """Parse the options before the command; see `TyperGroup.make_context`."""
+        return super().make_context(*args, **extra)
+
+    @command
+    def invoke(self, ctx: Any) -> Any:
+        """Parse and run the command; see `TyperGroup.invoke`."""
+        return super().invoke(ctx)
 
 
 class Command(TyperCommand):

@@ -132,9 +132,9 @@ def mean_attenuation(problem: Problem) -> float:
 
 
 def finer(fit: Fit, grid: VoxelGrid) -> Fit:
-    """Interpolate a fit onto another grid over the same box, with a dual of 0."""
+    """Interpolate a fit onto another grid over the same box, with a dual of 0; its passes are counted anew."""
     volume = interpolate(fit.volume[None, None], grid.shape, mode="trilinear")[0, 0]
-    return Fit(volume, torch.zeros(3, *grid.shape), fit.passes, fit.seconds)
+    return Fit(volume, torch.zeros(3, *grid.shape), seconds=fit.seconds)
 
 
 def reconstruct(

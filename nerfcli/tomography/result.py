@@ -89,6 +89,7 @@ class Reconstruction:
         missing_wedge_deg: range of directions without rays, see `marks.missing_wedge_deg`.
         versions: versions of the programs used.
         learned: arrays of a hash grid, keyed by file name, which `volume` samples; empty for voxels.
+        complete: False if the fit was interrupted.
     """
 
     volume: np.ndarray
@@ -106,6 +107,7 @@ class Reconstruction:
     missing_wedge_deg: float = 0.0
     versions: Mapping[str, str] = field(default_factory=dict)
     learned: Mapping[str, np.ndarray] = field(default_factory=dict)
+    complete: bool = True
 
 
 def is_reconstruction(run: Path) -> bool:
@@ -143,6 +145,7 @@ def save_reconstruction(run: Path, result: Reconstruction) -> None:
             "passes": result.passes,
             "seconds": result.seconds,
             "settled": result.settled,
+            "complete": result.complete,
             "missing_wedge_deg": result.missing_wedge_deg,
             "arrays": digests,
             "versions": dict(result.versions),
@@ -179,6 +182,7 @@ def load_reconstruction(run: Path) -> Reconstruction:
             content["missing_wedge_deg"],
             content["versions"],
             arrays,
+            complete=content.get("complete", True),  # earlier runs do not say
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{run} cannot be read as a reconstruction: {error}", "train the scan again") from error

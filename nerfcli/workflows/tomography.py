@@ -70,13 +70,13 @@ def train_scan(
         scan: a folder that `nerfcli convert` wrote.
         run: the folder to write.
         settings: budget, field, and values that are not to be estimated from the scan.
-        resume: continue from the volume in `run`.
+        resume: continue from the volume in `run`; start from the beginning if there is none.
         overwrite: replace another run at `run`.
         notify, warn: called with lines for the user.
         progress: called with the fraction of the budget and a short text.
 
     Raises:
-        UserError: the scan cannot be read, or `run` holds something else.
+        UserError: the scan cannot be read, or `run` holds something else, or an interrupted fit without `resume`.
         KeyboardInterrupt: passed on; the volume fitted so far has been written.
     """
     folder, run = Path(scan), Path(run)
@@ -84,9 +84,15 @@ def train_scan(
     earlier = load_reconstruction(run) if is_reconstruction(run) and not overwrite else None
     if earlier is not None:
         same = earlier.scan_digest == loaded.digest and _wanted(earlier.settings) == _wanted(settings)
-        if same and not resume:
-            notify(f"{run} is kept: it is complete and has these settings; add --overwrite to fit again")
+        if same and earlier.complete:
+            again = "give a larger --budget or --steps" if resume else "add --overwrite to fit again"
+            notify(f"{run} is kept: it is complete and has these settings; {again}")
             return earlier
+        if same and not resume:
+            raise UserError(
+                f"{run} holds a fit that was interrupted after pass {earlier.passes}",
+                "add --resume to continue, or --overwrite to replace it",
+            )
         continued = earlier.scan_digest == loaded.digest and earlier.settings.field == settings.field
         if not (same or (resume and continued)):
             raise UserError(
@@ -96,14 +102,15 @@ def train_scan(
         raise UserError(f"{run} exists and is not a reconstruction", "choose another folder with --output")
     with exclusive(run / LOCK, f"another nerfcli train is writing {run}"):
         clear_leftovers(run)
-        (run / METRICS).unlink(missing_ok=True)
         _warn_of(loaded, warn)
         threads = thread_count(settings.threads)
         torch.set_num_threads(threads)
-        result, interrupted = _fit(loaded, folder, settings, earlier=earlier if resume else None, progress=progress)
+        result, interrupt = _fit(loaded, folder, settings, earlier=earlier if resume else None, progress=progress)
+        (run / METRICS).unlink(missing_ok=True)  # they belong to the volume that is replaced
         save_reconstruction(run, result)
-    if interrupted:
-        raise KeyboardInterrupt
+    if interrupt is not None:
+        notify(f"the volume of pass {result.passes} is saved in {run}; to continue, add --resume to the same command")
+        raise interrupt
     for sentence in result.decisions:
         notify(sentence)
     return result
@@ -132,9 +139,9 @@ def _fit(
     *,
     earlier: Reconstruction | None,
     progress: Progress,
-) -> tuple[Reconstruction, bool]:
-    """Fit the volume, and return whether the fit was interrupted; before the fit, `KeyboardInterrupt` is passed on."""
-    begun = time.perf_counter()
+) -> tuple[Reconstruction, KeyboardInterrupt | None]:
+    """Fit the volume, and return what interrupted the fit, if anything; before the fit, an interrupt is passed on."""
+    begun = time.perf_counter() - (0.0 if earlier is None else earlier.seconds)
     decisions: list[str] = []
     views = scan.training_views
     # Check memory first: correcting the geometry takes seconds, and hardly changes the number of voxels.
@@ -171,7 +178,7 @@ def _fit(
     limit = Limit(settings.passes, settings.budget_seconds, begun, 0 if earlier is None else earlier.passes)
     if settings.field == "hash":
         used["start"] = mean_attenuation(problem) if earlier is None else earlier.used["start"]
-        fit, learned, interrupted = _fit_hash(
+        fit, learned, interrupt = _fit_hash(
             problem, used, limit, earlier=earlier, seed=settings.seed, progress=progress
         )
     else:
@@ -179,7 +186,7 @@ def _fit(
             fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
         else:
             fit = _coarse_start(scan, geometry, grid, factors, (strength, model_error), limit.seconds)
-        fit, interrupted = _fit_voxels(problem, fit, strength, limit, progress=progress)
+        fit, interrupt = _fit_voxels(problem, fit, strength, limit, progress=progress)
         learned = {}
     found = marks(problem.geometry, grid)
     decisions += [f"{words}; they are marked" for words in marks_in_words(found, (UNSEEN, TRUNCATED))]
@@ -202,8 +209,9 @@ def _fit(
         wedge,
         {"nerfcli": __version__, "python": platform.python_version(), "torch": version("torch")},
         learned,
+        complete=interrupt is None,
     )
-    return result, interrupted
+    return result, interrupt
 
 
 @dataclass(frozen=True)
@@ -212,7 +220,7 @@ class Limit:
 
     Args:
         total_passes, total_seconds: limits including earlier passes and the time before the fit; None for no limit.
-        begun: `time.perf_counter` at the start.
+        begun: `time.perf_counter` at the start, less the seconds of an earlier run.
         done: number of passes of an earlier run.
     """
 
@@ -234,7 +242,9 @@ class Limit:
         return max(self.total_seconds - (time.perf_counter() - self.begun), LEAST_FRACTION * self.total_seconds)
 
 
-def _fit_voxels(problem: Problem, fit: Fit, strength: float, limit: Limit, *, progress: Progress) -> tuple[Fit, bool]:
+def _fit_voxels(
+    problem: Problem, fit: Fit, strength: float, limit: Limit, *, progress: Progress
+) -> tuple[Fit, KeyboardInterrupt | None]:
     kept = deque([fit], maxlen=1)
     try:
         fitted = reconstruct(
@@ -246,9 +256,9 @@ def _fit_voxels(problem: Problem, fit: Fit, strength: float, limit: Limit, *, pr
             progress=progress,
             keep=kept.append,
         )
-        return fitted, False
-    except KeyboardInterrupt:
-        return kept[-1], True
+        return fitted, None
+    except KeyboardInterrupt as interrupt:
+        return kept[-1], interrupt
 
 
 def _fit_hash(
@@ -259,11 +269,11 @@ def _fit_hash(
     earlier: Reconstruction | None,
     seed: int,
     progress: Progress,
-) -> tuple[Fit, dict[str, np.ndarray], bool]:
-    """Fit a hash grid; return its volume on the voxel grid, its learned arrays, and whether it was interrupted."""
+) -> tuple[Fit, dict[str, np.ndarray], KeyboardInterrupt | None]:
+    """Fit a hash grid; return its volume on the voxel grid, its learned arrays, and what interrupted it."""
     learned = new_arrays(seed) if earlier is None else earlier.learned
     volume = hash_volume(problem.grid, used["start"], learned, passes=limit.done)
-    interrupted = False
+    interrupt: KeyboardInterrupt | None = None
     try:
         fit_hash(
             problem,
@@ -274,11 +284,11 @@ def _fit_hash(
             seconds=limit.seconds,
             progress=progress,
         )
-    except KeyboardInterrupt:
-        interrupted = True
+    except KeyboardInterrupt as came:
+        interrupt = came
     # The last step ends a little beyond a pass.
     passes = max(1, round(volume.passes))
-    return Fit(volume.on_grid(problem.grid), torch.zeros(0), passes), volume.arrays, interrupted
+    return Fit(volume.on_grid(problem.grid), torch.zeros(0), passes), volume.arrays, interrupt
 
 
 def _geometry(

@@ -53,7 +53,7 @@ def train_scene(
         run: the folder to write.
         settings: budget, components, resolution, seed, device, threads.
         memory_bytes: limit of resident memory, or of memory on the GPU that trains; None for no limit.
-        resume: continue from the last checkpoint of `run`.
+        resume: continue from the last checkpoint of `run`; start from the beginning if there is none.
         overwrite: replace another run at `run`.
         holdout: photos to hold out, "every:8", "block:0.15" or a file of names; None for the scene's own split.
         view: serve the interactive page during the training, see `workflows.view`; `notify` gets its address.
@@ -110,6 +110,12 @@ def _trained(
         warn(f"{len(loaded.missing)} photos of {folder} are missing and skipped: {listed}{more}")
     for text in describe_rescaling(loaded.rescaled):
         notify(text)
+
+    if resume and not Run(run).is_trained and not (run / STATE).exists():
+        # A script that a scheduler starts again always gives --resume, and may have been ended before a checkpoint.
+        resume = False
+        _refuse_others(run)
+        notify(f"{run} has no checkpoint to resume; the training starts from the beginning")
 
     ranks = joined_ranks(settings.device)
     if ranks.rank > 0:
@@ -274,13 +280,9 @@ def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, o
     """Return whether the run at `path` is complete with these settings and can be kept.
 
     Raises:
-        UserError: `path` holds something else that may not be replaced, or there is nothing to resume.
+        UserError: `path` holds something else that may not be replaced.
     """
     run = Run(path)
-    if resume and not run.is_trained and not (path / STATE).exists():
-        raise UserError(
-            f"there is nothing to resume in {path}", "remove --resume to start a new training, or give the run with -o"
-        )
     if resume and run.config.split_sha256 != split_hash(scene.test_names):
         before = run.config.holdout
         raise UserError(
@@ -299,10 +301,15 @@ def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, o
         raise UserError(
             f"{path} exists", "add --resume to continue, --overwrite to replace it, or choose another folder with -o"
         )
+    _refuse_others(path)
+    return False
+
+
+def _refuse_others(path: Path) -> None:
+    """Refuse a file, and a folder of other files than those of a run."""
     others = path.is_dir() and not (path / CONFIG).exists() and any(entry.name != LOCK for entry in path.iterdir())
     if path.is_file() or others:
         raise UserError(f"{path} exists and is not a run folder", "choose another folder with -o")
-    return False
 
 
 def _fit(
