@@ -252,8 +252,9 @@ def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None
         if mean.get(f"psnr{key}") is not None
     ]
     console.table(("", "PSNR", "SSIM", "LPIPS"), rows, styles={})
-    if metrics["shape"] is not None:
-        console.note(GeometryEvidence(**metrics["shape"]).in_words())
+    shape = None if metrics["shape"] is None else GeometryEvidence(**metrics["shape"])
+    if shape is not None and shape.shown:
+        console.note(shape.in_words())
     if kinds:
         where = {"interpolation": "between", "extrapolation": "beyond"}
         parts = [
@@ -261,6 +262,8 @@ def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None
         ]
         console.note(f"held-out views: {'; '.join(parts)}")
     console.note(summary_line([Entry(**entry) for entry in metrics["ledger"]]))
+    for text in metrics["warnings"]:
+        console.warn(text)
 
 
 def print_spread(folders: Sequence[Path], measured: Sequence[dict[str, Any]], console: Console) -> None:

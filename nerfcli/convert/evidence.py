@@ -14,6 +14,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import for_picture, shifted
 from nerfcli.convert.probes import distinct, rows_of_each
+from nerfcli.multiview.epipolar import sampson_angles
 from nerfcli.multiview.features import Matches
 
 # Most observations used: enough for a median, few enough to try hundreds of hypotheses.
@@ -71,8 +72,7 @@ class MatchEvidence:
     """Matches, points that two photos both show.
 
     The error of a match is its Sampson distance to the epipolar geometry of the two poses, as an angle times the focal
-    length: |b2 E b1| / sqrt(|E b1|^2 + |E^T b2|^2) with unit directions b and E = [t]x R of cam2_from_cam1.
-    Source: Hartley and Zisserman, 2nd edition, section 11.4.3; on the sphere as in Pagani and Stricker 2011.
+    length.
     """
 
     threshold_px = 4.0
@@ -99,17 +99,9 @@ class MatchEvidence:
         firsts, seconds = self._pairs
         second_from_first = (rigid.inverse(world_from_cam[seconds]) @ world_from_cam[firsts])[self.groups]
         rotation, t = second_from_first[:, :3, :3], second_from_first[:, :3, 3]
+        sampson, behind = sampson_angles(first, second, rotation, t)
         turned = np.einsum("mij,mj->mi", rotation, first)  # the first direction in the second camera's axes
-        normal1 = np.cross(t, turned)  # E b1
-        normal2 = np.cross(second, t)  # E^T b2, up to the rotation
-        with np.errstate(divide="ignore", invalid="ignore"):
-            sampson = np.abs(np.einsum("mi,mi->m", second, normal1)) / np.sqrt(
-                np.sum(normal1**2, axis=1) + np.sum(normal2**2, axis=1)
-            )
-        across = np.cross(turned, second)
-        # second d2 = turned d1 + t, so these have the signs of the distances d1 and d2.
-        behind = (np.einsum("mi,mi->m", across, normal2) < 0) | (np.einsum("mi,mi->m", across, normal1) > 0)
-        parallax = np.linalg.norm(across, axis=1) * focal_px > _LEAST_PARALLAX_PX
+        parallax = np.linalg.norm(np.cross(turned, second), axis=1) * focal_px > _LEAST_PARALLAX_PX
         return np.where(valid & ~(behind & parallax) & np.isfinite(sampson), focal_px * sampson, np.inf)
 
 

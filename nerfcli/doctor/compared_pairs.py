@@ -24,6 +24,8 @@ QUICK_FEATURES = 1000
 EPIPOLAR_PX = 2.0
 # Fewer inliers than this may agree on a geometry by chance.
 LEAST_MATCHES = 20
+# Matches of a pair that are kept, to compare them with cameras: enough for a median, and 40 MB for a thousand photos.
+MOST_KEPT = 200
 # Fewest inliers for estimating camera motion and moving patches.
 _LEAST_FOR_GEOMETRY = 40
 # Detail is compared at features of about the same size in both photos: their ratio is within this many octaves.
@@ -47,6 +49,7 @@ class Pair:
         views: camera motion between the photos; None with too few inliers.
         patches: parts that moved independently.
         motions: static and moving matches, see `stationary`; None if no match stays in place.
+        agreeing: pixels (N, 2) in each photo of the matches that agree on one geometry, at most `MOST_KEPT` of them.
     """
 
     first: int
@@ -61,6 +64,7 @@ class Pair:
     views: camera_motion.TwoViews | None
     patches: tuple[Patch, ...]
     motions: Motions | None = None
+    agreeing: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def linked(self) -> bool:
@@ -118,6 +122,7 @@ def compare(
         views=views,
         patches=patches,
         motions=still,
+        agreeing=_some(x[agree], y[agree]),
     )
 
 
@@ -126,6 +131,12 @@ def focal_px(features: PhotoFeatures, exif: Exif) -> float:
     longer = max(features.size)
     known_px = focal_evidence(exif).focal_px
     return longer * (1.0 if known_px is None else known_px / max(exif.width, exif.height))
+
+
+def _some(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return at most `MOST_KEPT` of the matches, evenly chosen."""
+    kept = slice(None, None, -(-len(x) // MOST_KEPT))
+    return x[kept].copy(), y[kept].copy()
 
 
 def _median(values: np.ndarray) -> float:

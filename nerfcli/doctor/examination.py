@@ -7,12 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.cameras.calibration import Calibration, Picture, calibrated
-from nerfcli.doctor import connectivity, coverage, geometry, inventory, quality, turntable
+from nerfcli.cameras.frame import Frame
+from nerfcli.doctor import connectivity, coverage, geometry, inventory, pose_agreement, quality, turntable
 from nerfcli.doctor.compared_pairs import Pair, compare, focal_px
+from nerfcli.doctor.misplaced_groups import misplaced_groups, nearest_pairs
 from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, read_all
 from nerfcli.doctor.photo_list import ExaminedCapture
+from nerfcli.doctor.pose_agreement import pair_errors
 from nerfcli.findings import Finding, as_json, worst
 from nerfcli.poses.judge.checks import Checks
+from nerfcli.scene import Scene
 
 # Measured on one core of a 2-core server; within a factor of two on other CPUs.
 _SECONDS_PER_PHOTO = 0.45
@@ -81,6 +85,8 @@ def examine(
         nothing = np.zeros(0)
         return Diagnosis(subject, tuple(findings), (("all else", "no readable photo"),), (), nothing, nothing, ())
     places = connectivity.choose_pairs(facts)
+    if subject.scene is not None:
+        places = sorted({*places, *nearest_pairs(_frames(subject.scene, facts))})
 
     def on_pair(done: int) -> None:
         progress(fraction + (1 - fraction) * done / max(len(places), 1), f"pair {done} of {len(places)}")
@@ -155,6 +161,7 @@ def judged(
     ]
     not_checked: list[tuple[str, str]] = []
     few = "too few pairs have enough matches"
+    turning = None
     if len(photos) > 1:
         turning = checks.run("turning object", lambda: turntable.turning_object(pairs), otherwise=None)
         planned.append(("connectivity", lambda: connectivity.connectivity(photos, pairs)))
@@ -179,11 +186,21 @@ def judged(
         not_checked.append(("directions", "needs poses: run nerfcli poses, then nerfcli doctor on the scene"))
     else:
         of_scene = subject.scene
+        frames = _frames(of_scene, photos)
+        # The background does not turn with the object, so its matches say nothing about the poses.
+        compared = pairs if turning is None else []
+        errors = checks.run("epipolar errors", lambda: pair_errors(frames, photos, compared), otherwise=[])
         found += [
             checks.run("spread of cameras", lambda: coverage.spread(of_scene), otherwise=None),
             checks.run("directions", lambda: coverage.directions(of_scene), otherwise=None),
             checks.run("points", lambda: coverage.points(of_scene), otherwise=None),
             checks.run("intrinsics", lambda: coverage.intrinsics(of_scene), otherwise=None),
+            checks.run(
+                "poses",
+                lambda: _or_not_checked("poses", pose_agreement.agreement(photos, errors), few, not_checked),
+                otherwise=None,
+            ),
+            checks.run("places", lambda: misplaced_groups(frames, photos, errors, pairs), otherwise=None),
         ]
         found += checks.run("files of the scene", lambda: coverage.belongings(of_scene), otherwise=[])
     not_checked += [(name, f"could not be computed: {why}") for name, why in checks.not_computed.items()]
@@ -201,6 +218,12 @@ def _or_not_checked(
     if finding is None:
         not_checked.append((name, reason))
     return finding
+
+
+def _frames(scene: Scene, photos: Sequence[PhotoFacts]) -> list[Frame]:
+    """Return the frames of the readable photos, in their order."""
+    by_name = {frame.name: frame for frame in scene.frames}
+    return [by_name[photo.name] for photo in photos]
 
 
 def _focals(subject: ExaminedCapture, photos: Sequence[PhotoFacts]) -> list[float]:

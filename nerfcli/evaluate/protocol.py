@@ -17,6 +17,7 @@ from nerfcli.evaluate.colour import colour_aligned
 from nerfcli.evaluate.colour_alignment import align_gains
 from nerfcli.evaluate.metrics import as_float, psnr, ssim, to_8_bit, whole_windows
 from nerfcli.evaluate.novelty import novelty
+from nerfcli.evaluate.outliers import outlier_warnings
 from nerfcli.evaluate.perceptual import NAME as LPIPS_NAME
 from nerfcli.evaluate.perceptual import SMALLEST, Perceptual
 from nerfcli.evaluate.pose_refinement import align_pose, halves
@@ -157,7 +158,7 @@ def evaluate_model(
     return {
         "protocol": _protocol_name(held_out, extras),
         "shape": shape.to_json() if shape is not None else None,
-        "warnings": _warnings(shape, evidence),
+        "warnings": [*_warnings(shape, evidence), *outlier_warnings(images)],
         "mean": mean_of(images),
         "images": images,
         "kinds": _kinds(images),
