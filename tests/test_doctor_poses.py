@@ -22,7 +22,7 @@ from nerfcli.doctor.examination import examine
 from nerfcli.doctor.misplaced_groups import NEAREST, misplaced_groups, nearest_pairs
 from nerfcli.doctor.photo_facts import PhotoFacts, PhotoFeatures, Source
 from nerfcli.doctor.photo_list import ExaminedCapture
-from nerfcli.doctor.pose_agreement import agreement, pair_errors
+from nerfcli.doctor.pose_agreement import PairError, agreement, contradicting, pair_errors
 from nerfcli.doctor.sharpness import Sharpness
 from nerfcli.findings import BAD, GOOD, LOOK, Finding
 from nerfcli.media.exif import Exif
@@ -160,6 +160,16 @@ def test_two_pairs_and_pairs_of_few_matches_are_too_little_to_accuse():
     assert checked(given, two).photos == ()
     few = [replace(pair, inliers=25) if 5 in (pair.first, pair.second) else pair for pair in pairs]
     assert checked(given, few).photos == ()
+
+
+def test_a_photo_between_two_wrong_ones_is_not_accused_by_them():
+    """Photos 0 and 5 are wrong. Two of the three pairs of photo 1 are with them."""
+    wrong = [(0, other) for other in (1, 2, 3, 4)] + [(5, other) for other in (1, 3, 4, 6)]
+    right = [(1, 2), (2, 3), (3, 4), (4, 6), (2, 4), (3, 6)]
+    errors = [PairError(*pair, 100, 50.0, False) for pair in wrong] + [
+        PairError(*pair, 90, 0.2, False) for pair in right
+    ]
+    assert sorted(contradicting(errors, 7, limit_px=4.0)) == [(0, 50.0), (5, 50.0)]
 
 
 def test_one_place_for_two_photos_that_saw_no_parallax_is_right():

@@ -493,9 +493,10 @@ def vertices_of(path: Path) -> tuple[np.ndarray, int]:
 
 def test_points_volume_and_distances_are_written(blocked, tmp_path):
     scale = Run(blocked).model().training_from_scene.scale
-    options = (*small(scale, 0.05), "-o")
+    voxels_and_pictures = small(scale, 0.05)
     for to, name in (("points", "p.ply"), ("volume", "v.npz"), ("tsdf", "t.nrrd")):
-        result = nerfcli("export", blocked, "--to", to, *options, tmp_path / name)
+        options = voxels_and_pictures[:2] if to == "volume" else voxels_and_pictures  # a volume needs no pictures
+        result = nerfcli("export", blocked, "--to", to, *options, "-o", tmp_path / name)
         assert result.exit_code == 0, result.stderr
     places, _ = vertices_of(tmp_path / "p.ply")
     assert np.abs(sides_of(blocked, places) - 0.5).max() < 0.02
