@@ -16,6 +16,7 @@ from walks import FOCAL_PX, HEIGHT, WIDTH, walk, write
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.doctor import connectivity, examination
 from nerfcli.doctor.brightness import Brightness
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.examination import examine
@@ -320,8 +321,30 @@ def test_sampson_angles_in_closed_form():
     assert np.isnan(no_baseline).all()
 
 
-def test_the_doctor_of_a_scene_names_the_wrong_pose(tmp_path: Path):
-    """On photos: all but the pose is as a user has it."""
+@pytest.mark.parametrize(("first_ahead", "second_ahead"), [(True, True), (True, False), (False, True), (False, False)])
+def test_points_behind_either_camera_are_behind(first_ahead: bool, second_ahead: bool):
+    """The point at the given signed distances along the two rays, from a camera at t in the second one's axes."""
+    t = np.array([0.4, -0.1, 0.2])
+    first = np.array([[0.1, 0.2, 0.97]]) / np.linalg.norm([0.1, 0.2, 0.97])
+    point = (3.0 if first_ahead else -3.0) * first + t
+    second = point / np.linalg.norm(point) * (1 if second_ahead else -1)
+    angles, behind = sampson_angles(first, second, np.eye(3), t)
+    np.testing.assert_allclose(angles, 0, atol=1e-15)
+    assert behind.tolist() == [not (first_ahead and second_ahead)]
+
+
+def test_the_doctor_of_a_scene_names_the_wrong_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """On photos: all but the pose is as a user has it. The check of groups gets nearest pairs, and is reported."""
+    seen: list[set[tuple[int, int]]] = []
+    of_groups = Finding("places", LOOK, "as if", 0, "", "")
+
+    def reported(frames: Sequence[Frame], *rest: Sequence[object]) -> Finding:
+        pairs = rest[-1]
+        seen.append(nearest_pairs(frames) - {(pair.first, pair.second) for pair in pairs if isinstance(pair, Pair)})
+        return of_groups
+
+    monkeypatch.setattr(examination, "misplaced_groups", reported)
+    monkeypatch.setattr(connectivity, "choose_pairs", lambda facts: [(i, i + 2) for i in range(len(facts) - 2)])
     steps = np.linspace(-1, 1, 7)
     folder = write(tmp_path / "photos", walk())
     camera = Camera.pinhole(WIDTH, HEIGHT, FOCAL_PX)
@@ -340,4 +363,6 @@ def test_the_doctor_of_a_scene_names_the_wrong_pose(tmp_path: Path):
         diagnosis = examine(subject, threads=2, progress=lambda done, text: None)
         found = next(finding for finding in diagnosis.findings if finding.check == "poses")
         verdicts.append((found.verdict, found.names))
+        assert of_groups in diagnosis.findings
     assert verdicts == [(GOOD, ()), (BAD, ("03.jpg",))]
+    assert seen == [set(), set()]
