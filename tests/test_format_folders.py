@@ -176,6 +176,42 @@ def test_a_hundred_damaged_files_are_refused_or_sound(tmp_path, name):
     assert refused > 40
 
 
+OTHER_NAMES = [
+    ("pose-files", "color", "images"),
+    ("pose-files", "pose", "poses"),
+    ("pose-files", "intrinsic/intrinsic_color.txt", "intrinsics.txt"),
+    ("mvsnet", "images", "blended_images"),
+    ("neus", "image", "images"),
+    ("neus", "image", "rgb"),
+    ("neus", "mask", "masks"),
+    ("record3d", "rgb", "rgbd"),
+    ("record3d", "rgb", "images"),
+    ("record3d", "metadata.json", "metadata"),
+]
+
+
+@pytest.mark.parametrize(("name", "usual", "other"), OTHER_NAMES)
+def test_other_names_of_folders_and_files_give_the_same_capture(tmp_path, name, usual, other):
+    WRITERS[name](tmp_path)
+    expected = parse(tmp_path)[1]
+    (tmp_path / usual).rename(tmp_path / other)
+    found = parse(tmp_path)[1]
+    assert [frame.name for frame in found.frames] == [frame.name for frame in expected.frames]
+    for frame, usual_frame in zip(found.frames, expected.frames, strict=True):
+        np.testing.assert_array_equal(frame.world_from_cam, usual_frame.world_from_cam)
+        assert frame.camera == usual_frame.camera
+        assert frame.image is not None
+        assert frame.image.is_file()
+        assert (frame.mask is None) == (usual_frame.mask is None)
+
+
+def test_of_photos_that_differ_only_in_suffix_the_first_is_used(tmp_path):
+    write_record3d(tmp_path)
+    photo(tmp_path / "rgb/1.jpeg")
+    photo(tmp_path / "rgb/1.png")
+    assert [frame.name for frame in parse(tmp_path)[1].frames] == ["0.jpg", "1.jpeg", "2.jpg"]
+
+
 class TestPoseFiles:
     def test_7_scenes_has_everything_in_one_folder_and_its_camera_is_given(self, tmp_path):
         for index, pose in enumerate(POSES):

@@ -110,9 +110,10 @@ def _describe_reconstruction(run: Path) -> dict[str, Any]:
 def _describe_capture(path: Path) -> dict[str, Any] | None:
     """Return the facts of a capture that only `nerfcli convert` reads; None if the path is something else."""
     from nerfcli.convert.formats import UserInputs, format_named
+    from nerfcli.runs.files import CONFIG
     from nerfcli.scene import is_scene
 
-    if path.is_dir() and is_scene(path):
+    if is_scene(path) or (path / CONFIG).is_file():
         return None
     for form in map(format_named, _CAPTURES):
         found = form.find(path)

@@ -69,12 +69,12 @@ def parse_mvsnet(
 
 def _read(file: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, float] | None]:
     """Return `cam_from_world` (4, 4), the matrix of intrinsics (3, 3), and nearest and farthest z if both are there."""
-    words = read_text(file, _EXPECTED).split()
-    if len(words) < 27 or words[0] != "extrinsic" or words[17] != "intrinsic" or len(words) > 31:
+    fields = read_text(file, _EXPECTED).split()
+    if len(fields) < 27 or fields[0] != "extrinsic" or fields[17] != "intrinsic" or len(fields) > 31:
         raise malformed(str(file), "is not a camera of MVSNet", _EXPECTED)
-    pose = np.array(numbers(words[1:17], 16, f"{file}: extrinsic")).reshape(4, 4)
-    matrix = np.array(numbers(words[18:27], 9, f"{file}: intrinsic")).reshape(3, 3)
-    depths = numbers(words[27:], len(words) - 27, f"{file}: depths")
+    pose = np.array(numbers(fields[1:17], 16, f"{file}: extrinsic")).reshape(4, 4)
+    matrix = np.array(numbers(fields[18:27], 9, f"{file}: intrinsic")).reshape(3, 3)
+    depths = numbers(fields[27:], len(fields) - 27, f"{file}: depths")
     return rigid_pose(pose, f"{file}: extrinsic"), matrix, _bounds(depths)
 
 

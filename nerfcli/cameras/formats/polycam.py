@@ -14,7 +14,7 @@ import numpy as np
 
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats.fields import check_unique_names, number, read_json_object, size_of
-from nerfcli.cameras.formats.lenses import camera_of_matrix
+from nerfcli.cameras.formats.limits import checked_camera
 from nerfcli.cameras.formats.photo_names import PhotoOfStem, photos_missing
 from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
@@ -51,7 +51,7 @@ def parse_polycam(folder: Path, list_images: Callable[[Path], list[Path]], *, im
         where, record = str(file), read_json_object(file)
         fx, fy, cx, cy, *pose = (number(record, key, where) for key in ("fx", "fy", "cx", "cy", *_POSE))
         size = size_of(number(record, "width", where), number(record, "height", where), where)
-        camera = camera_of_matrix(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), size, where)
+        camera = checked_camera("PINHOLE", *size, (fx, fy, cx, cy), where=where)
         image = photos.find(file.stem)
         if image is None:
             missing.append(file.stem)

@@ -11,6 +11,7 @@ Source: ScanNet SensReader; Microsoft 7-Scenes readme.txt; facebookresearch/NSVF
 (load_intrinsics, load_matrix); vsitzmann/scene-representation-networks util.py (parse_intrinsics).
 """
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -19,6 +20,7 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, size_of
 from nerfcli.cameras.formats.lenses import camera_of_matrix
+from nerfcli.cameras.formats.limits import checked_camera
 from nerfcli.cameras.formats.photo_names import PhotoOfStem, photos_missing
 from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
@@ -46,7 +48,7 @@ def pose_files(folder: Path) -> list[Path]:
 
 
 def is_pose(path: Path) -> bool:
-    """Return whether a text file has as many words as the rows of a pose."""
+    """Return whether a text file has as many numbers as a pose."""
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
         return len(stream.read(10_000).split()) in (12, 16)
 
@@ -106,12 +108,20 @@ def _image_folder(
 
 def _pose(file: Path) -> np.ndarray | None:
     """Return `world_from_cam` (4, 4); None if it has numbers that are not finite."""
-    words = read_text(file, _EXPECTED).split()
-    if any(word.lower().lstrip("+-") in ("inf", "nan") for word in words):
+    fields = read_text(file, _EXPECTED).split()
+    if len(fields) not in (12, 16):
+        raise malformed(str(file), f"has {len(fields)} numbers", _EXPECTED)
+    if not _is_tracked(fields):
         return None
-    if len(words) not in (12, 16):
-        raise malformed(str(file), f"has {len(words)} numbers", _EXPECTED)
-    return rigid_pose(np.array(numbers(words, len(words), str(file))).reshape(-1, 4), str(file))
+    return rigid_pose(np.array(numbers(fields, len(fields), str(file))).reshape(-1, 4), str(file))
+
+
+def _is_tracked(fields: Sequence[str]) -> bool:
+    """Return False if a number is infinite or NaN, as ScanNet writes the pose of a photo that was not tracked."""
+    try:
+        return all(math.isfinite(float(field)) for field in fields)
+    except ValueError:
+        return True  # not a number at all: an error that `numbers` reports
 
 
 def _cameras(folder: Path, camera: Camera | None) -> Callable[[tuple[int, int]], Camera]:
@@ -137,6 +147,6 @@ def _cameras(folder: Path, camera: Camera | None) -> Callable[[tuple[int, int]],
         )
     focal, x, y, _ = numbers(rows[0], 4, str(path))
     height, width = numbers(rows[-1], 2, str(path))
-    matrix = np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]])
-    calibrated = camera_of_matrix(matrix, size_of(width, height, str(path)), str(path))
+    size = size_of(width, height, str(path))
+    calibrated = checked_camera("PINHOLE", *size, (focal, focal, x, y), where=str(path))
     return lambda size: calibrated.resized(*size)

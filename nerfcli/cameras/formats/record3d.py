@@ -12,20 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats.fields import malformed, number, read_json_object, shown, size_of, vector
-from nerfcli.cameras.formats.lenses import camera_of_matrix
+from nerfcli.cameras.formats.limits import checked_camera
 from nerfcli.cameras.formats.photo_names import PhotoOfStem, photos_missing
+from nerfcli.cameras.formats.rigid_poses import quaternion_pose
 from nerfcli.cameras.frame import Capture, Frame
 
 FILES = ("metadata.json", "metadata")
 IMAGE_FOLDERS = ("rgb", "rgbd", "images")
 
 _POSES, _INTRINSICS = "poses", "perFrameIntrinsicCoeffs"
-# Largest deviation of a quaternion's length from 1: files print 7 digits, so more is a mistake, not rounding.
-_MAX_DEVIATION = 1e-2
 
 
 def is_record3d(content: dict[str, Any]) -> bool:
@@ -70,10 +68,7 @@ def parse_record3d(path: Path, list_images: Callable[[Path], list[Path]], *, ima
 
 def _pose(value: Any, where: str) -> np.ndarray:
     row = vector({"pose": value}, "pose", 7, where)
-    length = np.linalg.norm(row[:4])
-    if abs(length - 1.0) > _MAX_DEVIATION:
-        raise malformed(where, f"its quaternion has length {length:.4g}", "expected length 1")
-    return rigid.from_parts(rigid.rotation_from_quaternion(row[[3, 0, 1, 2]]), row[4:])
+    return quaternion_pose(row[:4], row[4:], where)
 
 
 def _intrinsics(content: dict[str, Any], count: int, where: str) -> np.ndarray:
@@ -87,5 +82,4 @@ def _intrinsics(content: dict[str, Any], count: int, where: str) -> np.ndarray:
 
 
 def _camera(row: np.ndarray, size: tuple[int, int], where: str) -> Camera:
-    fx, fy, cx, cy = row.tolist()
-    return camera_of_matrix(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), size, where)
+    return checked_camera("PINHOLE", *size, tuple(row.tolist()), where=where)

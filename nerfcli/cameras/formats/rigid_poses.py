@@ -5,10 +5,12 @@ from collections.abc import Callable
 import numpy as np
 
 from nerfcli.cameras import rigid
+from nerfcli.cameras.formats.fields import malformed
 from nerfcli.cameras.formats.limits import MOST_UNITS, plausible
 from nerfcli.errors import UserError
 
-# Largest deviation of a rotation from orthonormal: files print 6 digits or more, so more is a mistake, not rounding.
+# Largest deviation of a rotation from orthonormal, or of a quaternion's length from 1: files print 4 digits or more,
+# so more is a mistake, not rounding.
 _MAX_DEVIATION = 1e-2
 
 # Rotations that deviate by less are kept, bit for bit.
@@ -55,6 +57,18 @@ def rigid_poses(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray
 def rigid_pose(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return `rigid_poses` of one matrix (3, 4) or (4, 4): a pose (4, 4)."""
     return rigid_poses(matrix[None], lambda _: where)[0]
+
+
+def quaternion_pose(xyzw: np.ndarray, position: np.ndarray, where: str) -> np.ndarray:
+    """Return the pose (4, 4) of a quaternion (4,) in the order x, y, z, w and a position (3,).
+
+    Raises:
+        UserError: the quaternion's length differs from 1 by more than rounding explains.
+    """
+    length = np.linalg.norm(xyzw)
+    if abs(length - 1.0) > _MAX_DEVIATION:
+        raise malformed(where, f"its quaternion has length {length:.4g}", "expected length 1")
+    return rigid.from_parts(rigid.rotation_from_quaternion(xyzw[[3, 0, 1, 2]]), position)
 
 
 def _refuse(wrong: np.ndarray, where: Callable[[int], str], *, what: str, hint: str) -> None:

@@ -15,16 +15,13 @@ from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, shown
-from nerfcli.cameras.formats.rigid_poses import rigid_pose
+from nerfcli.cameras.formats.rigid_poses import quaternion_pose, rigid_pose
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import UserError
 
 _TUM_EXPECTED = "expected lines of timestamp tx ty tz qx qy qz qw"
 _KITTI_EXPECTED = "expected lines of 12 numbers, the first three rows of a 4x4 matrix"
-
-# Largest deviation of a quaternion's length from 1: files print 4 digits or more, so more is a mistake, not rounding.
-_MAX_DEVIATION = 1e-2
 
 _NUMBER = re.compile(r"[+-]?\d{1,20}(\.\d{0,20})?([eE][+-]?\d{1,2})?", re.ASCII)
 _PICTURE = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp)$", re.IGNORECASE)
@@ -121,12 +118,10 @@ def _tum_pose(_: int, words: list[str], where: str) -> tuple[str, np.ndarray]:
     if len(words) != 8:
         raise malformed(where, f"has {len(words)} numbers", "expected 8")
     values = np.array(numbers(words[1:], 7, where))
-    xyzw = values[3:]
-    if abs(np.linalg.norm(xyzw) - 1.0) > _MAX_DEVIATION:
-        raise malformed(where, f"its quaternion has length {np.linalg.norm(xyzw):.4g}", "expected length 1")
+    world_from_cam = quaternion_pose(values[3:], values[:3], where)
     if not _NUMBER.fullmatch(words[0]):
         raise malformed(where, f"its timestamp is {shown(words[0])}", "expected seconds, such as 1305031102.1753")
-    return words[0], rigid.from_parts(rigid.rotation_from_quaternion(xyzw[[3, 0, 1, 2]]), values[:3])
+    return words[0], world_from_cam
 
 
 def _kitti_pose(index: int, words: list[str], where: str) -> tuple[str, np.ndarray]:
