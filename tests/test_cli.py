@@ -24,7 +24,7 @@ from typer.exceptions import TyperException
 
 from nerfcli import cli, scene
 from nerfcli.atomic import write_json
-from nerfcli.cli.options import seconds_from_text, thread_count
+from nerfcli.cli.options import seconds_from_text
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TERMINATED, TOO_FEW_PHOTOS, in_shell
 from nerfcli.interrupts import install_handlers
 from nerfcli.media.float_tiff import read_tiff
@@ -34,6 +34,7 @@ from nerfcli.runs.log import append_log, read_log
 from nerfcli.train import loop
 from nerfcli.train.loop import Progress
 from nerfcli.workflows import poses as poses_workflow
+from nerfcli.workflows.machine import thread_count
 
 BATCH_COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench", "export")
 COMMANDS = (*BATCH_COMMANDS, "view")

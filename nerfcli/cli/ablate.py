@@ -5,31 +5,10 @@ from typing import Annotated
 
 import typer
 
+from nerfcli.cli import options
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import (
-    Device,
-    DeviceMemory,
-    Downscale,
-    Exclude,
-    Holdout,
-    Include,
-    Json,
-    Output,
-    Overwrite,
-    Quiet,
-    Seed,
-    Threads,
-    device_name,
-    downscale_factor,
-    holdout_rule,
-    memory_limit,
-    model_name,
-    named_components,
-    seconds_from_text,
-    split_at_commas,
-    thread_count,
-)
+from nerfcli.workflows.machine import device_name, thread_count
 
 DEFAULT_BUDGET = "1m"
 _STYLES = {"would help": "green", "needed: worse without it": "green", "not needed: better without it": "yellow"}
@@ -38,7 +17,7 @@ _STYLES = {"would help": "green", "needed: worse without it": "green", "not need
 @command
 def ablate(
     scene: Annotated[str, typer.Argument(help="Scene folder, or - to read paths from standard input.")],
-    output: Output = None,
+    output: options.Output = None,
     budget: Annotated[
         str | None, typer.Option(help="Time of each training: 30s, 2m.  [default: 1m, or none with --steps]")
     ] = None,
@@ -52,11 +31,11 @@ def ablate(
             "--only",
             metavar="NAME,...",
             help="Vary only these components. Repeatable.  [default: all]",
-            callback=split_at_commas,
+            callback=options.split_at_commas,
         ),
     ] = None,
-    include: Include = None,
-    exclude: Exclude = None,
+    include: options.Include = None,
+    exclude: options.Exclude = None,
     whole: Annotated[
         bool,
         typer.Option(
@@ -64,15 +43,15 @@ def ablate(
         ),
     ] = False,
     model: Annotated[str, typer.Option(help="Reference model: auto (selected for this scene) or default.")] = "auto",
-    downscale: Downscale = "auto",
-    holdout: Holdout = None,
-    memory: DeviceMemory = None,
-    device: Device = "auto",
-    seed: Seed = 0,
-    threads: Threads = 0,
-    overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    downscale: options.Downscale = "auto",
+    holdout: options.Holdout = None,
+    memory: options.DeviceMemory = None,
+    device: options.Device = "auto",
+    seed: options.Seed = 0,
+    threads: options.Threads = 0,
+    overwrite: options.Overwrite = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Measure what each component of the model contributes on a scene.
 
@@ -107,18 +86,18 @@ def ablate(
     console = Console(quiet=quiet, json_lines=json)
     torch_device = device_name(device)
     settings = TrainSettings(
-        budget_seconds=None if budget is None else seconds_from_text(budget),
+        budget_seconds=None if budget is None else options.seconds_from_text(budget),
         steps=steps,
-        downscale=downscale_factor(downscale),
+        downscale=options.downscale_factor(downscale),
         seed=seed,
         device=torch_device,
         threads=thread_count(threads),
         components=choose(Components(), included=include or (), excluded=exclude or ()),
-        model=model_name(model),
-        fixed=named_components(include, exclude),
+        model=options.one_of(model, ("auto", "default"), "--model"),
+        fixed=options.named_components(include, exclude),
         **sizes_for(torch_device),
     )
-    rule, limit = holdout_rule(holdout), memory_limit(memory, torch_device)
+    rule, limit = options.holdout_rule(holdout), options.memory_limit(memory, torch_device)
 
     def work(path: Path, one_of_many: bool) -> None:
         refuse_scan(path, "ablate")

@@ -5,22 +5,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from nerfcli.cli import options
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import (
-    Device,
-    Json,
-    Output,
-    Overwrite,
-    Quiet,
-    Seed,
-    Threads,
-    device_name,
-    one_of,
-    seconds_from_text,
-    thread_count,
-)
 from nerfcli.errors import UserError
+from nerfcli.workflows.machine import device_name, thread_count
 
 if TYPE_CHECKING:
     from nerfcli.bench.measurement import BenchOptions
@@ -35,19 +24,19 @@ def bench(
     source: Annotated[
         str, typer.Argument(help="Run folder, or a scene to train first; - to read paths from standard input.")
     ],
-    output: Output = None,
+    output: options.Output = None,
     budget: Annotated[
         str, typer.Option(help="Total time: 8m, 1h. More time allows more settings, longer trainings and more repeats.")
     ] = "8m",
     sweep: Annotated[
         str, typer.Option(help="render (rendering settings only), train (training settings only) or both.")
     ] = "both",
-    device: Device = "auto",
-    seed: Seed = 0,
-    threads: Threads = 0,
-    overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    device: options.Device = "auto",
+    seed: options.Seed = 0,
+    threads: options.Threads = 0,
+    overwrite: options.Overwrite = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Measure speed against error on this scene and machine.
 
@@ -66,8 +55,8 @@ def bench(
       nerfcli bench photos-scene --budget 30m -o bench/
       nerfcli bench photos-scene-run --json | jq -r .recommendations[].point
     """
-    one_of(sweep, _SWEEPS, "--sweep")
-    seconds = seconds_from_text(budget)
+    options.one_of(sweep, _SWEEPS, "--sweep")
+    seconds = options.seconds_from_text(budget)
     if seconds < _SHORTEST_SECONDS:
         raise typer.BadParameter(
             f"{budget!r} is too short; give at least {_SHORTEST_SECONDS:g}s", param_hint="--budget"

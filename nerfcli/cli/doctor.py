@@ -7,9 +7,10 @@ import typer
 
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads, one_of, thread_count
+from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads, one_of
 from nerfcli.cli.poses import Intrinsics, Subfolders
 from nerfcli.errors import GATE_NOT_MET, UserError
+from nerfcli.workflows.machine import thread_count
 
 if TYPE_CHECKING:
     from nerfcli.doctor.examination import Diagnosis

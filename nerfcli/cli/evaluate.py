@@ -8,9 +8,10 @@ import typer
 
 from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Device, Json, Overwrite, Quiet, Require, Threads, device_name, one_of, thread_count
+from nerfcli.cli.options import Device, Json, Overwrite, Quiet, Require, Threads, one_of
 from nerfcli.cli.plans import print_plan
 from nerfcli.errors import UserError
+from nerfcli.workflows.machine import device_name, thread_count
 
 if TYPE_CHECKING:
     from nerfcli.evaluate.requirements import Requirement

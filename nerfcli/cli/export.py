@@ -8,8 +8,9 @@ import typer
 
 from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, one_of, thread_count
+from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, one_of
 from nerfcli.cli.render_options import finite
+from nerfcli.workflows.machine import device_name, thread_count
 
 # Parameters for reconstructions of X-ray scans.
 _OF_SCANS = "run to output form water device threads overwrite json quiet"

@@ -9,7 +9,8 @@ import typer
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.info_text import cost_lines, lines_of, words_of
-from nerfcli.cli.options import Json, thread_count
+from nerfcli.cli.options import Json
+from nerfcli.workflows.machine import thread_count
 
 
 @command

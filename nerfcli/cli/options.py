@@ -7,6 +7,9 @@ from typing import Annotated, TypeVar
 
 import typer
 
+from nerfcli.holdout import check_holdout
+from nerfcli.memory import default_memory_limit
+
 Word = TypeVar("Word", str, str | None)
 
 
@@ -150,18 +153,6 @@ def downscale_factor(downscale: str) -> int | None:
     return None if downscale == "auto" else int(downscale)
 
 
-def field_kind(kind: str) -> str:
-    """Check --field."""
-    from nerfcli.field.kinds import KINDS
-
-    return one_of(kind, KINDS, "--field")
-
-
-def model_name(model: str) -> str:
-    """Check --model: auto or default."""
-    return one_of(model, ("auto", "default"), "--model")
-
-
 def named_components(included: list[str] | None, excluded: list[str] | None) -> tuple[str, ...]:
     """Return the component names in --with NAME[=VALUE] and --without NAME, without duplicates."""
     return tuple(sorted({text.partition("=")[0] for text in (*(included or ()), *(excluded or ()))}))
@@ -208,8 +199,6 @@ def holdout_rule(holdout: str | None) -> str | None:
     Raises:
         typer.BadParameter: neither a rule nor a file.
     """
-    from nerfcli.holdout import check_holdout
-
     try:
         return None if holdout is None else check_holdout(holdout)
     except ValueError as error:
@@ -222,24 +211,4 @@ def memory_limit(memory: str | None, device: str = "cpu") -> int | None:
     Raises:
         typer.BadParameter: not an amount of memory.
     """
-    from nerfcli.memory import default_memory_limit
-
     return default_memory_limit(device) if memory is None else bytes_from_text(memory)
-
-
-def thread_count(threads: int) -> int:
-    """Return the number of threads for --threads; for 0, the processors this process may use."""
-    from nerfcli.workflows import machine
-
-    return machine.thread_count(threads)
-
-
-def device_name(device: str) -> str:
-    """Return the torch device for --device.
-
-    Raises:
-        UserError: CUDA is requested but not available, or the name is unknown.
-    """
-    from nerfcli.workflows import machine
-
-    return machine.device_name(device)

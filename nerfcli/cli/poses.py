@@ -5,24 +5,10 @@ from typing import Annotated
 
 import typer
 
+from nerfcli.cli import options
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import (
-    Holdout,
-    Json,
-    Memory,
-    Output,
-    Overwrite,
-    Quiet,
-    Seed,
-    Strict,
-    Threads,
-    holdout_rule,
-    memory_limit,
-    one_of,
-    seconds_from_text,
-    thread_count,
-)
+from nerfcli.workflows.machine import thread_count
 
 # The minimum is the number of photos that structure from motion needs.
 Frames = Annotated[
@@ -51,7 +37,7 @@ Quality = Annotated[str, typer.Option(help="fast, default or best: image size an
 @command
 def poses(
     photos: Annotated[str, typer.Argument(help="Folder of photos or a video, or - to read paths from standard input.")],
-    output: Output = None,
+    output: options.Output = None,
     frames: Frames = None,
     subfolders: Subfolders = False,
     masks: Annotated[
@@ -76,8 +62,8 @@ def poses(
     ] = "auto",
     intrinsics: Intrinsics = None,
     intrinsics_as: IntrinsicsAs = None,
-    holdout: Holdout = None,
-    strict: Strict = False,
+    holdout: options.Holdout = None,
+    strict: options.Strict = False,
     min_registered: Annotated[float, typer.Option(help="Fraction of photos that must register.", min=0, max=1)] = 0.5,
     component: Annotated[
         int, typer.Option(help="Which model to use if the photos form several; 1 is the largest.", min=1)
@@ -85,7 +71,7 @@ def poses(
     accept_refused: Annotated[
         bool, typer.Option("--accept-refused", help="Write the scene even if the checks refuse the poses.")
     ] = False,
-    memory: Memory = None,
+    memory: options.Memory = None,
     time_limit: Annotated[
         str | None, typer.Option(help="Stop after this time: 90s, 10m, 2h. Run the command again to continue.")
     ] = None,
@@ -95,11 +81,11 @@ def poses(
     drop_database: Annotated[
         bool, typer.Option("--drop-database", help="Delete features and matches when the scene is complete.")
     ] = False,
-    seed: Seed = 0,
-    threads: Threads = 0,
-    overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    seed: options.Seed = 0,
+    threads: options.Threads = 0,
+    overwrite: options.Overwrite = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Estimate camera poses and intrinsics by structure from motion.
 
@@ -135,8 +121,8 @@ def poses(
         without_suffix,
     )
 
-    one_of(camera_model, CAMERA_MODELS, "--camera-model")
-    one_of(pairing, PAIRINGS, "--pairing")
+    options.one_of(camera_model, CAMERA_MODELS, "--camera-model")
+    options.one_of(pairing, PAIRINGS, "--pairing")
     if pairs is not None and pairing != "auto":
         raise typer.BadParameter("cannot be combined with --pairs; remove --pairing", param_hint="--pairing")
     use = use_of(intrinsics, intrinsics_as)
@@ -157,15 +143,15 @@ def poses(
         pairing=pairing,
         pairs_file=None if pairs is None else str(pairs.absolute()),
         masks=str(masks.resolve()) if masks else None,
-        holdout=holdout_rule(holdout) or DEFAULT_HOLDOUT,
+        holdout=options.holdout_rule(holdout) or DEFAULT_HOLDOUT,
         strict=strict,
         component=component,
         accept_refused=accept_refused,
         subfolders=subfolders,
     )
     limits = Limits(
-        memory_bytes=memory_limit(memory),
-        seconds=None if time_limit is None else seconds_from_text(time_limit, "--time-limit"),
+        memory_bytes=options.memory_limit(memory),
+        seconds=None if time_limit is None else options.seconds_from_text(time_limit, "--time-limit"),
     )
 
     def work(source: Path, one_of_many: bool) -> None:
@@ -211,7 +197,7 @@ def sizes_of(quality: str) -> tuple[int, int]:
     """
     from nerfcli.poses.input.settings import QUALITIES
 
-    return QUALITIES[one_of(quality, QUALITIES, "--quality")]
+    return QUALITIES[options.one_of(quality, QUALITIES, "--quality")]
 
 
 def use_of(intrinsics: Path | None, intrinsics_as: str | None) -> str:
@@ -222,7 +208,7 @@ def use_of(intrinsics: Path | None, intrinsics_as: str | None) -> str:
     """
     from nerfcli.poses.model.cameras import USES
 
-    one_of(intrinsics_as, USES, "--intrinsics-as")
+    options.one_of(intrinsics_as, USES, "--intrinsics-as")
     if intrinsics_as is not None and intrinsics is None:
         raise typer.BadParameter("needs --intrinsics", param_hint="--intrinsics-as")
     return intrinsics_as or USES[0]

@@ -6,39 +6,13 @@ from typing import Annotated
 
 import typer
 
+from nerfcli.cli import options, render_options
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import (
-    Device,
-    Json,
-    Output,
-    Overwrite,
-    Quiet,
-    Threads,
-    device_name,
-    one_of,
-    some_of,
-    thread_count,
-)
 from nerfcli.cli.plans import print_plan
-from nerfcli.cli.render_options import (
-    DepthFormat,
-    DepthScale,
-    Rgba,
-    SamplesPerPixel,
-    Step,
-    Tolerance,
-    colour_range_of,
-    depth_formats,
-    finite,
-    frame_range,
-    level_scale,
-    look_of,
-    tolerance_of,
-    video_settings,
-)
 from nerfcli.cli.scans import is_of_scan, refuse_photo_options, scan_pictures
 from nerfcli.errors import UserError
+from nerfcli.workflows.machine import device_name, thread_count
 
 DEFAULT_FPS = 24.0
 
@@ -105,12 +79,12 @@ def render(
     background_distance: Annotated[
         float | None, typer.Option(help="Distance of light that passes, for --depth background, in scene units.", min=0)
     ] = None,
-    depth_format: DepthFormat = "tiff",
-    depth_scale: DepthScale = "auto",
-    tolerance: Tolerance = "1/1020",
-    step: Step = 1.0,
-    samples_per_pixel: SamplesPerPixel = 1,
-    rgba: Rgba = False,
+    depth_format: render_options.DepthFormat = "tiff",
+    depth_scale: render_options.DepthScale = "auto",
+    tolerance: render_options.Tolerance = "1/1020",
+    step: render_options.Step = 1.0,
+    samples_per_pixel: render_options.SamplesPerPixel = 1,
+    rgba: render_options.Rgba = False,
     colour_map: Annotated[str, typer.Option(help="Colour map of depth previews: turbo, viridis or grey.")] = "turbo",
     colour_range: Annotated[
         str | None,
@@ -181,12 +155,12 @@ def render(
     crop: Annotated[
         str | None, typer.Option(help="Render only the window X,Y,WIDTH,HEIGHT of the pictures, in pixels.")
     ] = None,
-    output: Output = None,
-    device: Device = "auto",
-    threads: Threads = 0,
-    overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    output: options.Output = None,
+    device: options.Device = "auto",
+    threads: options.Threads = 0,
+    overwrite: options.Overwrite = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Render views of a run: colour, depth, opacity, videos.
 
@@ -261,19 +235,19 @@ def render(
     if is_of_scan(run, outputs=outputs, slices=slices):
         for_each_input(run, render_one_scan, command="render")
         return
-    chosen = some_of("rgb,depth,opacity" if outputs is None else outputs, OUTPUTS, "--outputs")
+    chosen = options.some_of("rgb,depth,opacity" if outputs is None else outputs, OUTPUTS, "--outputs")
     if not is_convention(depth):
         choices = f"{', '.join(CONVENTIONS)} or quantile:Q with 0 < Q < 1"
         raise typer.BadParameter(f"{depth!r}; choose {choices}", param_hint="--depth")
-    one_of(depth_axis, ("ray", "z"), "--depth-axis")
-    formats = depth_formats(depth_format, outputs=chosen, convention=depth)
-    scale = level_scale(depth_scale, formats=formats)
-    finite(background_distance, "--background-distance")
-    finite(min_opacity, "--min-opacity")
-    finite(step, "--step")
-    finite(min_parallax, "--min-parallax")
-    finite(level, "--level")
-    finite(depth_tolerance, "--depth-tolerance")
+    options.one_of(depth_axis, ("ray", "z"), "--depth-axis")
+    formats = render_options.depth_formats(depth_format, outputs=chosen, convention=depth)
+    scale = render_options.level_scale(depth_scale, formats=formats)
+    render_options.finite(background_distance, "--background-distance")
+    render_options.finite(min_opacity, "--min-opacity")
+    render_options.finite(step, "--step")
+    render_options.finite(min_parallax, "--min-parallax")
+    render_options.finite(level, "--level")
+    render_options.finite(depth_tolerance, "--depth-tolerance")
     if (min_views or min_parallax) and "depth" not in chosen:
         hint = "--min-views" if min_views else "--min-parallax"
         raise typer.BadParameter("it removes depth; add depth to --outputs", param_hint=hint)
@@ -287,12 +261,12 @@ def render(
         level=level,
         depth_tolerance=depth_tolerance,
     )
-    one_of(colour_map, COLOUR_MAPS, "--colour-map")
+    options.one_of(colour_map, COLOUR_MAPS, "--colour-map")
     if cameras_only and dry_run:
         raise typer.BadParameter("it renders nothing; remove --dry-run", param_hint="--cameras-only")
     if max_size is not None and (width is not None or height is not None):
         raise typer.BadParameter("cannot be combined with --width or --height", param_hint="--max-size")
-    look = look_of(width, height, lens=lens, fov_deg=fov, crop=crop)
+    look = render_options.look_of(width, height, lens=lens, fov_deg=fov, crop=crop)
     writes_video = video or video_format is not None
     unused = {
         "--fps": (fps is not None and not (writes_video or cameras_only), "--video"),
@@ -313,10 +287,10 @@ def render(
         if is_unused:
             raise typer.BadParameter(f"it works with {needed}; add that, or remove it", param_hint=option)
     fps = fps or file_fps(cameras) or DEFAULT_FPS
-    part = None if frames is None else frame_range(frames)
+    part = None if frames is None else render_options.frame_range(frames)
     videos = None
     if writes_video:
-        videos = video_settings(
+        videos = render_options.video_settings(
             video_format or "mp4", layout=video_layout, direction=direction, fps=fps, crf=crf, loop=loop
         )
     usual = ExportSettings(
@@ -325,9 +299,9 @@ def render(
         formats=formats,
         depth_scale=scale,
         colour_map=colour_map,
-        colour_range=colour_range_of(colour_range, outputs=chosen),
+        colour_range=render_options.colour_range_of(colour_range, outputs=chosen),
         video=videos,
-        quality=Quality(tolerance_of(tolerance), samples_per_pixel),
+        quality=Quality(render_options.tolerance_of(tolerance), samples_per_pixel),
         rgba=rgba,
     )
     if rgba and videos is not None:

@@ -7,7 +7,8 @@ import typer
 
 from nerfcli.cli.batch import STDIN, no_paths, stdin_paths
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, one_of, thread_count
+from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, one_of
+from nerfcli.workflows.machine import device_name, thread_count
 
 
 @command

@@ -5,62 +5,41 @@ from typing import Annotated
 
 import typer
 
+from nerfcli.cli import options
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import (
-    Device,
-    Downscale,
-    Exclude,
-    Holdout,
-    Include,
-    Json,
-    ModelChoice,
-    Output,
-    Overwrite,
-    Quiet,
-    Require,
-    Seed,
-    Strict,
-    Threads,
-    device_name,
-    downscale_factor,
-    holdout_rule,
-    model_name,
-    named_components,
-    seconds_from_text,
-    thread_count,
-)
 from nerfcli.cli.poses import Frames, Intrinsics, IntrinsicsAs, Quality, Subfolders, sizes_of, use_of
+from nerfcli.workflows.machine import device_name, thread_count
 
 
 @command
 def run(
     photos: Annotated[str, typer.Argument(help="Folder of photos or a video, or - to read paths from standard input.")],
-    output: Output = None,
+    output: options.Output = None,
     frames: Frames = None,
     subfolders: Subfolders = False,
     quality: Quality = "default",
     intrinsics: Intrinsics = None,
     intrinsics_as: IntrinsicsAs = None,
     budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h.")] = "2m",
-    include: Include = None,
-    exclude: Exclude = None,
-    model: ModelChoice = "auto",
-    downscale: Downscale = "auto",
+    include: options.Include = None,
+    exclude: options.Exclude = None,
+    model: options.ModelChoice = "auto",
+    downscale: options.Downscale = "auto",
     count: Annotated[int, typer.Option(help="Number of views of the orbit video.", min=2)] = 60,
     max_size: Annotated[
         int | None,
         typer.Option(help="Maximum longer side of the video, in pixels.  [default: training resolution]", min=8),
     ] = None,
-    holdout: Holdout = None,
-    strict: Strict = False,
-    require: Require = None,
-    device: Device = "auto",
-    seed: Seed = 0,
-    threads: Threads = 0,
-    overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    holdout: options.Holdout = None,
+    strict: options.Strict = False,
+    require: options.Require = None,
+    device: options.Device = "auto",
+    seed: options.Seed = 0,
+    threads: options.Threads = 0,
+    overwrite: options.Overwrite = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Run all stages: poses, train, evaluate, render, video, report.
 
@@ -93,7 +72,7 @@ def run(
     from nerfcli.workflows.views import Views, usual_depth
 
     console = Console(quiet=quiet, json_lines=json)
-    requirements, rule = requirements_of(require), holdout_rule(holdout)
+    requirements, rule = requirements_of(require), options.holdout_rule(holdout)
     cores, torch_device = thread_count(threads), device_name(device)
     max_image_size, max_features = sizes_of(quality)
     use = use_of(intrinsics, intrinsics_as)
@@ -107,14 +86,14 @@ def run(
         subfolders=subfolders,
     )
     train_settings = TrainSettings(
-        budget_seconds=seconds_from_text(budget),
-        downscale=downscale_factor(downscale),
+        budget_seconds=options.seconds_from_text(budget),
+        downscale=options.downscale_factor(downscale),
         seed=seed,
         device=torch_device,
         threads=cores,
         components=choose(Components(), included=include or (), excluded=exclude or ()),
-        model=model_name(model),
-        fixed=named_components(include, exclude),
+        model=options.one_of(model, ("auto", "default"), "--model"),
+        fixed=options.named_components(include, exclude),
         **sizes_for(torch_device),
     )
 

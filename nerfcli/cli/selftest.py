@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Device, Quiet, Threads, device_name, thread_count
+from nerfcli.cli.options import Device, Quiet, Threads
 from nerfcli.errors import GATE_NOT_MET, UserError
+from nerfcli.workflows.machine import device_name, thread_count
 
 if TYPE_CHECKING:
     from nerfcli.selftest.measure import Errors, Row

@@ -7,39 +7,10 @@ from typing import Annotated
 
 import typer
 
+from nerfcli.cli import options
 from nerfcli.cli.batch import STDIN, for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import (
-    Contraction,
-    Device,
-    DeviceMemory,
-    Downscale,
-    Exclude,
-    FieldKind,
-    FieldMemory,
-    Holdout,
-    Include,
-    Json,
-    ModelChoice,
-    Output,
-    Overwrite,
-    Quiet,
-    Seed,
-    Threads,
-    VoxelSize,
-    bytes_from_text,
-    contraction_name,
-    device_name,
-    downscale_factor,
-    field_kind,
-    holdout_rule,
-    model_name,
-    named_components,
-    one_of,
-    one_or_all,
-    seconds_from_text,
-    thread_count,
-)
+from nerfcli.workflows.machine import device_name, thread_count
 
 DEFAULT_BUDGET = "2m"
 # Parameters for X-ray scans.
@@ -49,21 +20,21 @@ _OF_SCANS = "scene output budget steps include exclude field voxel_size seed thr
 @command
 def train(
     scene: Annotated[str, typer.Argument(help="Scene folder, or - to read paths from standard input.")],
-    output: Output = None,
+    output: options.Output = None,
     budget: Annotated[
         str | None, typer.Option(help="Training time: 90s, 5m, 1h; 90 is 90 s.  [default: 2m, or none with --steps]")
     ] = None,
     steps: Annotated[
         int | None, typer.Option(help="Total optimizer steps; results repeat bit for bit on a CPU.", min=1)
     ] = None,
-    include: Include = None,
-    exclude: Exclude = None,
-    field: FieldKind = None,
-    field_memory: FieldMemory = None,
-    voxel_size: VoxelSize = None,
-    model: ModelChoice = "auto",
-    downscale: Downscale = "auto",
-    contraction: Contraction = "auto",
+    include: options.Include = None,
+    exclude: options.Exclude = None,
+    field: options.FieldKind = None,
+    field_memory: options.FieldMemory = None,
+    voxel_size: options.VoxelSize = None,
+    model: options.ModelChoice = "auto",
+    downscale: options.Downscale = "auto",
+    contraction: options.Contraction = "auto",
     log2_rows: Annotated[
         int | None,
         typer.Option(
@@ -83,7 +54,7 @@ def train(
             show_default=False,
         ),
     ] = None,
-    holdout: Holdout = None,
+    holdout: options.Holdout = None,
     members: Annotated[
         str | None,
         typer.Option(
@@ -111,16 +82,16 @@ def train(
     view: Annotated[
         bool, typer.Option("--view", help="Show the field in a browser while it trains; see nerfcli view.")
     ] = False,
-    memory: DeviceMemory = None,
+    memory: options.DeviceMemory = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show how much memory, disk and time it would take.")
     ] = False,
-    device: Device = "auto",
-    seed: Seed = 0,
-    threads: Threads = 0,
-    overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    device: options.Device = "auto",
+    seed: options.Seed = 0,
+    threads: options.Threads = 0,
+    overwrite: options.Overwrite = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Fit a radiance field to a scene.
 
@@ -187,6 +158,7 @@ def train(
     """
     values = dict(locals())
     from nerfcli.errors import UserError, in_shell
+    from nerfcli.field.kinds import KINDS
     from nerfcli.memory import default_memory_limit
     from nerfcli.runs.components import Components, choose
     from nerfcli.runs.run import Run
@@ -201,7 +173,7 @@ def train(
 
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
-    one_of(vary, VARIED, "--vary")
+    options.one_of(vary, VARIED, "--vary")
     if vary != "seeds" and members is None:
         raise typer.BadParameter("it works with --members; add that, or remove it", param_hint="--vary")
     if members is not None and (dry_run or view):
@@ -217,17 +189,17 @@ def train(
     }
     if field not in (None, "hash") and (option := next((name for name, given in of_hash.items() if given), None)):
         raise typer.BadParameter("it works with --field hash; for other fields, give --field-memory", param_hint=option)
-    only, count = one_or_all(blocks, "--blocks")
-    member, member_count = one_or_all(members, "--members")
+    only, count = options.one_or_all(blocks, "--blocks")
+    member, member_count = options.one_or_all(members, "--members")
     if count and (members is not None or view):
         option = "--members" if members is not None else "--view"
         raise typer.BadParameter(f"it cannot be combined with {option}", param_hint="--blocks")
     if is_one_of_several() and (dry_run or members is not None or count or scene == STDIN or is_scan(Path(scene))):
         raise UserError("processes of torchrun train one field of photos", "use this command without torchrun", 2)
     console = Console(quiet=quiet or not is_first(), json_lines=json)
-    budget_seconds = None if budget is None else seconds_from_text(budget)
-    rule = holdout_rule(holdout)
-    limit = None if memory is None else bytes_from_text(memory)
+    budget_seconds = None if budget is None else options.seconds_from_text(budget)
+    rule = options.holdout_rule(holdout)
+    limit = None if memory is None else options.bytes_from_text(memory)
 
     def train_one_scan(folder: Path, run: Path) -> None:
         from nerfcli.cli.scans import reconstruction_settings, refuse_photo_options
@@ -261,24 +233,25 @@ def train(
         torch_device = device_name(device)
         sized = replace(TrainSettings(), **sizes_for(torch_device))
         largest = batch or sized.samples_per_step
+        field_bytes = None if field_memory is None else options.bytes_from_text(field_memory, "--field-memory")
         return TrainSettings(
             budget_seconds=budget_seconds,
             steps=steps,
-            downscale=downscale_factor(downscale),
-            contraction=contraction_name(contraction),
+            downscale=options.downscale_factor(downscale),
+            contraction=options.contraction_name(contraction),
             seed=seed,
             device=torch_device,
             threads=thread_count(threads),
             components=choose(Components(), included=include or (), excluded=exclude or ()),
-            model=model_name(model),
-            fixed=named_components(include, exclude),
+            model=options.one_of(model, ("auto", "default"), "--model"),
+            fixed=options.named_components(include, exclude),
             first_samples_per_step=min(sized.first_samples_per_step, largest),
             samples_per_step=largest,
             levels=levels,
             log2_rows=log2_rows or sized.log2_rows,
             width=width,
-            field=field_kind(field or "hash"),
-            field_memory_bytes=None if field_memory is None else bytes_from_text(field_memory, "--field-memory"),
+            field=options.one_of(field or "hash", KINDS, "--field"),
+            field_memory_bytes=field_bytes,
         )
 
     def memory_of_process() -> int | None:

@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Json, Quiet, Threads, thread_count
+from nerfcli.cli.options import Json, Quiet, Threads
+from nerfcli.workflows.machine import thread_count
 
 
 @command
