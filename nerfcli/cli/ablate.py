@@ -102,7 +102,7 @@ def ablate(
     def work(path: Path, one_of_many: bool) -> None:
         refuse_scan(path, "ablate")
         folder = result_path(path, suffix="-ablation", output=output, one_of_many=one_of_many)
-        with console.progress(f"ablate {path.name}") as update:
+        with console.callbacks(f"ablate {path.name}") as callbacks:
             content = ablate_scene(
                 path,
                 folder,
@@ -113,9 +113,8 @@ def ablate(
                 holdout=rule,
                 memory_bytes=limit,
                 overwrite=overwrite,
-                notify=console.note,
                 warn=console.warn,
-                progress=update,
+                **callbacks,
             )
         rows = [ResultRow(**row) for row in content["rows"]]
         console.table(COLUMNS, table_of(rows), styles=_STYLES)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, ParamSpec, TextIO, TypeVar
+from typing import Any, ParamSpec, TextIO, TypedDict, TypeVar
 
 import typer
 
@@ -26,6 +26,13 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 # Widths of tables of findings and of numbers in a file or a pipe, which have no width of their own.
 PLAIN_TABLE_WIDTH = 140
 WIDE_TABLE_WIDTH = 200
+
+
+class Callbacks(TypedDict):
+    """Callbacks that tell the user what a workflow does."""
+
+    notify: Callable[[str], None]
+    progress: Callable[[float, str], None]
 
 
 class Console:
@@ -48,6 +55,13 @@ class Console:
     def address(self, url: str) -> None:
         """Print the address of a page as a result on stdout."""
         print(json.dumps({"url": url}) if self.json_lines else url, flush=True)  # noqa: T201 - a result, as above
+
+    def facts(self, path: Path, content: dict[str, Any], text: str) -> None:
+        """Print facts about a path on stdout: `text`, or with --json the same as `result`."""
+        if self.json_lines:
+            self.result(path, content)
+        else:
+            print(text, flush=True)  # noqa: T201 - a result, as above
 
     def fact(self, content: dict[str, Any]) -> None:
         """Print one result that is not a file, as a line of JSON on stdout."""
@@ -91,6 +105,12 @@ class Console:
                 bar(fraction, detail)
 
             yield (lambda fraction, detail: None) if self.quiet else update
+
+    @contextmanager
+    def callbacks(self, title: str) -> Iterator[Callbacks]:
+        """Provide `note` and `progress` under the names that workflows give them."""
+        with self.progress(title) as update:
+            yield {"notify": self.note, "progress": update}
 
 
 def _print_table(

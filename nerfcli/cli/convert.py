@@ -208,14 +208,10 @@ def convert(
             raise typer.BadParameter("--detect writes nothing; remove OUT and --to")
 
         def work(path: Path, one_of_many: bool) -> None:
-            with console.progress(f"detect {path.name}") as update:
-                form, found = detect_convention(
-                    path, given=given(), overrides=overrides, notify=console.note, progress=update
-                )
-            if json:
-                console.result(path, detection_record(found, form.name))
-            else:
-                typer.echo("\n".join([f"{path} ({form.name}), judged by {found.evidence}", *_table(found)]))
+            with console.callbacks(f"detect {path.name}") as callbacks:
+                form, found = detect_convention(path, given=given(), overrides=overrides, **callbacks)
+            lines = [f"{path} ({form.name}), judged by {found.evidence}", *_table(found)]
+            console.facts(path, detection_record(found, form.name), "\n".join(lines))
     else:
         to = PROGRAMS.get(to or "", to)
         if to is None or to not in FORMATS_WRITTEN:

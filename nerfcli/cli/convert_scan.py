@@ -64,12 +64,9 @@ def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console
         if values["detect"]:
             if to is not None or target is not None:
                 raise typer.BadParameter("--detect writes nothing; leave OUT and --to out")
-            with console.progress(f"detect {path.name}") as update:
-                found = detect_scan(path, given=options, notify=console.note, progress=update)
-            if values["json"]:
-                console.result(path, judgement_record(found))
-            else:
-                typer.echo("\n".join([str(path), *_table(found)]))
+            with console.callbacks(f"detect {path.name}") as callbacks:
+                found = detect_scan(path, given=options, **callbacks)
+            console.facts(path, judgement_record(found), "\n".join([str(path), *_table(found)]))
             return True
         if target is None:
             raise typer.BadParameter("say where the result goes", param_hint="OUT")

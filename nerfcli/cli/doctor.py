@@ -92,7 +92,7 @@ def doctor(
                 )
             _examine_scan(path, page, console, overwrite=overwrite, require=require)
             return
-        with console.progress(f"doctor {path.name}") as update:
+        with console.callbacks(f"doctor {path.name}") as callbacks:
             diagnosis = examine_capture(
                 path,
                 page,
@@ -100,8 +100,7 @@ def doctor(
                 overwrite=overwrite,
                 intrinsics=intrinsics,
                 subfolders=subfolders,
-                notify=console.note,
-                progress=update,
+                **callbacks,
             )
         _print_table(diagnosis, console)
         console.result(page, content(diagnosis))
@@ -115,10 +114,8 @@ def _examine_run(path: Path, folder: Path, console: Console, *, count: int, thre
     """Examine how much of the surface the photos of a run see, and suggest further photos."""
     from nerfcli.workflows.next_views import examine_run
 
-    with console.progress(f"doctor {path.name}") as update:
-        found = examine_run(
-            path, folder, count=count, threads=threads, overwrite=overwrite, notify=console.note, progress=update
-        )
+    with console.callbacks(f"doctor {path.name}") as callbacks:
+        found = examine_run(path, folder, count=count, threads=threads, overwrite=overwrite, **callbacks)
     fractions = [(f"{name} of {found.photos}", f"{100 * fraction:.1f} %") for name, fraction in found.fractions.items()]
     console.table(("photos that see it", "surface"), fractions, styles={})
     if not found.views:
@@ -138,8 +135,8 @@ def _examine_scan(path: Path, page: Path, console: Console, *, overwrite: bool, 
     """Examine an X-ray scan."""
     from nerfcli.workflows.scans import examine_scan_input, scan_diagnosis_record
 
-    with console.progress(f"doctor {path.name}") as update:
-        diagnosis = examine_scan_input(path, page, overwrite=overwrite, notify=console.note, progress=update)
+    with console.callbacks(f"doctor {path.name}") as callbacks:
+        diagnosis = examine_scan_input(path, page, overwrite=overwrite, **callbacks)
     _print_table(diagnosis, console)
     console.result(page, scan_diagnosis_record(diagnosis))
     if require is not None:

@@ -1,6 +1,7 @@
 """nerfcli evaluate: metrics of a run on its held-out photos, and their spread between seeds."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,7 +10,6 @@ import typer
 from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Overwrite, Quiet, Require, Threads, one_of
-from nerfcli.cli.plans import print_plan
 from nerfcli.errors import UserError
 from nerfcli.workflows.machine import device_name, thread_count
 
@@ -118,20 +118,13 @@ def evaluate(
         from nerfcli.workflows.tomography_scores import evaluate_scan
 
         refuse_photo_options(folder, evaluate, values, of_scans=_OF_SCANS)
-        with console.progress("evaluate") as update:
-            scan = evaluate_scan(
-                folder,
-                threads=cores,
-                overwrite=overwrite,
-                reference=reference,
-                notify=console.note,
-                progress=update,
-            )
+        with console.callbacks("evaluate") as callbacks:
+            scan = evaluate_scan(folder, threads=cores, overwrite=overwrite, reference=reference, **callbacks)
         print_scan_numbers(folder, scan, console)
         console.result(scan.path, scan.metrics)
 
     def measure(folder: Path) -> dict[str, Any]:
-        with console.progress("evaluate") as update:
+        with console.callbacks("evaluate") as callbacks:
             evaluation = evaluate_run(
                 folder,
                 device=torch_device,
@@ -140,8 +133,7 @@ def evaluate(
                 align_poses="pose" in aligned,
                 align_colours="colour" in aligned,
                 predictions=save_predictions,
-                notify=console.note,
-                progress=update,
+                **callbacks,
             )
         print_numbers(folder, evaluation, console)
         console.result(evaluation.path, evaluation.metrics)
@@ -150,15 +142,8 @@ def evaluate(
     def measure_members(folder: Path) -> None:
         from nerfcli.workflows.members import evaluate_members
 
-        with console.progress("evaluate members") as update:
-            found = evaluate_members(
-                Run(folder),
-                device=torch_device,
-                threads=cores,
-                overwrite=overwrite,
-                notify=console.note,
-                progress=update,
-            )
+        with console.callbacks("evaluate members") as callbacks:
+            found = evaluate_members(Run(folder), device=torch_device, threads=cores, overwrite=overwrite, **callbacks)
         if json:
             console.fact({"members": found})
         rows = [
@@ -183,7 +168,7 @@ def evaluate(
             align_colours="colour" in aligned,
             predictions=save_predictions,
         )
-        print_plan(folder, found, console)
+        console.facts(folder, asdict(found), f"{folder}: {found.describe()}")
 
     def work(folder: Path, one_of_many: bool) -> None:
         if is_reconstruction(folder):
@@ -209,8 +194,8 @@ def evaluate(
 
         first = Run(folders[0])
         others = other_seeds(first, seeds - 1, device=torch_device, threads=cores)
-        with console.progress(f"train {seeds - 1} more seeds") as update:
-            train_again(first, others, notify=console.note, warn=console.warn, progress=update)
+        with console.callbacks(f"train {seeds - 1} more seeds") as callbacks:
+            train_again(first, others, warn=console.warn, **callbacks)
         folders += others
     measured = [measure(folder) for folder in folders]
     print_spread(folders, measured, console)

@@ -145,7 +145,7 @@ def export(
         if output is None or one_of_many:
             usual = default_target(folder, to, suffix)
             target = usual if output is None else output / usual.name
-        with console.progress(f"export {to}") as update:
+        with console.callbacks(f"export {to}") as callbacks:
             written = export_run(
                 folder,
                 target,
@@ -154,8 +154,7 @@ def export(
                 device=device_name(device),
                 threads=thread_count(threads),
                 overwrite=overwrite,
-                notify=console.note,
-                progress=update,
+                **callbacks,
             )
         console.result(written)
 

@@ -8,7 +8,7 @@ import typer
 
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.info_text import cost_lines, lines_of, words_of
+from nerfcli.cli.info_text import lines_of, words_of
 from nerfcli.cli.options import Json
 from nerfcli.workflows.machine import thread_count
 
@@ -44,7 +44,7 @@ def info(
     """
     from nerfcli.workflows.describe import describe
 
-    console = Console(quiet=True, json_lines=True)
+    console = Console(quiet=True, json_lines=json)
     if machine == (path is not None):
         raise typer.BadParameter("give a path, or --machine", param_hint="PATH")
     if path is None:
@@ -56,16 +56,7 @@ def info(
 
     def work(folder: Path, one_of_many: bool) -> None:
         content = describe(folder)
-        if json:
-            console.result(folder, content)
-        elif "in_words" in content:
-            typer.echo("\n".join([str(folder), *(f"  {line}" for line in words_of(content))]))
-        else:
-            costs = content.pop("cost", {})
-            lines = lines_of(content)
-            if costs:
-                lines += [f"storage and cost of the {next(iter(costs))} field, and of other types of the same size:"]
-                lines += [f"  {line}" for line in cost_lines(costs)]
-            typer.echo("\n".join([str(folder), *(f"  {line}" for line in lines)]))
+        lines = words_of(content) if "in_words" in content else lines_of(content)
+        console.facts(folder, content, "\n".join([str(folder), *(f"  {line}" for line in lines)]))
 
     for_each_input(path, work, command="info")

@@ -51,10 +51,13 @@ WIDTH = 110
 
 
 def lines_of(facts: dict[str, Any]) -> list[str]:
-    """Format facts by label, one line each or folded, lists below their label; unknown values are omitted."""
+    """Format facts by label, one line each or folded, lists below their label; unknown values are omitted.
+
+    A table of costs comes last.
+    """
     lines = []
     for key, value in facts.items():
-        if value is None or value in ([], {}):
+        if value is None or value in ([], {}) or key == "cost":
             continue
         name = _name(key)
         if key == "corner":  # of a map: northings have seven digits before the point
@@ -69,6 +72,9 @@ def lines_of(facts: dict[str, Any]) -> list[str]:
         else:
             text = f"{name}: {_with_unit(key, value)}"
             lines += _folded(text) if isinstance(value, dict) else [text]
+    if costs := facts.get("cost"):
+        lines += [f"storage and cost of the {next(iter(costs))} field, and of other types of the same size:"]
+        lines += [f"  {line}" for line in _cost_lines(costs)]
     return lines
 
 
@@ -208,7 +214,7 @@ def _number(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def cost_lines(costs: dict[str, dict[str, Any]]) -> list[str]:
+def _cost_lines(costs: dict[str, dict[str, Any]]) -> list[str]:
     """Return a table of costs, one line per kind of field.
 
     Operations are the multiplications and additions of the forward pass; bytes are those of rows and layers' values.

@@ -159,19 +159,14 @@ def poses(
         if dry_run:
             folder = folder_with_frames(source, scene)
             given = given_intrinsics(intrinsics, folder, use=use)
-            with console.progress(f"poses {folder.name}") as update:
-                plan = plan_scene(folder, settings, intrinsics=given, notify=console.note, progress=update)
-            if json:
-                console.result(source, plan.to_json())
-            else:
-                typer.echo(f"{source}: {plan.describe()}")
+            with console.callbacks(f"poses {folder.name}") as callbacks:
+                plan = plan_scene(folder, settings, intrinsics=given, **callbacks)
+            console.facts(source, plan.to_json(), f"{source}: {plan.describe()}")
             return
-        with console.progress(f"extract frames of {source.name}") as update:
-            folder = folder_of_photos(
-                source, scene, frames=frames, overwrite=overwrite, notify=console.note, progress=update
-            )
+        with console.callbacks(f"extract frames of {source.name}") as callbacks:
+            folder = folder_of_photos(source, scene, frames=frames, overwrite=overwrite, **callbacks)
         given = given_intrinsics(intrinsics, folder, use=use)
-        with console.progress(f"poses {folder.name}") as update:
+        with console.callbacks(f"poses {folder.name}") as callbacks:
             estimate_poses(
                 folder,
                 scene,
@@ -179,9 +174,8 @@ def poses(
                 limits=limits,
                 intrinsics=given,
                 overwrite=overwrite,
-                notify=console.note,
                 warn=console.warn,
-                progress=update,
+                **callbacks,
             )
         print_database(scene, drop=drop_database, console=console)
         console.result(scene)

@@ -1,6 +1,6 @@
 """nerfcli render: render pictures, depth maps and videos of a run."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +9,6 @@ import typer
 from nerfcli.cli import options, render_options
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.plans import print_plan
 from nerfcli.cli.scans import is_of_scan, refuse_photo_options, scan_pictures
 from nerfcli.errors import UserError
 from nerfcli.workflows.machine import device_name, thread_count
@@ -221,15 +220,8 @@ def render(
         refuse_photo_options(folder, render, values, of_scans=_OF_SCANS)
         pictures = scan_pictures(outputs, slices, views=cameras)
         target = folder / RENDERS if output is None else output / folder.name if one_of_many else output
-        with console.progress("render") as update:
-            for path in pictures(
-                folder,
-                target,
-                threads=thread_count(threads),
-                overwrite=overwrite,
-                notify=console.note,
-                progress=update,
-            ):
+        with console.callbacks("render") as callbacks:
+            for path in pictures(folder, target, threads=thread_count(threads), overwrite=overwrite, **callbacks):
                 console.result(path)
 
     if is_of_scan(run, outputs=outputs, slices=slices):
@@ -338,9 +330,9 @@ def render(
                 step=step,
                 part=part,
             )
-            print_plan(folder, plan, console)
+            console.facts(folder, asdict(plan), f"{folder}: {plan.describe()}")
             return
-        with console.progress(f"render {views.name}") as update:
+        with console.callbacks(f"render {views.name}") as callbacks:
             written = render_run(
                 folder,
                 target,
@@ -352,8 +344,7 @@ def render(
                 jobs=jobs,
                 part=part,
                 overwrite=overwrite,
-                notify=console.note,
-                progress=update,
+                **callbacks,
             )
         for path in written:
             console.result(path)

@@ -102,11 +102,9 @@ def run(
         field = result_path(scene, suffix="-run", output=None, one_of_many=False)
         if output is not None:
             scene, field = scene / "scene", scene / "run"
-        with console.progress(f"extract frames of {source.name}") as update:
-            folder = folder_of_photos(
-                source, scene, frames=frames, overwrite=overwrite, notify=console.note, progress=update
-            )
-        with console.progress(f"poses {folder.name}") as update:
+        with console.callbacks(f"extract frames of {source.name}") as callbacks:
+            folder = folder_of_photos(source, scene, frames=frames, overwrite=overwrite, **callbacks)
+        with console.callbacks(f"poses {folder.name}") as callbacks:
             estimate_poses(
                 folder,
                 scene,
@@ -114,11 +112,10 @@ def run(
                 limits=Limits(memory_bytes=default_memory_limit()),
                 intrinsics=given_intrinsics(intrinsics, folder, use=use),
                 overwrite=overwrite,
-                notify=console.note,
                 warn=console.warn,
-                progress=update,
+                **callbacks,
             )
-        with console.progress(f"train {scene.name}") as update:
+        with console.callbacks(f"train {scene.name}") as callbacks:
             trained = train_scene(
                 scene,
                 field,
@@ -126,13 +123,12 @@ def run(
                 memory_bytes=default_memory_limit(torch_device),
                 resume=not overwrite and was_interrupted(scene, field, train_settings),
                 overwrite=overwrite,
-                notify=console.note,
                 warn=console.warn,
-                progress=update,
+                **callbacks,
             )
         where = {"device": torch_device, "threads": cores, "overwrite": overwrite}
-        with console.progress("evaluate") as update:
-            evaluation = evaluate_run(field, **where, notify=console.note, progress=update)
+        with console.callbacks("evaluate") as callbacks:
+            evaluation = evaluate_run(field, **where, **callbacks)
         print_numbers(field, evaluation, console)
         console.result(scene)
         console.result(field)
@@ -144,14 +140,12 @@ def run(
                 depth=usual_depth(load_run(field), views),
                 video=VideoSettings() if video else None,
             )
-            with console.progress(f"render {views.name}") as update:
-                written = render_run(
-                    field, views=views, settings=settings, **where, notify=console.note, progress=update
-                )
+            with console.callbacks(f"render {views.name}") as callbacks:
+                written = render_run(field, views=views, settings=settings, **where, **callbacks)
             for path in written:
                 console.result(path)
-        with console.progress("report") as update:
-            page = report_runs([field], keep=True, **where, notify=console.note, progress=update)
+        with console.callbacks("report") as callbacks:
+            page = report_runs([field], keep=True, **where, **callbacks)
         console.note(f"report with all results: {page}")
         console.result(page)
         check_requirements(trained, evaluation.metrics, requirements)

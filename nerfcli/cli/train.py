@@ -1,9 +1,9 @@
 """nerfcli train: from a scene to a field."""
 
 import functools
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -216,17 +216,8 @@ def train(
             seed=seed,
             threads=thread_count(threads),
         )
-        with console.progress(f"train {folder.name}") as update:
-            train_scan(
-                folder,
-                run,
-                settings,
-                resume=resume,
-                overwrite=overwrite,
-                notify=console.note,
-                warn=console.warn,
-                progress=update,
-            )
+        with console.callbacks(f"train {folder.name}") as callbacks:
+            train_scan(folder, run, settings, resume=resume, overwrite=overwrite, warn=console.warn, **callbacks)
 
     @functools.cache
     def photo_settings() -> TrainSettings:
@@ -259,38 +250,19 @@ def train(
         on_gpu = photo_settings().device != "cpu"
         return shared if shared is None or on_gpu else shared // local_rank_and_size()[1]
 
-    def train_in_blocks(folder: Path, run: Path) -> Path:
-        with console.progress(f"train {folder.name}") as update:
-            return train_blocks(
-                folder,
-                run,
-                photo_settings(),
-                count=count,
-                only=only,
-                memory_bytes=memory_of_process(),
-                resume=resume,
-                overwrite=overwrite,
-                holdout=rule,
-                notify=console.note,
-                warn=console.warn,
-                progress=update,
-            )
-
-    def train_one_scene(folder: Path, run: Path) -> None:
-        with console.progress(f"train {folder.name}") as update:
-            train_scene(
-                folder,
-                run,
-                photo_settings(),
-                memory_bytes=memory_of_process(),
-                resume=resume,
-                overwrite=overwrite,
-                holdout=rule,
-                view=view,
-                notify=console.note,
-                warn=console.warn,
-                progress=update,
-            )
+    def train_field_or_blocks(folder: Path, run: Path) -> Path:
+        with console.callbacks(f"train {folder.name}") as callbacks:
+            common: dict[str, Any] = {
+                "memory_bytes": memory_of_process(),
+                "resume": resume,
+                "overwrite": overwrite,
+                "holdout": rule,
+                "warn": console.warn,
+                **callbacks,
+            }
+            if count:
+                return train_blocks(folder, run, photo_settings(), count=count, only=only, **common)
+            return train_scene(folder, run, photo_settings(), view=view, **common).path
 
     def train_with_members(folder: Path, run: Path) -> None:
         if member is not None and folder.exists() and not Run(run).is_complete(photo_settings()):
@@ -298,7 +270,7 @@ def train(
                 f"{run} is not complete, and --members {members} trains one of its members",
                 "train it first, with the same options without --members",
             )
-        with console.progress(f"train {folder.name}") as update:
+        with console.callbacks(f"train {folder.name}") as callbacks:
             train_or_continue(
                 folder,
                 run,
@@ -307,11 +279,10 @@ def train(
                 resume=resume and member is None,
                 overwrite=overwrite and member is None,
                 holdout=rule,
-                notify=console.note,
                 warn=console.warn,
-                progress=update,
+                **callbacks,
             )
-        with console.progress(f"members of {folder.name}") as update:
+        with console.callbacks(f"members of {folder.name}") as callbacks:
             train_members(
                 Run(run),
                 member_count,
@@ -322,9 +293,8 @@ def train(
                 memory_bytes=limit or default_memory_limit(photo_settings().device),
                 resume=resume,
                 overwrite=overwrite,
-                notify=console.note,
                 warn=console.warn,
-                progress=update,
+                **callbacks,
             )
 
     def plan_one_scene(folder: Path) -> None:
@@ -333,10 +303,9 @@ def train(
         for number in [only] if only else range(1, count + 1) if count else [0]:
             settings = block_settings(photo_settings(), number, count) if count else photo_settings()
             plan = plan_training(folder, settings, memory_bytes=resident, holdout=rule)
-            if json:
-                console.result(folder, {**({"block": number} if number else {}), **plan.to_json()})
-            else:
-                typer.echo(f"{folder}{f', block {number} of {count}' if number else ''}: {plan.describe()}")
+            of_block = f", block {number} of {count}" if number else ""
+            content = {**({"block": number} if number else {}), **asdict(plan)}
+            console.facts(folder, content, f"{folder}{of_block}: {plan.describe()}")
 
     def work(folder: Path, one_of_many: bool) -> None:
         run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
@@ -352,12 +321,10 @@ def train(
         elif dry_run:
             plan_one_scene(folder)
             return
-        elif count:
-            run = train_in_blocks(folder, run)
         elif member_count:
             train_with_members(folder, run)
         else:
-            train_one_scene(folder, run)
+            run = train_field_or_blocks(folder, run)
         if is_first():
             console.result(run)
 

@@ -3,9 +3,8 @@
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -51,10 +50,6 @@ class RenderingPlan:
     seconds: float
     memory_bytes: int
     disk_bytes: int
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain values."""
-        return asdict(self)
 
     def describe(self) -> str:
         """Return one sentence."""

@@ -1,9 +1,8 @@
 """Estimate memory, disk space and time of a training before it starts, for users and for cluster schedulers."""
 
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from nerfcli import scene as scenes
 from nerfcli.photos.storage import InFiles, field_bytes, needs_of, storage_for
@@ -36,10 +35,6 @@ class TrainingPlan:
     disk_bytes: int
     seconds: float | None
     steps: int | None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain values."""
-        return asdict(self)
 
     def describe(self) -> str:
         """Return one sentence."""
