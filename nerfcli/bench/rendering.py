@@ -23,8 +23,7 @@ from nerfcli.bench.sample_pictures import FOLDER, MOST_ERROR, MOST_QUADRATURE, s
 from nerfcli.bench.session import Session
 from nerfcli.bench.sweep import STORED_IN, RenderSetting
 from nerfcli.evaluate.metrics import psnr, to_8_bit
-from nerfcli.evaluate.protocol import HeldOutPhoto, as_exposed, over_white
-from nerfcli.evaluate.sampled import background_of
+from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
 from nerfcli.field.cost import field_bytes
 from nerfcli.render.accuracy import TIGHT
 from nerfcli.render.model import Model
@@ -143,9 +142,9 @@ def _converged(model: Model, photos: Sequence[HeldOutPhoto], *, session: Session
             )
             with atomic_path(path) as partial:
                 np.save(partial, fine.rgb)
-            truth = over_white(photo.pixels)
-            write_picture(session.folder / FOLDER / f"{slug(photo.frame.name)}-truth.jpg", truth)
-            decibels = psnr(to_8_bit(as_exposed(fine.rgb, photo.log_gains)), truth, used=_used(fine, photo))
+            compared = compare(photo, fine)
+            write_picture(session.folder / FOLDER / f"{slug(photo.frame.name)}-truth.jpg", compared.photo)
+            decibels = psnr(to_8_bit(compared.rendered), compared.photo, used=compared.used)
             session.record("converged", photo=photo.frame.name, psnr=decibels)
         pictures.append(np.load(path))
     return tuple(pictures)
@@ -156,15 +155,15 @@ def _measure_picture(subject: _Subject, setting: RenderSetting, session: Session
     model, decibels, squares, bound = subject.models[setting.stored_in], [], [], 0.0
     for index, (photo, fine) in enumerate(zip(subject.photos, subject.converged, strict=True)):
         picture = _render(model, photo, setting)
-        used, truth = _used(picture, photo), over_white(photo.pixels)
-        shown = as_exposed(picture.rgb, photo.log_gains)
-        decibels.append(psnr(to_8_bit(shown), truth, used=used))
-        squares.append(float(np.square(picture.rgb - fine, dtype=np.float64)[used].mean()))
+        compared = compare(photo, picture)
+        rounded = to_8_bit(compared.rendered)
+        decibels.append(psnr(rounded, compared.photo, used=compared.used))
+        squares.append(float(np.square(picture.rgb - fine, dtype=np.float64)[compared.used].mean()))
         bound = max(bound, float(picture.truncation_error.max(initial=0.0)))
         if index == 0:
             place, name = session.folder / FOLDER, slug(setting.name)
-            write_picture(place / f"{name}-render.jpg", to_8_bit(shown))
-            write_difference(place / f"{name}-error.jpg", shown, truth / 255.0, most=MOST_ERROR)
+            write_picture(place / f"{name}-render.jpg", rounded)
+            write_difference(place / f"{name}-error.jpg", compared.rendered, compared.photo / 255.0, most=MOST_ERROR)
             write_difference(place / f"{name}-quadrature.jpg", picture.rgb, fine, most=MOST_QUADRATURE)
     return {
         "psnr": float(np.mean(decibels)),
@@ -206,10 +205,6 @@ def _render(model: Model, photo: HeldOutPhoto, setting: RenderSetting) -> Render
         quality=Quality(tolerance=setting.tolerance),
         rays_per_tile=None if setting.rays_per_tile == RAYS_PER_TILE else setting.rays_per_tile,
     )
-
-
-def _used(picture: RenderedPicture, photo: HeldOutPhoto) -> np.ndarray:
-    return picture.valid if photo.used is None else picture.valid & photo.used
 
 
 def _stored_in(model: Model, precision: str) -> Model:

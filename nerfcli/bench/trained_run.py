@@ -1,6 +1,6 @@
 """The subject of a bench: a trained run, or a scene that is trained first."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +106,7 @@ def _run_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
 
 def _trained(run: Run) -> dict[str, Any]:
     """Return the run's summary of its training, with the keys of the records; empty without a summary."""
-    summary = {} if run.summary is None else run.summary.to_json()
+    summary = {} if run.summary is None else asdict(run.summary)
     return {name: value for name, value in summary.items() if name != "rays_per_second"}
 
 

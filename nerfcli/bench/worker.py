@@ -19,9 +19,9 @@ from nerfcli.bench.sample_pictures import MOST_ERROR, write_difference, write_pi
 from nerfcli.child import take_stdout
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import psnr, to_8_bit
-from nerfcli.evaluate.protocol import HeldOutPhoto, as_exposed, over_white
+from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
 from nerfcli.evaluate.run_photos import held_out_photos
-from nerfcli.evaluate.sampled import SampledPixels, background_of
+from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.field.cost import field_bytes
 from nerfcli.memory import keep_freed_memory
 from nerfcli.render.model import Model
@@ -70,15 +70,15 @@ def measure_model(
         seconds.append(time.perf_counter() - began)
         if len(seconds) > _REPEATS or seconds[-1] > _SLOW_SECONDS:
             break
-    truth, rgb = over_white(small.pixels), as_exposed(picture.rgb, small.log_gains)
-    write_picture(folder / f"{prefix}-render.jpg", to_8_bit(rgb))
-    write_difference(folder / f"{prefix}-error.jpg", rgb, truth / 255.0, most=MOST_ERROR)
+    compared = compare(small, picture)
+    rounded, truth = to_8_bit(compared.rendered), compared.photo
+    write_picture(folder / f"{prefix}-render.jpg", rounded)
+    write_difference(folder / f"{prefix}-error.jpg", compared.rendered, truth / 255.0, most=MOST_ERROR)
     write_picture(folder / f"{prefix}-truth.jpg", truth)
-    used = picture.valid if small.used is None else picture.valid & small.used
     return {
         "psnr": sample.psnr(model),
         "quadrature": quadrature(sample, model),
-        "shown_psnr": psnr(to_8_bit(rgb), truth, used=used),
+        "shown_psnr": psnr(rounded, truth, used=compared.used),
         "render_seconds": seconds[1:] or seconds,  # the first one warms up
         "render_size": [small.frame.camera.width, small.frame.camera.height],
         "field_bytes": field_bytes(model.field),

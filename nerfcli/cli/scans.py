@@ -16,7 +16,7 @@ from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
     from nerfcli.tomography.result import ReconstructionSettings
-    from nerfcli.workflows.tomography_scores import ScanEvaluation
+    from nerfcli.workflows.evaluate import Evaluation
 
 # Options whose parameters have other names.
 _OPTIONS = {"include": "with", "exclude": "without", "form": "format"}
@@ -142,7 +142,7 @@ def scan_pictures(outputs: str | None, slices: list[str] | None, *, views: str) 
     return functools.partial(render_scan, outputs=chosen, views=views, slices=slices_of(slices or []))
 
 
-def print_scan_numbers(run: Path, evaluation: "ScanEvaluation", console: Console) -> None:
+def print_scan_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None:
     """Print a table of the methods; print nothing if the metrics were kept from an earlier call."""
     if evaluation.is_kept:
         return

@@ -9,8 +9,7 @@ on views that neither has seen; photos from a camera that only rotated, or only 
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -59,9 +58,6 @@ class GeometryEvidence:
     error_db: float | None
     shown: bool
     seconds: float
-
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
 
     def in_words(self) -> str:
         """Return a sentence for people."""

@@ -5,7 +5,7 @@ published number has such leaks; here each one is written down.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from nerfcli.runs.config import RunConfig
@@ -18,9 +18,6 @@ class Entry:
     stage: str
     saw_held_out: bool | None
     how: str
-
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def leak_ledger(config: RunConfig) -> list[Entry]:

@@ -27,19 +27,14 @@ def as_float(picture: np.ndarray) -> np.ndarray:
     return np.clip(picture, 0.0, 1.0).astype(np.float64)
 
 
-def mean_squared_error(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
-    """Return the mean squared difference of colours in [0, 1], over the pixels that count and their channels.
+def psnr(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
+    """Return the peak signal-to-noise ratio in dB over the pixels that count and their channels, see `psnr_of`.
 
     Args:
         picture, photo: (H, W, 3) uint8, or float in [0, 1].
         used: (H, W) bool, the pixels that count; at least one.
     """
-    return float(np.square(as_float(picture[used]) - as_float(photo[used])).mean())
-
-
-def psnr(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
-    """Return the peak signal-to-noise ratio in dB; see `mean_squared_error` and `psnr_of`."""
-    return psnr_of(mean_squared_error(picture, photo, used=used))
+    return psnr_of(float(np.square(as_float(picture[used]) - as_float(photo[used])).mean()))
 
 
 def whole_windows(used: np.ndarray) -> np.ndarray:

@@ -4,8 +4,7 @@ A metric measured between training views shows how well a field fills gaps; one 
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -37,9 +36,6 @@ class Novelty:
     spacings: float | None
     angle_deg: float
     kind: str
-
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def novelty(held_out: Sequence[Frame], training: Sequence[Frame]) -> list[Novelty]:

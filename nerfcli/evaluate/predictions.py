@@ -21,24 +21,22 @@ INFO = "info.json"
 KINDS = ("png", "float")
 
 
-def save_compared(folder: Path, stem: str, compared: ComparedImages) -> None:
+def save_compared(folder: Path, stem: str, compared: ComparedImages, *, kind: str) -> None:
     """Write the 8-bit picture, the photo and, where pixels are left out, the mask.
 
     Args:
         folder: the folder of predictions.
         stem: the name of the files, without suffix; subfolders are created.
+        kind: one of `KINDS`.
     """
     write_png(folder / "color" / f"{stem}.png", to_8_bit(compared.rendered))
     write_png(folder / "gt-color" / f"{stem}.png", compared.photo)
     if not compared.used.all():
         write_png(folder / "mask" / f"{stem}.png", compared.used.astype(np.uint8) * 255)
-
-
-def save_unrounded(folder: Path, stem: str, compared: ComparedImages) -> None:
-    """Write the rendered picture before rounding."""
-    path = folder / "color-float" / f"{stem}.npy"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.save(path, compared.rendered.astype(np.float32))
+    if kind == "float":
+        path = folder / "color-float" / f"{stem}.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, compared.rendered.astype(np.float32))
 
 
 def predictions_are_there(folder: Path, kind: str, *, checkpoint: str) -> bool:

@@ -4,7 +4,7 @@ import hashlib
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -131,7 +131,7 @@ def evaluate_model(
     evidence = GeometryComparison(extras.billboards) if extras.billboards is not None else None
     images, seconds = [], []
     for index, photo in enumerate(held_out):
-        background = WHITE if photo.pixels.shape[-1] == 4 else model.background
+        background = background_of(model, photo)
         began = time.perf_counter()
         picture = render_picture(model, photo.frame, background=background, on_tile=on_tile)
         seconds.append(time.perf_counter() - began)
@@ -139,7 +139,7 @@ def evaluate_model(
         extras.keep(compared)
         if evidence is not None:
             evidence.add(compared.frame, compared.rendered, compared.photo, compared.used)
-        entry = {
+        entry: dict[str, Any] = {
             "name": photo.frame.name,
             **measured(compared, extras.perceptual),
             **_counted(photo, picture, compared),
@@ -152,12 +152,12 @@ def evaluate_model(
         if extras.align_poses:
             entry |= _pose_aligned(model, compared, photo.log_gains, background=background, on_tile=on_tile)
         if views is not None:
-            entry["view"] = views[index].to_json()
+            entry["view"] = asdict(views[index])
         images.append(entry | {"seconds": seconds[-1]})
     shape = evidence.shape() if evidence is not None else None
     return {
         "protocol": _protocol_name(held_out, extras),
-        "shape": shape.to_json() if shape is not None else None,
+        "shape": asdict(shape) if shape is not None else None,
         "warnings": [*_warnings(shape, evidence), *outlier_warnings(images)],
         "mean": mean_of(images),
         "images": images,
@@ -183,6 +183,11 @@ def mean_of(images: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
         values = [image[key] for image in images if image[key] is not None]
         means[key] = statistics.fmean(values) if len(values) == len(images) else None
     return means
+
+
+def background_of(model: Model, photo: HeldOutPhoto) -> Background:
+    """Return the background of pictures that are compared with a photo: white if the photo has alpha."""
+    return WHITE if photo.pixels.shape[-1] == 4 else model.background
 
 
 def over_white(pixels: np.ndarray) -> np.ndarray:

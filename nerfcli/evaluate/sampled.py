@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from nerfcli.evaluate.metrics import psnr, to_8_bit
-from nerfcli.evaluate.protocol import PROTOCOL, WHITE, HeldOutPhoto, as_exposed, over_white
-from nerfcli.field.background import Background, colours_behind
+from nerfcli.evaluate.protocol import PROTOCOL, HeldOutPhoto, as_exposed, background_of, over_white
+from nerfcli.field.background import colours_behind
 from nerfcli.render.model import Model
 from nerfcli.render.rays import CENTRES, pixel_rays
 from nerfcli.render.tracing import TOLERANCE, render_cut_rays, uniform_cuts
@@ -61,11 +61,6 @@ class SampledPixels:
             if valid.any():
                 values.append(psnr(to_8_bit(as_exposed(rgb, photo.log_gains)), truth, used=valid))
         return float(np.mean(values))
-
-
-def background_of(model: Model, photo: HeldOutPhoto) -> Background:
-    """Return the background of pictures that are compared with a photo: white if the photo has alpha."""
-    return WHITE if photo.pixels.shape[-1] == 4 else model.background
 
 
 def render_sampled(

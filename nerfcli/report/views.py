@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
-from nerfcli.evaluate.protocol import WHITE, HeldOutPhoto, compare
+from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
 from nerfcli.export.visibility import with_visibility
 from nerfcli.media.colour_maps import levels_of
 from nerfcli.media.preview import coloured
@@ -85,8 +85,7 @@ def look_at(
     """
     views = []
     for photo in held_out:
-        background = WHITE if photo.pixels.shape[-1] == 4 else model.background
-        picture = render_picture(model, photo.frame, background=background, depth=depth)
+        picture = render_picture(model, photo.frame, background=background_of(model, photo), depth=depth)
         assert picture.depth is not None
         compared = compare(photo, picture)
         rendered, used = to_8_bit(compared.rendered), compared.used

@@ -5,7 +5,7 @@ that `--with NAME` stands for, and the values that `--with NAME=VALUE` allows.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from nerfcli.errors import UserError
@@ -66,21 +66,16 @@ class Components:
     pixels: str = "anywhere"
     movers: bool = False
 
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Choice:
     """Allowed values of a component.
 
     Args:
-        what: short description.
         off, on: values that `--without` and `--with` stand for.
         allowed: all values; None for any number that is not negative.
     """
 
-    what: str
     off: Value
     on: Value
     allowed: tuple[Value, ...] | None
@@ -107,20 +102,20 @@ class Choice:
 
 
 CHOICES = {
-    "background": Choice("colour behind the field", "black", "sphere", BACKGROUNDS),
-    "view": Choice("degree of view-dependent colour", 0, MOST_DEGREES, tuple(range(MOST_DEGREES + 1))),
-    "exposure": Choice("brightness and white balance per photo", "none", "learned", EXPOSURES),
-    "cameras": Choice("camera parameters optimized with the field", "fixed", "poses", CAMERAS),
-    "masks": Choice("whether black in masks is empty space", "ignore", "empty", MASKS),
-    "points": Choice("surfaces at 3D points of matched features, weight", 0.0, 0.1, None),
-    "stereo": Choice("points from stereo matching of photos", False, True, (False, True)),
-    "overlap": Choice("empty space near a camera that no other photo sees", False, True, (False, True)),
-    "entropy": Choice("opaque or transparent rays, weight", 0.0, 0.01, None),
-    "near": Choice("smaller gradients near cameras", False, True, (False, True)),
-    "distortion": Choice("concentrated density along rays, weight", 0.0, 0.05, None),
-    "antialias": Choice("fade out details smaller than a pixel", False, True, (False, True)),
-    "pixels": Choice("more pixels where the error is large", "anywhere", "error", PIXELS),
-    "movers": Choice("leave out what moves between photos", False, True, (False, True)),
+    "background": Choice("black", "sphere", BACKGROUNDS),
+    "view": Choice(0, MOST_DEGREES, tuple(range(MOST_DEGREES + 1))),
+    "exposure": Choice("none", "learned", EXPOSURES),
+    "cameras": Choice("fixed", "poses", CAMERAS),
+    "masks": Choice("ignore", "empty", MASKS),
+    "points": Choice(0.0, 0.1, None),
+    "stereo": Choice(False, True, (False, True)),
+    "overlap": Choice(False, True, (False, True)),
+    "entropy": Choice(0.0, 0.01, None),
+    "near": Choice(False, True, (False, True)),
+    "distortion": Choice(0.0, 0.05, None),
+    "antialias": Choice(False, True, (False, True)),
+    "pixels": Choice("anywhere", "error", PIXELS),
+    "movers": Choice(False, True, (False, True)),
 }
 assert tuple(CHOICES) == tuple(field.name for field in fields(Components))
 

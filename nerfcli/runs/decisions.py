@@ -35,12 +35,9 @@ class Decision:
     kept: bool
     why: str
 
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
-
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Decision":
-        """Read the content that `to_json` returned; numbers that earlier versions did not write are None."""
+        """Read the entries of a decision; numbers that earlier versions did not write are None."""
         entries: dict[str, Any] = {entry.name: content.get(entry.name) for entry in fields(cls)}
         return cls(**entries)
 
@@ -85,8 +82,8 @@ class Selection:
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "components": self.components.to_json(),
-            "decisions": [decision.to_json() for decision in self.decisions],
+            "components": asdict(self.components),
+            "decisions": [asdict(decision) for decision in self.decisions],
             "seconds": self.seconds,
         }
 

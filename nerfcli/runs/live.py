@@ -9,9 +9,9 @@ import json
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from nerfcli.atomic import write_json
 from nerfcli.runs.files import FIELD, LIVE
@@ -41,6 +41,9 @@ class Status:
     loss: float
     paused: bool
     fields: int
+
+
+Message = TypeVar("Message", Request, Status)
 
 
 class Pulse:
@@ -78,8 +81,7 @@ def write_request(run: Path, request: Request) -> None:
 
 def read_request(run: Path) -> Request | None:
     """Return the request of a viewer; None if there is none, or it cannot be read."""
-    content = _read(run / LIVE / REQUEST)
-    return None if content is None else Request(**content)
+    return _read(run / LIVE / REQUEST, Request)
 
 
 def write_status(run: Path, status: Status) -> None:
@@ -89,8 +91,7 @@ def write_status(run: Path, status: Status) -> None:
 
 def read_status(run: Path) -> Status | None:
     """Return the state of a training; None if there is none, or it cannot be read."""
-    content = _read(run / LIVE / STATUS)
-    return None if content is None else Status(**content)
+    return _read(run / LIVE / STATUS, Status)
 
 
 def end_request(run: Path) -> None:
@@ -106,11 +107,11 @@ def end_training(run: Path) -> None:
         (run / LIVE / name).unlink(missing_ok=True)
 
 
-def _read(path: Path) -> dict[str, Any] | None:
+def _read(path: Path, kind: type[Message]) -> Message | None:
     # Files are replaced atomically. One that has just been removed, or is of another version, counts as missing.
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    kind = Request if path.name == REQUEST else Status
-    return content if isinstance(content, dict) and content.keys() == kind.__dataclass_fields__.keys() else None
+    is_whole = isinstance(content, dict) and content.keys() == {entry.name for entry in fields(kind)}
+    return kind(**content) if is_whole else None

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict, cast
 
@@ -44,22 +44,17 @@ class TrainingSummary:
     rays_per_second: float
     peak_memory_bytes: int
 
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
-
-
-def summary_of(log: Sequence[LogEntry]) -> TrainingSummary | None:
-    """Return the summary of a training; None if nothing was logged."""
-    if not log:
-        return None
-    last = log[-1]
-    return TrainingSummary(
-        seconds=last["seconds"],
-        steps=last["step"],
-        samples_per_second=last["samples"] / last["seconds"],
-        rays_per_second=last["rays"] / last["seconds"],
-        peak_memory_bytes=max(entry["peak_memory_bytes"] for entry in log),
-    )
+    @classmethod
+    def of(cls, log: Sequence[LogEntry]) -> "TrainingSummary":
+        """Summarise a log of at least one line."""
+        last = log[-1]
+        return cls(
+            seconds=last["seconds"],
+            steps=last["step"],
+            samples_per_second=last["samples"] / last["seconds"],
+            rays_per_second=last["rays"] / last["seconds"],
+            peak_memory_bytes=max(entry["peak_memory_bytes"] for entry in log),
+        )
 
 
 def append_log(run: Path, entry: LogEntry) -> None:

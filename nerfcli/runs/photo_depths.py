@@ -1,4 +1,7 @@
-"""RUN/photo_depths.npz: depth map of the surface for each training photo, stored because rendering takes seconds."""
+"""RUN/photo_depths.npz and RUN/depth_errors.json: depths of the training photos, and errors of the field's depth.
+
+Both are stored with the digest of what they depend on, because computing them takes seconds.
+"""
 
 import zipfile
 from collections.abc import Sequence
@@ -8,11 +11,12 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras.frame import Frame
+from nerfcli.render.depth_errors import STRATA, DepthErrors
 from nerfcli.render.visibility import STEEPEST_DEG, DepthMap, small_frame
-from nerfcli.runs.files import PHOTO_DEPTHS
-from nerfcli.sealed import digest
+from nerfcli.runs.files import DEPTH_ERRORS, PHOTO_DEPTHS
+from nerfcli.sealed import digest, read_sealed, write_sealed
 
-FORMAT = "nerfcli photo depths 1"
+FORMAT, ERRORS_FORMAT = "nerfcli photo depths 1", "nerfcli depth errors 1"
 
 
 def photo_depths_digest(field_sha256: str | None, frames: Sequence[Frame], *, max_size: int) -> str:
@@ -42,3 +46,23 @@ def write_photo_depths(run: Path, maps: Sequence[DepthMap], *, digest: str) -> N
     arrays = {str(index): view.distances for index, view in enumerate(maps)}
     with atomic_path(run / PHOTO_DEPTHS) as partial, partial.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays, digest=np.array(digest))
+
+
+def read_depth_errors(run: Path, *, expected: str) -> DepthErrors | None:
+    """Return the stored errors; None if they are missing, damaged, or have another digest."""
+    try:
+        content = read_sealed(run / DEPTH_ERRORS)
+        if (content["format"], content["digest"], content["strata"]) != (ERRORS_FORMAT, expected, list(STRATA)):
+            return None
+        return DepthErrors.from_json(content)
+    except (OSError, ValueError, LookupError, TypeError):
+        return None  # the caller measures them again
+
+
+def write_depth_errors(run: Path, errors: DepthErrors, *, digest: str) -> None:
+    """Write the errors, atomically.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    write_sealed(run / DEPTH_ERRORS, {"format": ERRORS_FORMAT, "digest": digest, **errors.to_json()})

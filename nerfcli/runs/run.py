@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.atomic import read_json
-from nerfcli.cameras.formats.run_cameras import RunCameras, read_cameras, read_given_cameras
+from nerfcli.cameras.formats.run_cameras import CAMERAS, RunCameras, read_cameras, read_given_cameras
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.render.model import Model, load_model
 from nerfcli.runs.components import Components
 from nerfcli.runs.config import RunConfig, no_run, read_config, split_hash
 from nerfcli.runs.decisions import Decision
-from nerfcli.runs.files import CAMERAS, CONFIG, FIELD, METRICS, STATE
-from nerfcli.runs.log import LogEntry, TrainingSummary, read_log, summary_of
+from nerfcli.runs.files import CONFIG, FIELD, METRICS, STATE
+from nerfcli.runs.log import LogEntry, TrainingSummary, read_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene, fingerprint
 
@@ -57,7 +57,7 @@ class Run:
     @property
     def summary(self) -> TrainingSummary | None:
         """Summary of the training; None without a log."""
-        return summary_of(self.log)
+        return TrainingSummary.of(self.log) if self.log else None
 
     @property
     def components(self) -> Components:

@@ -1,7 +1,7 @@
 """Run an ablation: train and measure every variant with every seed."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +101,7 @@ def ablate_scene(
         compared.append(Variant(AUTO, settings.components))
         measured.append(measure(run, AUTO, settings, overwrite))
         settings = replace(settings, model="default", components=run.components, fixed=())
-        about["chosen"] = settings.components.to_json()
+        about["chosen"] = asdict(settings.components)
         notify(_line(measured[-1]))
     models = [Variant(CHOSEN, settings.components)]
     models += variants(settings.components, _capture(scene), only=only)

@@ -73,9 +73,10 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 def _whole(path: Path) -> Path:
     """Return the run or scene that a file such as metrics.json or poses_report.json is part of; else the path."""
+    from nerfcli.cameras.formats.run_cameras import CAMERAS
     from nerfcli.runs import files
 
-    parts_of_runs = (files.CONFIG, files.CAMERAS, files.LOG, files.METRICS, files.DEPTH_ERRORS, files.REPORT)
+    parts_of_runs = (files.CONFIG, CAMERAS, files.LOG, files.METRICS, files.DEPTH_ERRORS, files.REPORT)
     if path.name in parts_of_runs and (path.parent / files.CONFIG).is_file():
         return path.parent
     if path.name == "poses_report.json" and (path.parent / "scene.json").is_file():

@@ -1,5 +1,6 @@
 """Describe a run or a file of tensors as plain values: settings, decisions, metrics, costs."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ def describe_run(run: Run) -> dict[str, Any]:
         "unit": config.unit,
         "unit_source": config.unit_source,
         "settings": {name: value for name, value in settings.items() if name != "components"},
-        "components": run.components.to_json(),
+        "components": asdict(run.components),
         "decisions": [decision.in_words() for decision in run.decisions],
         "members": members_in_words(run),
         "versions": config.versions,

@@ -3,7 +3,7 @@
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import GATE_NOT_MET, UserError
 from nerfcli.evaluate.ledger import leak_ledger
 from nerfcli.evaluate.perceptual import find_perceptual
-from nerfcli.evaluate.predictions import (
-    INFO,
-    PREDICTIONS,
-    predictions_are_there,
-    save_compared,
-    save_unrounded,
-)
+from nerfcli.evaluate.predictions import INFO, PREDICTIONS, predictions_are_there, save_compared
 from nerfcli.evaluate.protocol import PROTOCOL, ComparedImages, Extras, evaluate_model
 from nerfcli.evaluate.requirements import WHY_ABSENT, Requirement, known_numbers, unmet
 from nerfcli.evaluate.run_photos import held_out_photos_of, training_billboards
@@ -33,11 +27,12 @@ from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Metrics of a run.
+    """Metrics of a run, or of a reconstruction.
 
     Args:
         path: RUN/metrics.json.
-        metrics: its content: protocol, means, values per photo, and the rest that `nerfcli evaluate --help` lists.
+        metrics: its content; for a run: protocol, means, values per photo, and the rest that `nerfcli evaluate --help`
+            lists.
         is_kept: whether the file already existed.
     """
 
@@ -117,8 +112,8 @@ def evaluate_run(
             on_image=lambda done, total: progress(done / total, f"of {total} rays"),
             extras=Extras(trained.cameras.train, perceptual, billboards, align_poses, align_colours, keep),
         )
-    metrics["training"] = summary.to_json()
-    metrics["ledger"] = [entry.to_json() for entry in leak_ledger(trained.config)]
+    metrics["training"] = asdict(summary)
+    metrics["ledger"] = [asdict(entry) for entry in leak_ledger(trained.config)]
     metrics["holdout"] = trained.config.holdout
     metrics["split_sha256"] = trained.config.split_sha256
     metrics["device"] = f"{torch_device}, {cores} threads, {platform.machine()}"
@@ -166,13 +161,7 @@ def saved_predictions(
         return
     stems = dict(zip((frame.name for frame in frames), file_names(frames), strict=True))
     with atomic_folder(run / PREDICTIONS) as folder:
-
-        def keep(compared: ComparedImages) -> None:
-            save_compared(folder, stems[compared.frame.name], compared)
-            if kind == "float":
-                save_unrounded(folder, stems[compared.frame.name], compared)
-
-        yield keep
+        yield lambda compared: save_compared(folder, stems[compared.frame.name], compared, kind=kind)
         write_json(folder / INFO, {"checkpoint_sha256": checkpoint, "kind": kind, "files": stems})
 
 

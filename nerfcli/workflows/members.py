@@ -9,7 +9,7 @@ import torch
 from nerfcli.atomic import read_json, write_json
 from nerfcli.errors import UserError
 from nerfcli.evaluate.perceptual import find_perceptual
-from nerfcli.evaluate.protocol import WHITE, compare, mean_of, measured
+from nerfcli.evaluate.protocol import background_of, compare, mean_of, measured
 from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.field.kinds import KINDS as FIELDS
 from nerfcli.render.pictures import render_picture
@@ -142,8 +142,8 @@ def evaluate_members(
         pairs = []
         for member, model in zip(members, models, strict=True):
             (photo,) = held_out_photos_of(member.config, [frame], model, threads=threads)
-            background = WHITE if photo.pixels.shape[-1] == 4 else model.background
-            pairs.append(compare(photo, render_picture(model, photo.frame, background=background)))
+            picture = render_picture(model, photo.frame, background=background_of(model, photo))
+            pairs.append(compare(photo, picture))
             progress((place + len(pairs) / len(members)) / len(test), f"{place}/{len(test)} photos")
         mean = replace(
             pairs[0], rendered=np.asarray(np.mean([pair.rendered for pair in pairs], axis=0, dtype=np.float32))

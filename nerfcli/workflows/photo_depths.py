@@ -13,8 +13,13 @@ from nerfcli.media.masks import read_mask
 from nerfcli.render.depth_errors import STRATA, DepthErrors
 from nerfcli.render.model import Model
 from nerfcli.render.visibility import MAX_SIZE, DepthMap, depth_maps
-from nerfcli.runs.depth_errors import read_depth_errors, write_depth_errors
-from nerfcli.runs.photo_depths import photo_depths_digest, read_photo_depths, write_photo_depths
+from nerfcli.runs.photo_depths import (
+    photo_depths_digest,
+    read_depth_errors,
+    read_photo_depths,
+    write_depth_errors,
+    write_photo_depths,
+)
 from nerfcli.runs.run import Run
 from nerfcli.workflows.notices import Notify
 

@@ -1,6 +1,6 @@
 """Evaluate a reconstruction on held-out projections and the true volume, next to other methods on the same views."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,24 +19,10 @@ from nerfcli.tomography.result import Reconstruction, load_reconstruction
 from nerfcli.tomography.scan import Scan, load_scan
 from nerfcli.tomography.scores import score_projections, score_volume
 from nerfcli.tomography.truth import load_truth
+from nerfcli.workflows.evaluate import Evaluation
 from nerfcli.workflows.machine import thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 from nerfcli.workflows.tomography import corrected_by
-
-
-@dataclass(frozen=True)
-class ScanEvaluation:
-    """Metrics of a reconstruction.
-
-    Args:
-        path: RUN/metrics.json.
-        metrics: its content.
-        is_kept: whether the file already existed.
-    """
-
-    path: Path
-    metrics: dict[str, Any]
-    is_kept: bool
 
 
 def evaluate_scan(
@@ -48,7 +34,7 @@ def evaluate_scan(
     reference: str | Path | None = None,
     notify: Notify = silent,
     progress: Progress = no_progress,
-) -> ScanEvaluation:
+) -> Evaluation:
     """Write RUN/metrics.json: errors of held-out projections and, if the scan names its true volume, of the volume.
 
     Args:
@@ -77,7 +63,7 @@ def evaluate_scan(
             raise UserError(f"{path} was measured without the reference {reference}", "measure again with --overwrite")
         if kept.get("scan_digest") == result.scan_digest and kept.get("passes") == result.passes:
             notify(f"{path} is kept; add --overwrite to measure again")
-            return ScanEvaluation(path, kept, True)
+            return Evaluation(path, kept, True)
     scan = scan_of(result, run)
     geometry = corrected(scan.geometry, result)
     truth = load_truth(scan.history)
@@ -124,7 +110,7 @@ def evaluate_scan(
         "methods": methods,
     }
     write_json(path, metrics)
-    return ScanEvaluation(path, metrics, False)
+    return Evaluation(path, metrics, False)
 
 
 def _reference_of(run: Path, unit: str) -> Reconstruction:
