@@ -25,7 +25,7 @@ from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
 from nerfcli.field.cost import field_bytes
 from nerfcli.fit.fitting import Fitting
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.train.held_out_pixels import PIXELS
+from nerfcli.train.waypoints import PIXELS
 
 # Fractions of the budget at which PSNR is measured.
 FRACTIONS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)

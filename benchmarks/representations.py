@@ -29,7 +29,7 @@ from nerfcli.photos.loading import load_photos
 from nerfcli.photos.pool import PixelPool
 from nerfcli.render.model import Model
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
-from nerfcli.train.held_out_pixels import HeldoutPixels
+from nerfcli.train.waypoints import HeldoutPixels
 
 # Samples per step of a network: with those of a hash grid, one step of a network of megabytes exceeds the budget.
 NETWORK_SAMPLES = 2**13

@@ -1,6 +1,7 @@
-"""Errors that a user can fix: one exception, and the exit codes that scripts rely on."""
+"""Errors that a user can fix: one exception, the exit codes that scripts rely on, and parts of messages."""
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 BAD_INPUT = 3
@@ -33,6 +34,12 @@ def reason_of(error: BaseException) -> str:
     """Describe an exception in one line: its type and the first line of its text."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """Return names separated by commas; if there are more than `most`, the others are only counted."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def in_shell(path: Path) -> str:

@@ -30,7 +30,7 @@ from nerfcli.runs.config import RunConfig
 from nerfcli.runs.files import CONFIG, FIELD
 from nerfcli.runs.log import LogEntry, append_log
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.train import held_out_pixels, preparation
+from nerfcli.train import preparation, waypoints
 from nerfcli.train.loop import train
 from nerfcli.workflows import photo_depths
 
@@ -74,7 +74,7 @@ def _two_threads():
 def _few_held_out_pixels() -> Iterator[None]:
     """Use 512 held-out pixels: most tests train only to fog, where the default 4096 would take longer than training."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(held_out_pixels, "PIXELS", 512)
+        patched.setattr(waypoints, "PIXELS", 512)
         yield
 
 
@@ -97,7 +97,7 @@ def spheres_run(spheres: scene.Scene, tmp_path_factory: pytest.TempPathFactory) 
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not run.exists():
             with pytest.MonkeyPatch.context() as patched:
-                patched.setattr(held_out_pixels, "PIXELS", 1024)
+                patched.setattr(waypoints, "PIXELS", 1024)
                 train(spheres, run, training, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
     return run
 

@@ -78,8 +78,6 @@ def measure(
         subject: a run or a scene.
         records: from `open_bench`.
         wanted: options of the bench.
-        tell: called with (fraction of the budget used, current work).
-        notify: called with lines for the user.
 
     Raises:
         UserError: a photo cannot be read, or the results cannot be written.

@@ -25,7 +25,6 @@ class RenderSetting:
     """One way to render a trained field.
 
     Args:
-        threads: CPU threads.
         step: length of the steps along rays, relative to those of the training.
         tolerance: see `render.pictures.Quality`.
         rays_per_tile: number of rays rendered at a time; the default suits the device.

@@ -1,6 +1,6 @@
 """The subject of a bench: a trained run, or a scene that is trained first."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ from nerfcli.render.model import Model
 from nerfcli.runs.files import CONFIG, RECONSTRUCTION
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings, automatic_downscale, sizes_for
-from nerfcli.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -64,28 +63,21 @@ def find_subject(path: Path, *, device: str, threads: int, seed: int) -> Benched
     """
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a run folder, or a scene folder")
+    usual = TrainSettings(seed=seed, device=device, threads=threads, **sizes_for(device))
     if (path / CONFIG).exists() or (path / RECONSTRUCTION).exists():
-        subject = _run_at(path, device=device, threads=threads, seed=seed)
+        subject = _run_at(path, usual)
     else:
-        subject = _scene_at(path, device=device, threads=threads, seed=seed)
+        subject = _scene_at(path, usual)
     if not subject.test_frames:
         raise UserError(f"{path} has no held-out photos", "by default every 8th photo is held out; check the split")
     return subject
 
 
-def _run_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
+def _run_at(path: Path, usual: TrainSettings) -> BenchedRun:
     run = Run(path)
     trained, named = run.config.settings, run.config.scene
     if not run.is_trained:
         raise UserError(f"{path} is not trained yet", "train it first (nerfcli train SCENE), or give a scene")
-    base = TrainSettings(
-        seed=seed,
-        device=device,
-        threads=threads,
-        downscale=trained.downscale,
-        components=trained.components,
-        **sizes_for(device),
-    )
     # The path that the training was given, possibly relative to another folder; or beside the run, if both were moved.
     places = (named, path.resolve().parent / named.name)
     scene = next((place for place in places if named.name and scenes.is_scene(place)), None)
@@ -97,7 +89,7 @@ def _run_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
         run=path,
         scene=scene,
         test_frames=run.cameras.test,
-        base=base,
+        base=replace(usual, downscale=trained.downscale, components=trained.components),
         identity=run.checkpoint_sha256(),
         trained=_trained(run),
         why_no_scene=why,
@@ -110,18 +102,15 @@ def _trained(run: Run) -> dict[str, Any]:
     return {name: value for name, value in summary.items() if name != "rays_per_second"}
 
 
-def _scene_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
+def _scene_at(path: Path, usual: TrainSettings) -> BenchedRun:
     scene = scenes.load(path)
+    camera = (scene.train_frames or scene.frames)[0].camera
     return BenchedRun(
         path=path,
         run=None,
         scene=path,
         test_frames=scene.test_frames,
-        base=TrainSettings(seed=seed, device=device, threads=threads, downscale=_factor(scene), **sizes_for(device)),
+        base=replace(usual, downscale=automatic_downscale(camera)),
         identity=scenes.fingerprint(scene),
         trained={},
     )
-
-
-def _factor(scene: Scene) -> int:
-    return automatic_downscale((scene.train_frames or scene.frames)[0].camera)

@@ -234,7 +234,7 @@ def convert(
 
         def work(path: Path, one_of_many: bool) -> None:
             place = target / _named_for(path).resolve().name if one_of_many else target
-            done = convert_capture(
+            done, record = convert_capture(
                 path,
                 place,
                 wanted,
@@ -244,8 +244,8 @@ def convert(
                 notify=console.note,
                 warn=console.warn,
             )
-            _print_verification(done.conversion, console)
-            console.result(done.conversion.path, done.record)
+            _print_verification(done, console)
+            console.result(done.path, record)
 
     def either(path: Path, one_of_many: bool) -> None:
         if is_reconstruction(path):
@@ -321,10 +321,7 @@ def _pixel_centre(text: str | None, option: str) -> float | None:
 
 
 def _named_for(path: Path) -> Path:
-    """Return the path that one result of many is named after.
-
-    This is a file without its suffix, or the file's folder if its name does not identify the capture.
-    """
+    """Return what a result is named after: a file without suffix, or its folder if its name tells nothing."""
     if not path.is_file():
         return path
     return path.parent if path.stem in COMMON_STEMS else path.with_suffix("")

@@ -73,10 +73,10 @@ def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console
         place = target
         if one_of_many:
             place = target / (path.stem + ".npy" if to == ASTRA else path.stem if path.is_file() else path.name)
-        done = convert_scan(
+        record = convert_scan(
             path, place, to=to or OWN, given=options, overwrite=values["overwrite"], notify=console.note
         )
-        console.result(done.path, done.record)
+        console.result(place, record)
         return True
 
     return work

@@ -1,7 +1,7 @@
 """nerfcli doctor: check photos before any long work."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -9,7 +9,8 @@ from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads, one_of
 from nerfcli.cli.poses import Intrinsics, Subfolders
-from nerfcli.errors import GATE_NOT_MET, UserError
+from nerfcli.errors import GATE_NOT_MET, UserError, listed
+from nerfcli.findings import VERDICTS
 from nerfcli.workflows.machine import thread_count
 
 if TYPE_CHECKING:
@@ -90,7 +91,11 @@ def doctor(
                 raise UserError(
                     f"{path}: --intrinsics and --subfolders are for photos, and this is a scan", "leave them out"
                 )
-            _examine_scan(path, page, console, overwrite=overwrite, require=require)
+            from nerfcli.workflows.scans import examine_scan_input, scan_diagnosis_record
+
+            with console.callbacks(f"doctor {path.name}") as callbacks:
+                of_scan = examine_scan_input(path, page, overwrite=overwrite, **callbacks)
+            _show(of_scan, page, scan_diagnosis_record(of_scan), console, require=require)
             return
         with console.callbacks(f"doctor {path.name}") as callbacks:
             diagnosis = examine_capture(
@@ -102,10 +107,7 @@ def doctor(
                 subfolders=subfolders,
                 **callbacks,
             )
-        _print_table(diagnosis, console)
-        console.result(page, content(diagnosis))
-        if require is not None:
-            _check_requirement(diagnosis, require)
+        _show(diagnosis, page, content(diagnosis), console, require=require)
 
     for_each_input(capture, work, command="doctor")
 
@@ -131,34 +133,20 @@ def _examine_run(path: Path, folder: Path, console: Console, *, count: int, thre
     console.result(folder, found.to_json())
 
 
-def _examine_scan(path: Path, page: Path, console: Console, *, overwrite: bool, require: str | None) -> None:
-    """Examine an X-ray scan."""
-    from nerfcli.workflows.scans import examine_scan_input, scan_diagnosis_record
-
-    with console.callbacks(f"doctor {path.name}") as callbacks:
-        diagnosis = examine_scan_input(path, page, overwrite=overwrite, **callbacks)
-    _print_table(diagnosis, console)
-    console.result(page, scan_diagnosis_record(diagnosis))
-    if require is not None:
-        _check_requirement(diagnosis, require)
-
-
-def _print_table(diagnosis: "Diagnosis | ScanDiagnosis", console: Console) -> None:
+def _show(
+    diagnosis: "Diagnosis | ScanDiagnosis", page: Path, record: dict[str, Any], console: Console, *, require: str | None
+) -> None:
+    """Print a table of the findings and the result, and raise if a finding is worse than required."""
     rows = []
     for finding in diagnosis.findings:
-        names = ", ".join(finding.names[:_NAMES_SHOWN])
-        more = f" and {len(finding.names) - _NAMES_SHOWN} more" if len(finding.names) > _NAMES_SHOWN else ""
-        found = f"{finding.summary}{': ' + names + more if names else ''}"
+        found = ": ".join(filter(None, (finding.summary, listed(finding.names, _NAMES_SHOWN))))
         rows.append((finding.check, finding.verdict, found, finding.threshold, finding.advice))
     console.table(("check", "verdict", "found", "threshold", "what to do"), rows, styles=_STYLES)
     for check, reason in diagnosis.not_checked:
         console.note(f"not checked: {check}: {reason}")
-
-
-def _check_requirement(diagnosis: "Diagnosis | ScanDiagnosis", require: str) -> None:
-    """Raise if a finding is worse than required."""
-    from nerfcli.findings import VERDICTS
-
+    console.result(page, record)
+    if require is None:
+        return
     worse = [f for f in diagnosis.findings if VERDICTS.index(f.verdict) > VERDICTS.index(require)]
     if worse:
         raise UserError(

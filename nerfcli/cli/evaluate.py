@@ -112,6 +112,13 @@ def evaluate(
     console = Console(quiet=quiet, json_lines=json)
     requirements = requirements_of(require)
     cores, torch_device = thread_count(threads), device_name(device)
+    how: dict[str, Any] = {
+        "device": torch_device,
+        "threads": cores,
+        "align_poses": "pose" in aligned,
+        "align_colours": "colour" in aligned,
+        "predictions": save_predictions,
+    }
 
     def measure_scan(folder: Path) -> None:
         from nerfcli.cli.scans import print_scan_numbers, refuse_photo_options
@@ -125,16 +132,7 @@ def evaluate(
 
     def measure(folder: Path) -> dict[str, Any]:
         with console.callbacks("evaluate") as callbacks:
-            evaluation = evaluate_run(
-                folder,
-                device=torch_device,
-                threads=cores,
-                overwrite=overwrite,
-                align_poses="pose" in aligned,
-                align_colours="colour" in aligned,
-                predictions=save_predictions,
-                **callbacks,
-            )
+            evaluation = evaluate_run(folder, overwrite=overwrite, **how, **callbacks)
         print_numbers(folder, evaluation, console)
         console.result(evaluation.path, evaluation.metrics)
         return evaluation.metrics
@@ -160,14 +158,7 @@ def evaluate(
 
         if is_reconstruction(folder):
             raise UserError(f"{folder} is a reconstruction of a scan; --dry-run is for photos", "remove --dry-run")
-        found = plan_evaluation(
-            folder,
-            device=torch_device,
-            threads=cores,
-            align_poses="pose" in aligned,
-            align_colours="colour" in aligned,
-            predictions=save_predictions,
-        )
+        found = plan_evaluation(folder, **how)
         console.facts(folder, asdict(found), f"{folder}: {found.describe()}")
 
     def work(folder: Path, one_of_many: bool) -> None:

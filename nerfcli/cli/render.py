@@ -2,14 +2,14 @@
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from nerfcli.cli import options, render_options
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.scans import is_of_scan, refuse_photo_options, scan_pictures
+from nerfcli.cli.scans import is_of_scan, refuse_photo_options, slices_of
 from nerfcli.errors import UserError
 from nerfcli.workflows.machine import device_name, thread_count
 
@@ -207,6 +207,7 @@ def render(
     from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
     from nerfcli.render.pictures import Quality
     from nerfcli.runs.run import Run, load_run
+    from nerfcli.tomography.result import OUTPUTS as SCAN_OUTPUTS
     from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.render import RENDERS, folder_name, render_run
     from nerfcli.workflows.views import PATHS, Views, chosen_frames, file_fps, usual_axis, write_frames
@@ -214,14 +215,19 @@ def render(
     console = Console(quiet=quiet, json_lines=json)
 
     def render_one_scan(folder: Path, one_of_many: bool) -> None:
+        from nerfcli.workflows.tomography_files import render_scan
+
         if not is_reconstruction(folder):
             option = "--slices" if slices else f"--outputs {outputs}"
             raise UserError(f"{folder} is not a reconstruction of a scan; {option} is for those", f"remove {option}", 2)
         refuse_photo_options(folder, render, values, of_scans=_OF_SCANS)
-        pictures = scan_pictures(outputs, slices, views=cameras)
+        chosen = options.some_of("projection" if outputs is None else outputs, SCAN_OUTPUTS, "--outputs")
+        options.one_of(cameras, ("test", "train"), "--cameras")
+        cuts = slices_of(slices or [])
         target = folder / RENDERS if output is None else output / folder.name if one_of_many else output
         with console.callbacks("render") as callbacks:
-            for path in pictures(folder, target, threads=thread_count(threads), overwrite=overwrite, **callbacks):
+            where = {"threads": thread_count(threads), "overwrite": overwrite}
+            for path in render_scan(folder, target, outputs=chosen, views=cameras, slices=cuts, **where, **callbacks):
                 console.result(path)
 
     if is_of_scan(run, outputs=outputs, slices=slices):
@@ -318,34 +324,22 @@ def render(
             write_frames(chosen_views, target, fps=fps, overwrite=overwrite, warn=console.warn)
             console.result(target)
             return
+        how: dict[str, Any] = {
+            "views": views,
+            "settings": settings,
+            "device": device_name(device),
+            "threads": thread_count(threads),
+            "step": step,
+            "part": part,
+        }
         if dry_run:
             from nerfcli.workflows.render_plan import plan_rendering
 
-            plan = plan_rendering(
-                folder,
-                views=views,
-                settings=settings,
-                device=device_name(device),
-                threads=thread_count(threads),
-                step=step,
-                part=part,
-            )
+            plan = plan_rendering(folder, **how)
             console.facts(folder, asdict(plan), f"{folder}: {plan.describe()}")
             return
         with console.callbacks(f"render {views.name}") as callbacks:
-            written = render_run(
-                folder,
-                target,
-                views=views,
-                settings=settings,
-                device=device_name(device),
-                threads=thread_count(threads),
-                step=step,
-                jobs=jobs,
-                part=part,
-                overwrite=overwrite,
-                **callbacks,
-            )
+            written = render_run(folder, target, jobs=jobs, overwrite=overwrite, **how, **callbacks)
         for path in written:
             console.result(path)
 

@@ -1,6 +1,5 @@
 """Options and printed results of commands for X-ray scans."""
 
-import functools
 import inspect
 import math
 from collections.abc import Callable
@@ -11,7 +10,6 @@ import typer
 
 from nerfcli.cli.batch import STDIN
 from nerfcli.cli.console import Console
-from nerfcli.cli.options import one_of, some_of
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
@@ -126,20 +124,6 @@ def is_of_scan(run: str, *, outputs: str | None, slices: list[str] | None) -> bo
     if slices or (outputs is not None and set(outputs.split(",")) & set(OUTPUTS)):
         return True
     return run != STDIN and is_reconstruction(Path(run))
-
-
-def scan_pictures(outputs: str | None, slices: list[str] | None, *, views: str) -> "Callable[..., list[Path]]":
-    """Build the rendering function from the options of render.
-
-    Raises:
-        typer.BadParameter: the options do not fit scans.
-    """
-    from nerfcli.tomography.result import OUTPUTS
-    from nerfcli.workflows.tomography_files import render_scan
-
-    chosen = some_of("projection" if outputs is None else outputs, OUTPUTS, "--outputs")
-    one_of(views, ("test", "train"), "--cameras")
-    return functools.partial(render_scan, outputs=chosen, views=views, slices=slices_of(slices or []))
 
 
 def print_scan_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None:

@@ -41,7 +41,6 @@ def measure_depth_errors(
         model: its field.
         photo_depths: depth maps of its training photos, in their order.
         threads: number of photos in progress.
-        on_progress: called with the fraction that is done.
 
     Raises:
         UserError: there are no held-out photos, or a photo cannot be read.

@@ -4,6 +4,8 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from nerfcli.errors import listed
+
 # A photo is far below the others if it lacks this many standard deviations, estimated by the median absolute deviation,
 # and this many dB. In sound runs the worst photo lacks up to 2 deviations and 2 dB; where views are uneven, 5 dB.
 _DEVIATIONS, _LEAST_DB = 5.0, 6.0
@@ -35,9 +37,8 @@ def outlier_warnings(images: Sequence[Mapping[str, Any]]) -> list[str]:
     if not low:
         return []
     median = statistics.median(image["psnr"] for image in images)
-    names = ", ".join(f"{image['name']} ({image['psnr']:.1f} dB)" for image in low[:_NAMES_SHOWN])
-    more = f" and {len(low) - _NAMES_SHOWN} more" if len(low) > _NAMES_SHOWN else ""
+    names = listed([f"{image['name']} ({image['psnr']:.1f} dB)" for image in low], _NAMES_SHOWN)
     return [
-        f"far below the median of {median:.1f} dB: {names}{more}. The pose may be wrong, or the photo shows what no "
+        f"far below the median of {median:.1f} dB: {names}. The pose may be wrong, or the photo shows what no "
         "training photo does: nerfcli doctor SCENE checks poses, nerfcli report RUN shows the pictures"
     ]

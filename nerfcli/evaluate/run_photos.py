@@ -24,7 +24,6 @@ def held_out_photos(
         model: the model that they are compared with.
         downscale: the factor of the training.
         masks: the meaning of black in masks, see `Components`.
-        threads: number of threads to read with.
 
     Raises:
         UserError: a photo cannot be read.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.cameras.formats.run_cameras import RunCameras
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, listed
 from nerfcli.runs.config import RunConfig
 from nerfcli.runs.log import LogEntry
 from nerfcli.runs.run import Run
@@ -85,7 +85,7 @@ def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
     yield from _of_poses(facts.poses or {})
     missing = facts.config.missing_photos
     if missing:
-        yield "scene", f"{len(missing)} photos are missing: {_listed(missing)}"
+        yield "scene", f"{len(missing)} photos are missing: {listed(missing, _NAMED)}"
     for note in facts.config.warnings:
         yield "training", note
     rollbacks = max((entry.get("rollbacks", 0) for entry in facts.log), default=0)
@@ -141,8 +141,8 @@ def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:
 def _of_poses(poses: dict[str, Any]) -> Iterator[tuple[str, str]]:
     left_out = [image for image in poses.get("images", []) if not image.get("registered")]
     if left_out:
-        text = _listed([f"{image['name']} ({image.get('reason') or 'unknown reason'})" for image in left_out])
-        yield "poses", f"{len(left_out)} photos have no pose: {text}"
+        reasons = [f"{image['name']} ({image.get('reason') or 'unknown reason'})" for image in left_out]
+        yield "poses", f"{len(left_out)} photos have no pose: {listed(reasons, _NAMED)}"
     for failure in poses.get("verdict", {}).get("failures", []):
         yield "poses", str(failure)
     attempts = poses.get("attempts", [])
@@ -153,17 +153,8 @@ def _of_poses(poses: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "poses", f"the pose of {blur.get('photo')} is uncertain by {blur['largest']:.1f} px"
 
 
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
-
-
 def _json(path: Path) -> dict[str, Any] | None:
-    """Return the JSON object in a file; None if the file does not exist.
-
-    Raises:
-        UserError: the file cannot be read or is not a JSON object.
-    """
+    """Return the JSON object in a file; None if the file does not exist."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):

@@ -81,7 +81,6 @@ def look_at(
         held_out: the photos; their masks must leave pixels to compare.
         depth: definition of the depth to show.
         photo_depths: depths of all training photos.
-        on_progress: called with the fraction done, in [0, 1].
     """
     views = []
     for photo in held_out:

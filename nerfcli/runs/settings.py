@@ -41,7 +41,6 @@ class TrainSettings:
             "none" for photos with alpha, which show only an object, "l2" for others.
         seed: seed of all random numbers.
         device: a torch device name.
-        threads: CPU threads.
         first_samples_per_step, samples_per_step: target number of field samples of a step, at the start and at most;
             determines the number of rays. Small steps learn more per sample, large ones cost less per sample.
         learning_rate, final_learning_rate: learning rate of Adam at the start and at the end of the budget.

@@ -1,6 +1,5 @@
 """Checkpoints: write a training's state to the run folder and restore it bit for bit."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -73,49 +72,32 @@ class Checkpoints:
             self._scene.unit,
             self._scene.unit_source,
             log_exposure=prepared.log_exposure,
-            exif_slope=self._exif_slope(),
-            exposures=self._held_out_exposures(),
-            beyond_exif=self._beyond_exif(),
+            **self._held_out_exposures(),
         )
 
-    def _learned_gains(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the places (P,) of the training photos in the capture and their learned log gains (P, 3), if any."""
-        exposure = self._fitting.parts.exposure
+    def _held_out_exposures(self) -> dict[str, Any]:
+        """Return the exposures of held-out photos for `Model`, from the learned ones; nothing if none are learned."""
+        exposure, test = self._fitting.parts.exposure, self._scene.test_frames
         if exposure is None or self._fitting.components.exposure != "learned":
-            return None
-        return self._places(self._scene.train_frames), exposure.log_gains().detach().cpu().double().numpy()
-
-    def _places(self, frames: Sequence[Frame]) -> np.ndarray:
+            return {}
         place = {frame.name: index for index, frame in enumerate(self._scene.frames)}
-        return np.array([place[frame.name] for frame in frames], dtype=int)
-
-    def _exif_slope(self) -> float:
-        learned = self._learned_gains()
-        if learned is None or self._prepared.log_exposure is None:
-            return 1.0
-        return exif_slope(*learned, self._exif)
+        places = np.array([place[frame.name] for frame in self._scene.train_frames], dtype=int)
+        wanted = np.array([place[frame.name] for frame in test], dtype=int)
+        log_gains = exposure.log_gains().detach().cpu().double().numpy()
+        found = {"exposures": gains_between(places, log_gains, wanted)}
+        slope = 1.0
+        if self._prepared.log_exposure is not None:
+            slope = exif_slope(places, log_gains, self._exif)
+            found["beyond_exif"] = gains_beyond_exif(places, log_gains, self._exif, wanted, slope=slope)
+        by_name = {
+            kind: {frame.name: tuple(row) for frame, row in zip(test, gains.tolist(), strict=True)}
+            for kind, gains in found.items()
+        }
+        return {"exif_slope": slope, **by_name}
 
     @cached_property
     def _exif(self) -> np.ndarray:
         return log_exposures(self._scene.train_frames)
-
-    def _held_out_exposures(self) -> dict[str, tuple[float, ...]]:
-        """Return by name the log gains of held-out photos, interpolated from the learned exposures."""
-        learned = self._learned_gains()
-        if learned is None:
-            return {}
-        return self._by_name(gains_between(*learned, self._places(self._scene.test_frames)))
-
-    def _beyond_exif(self) -> dict[str, tuple[float, ...]]:
-        """Return by name the offsets to the log gains that EXIF predicts for held-out photos."""
-        learned = self._learned_gains()
-        if learned is None or self._prepared.log_exposure is None:
-            return {}
-        wanted = self._places(self._scene.test_frames)
-        return self._by_name(gains_beyond_exif(*learned, self._exif, wanted, slope=self._exif_slope()))
-
-    def _by_name(self, gains: np.ndarray) -> dict[str, tuple[float, ...]]:
-        return {frame.name: tuple(row) for frame, row in zip(self._scene.test_frames, gains.tolist(), strict=True)}
 
     def frames(self) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
         """Return the training frames and the held-out frames with their current cameras."""
@@ -136,10 +118,7 @@ class Checkpoints:
         tensors, description = self._fitting.state()
         extent = self._prepared.extent.to_json()
         description |= {"format": STATE_FORMAT, "extent": extent, "totals": vars(self._totals)}
-        writing = [
-            self._write_field,
-            lambda: save_tensors(self._run / STATE, tensors, description),
-        ]
+        writing = [self._write_field, lambda: save_tensors(self._run / STATE, tensors, description)]
         # The process may be killed between the two. The state is all that resuming needs and must never be ahead of the
         # field. The first time it is written first, so that no field exists that can neither be resumed nor replaced.
         for write in writing if (self._run / FIELD).exists() else reversed(writing):

@@ -37,7 +37,6 @@ class Evidence:
         album, pool: the photos, and their pixels in the training frame.
         extent: of the field.
         settings: of the training; its budget determines the size of the pictures that are matched.
-        notify: takes lines for the user.
     """
 
     def __init__(
@@ -49,8 +48,8 @@ class Evidence:
         settings: TrainSettings,
         notify: Callable[[str], None],
     ):
-        self._shared, self._album, self._pool, self._settings = shared, album, pool, settings
-        self._similarity, self.notify = extent.training_from_scene, notify
+        self.shared, self.album, self.pool, self.settings = shared, album, pool, settings
+        self.extent, self.notify = extent, notify
         self.stereo_seconds = 0.0
         budget = settings.budget_seconds
         # A training by steps must give the same result on all machines: without a time budget, ignore the threads.
@@ -60,16 +59,16 @@ class Evidence:
     @cached_property
     def of_tracks(self) -> PointDepths:
         """Depths of points from structure from motion, or of matched features."""
-        return point_depths(self._shared.tracks, self._pool, self._similarity)
+        return point_depths(self.shared.tracks, self.pool, self.extent.training_from_scene)
 
     @cached_property
     def _dense(self) -> list[DenseDepth]:
         began = time.perf_counter()
         found = dense_depths(
-            self._album.photos,
-            self._shared.tracks,
+            self.album.photos,
+            self.shared.tracks,
             longer_side_px=self.side_px or LEAST_SIDE_PX,
-            threads=self._settings.threads,
+            threads=self.settings.threads,
         )
         self.stereo_seconds += time.perf_counter() - began
         return found
@@ -83,8 +82,8 @@ class Evidence:
         """
         dense = self._dense
         began = time.perf_counter()
-        found = matched_log_gains(self._album.photos, dense)
-        exif = log_exposures([photo.frame for photo in self._album.photos])
+        found = matched_log_gains(self.album.photos, dense)
+        exif = log_exposures([photo.frame for photo in self.album.photos])
         measured = np.isfinite(found).all(1) & np.isfinite(exif)
         if measured.sum() < FEWEST_EXIF or exif_slope(np.flatnonzero(measured), found[measured], exif[measured]) == 0.0:
             found = np.full_like(found, np.nan)
@@ -104,8 +103,8 @@ class Evidence:
 
     @cached_property
     def _plain(self) -> Tensor:
-        masks = sky_masks(self._album.photos, threads=self._settings.threads)
-        return torch.from_numpy(np.concatenate([mask.ravel() for mask in masks])).to(self._pool.colours.device)
+        masks = sky_masks(self.album.photos, threads=self.settings.threads)
+        return torch.from_numpy(np.concatenate([mask.ravel() for mask in masks])).to(self.pool.colours.device)
 
     @property
     def sky_fraction(self) -> float:
@@ -120,7 +119,7 @@ class Evidence:
     @cached_property
     def of_stereo(self) -> PointDepths:
         """Depths from stereo matching."""
-        found = stereo_depths(self._dense, self._pool, self._similarity)
+        found = stereo_depths(self._dense, self.pool, self.extent.training_from_scene)
         self.notify(
             f"stereo matching: the depth of {len(found.numbers)} pixels of the training photos, "
             f"{self.stereo_seconds:.1f} s"

@@ -29,7 +29,6 @@ class LiveTraining:
         run: the run folder.
         model: returns the current field.
         still_wanted: called while the training is paused; raises to end it.
-        notify: takes lines for the user.
     """
 
     def __init__(
@@ -83,11 +82,7 @@ class LiveTraining:
             time.sleep(seconds)
 
     def _request(self) -> Request | None:
-        """Return the request of a viewer; None without a live viewer.
-
-        Raises:
-            KeyboardInterrupt: somebody wants the training to end.
-        """
+        """Return the request of a viewer, None without a live viewer; raise KeyboardInterrupt if it is to stop."""
         request = read_request(self._run)
         if not self._pulse.beats(None if request is None else request.count):
             return None

@@ -70,7 +70,6 @@ def train(
         memory_bytes: limit of resident memory; photos that do not fit are kept in files, and the result is the same. On
             a GPU, limit of its memory, into which everything has to fit.
         ranks: the processes that train together; this is the first, and the others run `following.follow`.
-        notify: takes lines for the user.
         on_progress: called after every step.
 
     Raises:

@@ -164,7 +164,6 @@ def prepare(
         run: folder for temporary files that hold what does not fit into memory.
         memory_bytes: limit of resident memory, or of GPU memory.
         begun: decisions of a training that is resumed; None for a new one.
-        notify: takes lines for the user.
 
     Raises:
         UserError: too little memory, no training photo, unreadable photos.
@@ -195,14 +194,11 @@ def prepare(
         settings = replace(settings, components=begun.components)
     elif settings.model == "auto":
         began = time.perf_counter()
-        facts = _facts(scene, album, settings, shared=shared, evidence=evidence, notify=notify)
-        selection = _search(
-            scene, album, extent, settings, facts=facts, evidence=evidence, storage=storage, began=began, notify=notify
-        )
+        facts = _facts(scene, evidence)
+        selection = _search(scene, evidence, facts, storage=storage, began=began)
         settings, log_focal = replace(settings, components=selection.components), selection.log_focal
     elif settings.components.cameras in LEARN_FOCAL:
-        facts = _facts(scene, album, settings, shared=shared, evidence=evidence, notify=notify)
-        _, log_focal, decisions = with_known_cameras(settings.components, facts)
+        _, log_focal, decisions = with_known_cameras(settings.components, _facts(scene, evidence))
         for decision in decisions:
             notify(decision.in_words())
     sky = evidence.sky if settings.components.background == "sphere" else None
@@ -212,16 +208,16 @@ def prepare(
         gains = selection.log_gains
     elif settings.components.exposure == "learned" and settings.components.stereo:
         gains = evidence.gains_or(gains)
-    points = _points(scene, settings, evidence, pool=pool) if settings.components.points else None
+    points = _points(scene, settings, evidence) if settings.components.points else None
     seconds = evidence.stereo_seconds if selection is None else selection.seconds
     return Prepared(
         settings, factor, storage, extent, pool, selection, reference, gains, log_focal, points, seconds, sky
     )
 
 
-def _points(scene: Scene, settings: TrainSettings, evidence: Evidence, *, pool: PixelPool) -> PointRays:
+def _points(scene: Scene, settings: TrainSettings, evidence: Evidence) -> PointRays:
     """Return the pixels at known distances that are drawn in each step."""
-    points = PointRays(evidence.sets(settings.components), pool)
+    points = PointRays(evidence.sets(settings.components), evidence.pool)
     if not points.sets:
         raise UserError(
             f"--with points: no 3D point could be triangulated from the photos of {scene.root}",
@@ -236,16 +232,9 @@ def _threads(count: int) -> str:
     return f"{count} {'thread' if count == 1 else 'threads'}"
 
 
-def _facts(
-    scene: Scene,
-    album: Album,
-    settings: TrainSettings,
-    *,
-    shared: SharedFeatures,
-    evidence: Evidence,
-    notify: Callable[[str], None],
-) -> Facts:
+def _facts(scene: Scene, evidence: Evidence) -> Facts:
     """Collect facts about the scene before training."""
+    album, shared, settings = evidence.album, evidence.shared, evidence.settings
     lacks_points = album.fills_frame and len(scene.points) == 0
     budget = settings.budget_seconds
     has_time = is_worth_a_search(budget, settings.steps) and (
@@ -256,7 +245,7 @@ def _facts(
         has_alpha=album.colours.shape[-1] == 4,
         has_exif=bool(np.ptp(_exif(scene)) > 0.0),
         cameras_known=_known(scene) or (None if has_time else "the budget is too short to match photos"),
-        cameras=_camera_check(album, shared, notify=notify) if lacks_points and has_time else None,
+        cameras=_camera_check(evidence) if lacks_points and has_time else None,
         fixed=settings.fixed,
     )
     if not facts.has_alpha and "background" not in facts.fixed:
@@ -269,28 +258,18 @@ def _facts(
     return facts
 
 
-def _camera_check(album: Album, shared: SharedFeatures, *, notify: Callable[[str], None]) -> CameraCheck | None:
+def _camera_check(evidence: Evidence) -> CameraCheck | None:
     """Check the cameras against matched features; None, with a note, if the check cannot be computed."""
     try:
-        return check_cameras(album.photos, shared.matched)
+        return check_cameras(evidence.album.photos, evidence.shared.matched)
     except Exception as error:
-        notify(f"could not check the cameras against matched features: {reason_of(error)}")
+        evidence.notify(f"could not check the cameras against matched features: {reason_of(error)}")
         return None
 
 
-def _search(
-    scene: Scene,
-    album: Album,
-    extent: Extent,
-    settings: TrainSettings,
-    *,
-    facts: Facts,
-    evidence: Evidence,
-    storage: PhotoStorage,
-    began: float,
-    notify: Callable[[str], None],
-) -> Selection:
+def _search(scene: Scene, evidence: Evidence, facts: Facts, *, storage: PhotoStorage, began: float) -> Selection:
     """Select components for the scene and report each decision."""
+    album, settings, notify = evidence.album, evidence.settings, evidence.notify
     budget, steps = settings.budget_seconds, settings.steps
     if not is_worth_a_search(budget, steps):
         notify("the budget is too short for trials; only components that need no trial are selected")
@@ -302,7 +281,7 @@ def _search(
     model, _ = with_evidence(requested, facts)
     trials = Trials(
         album.photos,
-        extent,
+        evidence.extent,
         settings=settings,
         exif=_exif(scene),
         log_focal=log_focal,
@@ -313,27 +292,23 @@ def _search(
         storage=storage,
     )
     took = time.perf_counter() - began
+    seconds = None
+    if budget is not None:
+        seconds = max(LEAST_SECONDS, SEARCH_FRACTION * budget - took + evidence.stereo_seconds)
     notify(f"selecting components, for up to {100 * SEARCH_FRACTION:.0f} % of the budget")
     selection = select(
         trials,
         requested,
         facts,
-        seconds=None
-        if budget is None
-        else max(LEAST_SECONDS, SEARCH_FRACTION * budget - took + evidence.stereo_seconds),
+        seconds=seconds,
         steps=None if steps is None else round(SEARCH_FRACTION * steps),
     )
     if not selection.decisions:
         notify("the budget is too short for trials; using the default components")
-    selection = replace(
-        selection,
-        decisions=(*measured, *selection.decisions),
-        seconds=selection.seconds + took,
-        log_focal=log_focal,
-    )
-    for decision in selection.decisions:
+    decisions = (*measured, *selection.decisions)
+    for decision in decisions:
         notify(decision.in_words())
-    return selection
+    return replace(selection, decisions=decisions, seconds=selection.seconds + took, log_focal=log_focal)
 
 
 def _exif(scene: Scene) -> np.ndarray:

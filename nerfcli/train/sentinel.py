@@ -42,7 +42,6 @@ class Sentinel:
         fitting: the training, in a state that is finite.
         pool: the source of its pixels.
         run: folder for states before failures.
-        notify: takes lines for the user.
     """
 
     def __init__(self, fitting: Fitting, pool: PixelPool, *, run: Path, notify: Callable[[str], None]):

@@ -1,4 +1,4 @@
-"""Waypoints: copies of the field during training, measured on held-out photos once the training is over.
+"""Waypoints: copies of the field during training, measured on held-out pixels once the training is over.
 
 No held-out photo is opened before, so training can neither learn from them nor be stopped or steered by them.
 """
@@ -7,20 +7,32 @@ import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from nerfcli.atomic import cannot_write
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
+from nerfcli.field.background import colours_behind
+from nerfcli.field.exposure import exposed
+from nerfcli.fit.losses import over_background
 from nerfcli.photos.held_out_exposure import log_gains_of
-from nerfcli.photos.pool import load_album
+from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.photos.pool import PixelPool, load_album
+from nerfcli.photos.psnr import psnr_of
+from nerfcli.photos.storage import IN_MEMORY, PhotoStorage
 from nerfcli.render.model import Model, load_model, save_model
+from nerfcli.render.tracing import render_rays
 from nerfcli.runs.log import add_to_log
-from nerfcli.train.held_out_pixels import HeldoutPixels
 from nerfcli.train.preparation import Prepared
 
 FRACTIONS = (0.25, 0.5, 0.75, 1.0)
 FOLDER = "waypoints"
+# Number of held-out pixels that are measured, and the seed of their choice.
+PIXELS, SEED = 4096, 1
+# All rays at once would take half a gigabyte while space is still full of fog.
+RAYS_AT_A_TIME = 512
 
 
 def keep_waypoint(run: Path, step: int, model: Model) -> None:
@@ -78,6 +90,55 @@ def measure_waypoints(
         curve = ", ".join(f"{psnr:.2f} dB at step {step}" for step, psnr in measured.items())
         notify(f"PSNR on a sample of held-out pixels: {curve}")
     forget_waypoints(run)
+
+
+class HeldoutPixels:
+    """A fixed sample of a few thousand distinct pixels of the held-out photos, or most of them if there are fewer.
+
+    Args:
+        photos: the held-out photos.
+        training_from_scene: the normalisation.
+        device: for the pixels.
+        colours, storage: see `PixelPool`.
+    """
+
+    def __init__(
+        self,
+        photos: Sequence[LoadedPhoto],
+        training_from_scene: Similarity,
+        device: torch.device,
+        *,
+        colours: np.ndarray | None = None,
+        storage: PhotoStorage = IN_MEMORY,
+    ):
+        pool = PixelPool(photos, training_from_scene, device, colours=colours, storage=storage)
+        generator = torch.Generator(device=device).manual_seed(SEED)
+        numbers = pool.numbers(PIXELS, generator).unique()
+        self.origins, self.directions, self.colours = pool.rays_of(numbers)[:3]
+        self.cones = pool.cones[pool.photo_of(numbers)]
+        self.photos = pool.photo_of(numbers)
+
+    @torch.no_grad()
+    def psnr(self, model: Model, *, log_gains: np.ndarray) -> float:
+        """Return the PSNR in dB over all these pixels, clipped to [0, 1], on the model's background.
+
+        Args:
+            model: to be measured.
+            log_gains: (photos, 3) of the photos relative to the model's pictures; see `held_out_exposure`.
+        """
+        background = colours_behind(model.background, self.directions)
+        parts = zip(
+            *(rays.split(RAYS_AT_A_TIME) for rays in (self.origins, self.directions, self.cones, background)),
+            strict=True,
+        )
+        rendered = torch.cat(
+            [render_rays(model, *rays, background=behind, cones=cones).rgb for *rays, cones, behind in parts]
+        )
+        wanted = over_background(self.colours, background)
+        if log_gains.any():
+            rendered = exposed(rendered, torch.as_tensor(log_gains).to(rendered)[self.photos])
+        error = (rendered.clamp(0.0, 1.0) - wanted).square().mean().item()
+        return psnr_of(error)
 
 
 def _kept(run: Path) -> list[int]:

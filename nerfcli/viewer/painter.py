@@ -170,7 +170,6 @@ class Painter:
 
     Args:
         model: returns the version number of the newest model, and the model.
-        threads: CPU threads.
     """
 
     def __init__(self, model: Callable[[], tuple[int, Model]], *, threads: int):

@@ -56,8 +56,6 @@ def page_photos(
         model: the trained model, for the exposures of the photos.
         train, test: the frames.
         room_bytes: budget for all pictures, as text in the page.
-        threads: threads that read photos.
-        on_progress: called with the fraction done.
     """
     frames = _sorted(train, test)
     there = [index for index, (frame, _) in enumerate(frames) if frame.image is not None and frame.image.exists()]

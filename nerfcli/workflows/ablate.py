@@ -56,9 +56,6 @@ def ablate_scene(
         whole: measure whole held-out photos as `evaluate_run` does, not random pixels of them.
         holdout: see `train_scene`.
         memory_bytes: limit of a training's resident memory, or of the memory that it uses on a GPU.
-        overwrite: train and measure existing runs again.
-        notify, warn: called with lines for the user.
-        progress: called with the fraction of the trainings that is done and a short text.
 
     Returns:
         The content of ablation.json.

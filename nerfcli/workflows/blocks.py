@@ -15,7 +15,7 @@ from nerfcli.runs.log import LogEntry, append_log
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.workflows.notices import Notify, Progress, no_progress, one_of_several, silent, warn_python
 from nerfcli.workflows.train import train_or_continue
 
 # Components left out of the automatic selection: blocks must agree on them, but would select them separately.
@@ -61,7 +61,6 @@ def train_blocks(
         count: number of blocks.
         only: the block to train, counted from 1; None for all.
         resume: also continue complete blocks to a larger budget.
-        progress: called with the fraction of the blocks' training that is done and a short text.
 
     Returns:
         The run; or, if some blocks are not complete, the folder of the first block trained here.
@@ -84,10 +83,6 @@ def train_blocks(
     numbers = range(1, count + 1)
     chosen = numbers if only is None else [only]
     for place, number in enumerate(chosen):
-
-        def of_all(fraction: float, words: str, before: int = place, number: int = number) -> None:
-            progress((before + fraction) / len(chosen), f"block {number} of {count}  {words}")
-
         train_or_continue(
             folder,
             block_path(run, number),
@@ -98,7 +93,7 @@ def train_blocks(
             holdout=holdout,
             notify=notify,
             warn=warn,
-            progress=of_all,
+            progress=one_of_several(progress, place, len(chosen), f"block {number} of {count}"),
         )
     blocks = [Run(block_path(run, number)) for number in numbers]
     waiting = [

@@ -1,6 +1,6 @@
 """Convert a capture and verify it, or detect its convention."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,6 @@ from nerfcli.media.images import HEIC_SUFFIXES
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
 
-@dataclass(frozen=True)
-class Converted:
-    """A conversion: what was done, and its record as plain values."""
-
-    conversion: Conversion
-    record: dict[str, Any]
-
-
 def convert_capture(
     source: Path,
     target: Path,
@@ -36,8 +28,8 @@ def convert_capture(
     world: WorldFrame = WorldFrame(),
     notify: Notify = silent,
     warn: Notify = warn_python,
-) -> Converted:
-    """Convert one capture.
+) -> tuple[Conversion, dict[str, Any]]:
+    """Convert one capture; return the conversion, and its record as plain values.
 
     Args:
         source: a file or folder in a known format.
@@ -46,7 +38,6 @@ def convert_capture(
         given: photos and cameras that the source does not name.
         overrides: conventions of the source that differ from those of its format.
         world: the world frame of the target.
-        notify, warn: called with lines for the user.
 
     Raises:
         UserError: the capture cannot be read or written, the format cannot hold it, or the verification fails.
@@ -84,7 +75,7 @@ def convert_capture(
         warn(f"{to} cannot hold {loss}")
     if done.loss_px > wanted.tolerance_px:
         warn(f"dropping lens parameters shifts pixels by up to {done.loss_px:.3g} px")
-    return Converted(done, _record(done, to) | frame)
+    return done, _record(done, to) | frame
 
 
 def _describe_outside(capture: Capture) -> str | None:

@@ -29,12 +29,8 @@ def examine_capture(
     Args:
         path: a folder of photos, or a scene.
         page: the file to write.
-        threads: number of CPU threads.
-        overwrite: replace any existing file at `page`.
         intrinsics: a file with the intrinsics of the cameras, if they are known.
         subfolders: whether photos in subfolders are examined, too.
-        notify: called with lines for the user.
-        progress: called with the fraction done and a short text.
 
     Raises:
         UserError: see `find_subject`, `read_calibration` and `refuse_foreign`; or the page cannot be written.

@@ -27,7 +27,7 @@ from nerfcli.workflows.export_geometry import (
 )
 from nerfcli.workflows.export_map import export_ortho
 from nerfcli.workflows.machine import device_name, thread_count
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.workflows.photo_depths import photo_depths
 
 # Maximum size of a page; the field comes first, and photos get the rest.
@@ -87,14 +87,10 @@ def export_run(
         check_box(settings.box)
     _ = trained.config
     refuse_existing(path, overwrite=overwrite, folder=not suffix)
-    cores = thread_count(threads)
-    torch.set_num_threads(cores)
+    torch.set_num_threads(thread_count(threads))
     model = trained.model(torch_device)
     progress(0.0, "")
-    if to == "mesh":
-        export_mesh(trained, model, path, settings=settings, threads=cores, notify=notify, progress=progress)
-    else:
-        _EXPORTS[to](trained, model, path, settings=settings, notify=notify, progress=progress)
+    _EXPORTS[to](trained, model, path, settings=settings, notify=notify, progress=progress)
     return path
 
 
@@ -147,12 +143,8 @@ def _export_page(
     box = settings.box or scene_box(model, frames)
     proof = make_proof(model, frames)
     progress(0.1, "depths of the training photos")
-    seen = photo_depths(
-        run,
-        model,
-        on_progress=lambda fraction: progress(0.1 + 0.3 * fraction, "depths of the training photos"),
-        notify=notify,
-    )
+    depths = part_of(progress, 0.1, 0.4, "depths of the training photos")
+    seen = photo_depths(run, model, on_progress=depths, notify=notify)
     numbers = PageNumbers.of(packed, proof, seen_cells(model, seen))
     text_bytes = len(numbers.elements)
     photos = page_photos(
@@ -161,19 +153,18 @@ def _export_page(
         cameras.test,
         room_bytes=PAGE_BYTES - text_bytes - 150_000,
         threads=torch.get_num_threads(),
-        on_progress=lambda fraction: progress(0.4 + 0.6 * fraction, "photos"),
+        on_progress=part_of(progress, 0.4, 1.0, "photos"),
     )
     if photos.missing:
         notify(f"{photos.missing} photos are missing: the page shows only their cameras")
     if text_bytes > PAGE_BYTES:
-        notify(
-            f"the field alone needs {text_bytes / 1000000.0:.0f} MB of text: the page is large and contains no photos"
-        )
+        notify(f"the field alone needs {text_bytes / 1e6:.0f} MB of text: the page is large and contains no photos")
     write_page(page_html(model, numbers, run=run.path, frames=frames, photos=photos, box=box), path)
 
 
 _EXPORTS = {
     "page": _export_page,
+    "mesh": export_mesh,
     "points": export_points,
     "volume": export_volume,
     "tsdf": export_tsdf,

@@ -1,11 +1,12 @@
 """Export the geometry of a run: surfaces, points, volumes, and COLMAP's dense folder, in the scene's frame and unit."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from nerfcli import __version__
 from nerfcli.atomic import atomic_folder
@@ -33,7 +34,7 @@ from nerfcli.surface.settings import MOST_VIEWS, SurfaceSettings
 from nerfcli.surface.simplify import simplified
 from nerfcli.surface.views import DepthView, depth_views, spread_frames
 from nerfcli.surface.volume import automatic_volume_voxel, sample_volume
-from nerfcli.workflows.notices import Notify, Progress
+from nerfcli.workflows.notices import Notify, Progress, part_of
 
 FORMAT = "nerfcli geometry 1"
 FRAME = "of the scene, as its cameras have it"
@@ -43,7 +44,7 @@ _DEPTHS = 0.7
 
 
 def export_mesh(
-    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, threads: int, notify: Notify, progress: Progress
+    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
 ) -> None:
     """Write the surface as .ply, .glb or .obj."""
     views, grid = _seen(run, model, settings, progress)
@@ -52,7 +53,7 @@ def export_mesh(
     if not len(mesh.faces):
         raise UserError("no surface found in the box", "use another --box, a larger --voxel-size, or train longer")
     found = len(mesh.faces)
-    mesh = simplified(mesh, settings.faces, threads=threads)
+    mesh = simplified(mesh, settings.faces, threads=torch.get_num_threads())
     progress(0.97, "colours")
     colours = surface_colours(model, mesh.vertices, mesh.normals, voxel_size=grid.voxel_size)
     description = _description(run, model, "mesh", grid) | {
@@ -108,7 +109,7 @@ def export_volume(
     box = settings.box or scene_box(model, run.cameras.train)
     grid = Grid.over(box, settings.voxel_size or automatic_volume_voxel(box))
     maps = sample_volume(model, grid, on_progress=part_of(progress, 0.05, 1.0, "evaluating the field"))
-    per_unit = {"metre": "1/m"}.get(model.unit, "1 / unit")
+    per_unit = "1/m" if model.unit == "metre" else "1 / unit"
     described = _description(run, model, "volume", grid) | {
         "density": f"fraction of light that ends per length, {per_unit}; 0 where rays pass over cells",
         "colour": "sRGB, mean over six directions; 0 where a voxel takes less than a thousandth of the light",
@@ -178,11 +179,6 @@ def _seen(
     return views, Grid.over(box, settings.voxel_size or automatic_voxel(views, box))
 
 
-def part_of(progress: Progress, start: float, end: float, words: str) -> Callable[[float], None]:
-    """Return a function that reports the progress of a part of the work, from `start` to `end` of the whole."""
-    return lambda fraction: progress(start + (end - start) * fraction, words)
-
-
 def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any]:
     """Return the description that an exported file contains."""
     return {
@@ -207,8 +203,12 @@ def provenance_of(run: Run, model: Model) -> dict[str, Any]:
 
 
 def _grid_in_words(grid: Grid, model: Model) -> str:
-    unit = {"metre": "m"}.get(model.unit, "units of the scene")
-    return f"{'x'.join(map(str, grid.shape))} voxels of {grid.voxel_size:.4g} {unit}"
+    return f"{'x'.join(map(str, grid.shape))} voxels of {grid.voxel_size:.4g} {unit_of(model)}"
+
+
+def unit_of(model: Model) -> str:
+    """Return the unit of lengths, for messages."""
+    return "m" if model.unit == "metre" else "units of the scene"
 
 
 def _write_mesh(

@@ -15,8 +15,8 @@ from nerfcli.surface.extent import scene_box
 from nerfcli.surface.ortho import SEEN, automatic_pixel, check_upright, ortho_of, typical_depth
 from nerfcli.surface.settings import MOST_VIEWS, SurfaceSettings
 from nerfcli.surface.views import depth_views, spread_frames
-from nerfcli.workflows.export_geometry import part_of, provenance_of
-from nerfcli.workflows.notices import Notify, Progress
+from nerfcli.workflows.export_geometry import provenance_of, unit_of
+from nerfcli.workflows.notices import Notify, Progress, part_of
 
 # Fraction of the work that is spent on the depths of photos.
 _DEPTHS = 0.6
@@ -62,11 +62,10 @@ def export_ortho(
         write_geotiff(
             partial / "heights.tif", made.heights + height, place, description={**described, "holds": "heights"}
         )
-    unit = {"metre": "m"}.get(model.unit, "units of the scene")
     where = f"coordinates in {place.system}" if origin else "coordinates of the scene, which is not georeferenced"
     notify(
-        f"{shown.shape[1]}x{shown.shape[0]} pixels of {pixel:.3g} {unit}, three photos see {100 * shown.mean():.0f} %; "
-        f"{where}"
+        f"{shown.shape[1]}x{shown.shape[0]} pixels of {pixel:.3g} {unit_of(model)}, three photos see "
+        f"{100 * shown.mean():.0f} %; {where}"
     )
 
 

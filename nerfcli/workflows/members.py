@@ -17,7 +17,7 @@ from nerfcli.runs.files import MEMBERS, METRICS
 from nerfcli.runs.members import members_of
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.workflows.notices import Notify, Progress, no_progress, one_of_several, silent, warn_python
 from nerfcli.workflows.train import train_again
 
 VARIED = ("seeds", "photos", "prior", "field")
@@ -77,7 +77,6 @@ def train_members(
         vary: one of `VARIED`, see `member_settings`.
         device, threads: as for `TrainSettings`.
         memory_bytes, resume, overwrite, notify, warn: see `train_again`.
-        progress: called with the fraction of all members' training that is done and a short text.
 
     Raises:
         UserError: see `train_again`; or a member with other settings exists.
@@ -89,20 +88,16 @@ def train_members(
     members, all_settings = [], member_settings(first, count, vary=vary)
     chosen = range(1, count + 1) if only is None else [only]
     for place, number in enumerate(chosen):
-        path, settings = run.path / MEMBERS / str(number), all_settings[number - 1]
-
-        def of_all(fraction: float, words: str, before: int = place, number: int = number) -> None:
-            progress((before + fraction) / len(chosen), f"member {number} of {count}  {words}")
-
+        path = run.path / MEMBERS / str(number)
         train_again(
             run,
-            {path: settings},
+            {path: all_settings[number - 1]},
             memory_bytes=memory_bytes,
             resume=resume,
             overwrite=overwrite,
             notify=notify,
             warn=warn,
-            progress=of_all,
+            progress=one_of_several(progress, place, len(chosen), f"member {number} of {count}"),
         )
         members.append(Run(path))
     return members
@@ -115,10 +110,6 @@ def evaluate_members(
 
     Args:
         run: a run with members.
-        device, threads: to render with.
-        overwrite: measure again.
-        notify: called with lines for the user.
-        progress: called with the fraction of the pictures that is done and a short text.
 
     Returns:
         Content of RUN/members/metrics.json: "members", each member's measures averaged over the photos; "mean_picture",

@@ -21,7 +21,7 @@ from nerfcli.surface.extent import scene_box
 from nerfcli.surface.grid import Grid
 from nerfcli.surface.next_views import candidate_frames, in_free_space, next_views, surface_points
 from nerfcli.workflows.machine import thread_count
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.workflows.photo_depths import photo_depths
 from nerfcli.workflows.views import refuse_frames, write_frames
 
@@ -86,9 +86,6 @@ def examine_run(
             view to suggest.
         count: maximum number of views to suggest.
         threads: number of CPU threads; 0 for all.
-        overwrite: replace the files at `target`.
-        notify: called with lines for the user.
-        progress: called with the fraction done and a short text.
 
     Raises:
         UserError: the run does not exist, its cameras see no surface, or the files exist.
@@ -97,9 +94,7 @@ def examine_run(
     trained = Run(run)
     torch.set_num_threads(thread_count(threads))
     model, frames = trained.model(), trained.cameras.train
-    photos = photo_depths(
-        trained, model, on_progress=lambda fraction: progress(0.4 * fraction, "photos"), notify=notify
-    )
+    photos = photo_depths(trained, model, on_progress=part_of(progress, 0.0, 0.4, "photos"), notify=notify)
     box = scene_box(model, frames)
     low, high = np.array(box[:3]), np.array(box[3:])
     grid = Grid.over(box, float((high - low).max()) / CELLS)
@@ -108,7 +103,7 @@ def examine_run(
         model,
         candidates,
         max_size=CANDIDATE_PX,
-        on_progress=lambda fraction: progress(0.4 + 0.5 * fraction, "candidates"),
+        on_progress=part_of(progress, 0.4, 0.9, "candidates"),
     )
     views = in_free_space(rendered, photos)
     points = surface_points([*photos, *views], grid)

@@ -17,6 +17,16 @@ def no_progress(fraction: float, detail: str) -> None:
     """Show no progress."""
 
 
+def part_of(progress: Progress, start: float, end: float, words: str) -> Callable[[float], None]:
+    """Return a function that reports the progress of a part of the work, from `start` to `end` of the whole."""
+    return lambda fraction: progress(start + (end - start) * fraction, words)
+
+
+def one_of_several(progress: Progress, place: int, count: int, title: str) -> Progress:
+    """Return the progress of one of several equal pieces of work, counted from 0; the title precedes its words."""
+    return lambda fraction, words: progress((place + fraction) / count, f"{title}  {words}")
+
+
 def warn_python(text: str) -> None:
     """Issue a Python warning with `warnings.warn`."""
     warnings.warn(text, stacklevel=3)

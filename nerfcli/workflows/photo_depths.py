@@ -36,8 +36,6 @@ def photo_depths(
     Args:
         run: the run.
         model: its model, with the step lengths of the training.
-        on_progress: called with the fraction done.
-        notify: called with a line for the user.
     """
     frames = run.cameras.train
     expected = photo_depths_digest(model.sha256, frames, max_size=MAX_SIZE)

@@ -14,7 +14,7 @@ from nerfcli.render.model import Model
 from nerfcli.runs.members import members_of
 from nerfcli.runs.run import Run, load_run
 from nerfcli.workflows.machine import device_name, thread_count
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.workflows.photo_depths import depth_errors, photo_depths
 from nerfcli.workflows.views import Views, chosen_frames, refuse_z_depth_for_equirectangular, usual_depth
 
@@ -84,23 +84,13 @@ def render_run(
     seen = ()
     provenance: dict[str, Any] = {"cameras": views.cameras, "run": trained.path.name, "field_sha256": model.sha256}
     if settings.needs_visibility:
-        seen = photo_depths(
-            trained,
-            model,
-            on_progress=lambda fraction: progress(fraction, "depths of the training photos"),
-            notify=notify,
-        )
+        depths = part_of(progress, 0.0, 1.0, "depths of the training photos")
+        seen = photo_depths(trained, model, on_progress=depths, notify=notify)
         provenance["training_photos"] = len(seen)
     errors = None
     if settings.needs_errors:
-        errors = depth_errors(
-            trained,
-            model,
-            seen,
-            threads=cores,
-            on_progress=lambda fraction: progress(fraction, "depth of the held-out photos"),
-            notify=notify,
-        )
+        depths = part_of(progress, 0.0, 1.0, "depth of the held-out photos")
+        errors = depth_errors(trained, model, seen, threads=cores, on_progress=depths, notify=notify)
         provenance["measured_photos"] = errors.photos
     members: list[Model] = []
     if settings.needs_members:

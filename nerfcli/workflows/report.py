@@ -17,7 +17,7 @@ from nerfcli.report.views import common_names, look_at
 from nerfcli.runs.files import REPORT
 from nerfcli.runs.run import load_run
 from nerfcli.workflows.machine import device_name, thread_count
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.workflows.photo_depths import photo_depths
 from nerfcli.workflows.views import Views, usual_depth
 
@@ -48,8 +48,6 @@ def report_runs(
         device, threads: to render with; 0 threads for all.
         overwrite: replace any existing file, even if it is not a report on these runs.
         keep: keep a page that was made from the same files with the same options.
-        notify: called with lines for the user.
-        progress: called with the fraction of the rendering that is done and a label.
 
     Raises:
         UserError: a folder is not a run, its photos cannot be read, or the page's path holds something else.
@@ -80,10 +78,7 @@ def report_runs(
     looks, meanings = [], []
     progress(0.0, "")
     for index, (run, described) in enumerate(zip(opened, facts, strict=True)):
-
-        def on_progress(fraction: float, index: int = index, label: str = described.label) -> None:
-            progress((index + fraction) / len(runs), label)
-
+        on_progress = part_of(progress, index / len(runs), (index + 1) / len(runs), described.label)
         model = run.model(device_name(device))
         if model.sha256 != hashes[index]:
             raise UserError(

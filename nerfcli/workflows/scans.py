@@ -1,6 +1,5 @@
 """Conversion, checks and description of X-ray scans."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,23 +39,6 @@ _FILE_SUFFIXES = (
 TOLERANCES = {"angle_deg": 1e-9, "length": 1e-9, "shift_px": 1e-6, "tilt_deg": 1e-9}
 
 
-@dataclass(frozen=True)
-class ConvertedScan:
-    """Result of converting a scan.
-
-    Args:
-        path: the written folder or file.
-        scan: as read back from a written folder; as read from the source if only ASTRA's vectors were written.
-        record: plain values for JSON.
-        lines: for the user.
-    """
-
-    path: Path
-    scan: Scan
-    record: dict[str, Any]
-    lines: tuple[str, ...]
-
-
 def convert_scan(
     source: Path,
     target: Path,
@@ -65,8 +47,8 @@ def convert_scan(
     given: ScanOptions = ScanOptions(),
     overwrite: bool = False,
     notify: Notify = silent,
-) -> ConvertedScan:
-    """Write a scan as a scan folder, or its geometry as ASTRA's vectors.
+) -> dict[str, Any]:
+    """Write a scan as a scan folder, or its geometry as ASTRA's vectors, and return its record as plain values.
 
     A written folder is read back, and the angles, distances and pixel sizes stated by the source are recovered from it.
 
@@ -76,7 +58,6 @@ def convert_scan(
         to: nerfcli or astra.
         given: properties of the scan that the user states.
         overwrite: replace a scan folder, or a file of vectors.
-        notify: called with lines for the user.
 
     Raises:
         UserError: the scan cannot be read or written, `target` exists, or the written scan differs from its source.
@@ -91,23 +72,19 @@ def convert_scan(
         raise UserError(f"{target} exists", what)
     if target.exists() and target.resolve() == source.resolve():
         raise UserError(f"{target} is the input itself", "choose another output path")
+    scan = read_scan(source, given)
     if to == ASTRA:
-        scan = read_scan(source, given)
         facts = write_astra(scan, target)
         notify(f"{source}: {in_words(scan)}")
-        record = {"to": to, "views": scan.geometry.views, "json": str(facts)}
-        return ConvertedScan(target, scan, record, ())
-    scan = read_scan(source, given)
+        return {"to": to, "views": scan.geometry.views, "json": str(facts)}
     notify(f"{source}: {scan.history.get('format')}, {in_words(scan)}")
     for note in scan.history.get("notes", ()):
         notify(note)
     save_scan(target, scan)
     stored = load_scan(target)
     checks = _read_back(scan, stored)
-    line = _proof(checks)
-    notify(f"{target}: {line}")
-    record = {"from": scan.history.get("format"), "to": to, **facts_of(stored), "read_back": checks}
-    return ConvertedScan(target, stored, record, (line,))
+    notify(f"{target}: {_proof(checks)}")
+    return {"from": scan.history.get("format"), "to": to, **facts_of(stored), "read_back": checks}
 
 
 def detect_scan(
@@ -175,15 +152,15 @@ def facts_of(scan: Scan) -> dict[str, Any]:
         "views": geometry.views,
         "held_out": len(scan.held_out),
         "detector": f"{geometry.columns} x {geometry.rows} pixels",
-        "beam": "fan" if geometry.beam == "cone" and geometry.rows == 1 else geometry.beam,
+        "beam": _beam(scan),
         "values": scan.kind,
         "unit": scan.unit,
-        "pixel_at_object": {"width": float(f"{width:.6g}"), "height": float(f"{height:.6g}")},
-        "magnification": float(f"{np.median(geometry.magnification):.6g}"),
+        "pixel_at_object": {"width": _rounded(width), "height": _rounded(height)},
+        "magnification": _rounded(np.median(geometry.magnification)),
         "angles_deg": {"from": _rounded(angles.min()), "to": _rounded(angles.max())} if around else None,
         "orbit": "a circle" if around else "views that are not on one circle",
-        "source_origin": float(f"{circle.source_origin:.6g}") if around and geometry.beam == "cone" else None,
-        "source_detector": float(f"{circle.source_detector:.6g}") if around and geometry.beam == "cone" else None,
+        "source_origin": _rounded(circle.source_origin) if around and geometry.beam == "cone" else None,
+        "source_detector": _rounded(circle.source_detector) if around and geometry.beam == "cone" else None,
         "axis_column": float(f"{axis_column(geometry):.6g}"),
         "photons_per_value": scan.photons_per_value,
         "unusable": None if scan.usable is None else float(f"{1 - float(scan.usable.mean()):.4g}"),
@@ -195,21 +172,20 @@ def _rounded(value: float) -> float:
     return float(f"{value:.6g}") + 0.0  # no minus before 0
 
 
+def _beam(scan: Scan) -> str:
+    return "fan" if scan.geometry.beam == "cone" and scan.geometry.rows == 1 else scan.geometry.beam
+
+
 def in_words(scan: Scan) -> str:
     """Describe a scan in a few words."""
     geometry = scan.geometry
-    beam = "fan" if geometry.beam == "cone" and geometry.rows == 1 else geometry.beam
     size = f"{geometry.columns} x {geometry.rows} pixels"
-    words = f"{geometry.views} views of {size}, {beam} beam, {scan.kind.replace('_', ' ')}s"
+    words = f"{geometry.views} views of {size}, {_beam(scan)} beam, {scan.kind.replace('_', ' ')}s"
     return words.replace("countss", "counts") + f", {len(scan.held_out)} held out"
 
 
 def _read_back(scan: Scan, stored: Scan) -> dict[str, float]:
-    """Return the differences between a scan as its source states it and as stored in the folder.
-
-    Raises:
-        UserError: a difference is larger than rounding.
-    """
+    """Return how much a scan as its source states it differs from the stored one; raise if it is more than rounding."""
     checks = {"vector": float(np.abs(stored.geometry.vectors() - scan.geometry.vectors()).max())}
     checks["value"] = float(np.abs(np.asarray(stored.values) - scan.values).max())
     largest = float(np.abs(scan.geometry.vectors()).max())

@@ -72,8 +72,6 @@ def train_scan(
         settings: budget, field, and values that are not to be estimated from the scan.
         resume: continue from the volume in `run`; start from the beginning if there is none.
         overwrite: replace another run at `run`.
-        notify, warn: called with lines for the user.
-        progress: called with the fraction of the budget and a short text.
 
     Raises:
         UserError: the scan cannot be read, or `run` holds something else, or an interrupted fit without `resume`.

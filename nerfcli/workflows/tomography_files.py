@@ -43,9 +43,6 @@ def render_scan(
         views: "test" for the held-out ones, "train" for the fitted ones.
         slices: (axis, position in the scan's unit); if given, slices and their marks replace the projections.
         threads: number of CPU threads; 0 for all.
-        overwrite: replace existing files.
-        notify: called with lines for the user.
-        progress: called with the fraction done and a short text.
 
     Returns:
         The paths of the float files.
@@ -101,8 +98,6 @@ def export_scan(
         run: the folder that `train_scan` wrote.
         target: the file; its suffix determines the format.
         water: attenuation of water in 1 / unit, to write Hounsfield units, 1000 (mu / water - 1); None for attenuation.
-        overwrite: replace existing files.
-        notify: called with lines for the user.
 
     Raises:
         UserError: there is no reconstruction, or a file exists.

@@ -40,12 +40,9 @@ def evaluate_scan(
     Args:
         run: the folder that `train_scan` wrote.
         threads: number of CPU threads; 0 for all.
-        overwrite: measure again.
         baselines: also measure filtered back-projection and SART with total variation on the same views.
         reference: folder of another reconstruction, usually from more views, to compare volumes with. It is not the
             truth: it has errors too, and errors common to both do not show.
-        notify: called with lines for the user.
-        progress: called with the fraction done and a short text.
 
     Raises:
         UserError: there is no reconstruction, its scan has changed, or the reference has another unit or is not the one

@@ -1,13 +1,13 @@
 """Train a scene, keep an existing run, resume one, or refuse to overwrite another one."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from nerfcli import scene as scenes
 from nerfcli.atomic import clear_leftovers
 from nerfcli.cameras.orientation import describe_rescaling
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, listed
 from nerfcli.exclusive import exclusive
 from nerfcli.runs.blocks import divide
 from nerfcli.runs.config import split_hash
@@ -17,7 +17,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train import loop
 from nerfcli.train.following import follow
-from nerfcli.train.ranks import SingleProcess, joined_ranks
+from nerfcli.train.ranks import joined_ranks
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.workflows.view_worker import viewer_beside
 
@@ -105,9 +105,8 @@ def _trained(
     """See `train_scene`."""
     loaded = scene_for(settings, folder, holdout=holdout)
     if loaded.missing:
-        listed = ", ".join(loaded.missing[:NAMES_SHOWN])
-        more = f" and {len(loaded.missing) - NAMES_SHOWN} more" if len(loaded.missing) > NAMES_SHOWN else ""
-        warn(f"{len(loaded.missing)} photos of {folder} are missing and skipped: {listed}{more}")
+        names = listed(loaded.missing, NAMES_SHOWN)
+        warn(f"{len(loaded.missing)} photos of {folder} are missing and skipped: {names}")
     for text in describe_rescaling(loaded.rescaled):
         notify(text)
 
@@ -140,16 +139,23 @@ def _trained(
         if overwrite:
             (run / METRICS).unlink(missing_ok=True)  # they belong to the field that is replaced
         with viewer_beside(run, threads=settings.threads, notify=notify) as start_viewer:
-            _fit(
+
+            def on_progress(state: loop.Progress) -> None:
+                if view:  # cameras and configuration have been written by now
+                    start_viewer()
+                speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
+                progress(state.fraction, f"step {state.step}  loss {state.loss:.4f}  {speed}")
+
+            progress(0.0, "")
+            loop.train(
                 loaded,
                 run,
                 settings,
+                resume=resume,
                 memory_bytes=memory_bytes,
                 ranks=ranks,
-                resume=resume,
-                on_begin=start_viewer if view else lambda: None,
                 notify=notify,
-                progress=progress,
+                on_progress=on_progress,
             )
     return Run(run)
 
@@ -182,7 +188,6 @@ def train_again(
         run: a complete run.
         others: the folders to write, and the settings of each.
         resume: also continue complete runs to the budget or step count of their settings.
-        overwrite: replace other runs.
         memory_bytes, notify, warn, progress: see `train_scene`.
 
     Raises:
@@ -277,11 +282,7 @@ def scene_for(settings: TrainSettings, folder: Path, *, holdout: str | None) -> 
 
 
 def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:
-    """Return whether the run at `path` is complete with these settings and can be kept.
-
-    Raises:
-        UserError: `path` holds something else that may not be replaced.
-    """
+    """Return whether the run at `path` is complete with these settings; raise if it may not be replaced otherwise."""
     run = Run(path)
     if resume and run.config.split_sha256 != split_hash(scene.test_names):
         before = run.config.holdout
@@ -310,35 +311,3 @@ def _refuse_others(path: Path) -> None:
     others = path.is_dir() and not (path / CONFIG).exists() and any(entry.name != LOCK for entry in path.iterdir())
     if path.is_file() or others:
         raise UserError(f"{path} exists and is not a run folder", "choose another folder with -o")
-
-
-def _fit(
-    scene: Scene,
-    run: Path,
-    settings: TrainSettings,
-    *,
-    memory_bytes: int | None,
-    ranks: SingleProcess,
-    resume: bool,
-    on_begin: Callable[[], None],
-    notify: Notify,
-    progress: Progress,
-) -> None:
-    """Train; `on_begin` is called after every step, when cameras and configuration have been written."""
-
-    def on_progress(state: loop.Progress) -> None:
-        on_begin()
-        speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
-        progress(state.fraction, f"step {state.step}  loss {state.loss:.4f}  {speed}")
-
-    progress(0.0, "")
-    loop.train(
-        scene,
-        run,
-        settings,
-        resume=resume,
-        memory_bytes=memory_bytes,
-        ranks=ranks,
-        notify=notify,
-        on_progress=on_progress,
-    )
