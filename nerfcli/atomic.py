@@ -84,8 +84,10 @@ def replace_folder(complete: Path, path: Path) -> None:
 def clear_leftovers(folder: Path) -> None:
     """Remove leftovers of killed processes in a folder: partial results, and old results moved aside, which are
     restored if nothing has replaced them. Files of running processes are kept."""
-    found = [match for match in map(_LEFTOVER.fullmatch, _names(folder)) if match and not _lives(int(match["process"]))]
-    for match in found:
+    hidden = [path.name for path in folder.glob(".*")]
+    for match in map(_LEFTOVER.fullmatch, hidden):
+        if match is None or _lives(int(match["process"])):
+            continue
         path, place = folder / match.string, folder / match["name"]
         with suppress(OSError):  # another command is doing the same, or the file does no harm
             if match["kind"] == "old" and not place.exists():
@@ -94,13 +96,6 @@ def clear_leftovers(folder: Path) -> None:
                 shutil.rmtree(path)
             else:
                 path.unlink()
-
-
-def _names(folder: Path) -> list[str]:
-    try:
-        return os.listdir(folder)
-    except OSError:  # the folder does not exist yet
-        return []
 
 
 def _lives(process: int) -> bool:

@@ -20,7 +20,7 @@ from nerfcli.child import take_stdout
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import psnr, to_8_bit
 from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
-from nerfcli.evaluate.run_photos import held_out_photos
+from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.field.cost import field_bytes
 from nerfcli.memory import keep_freed_memory
@@ -102,13 +102,7 @@ def _train_and_measure(job: dict[str, Any], send: Callable[[dict[str, Any]], Non
     summary, model = trained.summary, trained.model(settings.device)
     assert summary is not None
     send({"fraction": 1.0, "detail": "comparing with held-out photos"})
-    held_out = held_out_photos(
-        scene.test_frames,
-        model,
-        downscale=trained.config.downscale,
-        masks=trained.components.masks,
-        threads=settings.threads,
-    )
+    held_out = held_out_photos_of(trained.config, scene.test_frames, model, threads=settings.threads)
     return {
         "seconds": summary.seconds,
         "steps": summary.steps,

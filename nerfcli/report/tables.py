@@ -37,17 +37,12 @@ def _protocols_html(runs: Sequence[RunFacts]) -> str:
 
 def metric(key: str, form: str) -> Callable[[RunFacts], str]:
     """Return a formatter of a mean over the held-out photos; it gives "" if there is none."""
-
-    def read(run: RunFacts) -> str:
-        value = (run.metrics or {}).get("mean", {}).get(key)
-        return form.format(value) if isinstance(value, int | float) else ""
-
-    return read
+    return _of("mean", key, form)
 
 
 def _of(part: str, key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
     def read(run: RunFacts) -> str:
-        content: dict[str, Any] = (run.metrics if part in ("training", "render") else run.poses) or {}
+        content: dict[str, Any] = (run.metrics if part in ("mean", "training", "render") else run.poses) or {}
         value = content.get(part, content).get(key) if part else content.get(key)
         return form.format(value / scale) if isinstance(value, int | float) else ""
 
@@ -72,7 +67,7 @@ def _shape(run: RunFacts) -> str:
     return f"{shape['gain_db']:+.2f} dB" if shape else ""
 
 
-def number(value: float | None, digits: int) -> str:
+def _number(value: float | None, digits: int) -> str:
     """Format a number with `digits` decimals; "" for None."""
     return "" if value is None else f"{value:.{digits}f}"
 
@@ -133,7 +128,7 @@ def _photos_html(runs: Sequence[RunFacts], *, of_many: bool) -> str:
         row = [name]
         for images in by_run:
             image = images.get(name, {})
-            row += [number(image.get("psnr"), 2), number(image.get("ssim"), 4)]
+            row += [_number(image.get("psnr"), 2), _number(image.get("ssim"), 4)]
         view = next((images[name]["view"] for images in by_run if "view" in images.get(name, {})), None)
         rows.append([*row, *_novelty(view)])
     columns += ["nearest training view", "distance / scene radius", "degrees between", "type of view"]
@@ -144,7 +139,7 @@ def _novelty(view: dict[str, Any] | None) -> list[str]:
     """Format how far a held-out view is from the nearest training view."""
     if view is None:
         return ["", "", "", ""]
-    distance, angle = number(view.get("distance_relative"), 3), number(view.get("angle_deg"), 1)
+    distance, angle = _number(view.get("distance_relative"), 3), _number(view.get("angle_deg"), 1)
     return [str(view.get("nearest") or ""), distance, angle, str(view.get("kind") or "")]
 
 

@@ -3,7 +3,7 @@
 import hashlib
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,6 @@ class RunConfig:
     """Source and settings of a run; entries missing in files of earlier versions have their defaults.
 
     Args:
-        settings: as requested, with the downscale and contraction that were chosen.
         scene: the folder of the scene, absolute or relative to the working directory of the training.
         scene_kind: the format of the scene, see `Scene`.
         unit, unit_source: unit of length, see `Scene`.
@@ -36,11 +35,11 @@ class RunConfig:
         history: how cameras and points were found, see `Scene`; None if not recorded.
         missing_photos: photos that the scene lists but that were not on disk.
         warnings: warnings about the scene.
+        settings: as requested, with the downscale and contraction that were chosen.
         selection: automatic selection of the components, if there was one; without its exposures.
         versions: versions of nerfcli, Python, torch and NumPy.
     """
 
-    settings: TrainSettings = field(default_factory=TrainSettings)
     scene: Path = Path()
     scene_kind: str | None = None
     unit: str | None = None
@@ -51,6 +50,7 @@ class RunConfig:
     history: Mapping[str, Any] | None = None
     missing_photos: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    settings: TrainSettings = field(default_factory=TrainSettings)
     selection: Selection | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -112,16 +112,10 @@ class RunConfig:
         return self.settings.downscale or 1
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of the file; its keys are in the same order as in all earlier versions."""
+        """Return the content of the file; its keys, as the fields, are in the same order as in all earlier versions."""
         return {
+            **{entry.name: getattr(self, entry.name) for entry in fields(self)},
             "scene": str(self.scene),
-            "scene_kind": self.scene_kind,
-            "unit": self.unit,
-            "unit_source": self.unit_source,
-            "scene_fingerprint": self.scene_fingerprint,
-            "split_sha256": self.split_sha256,
-            "holdout": self.holdout,
-            "history": self.history,
             "missing_photos": list(self.missing_photos),
             "warnings": list(self.warnings),
             "settings": self.settings.to_json(),
