@@ -310,7 +310,7 @@ def test_curves_go_where_their_values_say():
     """Linear values on a linear axis, and decades on a logarithmic one, are evenly spaced and rise to the right."""
 
     def rows(y: list[float], *, logarithmic: bool) -> np.ndarray:
-        drawn = curves([Curve(0, "a", [0, 1, 2], y)], x_title="s", y_title="y", logarithmic=logarithmic)
+        drawn = curves([Curve(0, "a", [0, 1, 2], y)], y_title="y", logarithmic=logarithmic)
         found = re.search(r'points="([^"]+)"', drawn)
         assert found is not None
         return np.array([point.split(",") for point in found[1].split()], float)
@@ -320,9 +320,9 @@ def test_curves_go_where_their_values_say():
         assert np.diff(points[:, 0]) == pytest.approx(np.diff(points[:, 0])[0], abs=0.11)
         assert np.diff(points[:, 1]) == pytest.approx(np.diff(points[:, 1])[0], abs=0.11)
         assert points[0, 1] > points[-1, 1]
-    assert curves([Curve(0, "a", [0.0], [float("nan")])], x_title="s", y_title="y") == ""
-    assert curves([Curve(0, "a", [0.0], [0.0])], x_title="s", y_title="y", logarithmic=True) == ""
-    assert "<circle" in curves([Curve(0, "a", [0.0], [1.0], dots=True)], x_title="s", y_title="y")
+    assert curves([Curve(0, "a", [0.0], [float("nan")])], y_title="y") == ""
+    assert curves([Curve(0, "a", [0.0], [0.0])], y_title="y", logarithmic=True) == ""
+    assert "<circle" in curves([Curve(0, "a", [0.0], [1.0], dots=True)], y_title="y")
 
 
 def test_a_ring_of_cameras_is_drawn_as_a_ring_whichever_way_it_is_turned():

@@ -38,16 +38,13 @@ class ResultRow:
     """A variant against the chosen model.
 
     Args:
-        name: name of the variant.
         psnr: mean PSNR over its seeds, in dB.
         ssim: mean SSIM over its seeds; None if it is not known.
         difference_db: mean PSNR difference of the variant from the chosen model, over the seeds that both have; None
             for the chosen model itself and if they have no seed in common.
         interval_db: half the width of the 95 % interval of that mean, by Student's t over seeds; None for one seed.
         seconds, steps: means per training.
-        seeds: number of seeds.
         verdict: a short text such as "better"; empty where nothing can be compared.
-        protocol: protocol of the measurements.
     """
 
     name: str
@@ -123,9 +120,6 @@ def write_results(
     """Write FOLDER/ablation.json and ablation.csv.
 
     Args:
-        folder: folder of the ablation.
-        rows: rows of the table.
-        measured: every training.
         about: description of the ablation's subject, as plain values.
     """
     content = {

@@ -16,7 +16,6 @@ class Variant:
 
     Args:
         name: name of its row and its folders.
-        components: its components.
         adds: True if it has one component more than the chosen model, False for one less; None for the chosen model.
     """
 

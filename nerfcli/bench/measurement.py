@@ -39,7 +39,6 @@ class BenchOptions:
     Args:
         budget_seconds: time limit for everything.
         sweep: "both", "render" or "train".
-        seed: seed of the trainings.
     """
 
     budget_seconds: float
@@ -77,7 +76,6 @@ def measure(
     Args:
         subject: a run or a scene.
         records: from `open_bench`.
-        wanted: options of the bench.
 
     Raises:
         UserError: a photo cannot be read, or the results cannot be written.

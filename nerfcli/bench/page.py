@@ -28,7 +28,6 @@ def bench_page(content: Mapping[str, Any], pictures: Mapping[str, str], folder: 
     Args:
         content: the output of `summary.summarised`.
         pictures: pictures of the points as data URIs, by name.
-        folder: folder of the bench.
     """
     machine = content["machine"]
     here = Path(__file__)

@@ -55,7 +55,6 @@ def measure_rendering(
     """Measure as many rendering settings as time allows, continuing an earlier call.
 
     Args:
-        model: the trained field.
         photos: the held-out photos, at least one.
         settings: rendering settings, the default first, then the most informative ones first.
         session: records the measurements: "rendering plan", "converged", "float64", "picture" and "time".
@@ -72,7 +71,7 @@ def measure_rendering(
     subject = _Subject(models, used, _converged(model, used, session=session))
     if session.records.last("float64") is None:
         session.say("checking against float64")
-        error = distance_to_float64(model, used[0], seed=0, count=_FLOAT64_PIXELS)
+        error = distance_to_float64(model, used[0], count=_FLOAT64_PIXELS)
         session.record("float64", error=error, pixels=_FLOAT64_PIXELS)
     done = {entry["point"] for entry in session.records.of_kind("picture")}
     for number, setting in enumerate(chosen):

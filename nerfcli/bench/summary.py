@@ -21,7 +21,6 @@ def summarised(records: Records, plan: dict[str, Any]) -> dict[str, Any]:
     """Return all numbers of a complete or interrupted bench as plain values.
 
     Args:
-        records: the measurements.
         plan: subject and options of the bench; the content of plan.json.
     """
     begun = list(records.of_kind("begun"))
@@ -134,15 +133,9 @@ def _training_point(entry: dict[str, Any]) -> dict[str, Any]:
     prefix = slug(f"training {entry['point']}")
     return {
         "name": entry["point"],
-        "group": entry["group"],
-        "options": entry["options"],
-        "settings": entry["settings"],
+        **{name: entry[name] for name in ("group", "options", "settings")},
         "seconds": asdict(TimeSpread.of([entry["seconds"]])),
-        "steps": entry["steps"],
-        "samples_per_second": entry["samples_per_second"],
-        "peak_memory_bytes": entry["peak_memory_bytes"],
-        "field_bytes": entry["field_bytes"],
-        "psnr": entry["psnr"],
+        **{name: entry[name] for name in ("steps", "samples_per_second", "peak_memory_bytes", "field_bytes", "psnr")},
         "quadrature_levels": LEVELS * entry["quadrature"],
         "render_seconds": asdict(TimeSpread.of(entry["render_seconds"])),
         "render_size": entry["render_size"],

@@ -91,12 +91,12 @@ def _run_at(path: Path, usual: TrainSettings) -> BenchedRun:
         test_frames=run.cameras.test,
         base=replace(usual, downscale=trained.downscale, components=trained.components),
         identity=run.checkpoint_sha256(),
-        trained=_trained(run),
+        trained=training_record(run),
         why_no_scene=why,
     )
 
 
-def _trained(run: Run) -> dict[str, Any]:
+def training_record(run: Run) -> dict[str, Any]:
     """Return the run's summary of its training, with the keys of the records; empty without a summary."""
     summary = {} if run.summary is None else asdict(run.summary)
     return {name: value for name, value in summary.items() if name != "rays_per_second"}

@@ -25,7 +25,6 @@ class Trainings:
     """Common data of all trainings of a bench.
 
     Args:
-        scene: the folder of the scene.
         base: settings that are not varied.
         shown: the name of the held-out photo that is rendered.
         kept: the name of the setting whose field is kept in the folder of the bench; None for none.
@@ -43,7 +42,6 @@ def measure_trainings(
     """Train as many settings as time allows, continuing an earlier call.
 
     Args:
-        trainings: common data of the trainings.
         settings: training settings, the most informative first.
         session: records the measurements: "training plan", "training" and "failed".
         seconds: time limit for all of this.

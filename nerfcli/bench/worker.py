@@ -16,6 +16,7 @@ from nerfcli import kernels
 from nerfcli import scene as scenes
 from nerfcli.bench.convergence import quadrature, smaller
 from nerfcli.bench.sample_pictures import MOST_ERROR, write_difference, write_picture
+from nerfcli.bench.trained_run import training_record
 from nerfcli.child import take_stdout
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import psnr, to_8_bit
@@ -53,7 +54,6 @@ def measure_model(
     """Measure the rendering time and the error of a field.
 
     Args:
-        model: the trained field.
         held_out: the held-out photos at the resolution of the training.
         seed: seed for the choice of pixels.
         folder: where the pictures are written, under names that begin with `prefix`.
@@ -99,15 +99,11 @@ def _train_and_measure(job: dict[str, Any], send: Callable[[dict[str, Any]], Non
 
     train(scene, run, settings, resume=False, notify=lambda text: None, on_progress=on_progress)
     trained = Run(run)
-    summary, model = trained.summary, trained.model(settings.device)
-    assert summary is not None
+    model = trained.model(settings.device)
     send({"fraction": 1.0, "detail": "comparing with held-out photos"})
     held_out = held_out_photos_of(trained.config, scene.test_frames, model, threads=settings.threads)
     return {
-        "seconds": summary.seconds,
-        "steps": summary.steps,
-        "samples_per_second": summary.samples_per_second,
-        "peak_memory_bytes": summary.peak_memory_bytes,
+        **training_record(trained),
         "compiled": settings.device == "cpu" and _has_compiled(settings),
         **measure_model(
             model,

@@ -22,43 +22,40 @@ _COMPONENTS = "tv=WEIGHT, centre=COLUMNS, tilt=DEGREES, air=measured"
 
 
 def reconstruction_settings(
-    *,
-    budget_seconds: float | None,
-    passes: int | None,
-    field: str | None,
-    voxel_size: float | None,
-    include: list[str] | None,
-    exclude: list[str] | None,
-    seed: int,
-    threads: int,
+    given: dict[str, Any], *, budget_seconds: float | None, threads: int
 ) -> "ReconstructionSettings":
-    """Build the settings of a reconstruction from the options of train.
+    """Build the settings of a reconstruction.
+
+    Args:
+        given: values of the parameters of train, by name.
+        budget_seconds, threads: the budget and the threads in it, parsed.
 
     Raises:
         UserError: scans do not have such a component or type of field, or a component's value is not a number.
     """
     from nerfcli.tomography.result import FIELDS, ReconstructionSettings
 
+    field = given["field"]
     if field is not None and field not in FIELDS:
         raise UserError(f"scans cannot use --field {field}", f"choose {' or '.join(FIELDS)}")
     values: dict[str, float | bool | None] = {"tv": None, "centre": None, "tilt": None, "air": None}
-    for text in exclude or ():
+    for text in given["exclude"] or ():
         values.update({_component(text, "--without"): 0.0 if text != "air" else False})
-    for text in include or ():
+    for text in given["include"] or ():
         name, _, value = text.partition("=")
         name = _component(name, "--with")
         values[name] = value == "measured" if name == "air" else _number(text, value)
     tilt = values["tilt"]
     return ReconstructionSettings(
         budget_seconds=budget_seconds,
-        passes=passes,
+        passes=given["steps"],
         field=field or "voxels",
-        voxel_size=voxel_size,
+        voxel_size=given["voxel_size"],
         strength=values["tv"],
         centre=values["centre"],
         tilt=None if tilt is None else math.radians(tilt),
         air=None if values["air"] is None else bool(values["air"]),
-        seed=seed if field == "hash" else 0,
+        seed=given["seed"] if field == "hash" else 0,
         threads=threads,
     )
 

@@ -206,16 +206,7 @@ def train(
         from nerfcli.workflows.tomography import train_scan
 
         refuse_photo_options(folder, train, values, of_scans=_OF_SCANS)
-        settings = reconstruction_settings(
-            budget_seconds=budget_seconds,
-            passes=steps,
-            field=field,
-            voxel_size=voxel_size,
-            include=include,
-            exclude=exclude,
-            seed=seed,
-            threads=thread_count(threads),
-        )
+        settings = reconstruction_settings(values, budget_seconds=budget_seconds, threads=thread_count(threads))
         with console.callbacks(f"train {folder.name}") as callbacks:
             train_scan(folder, run, settings, resume=resume, overwrite=overwrite, warn=console.warn, **callbacks)
 

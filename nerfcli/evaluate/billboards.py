@@ -203,7 +203,6 @@ class GeometryComparison:
         """Compare random pixels of one held-out photo, reduced to the size of the billboards.
 
         Args:
-            frame: the view.
             rendered: (H, W, 3) sRGB of the field.
             photo: (H, W, 3) uint8.
             used: (H, W) bool, the pixels that count; at least one.

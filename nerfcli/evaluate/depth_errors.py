@@ -38,7 +38,6 @@ def measure_depth_errors(
 
     Args:
         run: a run whose held-out photos are on disk.
-        model: its field.
         photo_depths: depth maps of its training photos, in their order.
         threads: number of photos in progress.
 

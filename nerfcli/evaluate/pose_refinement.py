@@ -75,11 +75,9 @@ def align_pose(
     recovers from an error of about one pixel of the measured picture; from three it ends in the nearest local minimum.
 
     Args:
-        model: the trained model.
         frame: the photo's camera and pose.
         colours: (H, W, 3) the photo, float in [0, 1].
         used: (H, W) bool, the pixels to use.
-        background: the background of the renders.
         log_gains: the photo's exposure, as in `protocol.HeldOutPhoto`.
 
     Returns:

@@ -102,10 +102,8 @@ def evaluate_model(
     the gains fitted to it. Unknown values are None.
 
     Args:
-        model: the trained model.
         held_out: the photos, at least one.
         on_image: called with (rays done, total rays).
-        extras: optional measurements.
 
     Returns:
         The keys "protocol", "shape", "warnings", "mean", "images", "kinds" and "render" of metrics.json.

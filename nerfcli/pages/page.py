@@ -48,7 +48,6 @@ def page_html(
 
     Args:
         title: plain text.
-        mark: mark of the page's source.
         style: CSS that follows `page.css`.
         body: HTML, in which all outside text is escaped.
         script: JavaScript that runs once the body exists; for its data see `data_element`.

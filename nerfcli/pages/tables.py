@@ -8,7 +8,6 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Col
     """Return a table that scrolls sideways where the window is too narrow; all cells are plain text.
 
     Args:
-        columns: the headings.
         rows: each with as many cells.
         numbers: indices of the columns that are aligned to the right.
     """

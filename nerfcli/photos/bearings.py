@@ -28,7 +28,6 @@ class BearingTables:
 
     Args:
         cameras: (P,) of the photos.
-        device: of the tensors.
         storage: for the tables, which may be as large as photos.
     """
 

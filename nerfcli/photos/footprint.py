@@ -16,7 +16,6 @@ def pixel_footprint(frames: Sequence[Frame], training_from_scene: Similarity) ->
 
     Args:
         frames: with the cameras of the downscaled training photos.
-        training_from_scene: the normalisation.
     """
     footprints = []
     for frame in frames:

@@ -33,7 +33,6 @@ def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: 
 
     Args:
         frames: with their images and masks.
-        factor: of the downscaling.
         masks: meaning of black in masks: "ignore" (not used), or "empty" (transparent).
 
     Raises:

@@ -138,7 +138,6 @@ class PixelPool:
 
     Args:
         photos: at least one.
-        training_from_scene: the normalisation.
         device: where the pixels are drawn.
         colours: of all photos in one array, if there is such an array already.
         storage: for arrays as large as the photos.

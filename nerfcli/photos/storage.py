@@ -132,8 +132,6 @@ def check_device_memory(needs: MemoryNeeds, device: torch.device, limit: int | N
     """Limit the memory that torch uses on a CUDA device, and return a message for the user.
 
     Args:
-        needs: of the training run.
-        device: the device that it will run on.
         limit: bytes that it may use there; None for all free memory.
 
     Raises:
@@ -159,7 +157,6 @@ def storage_for(needs: MemoryNeeds, limit: int | None, *, folder: Path) -> tuple
     Args:
         needs: of all photos and the field.
         limit: bytes that may be resident; None for no limit.
-        folder: for files with photos.
 
     Raises:
         UserError: the training does not fit, even with the photos on the disk.

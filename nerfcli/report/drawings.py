@@ -28,13 +28,12 @@ class Curve:
     dots: bool = False
 
 
-def curves(drawn: Sequence[Curve], *, x_title: str, y_title: str, logarithmic: bool = False) -> str:
+def curves(drawn: Sequence[Curve], *, y_title: str, logarithmic: bool = False) -> str:
     """Draw curves on common axes; return "" if there is nothing to draw.
 
     Args:
         drawn: curves; values that are not finite, or not positive on a logarithmic axis, are left out.
-        x_title, y_title: titles of the axes, with the unit.
-        logarithmic: use a logarithmic y axis.
+        y_title: title of the y axis, with the unit; x is in seconds.
     """
     points = [
         [
@@ -63,7 +62,7 @@ def curves(drawn: Sequence[Curve], *, x_title: str, y_title: str, logarithmic: b
     for tick in _ticks(low_x, high_x):
         x = place(tick, low_y)[0]
         parts.append(f'<text x="{x:.1f}" y="{_HEIGHT - 18}" text-anchor="middle">{_number(tick)}</text>')
-    parts.append(f'<text x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 3}" text-anchor="end">{escape(x_title)}</text>')
+    parts.append(f'<text x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 3}" text-anchor="end">s</text>')
     for curve, own in zip(drawn, points, strict=True):
         parts.append(_line(curve, [place(*point) for point in _thinned(own)]))
         if curve.dots:

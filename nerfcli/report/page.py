@@ -53,7 +53,6 @@ def origin_of(runs: Sequence[RunFacts], hashes: Sequence[str], *, views: int, de
     """Return a digest of everything a page is made from: fields, metrics, logs, settings, and display options.
 
     Args:
-        runs: facts from the folders.
         hashes: digests of their fields.
         views, depth: number of held-out photos to show, and the depth that is shown.
     """
@@ -213,10 +212,10 @@ def _curves_html(runs: Sequence[RunFacts]) -> str:
         return found
 
     charts = (
-        ("PSNR of held-out pixels, dB", curves(drawn("heldout_psnr", dots=True), x_title="s", y_title="dB")),
-        ("Loss", curves(drawn("loss"), x_title="s", y_title="loss", logarithmic=True)),
-        ("Samples per second, M", curves(drawn("samples_per_second", scale=_MEGA), x_title="s", y_title="M/s")),
-        ("Peak memory, MB", curves(drawn("peak_memory_bytes", scale=_MEGA), x_title="s", y_title="MB")),
+        ("PSNR of held-out pixels, dB", curves(drawn("heldout_psnr", dots=True), y_title="dB")),
+        ("Loss", curves(drawn("loss"), y_title="loss", logarithmic=True)),
+        ("Samples per second, M", curves(drawn("samples_per_second", scale=_MEGA), y_title="M/s")),
+        ("Peak memory, MB", curves(drawn("peak_memory_bytes", scale=_MEGA), y_title="MB")),
     )
     key = "".join(
         f'<span><i class="s{index % COLOURS}"></i>{escape(run.label)}</span>' for index, run in enumerate(runs)

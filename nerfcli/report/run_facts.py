@@ -24,7 +24,6 @@ class RunFacts:
     """Facts of one run.
 
     Args:
-        path: its folder.
         label: its name on the page.
         config: RUN/config.json.
         log: RUN/log.jsonl.
@@ -48,7 +47,6 @@ def read_facts(run: Run, label: str, *, checkpoint_sha256: str) -> RunFacts:
     """Read all facts of a run.
 
     Args:
-        run: the run.
         label: its name on the page.
         checkpoint_sha256: digest of its field; metrics of another checkpoint are left out.
 

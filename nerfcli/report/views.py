@@ -77,9 +77,7 @@ def look_at(
     """Render held-out photos of a run.
 
     Args:
-        model: the trained model.
         held_out: the photos; their masks must leave pixels to compare.
-        depth: definition of the depth to show.
         photo_depths: depths of all training photos.
     """
     views = []

@@ -184,7 +184,6 @@ def _occupied(field: BlocksField, *, cells: int) -> Tensor:
     """Return the cells (G, G, G) of a joined field's cube that are occupied or next to an occupied one, bool.
 
     Args:
-        field: the joined field.
         cells: number of cells along a side, with cells no larger than those of a block's occupancy; the result has
             fewer if this is more than `MOST_CELLS`.
     """

@@ -64,15 +64,7 @@ class RunConfig:
         contraction: str,
         selection: Selection | None = None,
     ) -> "RunConfig":
-        """Describe a training that begins now.
-
-        Args:
-            scene: the scene that is trained on.
-            settings: as requested.
-            factor: downscale factor of the photos.
-            contraction: contraction of the field.
-            selection: automatic selection of the components, if there was one.
-        """
+        """Describe a training that begins now."""
         return cls(
             settings=replace(settings, downscale=factor, contraction=contraction),
             scene=scene.root,

@@ -106,18 +106,14 @@ class TrainSettings:
             raise UserError(f"invalid downscale factor {self.downscale}", "choose auto, 1, 2, 4 or 8")
         if self.field not in KINDS:
             raise UserError(f"unknown type of field: {self.field!r}", f"choose {', '.join(KINDS)}")
-        if self.components.antialias and self.field != HashFieldSettings.kind:
-            raise UserError(
-                f"--with antialias does not work with --field {self.field}: it needs the levels of a hash grid",
-                "use --field hash, or remove --with antialias",
-                2,
-            )
-        if self.random_start and self.field != HashFieldSettings.kind:
-            raise UserError(
-                f"--vary prior does not work with --field {self.field}: it needs the levels of a hash grid",
-                "use --field hash, or another --vary",
-                2,
-            )
+        of_levels = {
+            "--with antialias": (self.components.antialias, "remove --with antialias"),
+            "--vary prior": (self.random_start, "another --vary"),
+        }
+        for option, (given, instead) in of_levels.items():
+            if given and self.field != HashFieldSettings.kind:
+                message = f"{option} does not work with --field {self.field}: it needs the levels of a hash grid"
+                raise UserError(message, f"use --field hash, or {instead}", 2)
         if self.components.stereo and not self.components.points and (self.model != "auto" or "points" in self.fixed):
             raise UserError(
                 "--with stereo needs points: it adds to their pixels", "add --with points, or remove --with stereo", 2

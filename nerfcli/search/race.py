@@ -72,7 +72,6 @@ class Race:
 
     Args:
         trials, start: the trials, and the training that they continue.
-        budget: for the trials.
         requested: the components of the model to improve.
     """
 

@@ -60,7 +60,6 @@ class Facts:
     """Facts about a scene and the requested components, before training.
 
     Args:
-        field: the kind of field.
         has_alpha: whether the photos have alpha: then nothing is behind the object.
         has_exif: whether exposures in EXIF differ.
         cameras_known: reason to trust the cameras, shown to the user; None if they may be wrong.
@@ -169,7 +168,6 @@ def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list
     Args:
         start: components of the model so far.
         signs: diagnostics of its first training.
-        facts: about the scene.
     """
     candidates: list[Change] = []
     declined: list[Decision] = []
@@ -269,9 +267,7 @@ def select(
     anything is lost.
 
     Args:
-        trials: of the scene.
         requested: the components to keep where nothing supports a change.
-        facts: about the scene.
         seconds: for all trials together; None to go by `steps`.
         steps: for all trials together, if there is no time budget.
 

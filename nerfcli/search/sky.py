@@ -23,7 +23,6 @@ def paint(background: SphereBackground, seen: Callable[[], tuple[Tensor, Tensor]
     """Fit a background so that each direction has about the median colour of the pixels that look along it.
 
     Args:
-        background: to be painted.
         seen: returns directions (N, 3) and the sRGB colours (N, 3) along them; called once per step.
     """
     adam = Adam(background.parameters())

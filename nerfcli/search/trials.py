@@ -56,7 +56,6 @@ class Trial:
         halfway: the same after half of its steps.
         counts: (photos,) numbers of values that were summed.
         seconds: that it took.
-        steps: number of its steps.
         log_gains: (photos, 3) exposures of its model; None if it has none.
     """
 
@@ -100,8 +99,6 @@ class Trials:
     """Trainings of one scene on the same pixels.
 
     Args:
-        photos: the training photos.
-        extent: of the field.
         settings: of the training that the trials are for; seed and components are given with each trial.
         exif: (photos,) logarithms of EXIF exposures, relative to their mean.
         log_focal: see `Fitting`.
@@ -154,7 +151,6 @@ class Trials:
         """Train from the beginning to `FORK_FRACTION` of a schedule.
 
         Args:
-            components: of the model.
             steps: largest number of steps.
             seconds: time limit; the result tells how many steps were taken.
             fewest: smallest number of steps, for which up to twice the time is used; end early if it is out of reach.
@@ -203,7 +199,6 @@ class Trials:
             components: of the model from here on. New parts begin so that they change nothing: new harmonics with no
                 weight, exposures as in the residuals.
             seed: of everything random; candidates with the same seed draw the same pixels.
-            steps: number of steps.
         """
         learned = start.signs.log_gains if self._log_gains is None else self._log_gains
         gains = {"exif": self._exif, "learned": learned}.get(components.exposure)

@@ -45,7 +45,6 @@ class Checkpoints:
     """The files of one training.
 
     Args:
-        run: the run folder.
         fitting, totals: read when a checkpoint is written.
         prepared: the data that the fitting was made from.
         scene: gives the unit of length.

@@ -26,8 +26,6 @@ class LiveTraining:
     """Answers the viewers of a training, see `runs.live`.
 
     Args:
-        run: the run folder.
-        model: returns the current field.
         still_wanted: called while the training is paused; raises to end it.
     """
 

@@ -69,8 +69,6 @@ class Prepared:
         settings: with the components that were chosen.
         factor: photos are averaged over squares of this side in pixels.
         storage: where arrays of the size of the photos are kept.
-        extent: of the field.
-        pool: the training photos.
         selection: result of the automatic selection of components; None if there was none.
         log_exposure: mean log exposure of the training photos by EXIF; None if unknown or not used.
         log_gains: (photos, 3) logarithms of their exposures relative to it: from the trials, from stereo matching, or
@@ -160,7 +158,6 @@ def prepare(
 
     Args:
         scene: photos, cameras and split.
-        settings: as requested.
         run: folder for temporary files that hold what does not fit into memory.
         memory_bytes: limit of resident memory, or of GPU memory.
         begun: decisions of a training that is resumed; None for a new one.

@@ -96,9 +96,6 @@ class HeldoutPixels:
     """A fixed sample of a few thousand distinct pixels of the held-out photos, or most of them if there are fewer.
 
     Args:
-        photos: the held-out photos.
-        training_from_scene: the normalisation.
-        device: for the pixels.
         colours, storage: see `PixelPool`.
     """
 
@@ -123,7 +120,6 @@ class HeldoutPixels:
         """Return the PSNR in dB over all these pixels, clipped to [0, 1], on the model's background.
 
         Args:
-            model: to be measured.
             log_gains: (photos, 3) of the photos relative to the model's pictures; see `held_out_exposure`.
         """
         background = colours_behind(model.background, self.directions)

@@ -59,11 +59,9 @@ def page_html(
     """Return the text of a page that needs no server.
 
     Args:
-        model: the model to show.
         numbers: its field, and the proof that the page compares its rendering with.
         run: the folder; the page shows its name.
         frames: pinhole frames, at least one; the first view is that of the middle one.
-        photos: the photos on the page.
         box: low and high corner of the initial crop box, scene units.
     """
     scene = _scene(model, run=run, frames=frames, photos=photos.entries, box=box) | numbers.description
@@ -121,7 +119,9 @@ def _scene(
 
 def _html(scene: dict[str, Any], numbers: str, *, run: Path, connect: bool) -> str:
     """Assemble the HTML page around a scene description."""
-    shaders = "".join(_element(part, "x-shader/x-fragment", _text(f"{part}.glsl")) for part in ("trace", "show"))
+    shaders = "".join(
+        f'<script type="x-shader/x-fragment" id="{part}">{_text(f"{part}.glsl")}</script>' for part in ("trace", "show")
+    )
     body = "\n".join(
         [
             _text("body.html"),
@@ -141,10 +141,6 @@ def _html(scene: dict[str, Any], numbers: str, *, run: Path, connect: bool) -> s
         script=f'"use strict";\n{script}',
         connect=connect,
     )
-
-
-def _element(name: str, kind: str, text: str) -> str:
-    return f'<script type="{kind}" id="{name}">{text}</script>'
 
 
 def array_element(name: str, values: np.ndarray) -> str:

@@ -54,7 +54,6 @@ def page_photos(
 
     Args:
         model: the trained model, for the exposures of the photos.
-        train, test: the frames.
         room_bytes: budget for all pictures, as text in the page.
     """
     frames = _sorted(train, test)

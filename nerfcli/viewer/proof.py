@@ -41,7 +41,6 @@ def make_proof(model: Model, frames: Sequence[Frame]) -> Proof:
     """Render the proof of a model: small pinhole pictures of a few frames, spread evenly.
 
     Args:
-        model: the model of the page.
         frames: pinhole frames, at least one.
     """
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, CAMERAS).astype(int))]

@@ -213,18 +213,14 @@ class _Handler(BaseHTTPRequestHandler):
             raise ValueError("the request is no object")
         return content
 
-    def _begin(self, kind: str, more: dict[str, str] | None = None) -> None:
-        self.send_response(HTTPStatus.OK)
+    def _begin(self, kind: str, status: HTTPStatus = HTTPStatus.OK, more: dict[str, str] | None = None) -> None:
+        self.send_response(status)
         for name, value in {"Content-Type": kind, **_HEADERS, **(more or {})}.items():
             self.send_header(name, value)
         self.end_headers()
 
     def _send(self, status: HTTPStatus, kind: str, content: bytes, more: dict[str, str] | None = None) -> None:
-        self.send_response(status)
-        headers = {"Content-Type": kind, "Content-Length": str(len(content)), **_HEADERS, **(more or {})}
-        for name, value in headers.items():
-            self.send_header(name, value)
-        self.end_headers()
+        self._begin(kind, status, {"Content-Length": str(len(content)), **(more or {})})
         self.wfile.write(content)
 
     def log_message(self, format: str, *args: Any) -> None:

@@ -48,7 +48,6 @@ def ablate_scene(
     """Train and measure every variant with every seed, continue an earlier call, and write the table after each.
 
     Args:
-        path: the scene.
         folder: the folder to write the table and the runs into.
         settings: of all trainings; with `model` "auto", the components are first selected for the scene.
         seeds: number of seeds, counted up from the seed of the settings.

@@ -58,7 +58,6 @@ def train_blocks(
 
     Args:
         scene, run, settings, memory_bytes, overwrite, holdout, notify, warn: see `train_scene`.
-        count: number of blocks.
         only: the block to train, counted from 1; None for all.
         resume: also continue complete blocks to a larger budget.
 

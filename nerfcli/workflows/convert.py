@@ -33,11 +33,8 @@ def convert_capture(
 
     Args:
         source: a file or folder in a known format.
-        target: the file or folder to write.
-        wanted: format and conventions of the target.
         given: photos and cameras that the source does not name.
         overrides: conventions of the source that differ from those of its format.
-        world: the world frame of the target.
 
     Raises:
         UserError: the capture cannot be read or written, the format cannot hold it, or the verification fails.

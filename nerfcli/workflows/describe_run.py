@@ -79,7 +79,6 @@ def costs_of_run(run: Run, model: Model) -> dict[str, dict[str, Any]]:
 
     Args:
         run: provides settings, cameras and the last number of samples per ray.
-        model: of the run.
 
     Returns:
         Size, bytes, operations and memory traffic by kind of field, with the run's own kind first.

@@ -28,9 +28,7 @@ def examine_capture(
 
     Args:
         path: a folder of photos, or a scene.
-        page: the file to write.
         intrinsics: a file with the intrinsics of the cameras, if they are known.
-        subfolders: whether photos in subfolders are examined, too.
 
     Raises:
         UserError: see `find_subject`, `read_calibration` and `refuse_foreign`; or the page cannot be written.

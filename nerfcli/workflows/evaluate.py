@@ -151,10 +151,7 @@ def saved_predictions(
     """Yield a function that saves one comparison in RUN/predictions; the folder appears when all are saved.
 
     Args:
-        run: the run's folder.
-        frames: the held-out frames.
         kind: one of `evaluate.predictions.KINDS`; None to save nothing.
-        checkpoint: the hash of the field.
     """
     if kind is None:
         yield lambda compared: None

@@ -31,8 +31,6 @@ def member_settings(first: TrainSettings, count: int, *, vary: str) -> list[Trai
     """Return the settings of the members of a run.
 
     Args:
-        first: settings of the run.
-        count: number of members.
         vary: one of `VARIED`. "seeds": only the seeds, which follow the run's seed; they also vary in all other kinds.
             "photos": `PHOTO_FRACTION` of the training photos, drawn without replacement. "prior": a smooth random
             field to start from. "field": each kind of field in turn.
@@ -72,7 +70,6 @@ def train_members(
 
     Args:
         run: a complete run.
-        count: number of members.
         only: the member to train, counted from 1; None for all. Processes that train one each need no communication.
         vary: one of `VARIED`, see `member_settings`.
         device, threads: as for `TrainSettings`.
@@ -107,9 +104,6 @@ def evaluate_members(
     run: Run, *, device: str, threads: int, overwrite: bool = False, notify: Notify, progress: Progress = no_progress
 ) -> dict[str, Any]:
     """Measure a run's members and the mean of their pictures on the held-out photos, or keep existing metrics.
-
-    Args:
-        run: a run with members.
 
     Returns:
         Content of RUN/members/metrics.json: "members", each member's measures averaged over the photos; "mean_picture",

@@ -81,7 +81,6 @@ def examine_run(
     """Measure the coverage of a run's surface, and write the suggested views as a page and as a camera path.
 
     Args:
-        run: the folder that training wrote.
         target: the folder to write: next_views.html, cameras.json and camera_path.json; only the page if there is no
             view to suggest.
         count: maximum number of views to suggest.

@@ -34,7 +34,6 @@ def photo_depths(
     """Return the depth maps of all training photos, read from the run if they were saved for this field.
 
     Args:
-        run: the run.
         model: its model, with the step lengths of the training.
     """
     frames = run.cameras.train

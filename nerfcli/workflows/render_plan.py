@@ -38,7 +38,6 @@ class RenderingPlan:
     """Cost of rendering or evaluating a run, without the time to start the program and to load the model.
 
     Args:
-        pictures: number of pictures.
         pixels: number of pixels of all pictures.
         seconds: time on this machine.
         memory_bytes: peak memory of the process.

@@ -56,8 +56,6 @@ def convert_scan(
         source: a file or folder in a known format.
         target: the folder, or the file of vectors.
         to: nerfcli or astra.
-        given: properties of the scan that the user states.
-        overwrite: replace a scan folder, or a file of vectors.
 
     Raises:
         UserError: the scan cannot be read or written, `target` exists, or the written scan differs from its source.

@@ -68,10 +68,8 @@ def train_scan(
 
     Args:
         scan: a folder that `nerfcli convert` wrote.
-        run: the folder to write.
         settings: budget, field, and values that are not to be estimated from the scan.
         resume: continue from the volume in `run`; start from the beginning if there is none.
-        overwrite: replace another run at `run`.
 
     Raises:
         UserError: the scan cannot be read, or `run` holds something else, or an interrupted fit without `resume`.
@@ -100,7 +98,8 @@ def train_scan(
         raise UserError(f"{run} exists and is not a reconstruction", "choose another folder with --output")
     with exclusive(run / LOCK, f"another nerfcli train is writing {run}"):
         clear_leftovers(run)
-        _warn_of(loaded, warn)
+        if loaded.kind != "line_integral" and loaded.photons_per_value is None:
+            warn("photons per detector value not given: estimated from the noise of neighbouring pixels")
         threads = thread_count(settings.threads)
         torch.set_num_threads(threads)
         result, interrupt = _fit(loaded, folder, settings, earlier=earlier if resume else None, progress=progress)
@@ -380,8 +379,3 @@ def _fits_memory(grid: VoxelGrid) -> None:
             f"{size} voxels need {needed / 1e9:.1f} GB of memory; the limit is {limit / 1e9:.1f} GB",
             f"choose larger voxels with --voxel-size (now {grid.size:.3g})",
         )
-
-
-def _warn_of(scan: Scan, warn: Notify) -> None:
-    if scan.kind != "line_integral" and scan.photons_per_value is None:
-        warn("photons per detector value not given: estimated from the noise of neighbouring pixels")

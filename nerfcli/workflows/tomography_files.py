@@ -38,7 +38,6 @@ def render_scan(
 
     Args:
         run: the folder that `train_scan` wrote.
-        target: the folder to write.
         outputs: some of `OUTPUTS`: line integrals, transmissions, and (measured - predicted) in units of the noise.
         views: "test" for the held-out ones, "train" for the fitted ones.
         slices: (axis, position in the scan's unit); if given, slices and their marks replace the projections.

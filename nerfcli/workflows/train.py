@@ -238,7 +238,6 @@ def train_or_continue(
     """Train one of several runs: keep a complete one, resume an interrupted one, else start; see `train_scene`.
 
     Args:
-        folder, path: folders of the scene and of the run.
         resume: also continue a complete run if the settings have a larger budget.
     """
     interrupted = was_interrupted(folder, path, settings, holdout=holdout)

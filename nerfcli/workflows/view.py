@@ -52,7 +52,6 @@ def view_run(
         host: address to listen on; the default can be reached only from this machine.
         port: to listen on; None for the first free one from 8123 on.
         threads: number of CPU threads for pictures; 0 for all.
-        browser: open the page in this machine's browser.
         on_ready: called with the page's address and the command that makes it work on another machine ("" for none).
 
     Raises:
@@ -89,7 +88,6 @@ class RunData:
     """Data of a run for the server, see `viewer.server.PageData`.
 
     Args:
-        path: of the run.
         threads: number of CPU threads for pictures; 0 for all.
     """
 

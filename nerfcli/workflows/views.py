@@ -105,8 +105,6 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
     """Return the frames to render.
 
     Args:
-        run: the run.
-        views: which views to render.
         depth_hint: distance to the scene's centre, for paths around it if the optical axes do not determine it.
 
     Raises:
