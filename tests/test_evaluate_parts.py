@@ -19,8 +19,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, apply, inverse, look_at, transform_from_twist
 from nerfcli.errors import UserError
 from nerfcli.evaluate import perceptual
-from nerfcli.evaluate.colour import colour_aligned
-from nerfcli.evaluate.colour_alignment import align_gains
+from nerfcli.evaluate.colour_alignment import align_gains, colour_aligned
 from nerfcli.evaluate.ledger import leak_ledger, summary_line
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.evaluate.pose_refinement import align_pose, halves

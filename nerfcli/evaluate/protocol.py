@@ -13,8 +13,7 @@ import torch
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.billboards import Billboards, GeometryComparison, GeometryEvidence
-from nerfcli.evaluate.colour import colour_aligned
-from nerfcli.evaluate.colour_alignment import align_gains
+from nerfcli.evaluate.colour_alignment import align_gains, colour_aligned
 from nerfcli.evaluate.metrics import as_float, psnr, ssim, to_8_bit, whole_windows
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.evaluate.outliers import outlier_warnings
@@ -97,7 +96,7 @@ def evaluate_model(
     """Compare the model with every held-out photo: metrics per photo, means, and render time.
 
     Per photo: psnr, ssim and lpips of the 8-bit picture; psnr_float and ssim_float of the picture before rounding;
-    *_colour_aligned after `colour.colour_aligned`. With `align_poses` or `align_colours`, *_right_half are measured on
+    *_colour_aligned after `colour_aligned`. With `align_poses` or `align_colours`, *_right_half are measured on
     the right half of the photo; *_pose_aligned the same with the pose fitted to the left half, *_gains_aligned with
     the gains fitted to it. Unknown values are None.
 

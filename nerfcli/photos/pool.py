@@ -15,7 +15,6 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.kernels import PixelTable, backend_for
 from nerfcli.photos.bearings import BearingTables
-from nerfcli.photos.footprint import pixel_footprint
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photo
 from nerfcli.photos.storage import IN_MEMORY, PhotoStorage
 
@@ -126,6 +125,22 @@ class Pool(Protocol):
     def photo_of(self, numbers: Tensor) -> Tensor:
         """Return the photo index of each pixel (N,)."""
         ...
+
+
+def pixel_footprint(frames: Sequence[Frame], training_from_scene: Similarity) -> float:
+    """Return the median over photos of a pixel's footprint at the centre of the training frame, in its units.
+
+    The footprint is distance / focal length. The distance is at least 1, since cameras inside the unit ball look at
+    things about one radius away.
+
+    Args:
+        frames: with the cameras of the downscaled training photos.
+    """
+    footprints = []
+    for frame in frames:
+        position = training_from_scene.apply_pose(frame.world_from_cam)[:3, 3]
+        footprints.append(max(float(np.linalg.norm(position)), 1.0) / frame.camera.focal_px)
+    return float(np.median(footprints))
 
 
 class PixelPool:

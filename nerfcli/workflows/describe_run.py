@@ -8,7 +8,7 @@ from nerfcli.field.blocks_field import BlocksField
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.comparison import described_cost, other_kinds_with_equal_storage
 from nerfcli.field.cost import field_bytes
-from nerfcli.photos.footprint import pixel_footprint
+from nerfcli.photos.pool import pixel_footprint
 from nerfcli.render.model import Model
 from nerfcli.runs.blocks import block_path
 from nerfcli.runs.camera_moves import camera_moves
