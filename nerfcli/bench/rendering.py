@@ -10,7 +10,7 @@ import random
 import time
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -82,7 +82,7 @@ def measure_rendering(
         if setting.name not in done:
             session.say(f"rendering: {setting.name}")
             measured = _measure_picture(subject, setting, session)
-            described = {"options": setting.options, "settings": setting.to_json()}
+            described = {"options": setting.options, "settings": asdict(setting)}
             session.record("picture", point=setting.name, **described, **measured)
             done.add(setting.name)
     _measure_times(subject, chosen, rounds=plan["rounds"], session=session, ends=ends)

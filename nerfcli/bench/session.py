@@ -39,11 +39,6 @@ class Session:
         """Seconds used so far."""
         return self._spent + time.monotonic() - self._lap
 
-    @property
-    def left(self) -> float:
-        """Seconds of the budget that are left; negative if it was exceeded."""
-        return self.budget_seconds - self.spent
-
     def record(self, kind: str, **content: Any) -> None:
         """Record a measurement, with the time since the previous one."""
         now = time.monotonic()
@@ -53,6 +48,6 @@ class Session:
 
     def say(self, doing: str) -> None:
         """Report the current work and the remaining time."""
-        left = max(0.0, self.left)
+        left = max(0.0, self.budget_seconds - self.spent)
         text = f"{left / 60:.0f} min" if left >= 90 else f"{left:.0f} s"
         self.tell(min(1.0, self.spent / self.budget_seconds), f"{doing}, about {text} left")

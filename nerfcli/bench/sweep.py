@@ -1,7 +1,7 @@
 """The settings to try, the most informative first; how many are tried depends on the time."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import accumulate
 from typing import Any
@@ -40,44 +40,35 @@ class RenderSetting:
     @property
     def name(self) -> str:
         """Name of the setting: its differences from the defaults, except threads if all are used."""
-        return ", ".join(self._parts()) or "default"
-
-    def _parts(self) -> list[str]:
-        parts = []
-        if self.step != 1.0:
-            parts.append(f"step {self.step:g}")
-        if self.tolerance != TOLERANCE:
-            parts.append(f"tolerance {as_text(self.tolerance)}")
-        if self.rays_per_tile != RAYS_PER_TILE:
-            parts.append(f"{self.rays_per_tile} rays a tile")
-        if self.stored_in != "float32":
-            parts.append(f"stored in {self.stored_in}")
-        return parts
+        return ", ".join(self._changes()) or "default"
 
     @property
     def options(self) -> str | None:
         """Options of `nerfcli render` that select this setting; None if options cannot select it."""
-        if self.rays_per_tile != RAYS_PER_TILE or self.stored_in != "float32":
-            return None
-        step = [f"--step {self.step:g}"] if self.step != 1.0 else []
-        tolerance = [f"--tolerance {as_text(self.tolerance)}"] if self.tolerance != TOLERANCE else []
-        return " ".join([*step, *tolerance])
+        given = list(self._changes().values())
+        return " ".join(given) if all(given) else None
 
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
+    def _changes(self) -> dict[str, str]:
+        """Return the differences from the defaults, each with the option that selects it, "" if there is none."""
+        changes = {}
+        if self.step != 1.0:
+            changes[f"step {self.step:g}"] = f"--step {self.step:g}"
+        if self.tolerance != TOLERANCE:
+            changes[f"tolerance {as_text(self.tolerance)}"] = f"--tolerance {as_text(self.tolerance)}"
+        if self.rays_per_tile != RAYS_PER_TILE:
+            changes[f"{self.rays_per_tile} rays a tile"] = ""
+        if self.stored_in != "float32":
+            changes[f"stored in {self.stored_in}"] = ""
+        return changes
 
 
 @dataclass(frozen=True)
 class ThreadSetting(RenderSetting):
     """A setting with fewer threads than are available."""
 
-    def _parts(self) -> list[str]:
-        return [*super()._parts(), f"{self.threads} {'thread' if self.threads == 1 else 'threads'}"]
-
-    @property
-    def options(self) -> str | None:
-        own = super().options
-        return None if own is None else f"{own} --threads {self.threads}".strip()
+    def _changes(self) -> dict[str, str]:
+        words = f"{self.threads} {'thread' if self.threads == 1 else 'threads'}"
+        return {**super()._changes(), words: f"--threads {self.threads}"}
 
 
 @dataclass(frozen=True)

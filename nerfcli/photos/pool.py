@@ -171,7 +171,6 @@ class PixelPool:
         self._backend = backend_for(device, torch.float32)
         counts = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
         self.first_pixel = torch.tensor(np.cumsum([0, *counts[:-1]]), device=device)
-        self.names_and_widths = [(photo.frame.name, photo.pixels.shape[1]) for photo in photos]
         self.sizes = torch.tensor([photo.pixels.shape[:2] for photo in photos], device=device)
         self.frames = tuple(photo.frame for photo in photos)
         self.cameras = tuple(photo.frame.camera for photo in photos)
@@ -239,9 +238,8 @@ class PixelPool:
     def place(self, number: int) -> tuple[str, int, int]:
         """Return the photo's name, the column and the row of the pixel with an index."""
         photo = int(self.photo_of(torch.tensor(number, device=self.first_pixel.device)))
-        name, width = self.names_and_widths[photo]
-        row, column = divmod(number - int(self.first_pixel[photo]), width)
-        return name, column, row
+        row, column = divmod(number - int(self.first_pixel[photo]), self.cameras[photo].width)
+        return self.frames[photo].name, column, row
 
 
 def _one_after_another(photos: Sequence[LoadedPhoto]) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Describe a folder or file as plain values: scenes, captures, runs, renders, depth, pictures, training states.
 
-Imports are local, so that a depth file can be described without importing torch.
+Imports that need torch are local, so that a depth file can be described without importing torch.
 """
 
 from collections.abc import Iterable
@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.cameras.camera import by_lens
+from nerfcli.cameras.formats.run_cameras import CAMERAS
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError, in_shell
 from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
 from nerfcli.media.geotiff import map_facts
 from nerfcli.media.model_facts import SUFFIXES as MODEL_SUFFIXES
 from nerfcli.media.model_facts import model_facts, volume_facts
+from nerfcli.runs.files import CONFIG, DEPTH_ERRORS, LOG, METRICS, REPORT
 from nerfcli.tomography.result import is_reconstruction, load_reconstruction
 from nerfcli.tomography.volume_files import is_volume_file, map_of, read_volume
 
@@ -61,8 +63,6 @@ def describe(path: str | Path) -> dict[str, Any]:
         return file_facts(folder)
     if (folder / RENDERS).exists():
         return renders_facts(folder)
-    from nerfcli.runs.files import CONFIG
-
     if not (folder / CONFIG).exists():
         return _describe_scene(folder)
     from nerfcli.runs.run import Run
@@ -73,11 +73,8 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 def _whole(path: Path) -> Path:
     """Return the run or scene that a file such as metrics.json or poses_report.json is part of; else the path."""
-    from nerfcli.cameras.formats.run_cameras import CAMERAS
-    from nerfcli.runs import files
-
-    parts_of_runs = (files.CONFIG, CAMERAS, files.LOG, files.METRICS, files.DEPTH_ERRORS, files.REPORT)
-    if path.name in parts_of_runs and (path.parent / files.CONFIG).is_file():
+    parts_of_runs = (CONFIG, CAMERAS, LOG, METRICS, DEPTH_ERRORS, REPORT)
+    if path.name in parts_of_runs and (path.parent / CONFIG).is_file():
         return path.parent
     if path.name == "poses_report.json" and (path.parent / "scene.json").is_file():
         return path.parent
@@ -111,7 +108,6 @@ def _describe_reconstruction(run: Path) -> dict[str, Any]:
 def _describe_capture(path: Path) -> dict[str, Any] | None:
     """Return the facts of a capture that only `nerfcli convert` reads; None if the path is something else."""
     from nerfcli.convert.formats import UserInputs, format_named
-    from nerfcli.runs.files import CONFIG
     from nerfcli.scene import is_scene
 
     if is_scene(path) or (path / CONFIG).is_file():
