@@ -1,6 +1,5 @@
 """Run an ablation: train and measure every variant with every seed."""
 
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -25,9 +24,6 @@ from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, war
 from nerfcli.workflows.train import train_scene, was_interrupted
 
 _SAME = "; the same pixels for all variants of a seed, other pixels for each seed"
-
-# Arguments: a run, its variant's name, its settings, and whether to measure it again.
-Measure = Callable[[Run, str, TrainSettings, bool], MeasuredTraining]
 
 
 def ablate_scene(

@@ -82,11 +82,13 @@ def export_run(
     """
     trained, torch_device = Run(Path(run)), device_name(device)
     path = Path(target) if target is not None else default_target(trained.path, to)
-    suffix = suffix_of(path, to)
+    suffixes = TARGETS[to]
+    if "" not in suffixes and path.suffix.lower() not in suffixes:
+        raise UserError(f"{path} does not have the suffix of a {to}", f"use one of {', '.join(suffixes)}", exit_code=2)
     if settings.box is not None:
         check_box(settings.box)
     _ = trained.config
-    refuse_existing(path, overwrite=overwrite, folder=not suffix)
+    refuse_existing(path, overwrite=overwrite, folder="" in suffixes)
     torch.set_num_threads(thread_count(threads))
     model = trained.model(torch_device)
     progress(0.0, "")
@@ -99,20 +101,6 @@ def default_target(run: Path, to: str, suffix: str | None = None) -> Path:
     place = run.resolve()
     name = place.name if to == "page" else f"{place.name}-{to}"
     return (run if run.name not in ("", "..") else place).with_name(name + (suffix or TARGETS[to][0]))
-
-
-def suffix_of(path: Path, to: str) -> str:
-    """Return the suffix of a target, "" for a folder.
-
-    Raises:
-        UserError: the suffix is not one of the formats of `to`.
-    """
-    suffixes = TARGETS[to]
-    if "" in suffixes:
-        return ""
-    if path.suffix.lower() not in suffixes:
-        raise UserError(f"{path} does not have the suffix of a {to}", f"use one of {', '.join(suffixes)}", exit_code=2)
-    return path.suffix.lower()
 
 
 def refuse_existing(path: Path, *, overwrite: bool, folder: bool) -> None:
