@@ -27,6 +27,11 @@ def test_a_file_where_a_run_is_needed_is_named(tmp_path):
     assert error[0] == f"Error: {tmp_path / 'notes.txt'} is a file, not a run folder"
 
 
+def test_doctor_refuses_the_number_of_further_photos_where_no_run_is(tmp_path):
+    lines = error_of(nerfcli("doctor", tmp_path, "--views", "3"))
+    assert "--views is for runs" in lines[0]
+
+
 @pytest.mark.parametrize("command", ["evaluate", "report", "export"])
 def test_a_folder_that_cannot_be_written_is_found_before_the_work(command, finished, tmp_path, monkeypatch):
     run = shutil.copytree(finished, tmp_path / "run")

@@ -219,6 +219,8 @@ def convert(
             raise typer.BadParameter(f"{given_text}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
         if target is None:
             raise typer.BadParameter("missing; give the file or folder to write", param_hint="OUT")
+        if not verify and tolerance != TargetOptions.tolerance_px:
+            raise typer.BadParameter("nothing is compared with --no-verify; remove it", param_hint="--tolerance")
         one_of(pixels, ("stored", "upright"), "--pixels")
         world = WorldFrame(world_up, origin, scale, markers, tuple(distance or ()), georeference)
         wanted = TargetOptions(

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _NAMES_SHOWN = 4
 _GATES = ("good", "look")
+DEFAULT_VIEWS = 5
 _STYLES = {"good": "green", "look": "yellow", "bad": "bold red"}
 
 
@@ -33,7 +34,10 @@ def doctor(
     require: Annotated[
         str | None, typer.Option(help="good or look: exit code 7 if any finding is worse.", show_default=False)
     ] = None,
-    views: Annotated[int, typer.Option(help="Runs: number of further photos to suggest.", min=1, max=100)] = 5,
+    views: Annotated[
+        int | None,
+        typer.Option(help=f"Runs: number of further photos to suggest.  [default: {DEFAULT_VIEWS}]", min=1, max=100),
+    ] = None,
     threads: Threads = 0,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -79,8 +83,10 @@ def doctor(
                     "leave them out",
                 )
             folder = result_path(path, suffix="-next-views", output=output, one_of_many=one_of_many)
-            _examine_run(path, folder, console, count=views, threads=threads, overwrite=overwrite)
+            _examine_run(path, folder, console, count=views or DEFAULT_VIEWS, threads=threads, overwrite=overwrite)
             return
+        if views is not None:
+            raise UserError(f"{path}: --views is for runs, whose missing photos it suggests", "leave it out")
         if is_reconstruction(path):
             raise UserError(
                 f"{path} is the reconstruction of an X-ray scan", "doctor examines the scan itself: give its folder"
