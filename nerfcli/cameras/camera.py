@@ -4,8 +4,8 @@ A model has COLMAP's name and COLMAP's order of parameters. The centre of the to
 picture spans [0, width] x [0, height]. Camera axes are OpenCV's: +x right, +y down, +z forward.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -64,9 +64,18 @@ class Camera:
                 f"camera model {self.model} has {len(names)} parameters, got {len(self.params)}",
                 f"expected {', '.join(names)}, in this order",
             )
-        values = dict(zip(names, self.params, strict=True))
-        if complaint := _complaint(self.model, values):
+        if complaint := _complaint(self.model, self.values):
             raise UserError(f"invalid parameters {self.params} for camera model {self.model}", complaint)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The parameters by COLMAP's names."""
+        return dict(zip(parameter_names(self.model), self.params, strict=True))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture in pixels."""
+        return self.width, self.height
 
     @staticmethod
     def pinhole(width: int, height: int, focal_px: float) -> "Camera":
@@ -82,6 +91,13 @@ class Camera:
     def focal_px(self) -> float:
         """Mean focal length in pixels; for a spherical picture, pixels per radian at its equator."""
         return self.width / (2 * np.pi) if self.is_spherical else _colmap_camera(self).mean_focal_length()
+
+    @property
+    def focal_lengths(self) -> tuple[float, float]:
+        """Focal lengths along x and y in pixels; infinite for a spherical picture, which has none."""
+        values = self.values
+        only = values.get("f", np.inf)
+        return values.get("fx", only), values.get("fy", only)
 
     @property
     def pixel_aspect(self) -> float:
@@ -151,6 +167,11 @@ class Camera:
             found[:, length == 0] = 0.0
             pixels[block], valid[block] = found.T, seen & (length > 0)
         return pixels, valid
+
+    def shows(self, points_cam: np.ndarray) -> np.ndarray:
+        """Return which points (N, 3) in camera axes are inside the picture or on its edge; (N,) bool."""
+        pixels, valid = self.project(points_cam)
+        return valid & ((pixels >= 0) & (pixels <= self.size)).all(axis=1)
 
     def project_jacobian(self, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute the Jacobian of pixels with respect to points and camera parameters.
@@ -241,9 +262,11 @@ class Camera:
 
     def with_principal_point(self, x: float, y: float) -> "Camera":
         """Return the same lens with its principal point at (x, y) pixels; a spherical picture has none and is kept."""
-        names = parameter_names(self.model)
-        values = dict(zip(names, self.params, strict=True)) | {"cx": x, "cy": y}
-        return replace(self, params=tuple(values[name] for name in names))
+        return self.with_values({"cx": x, "cy": y})
+
+    def with_values(self, values: Mapping[str, float]) -> "Camera":
+        """Return the camera with other values of some parameters; names that its model does not have are ignored."""
+        return replace(self, params=tuple(values.get(name, value) for name, value in self.values.items()))
 
     def centred(self) -> "Camera":
         """Return the same lens with its principal point in the middle: equal for all cameras of one lens."""
@@ -255,12 +278,7 @@ class Camera:
 
     def to_json(self) -> dict[str, Any]:
         """Return {"model", "width", "height", "params"}; floats survive a round trip exactly."""
-        return {
-            "model": self.model,
-            "width": self.width,
-            "height": self.height,
-            "params": list(self.params),
-        }
+        return {**asdict(self), "params": list(self.params)}
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> "Camera":
@@ -326,7 +344,7 @@ def _colmap_camera(camera: Camera) -> pycolmap.Camera:
 
 @lru_cache(maxsize=256)
 def _lens(camera: Camera) -> Lens:
-    return lens_of(camera.model, dict(zip(parameter_names(camera.model), camera.params, strict=True)))
+    return lens_of(camera.model, camera.values)
 
 
 def _blocks(count: int) -> Iterator[slice]:

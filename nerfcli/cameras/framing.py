@@ -4,9 +4,9 @@ Notation: the camera's picture is w x h; the new picture is W x H.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.camera import Camera
 from nerfcli.errors import UserError
 
 LENSES = ("pinhole", "fisheye", "equirectangular")
@@ -47,8 +47,10 @@ def sized(camera: Camera, width: int | None, height: int | None) -> Camera:
     if camera.is_spherical:
         return equirectangular(width, height)
     scale = max(width / camera.width, height / camera.height)
-    scaled = _changed(camera, dict.fromkeys(("f", "fx", "fy", "cx", "cy"), scale), (width, height))
-    return _shifted(scaled, (width - scale * camera.width) / 2, (height - scale * camera.height) / 2)
+    names = ("f", "fx", "fy", "cx", "cy")
+    scaled = camera.with_values({name: scale * value for name, value in camera.values.items() if name in names})
+    covering = replace(scaled, width=width, height=height)
+    return _shifted(covering, (width - scale * camera.width) / 2, (height - scale * camera.height) / 2)
 
 
 def cropped(camera: Camera, window: Window) -> Camera:
@@ -68,8 +70,7 @@ def cropped(camera: Camera, window: Window) -> Camera:
             "give X,Y,WIDTH,HEIGHT in pixels from the top-left corner, after --width and --height are applied",
             exit_code=2,
         )
-    smaller = _changed(camera, {}, (window.width, window.height))
-    return _shifted(smaller, -window.x, -window.y)
+    return _shifted(replace(camera, width=window.width, height=window.height), -window.x, -window.y)
 
 
 def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
@@ -128,12 +129,5 @@ def equirectangular(width: int, height: int) -> Camera:
 
 def _shifted(camera: Camera, x: float, y: float) -> Camera:
     """Return the camera with its principal point moved, for a picture that was cropped at its left or top edge."""
-    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
-    values["cx"] += x
-    values["cy"] += y
-    return Camera(camera.model, camera.width, camera.height, tuple(values.values()))
-
-
-def _changed(camera: Camera, factors: dict[str, float], size: tuple[int, int]) -> Camera:
-    values = zip(parameter_names(camera.model), camera.params, strict=True)
-    return Camera(camera.model, *size, tuple(factors.get(name, 1.0) * value for name, value in values))
+    cx, cy = camera.principal_point
+    return camera.with_principal_point(cx + x, cy + y)

@@ -4,7 +4,6 @@ Changes do not depend on the resolution: the same change applies to a photo and 
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -20,7 +19,7 @@ _RADIAL_TERMS = 2
 def changeable(camera: Camera) -> tuple[str, ...]:
     """List the parameters that can change: "focal" and the radial terms; none for a spherical camera."""
     radial = [name for group in DISTORTIONS[camera.model] for name in group.get("radial", ())]
-    has_focal = any(name in _FOCAL_NAMES for name in parameter_names(camera.model))
+    has_focal = any(name in _FOCAL_NAMES for name in camera.values)
     return (*([FOCAL] if has_focal else []), *radial[:_RADIAL_TERMS])
 
 
@@ -39,11 +38,12 @@ def changed(camera: Camera, names: Sequence[str], values: np.ndarray) -> Camera:
     """
     change = dict(zip(names, values, strict=True))
     factor = float(np.exp(change.get(FOCAL, 0.0)))
-    params = [
-        value * factor if name in _FOCAL_NAMES else value + change.get(name, 0.0)
-        for name, value in zip(parameter_names(camera.model), camera.params, strict=True)
-    ]
-    return replace(camera, params=tuple(params))
+    return camera.with_values(
+        {
+            name: value * factor if name in _FOCAL_NAMES else value + change.get(name, 0.0)
+            for name, value in camera.values.items()
+        }
+    )
 
 
 def pixels_by_change(camera: Camera, names: Sequence[str], by_parameters: np.ndarray) -> np.ndarray:

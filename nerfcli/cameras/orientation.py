@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Size
 from nerfcli.errors import UserError
 
@@ -102,9 +102,8 @@ def turned(camera: Camera, world_from_cam: np.ndarray, *, orientation: int) -> t
             "save the panorama upright without the tag",
         )
     turn = _TURNS[orientation]
-    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
-    middle = np.array([camera.width, camera.height]) / 2
-    width, height = (camera.height, camera.width) if orientation in (6, 8) else (camera.width, camera.height)
+    values, middle = camera.values, np.array(camera.size) / 2
+    width, height = camera.size[::-1] if orientation in (6, 8) else camera.size
     values["cx"], values["cy"] = (
         turn @ (np.array([values["cx"], values["cy"]]) - middle) + np.array([width, height]) / 2
     )
@@ -131,7 +130,7 @@ def turn_back(orientation: int) -> int:
 
 def rescaling(calibrated: Camera, fitted: Camera) -> tuple[Size, Size] | None:
     """Return the sizes of a calibration and of the picture it was fitted to, both upright; None if they are equal."""
-    size, other = (fitted.width, fitted.height), (calibrated.width, calibrated.height)
+    size, other = fitted.size, calibrated.size
     if size in (other, other[::-1]):
         return None
     lying = (other[0] < other[1]) != (size[0] < size[1])

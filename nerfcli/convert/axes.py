@@ -4,7 +4,7 @@ Axes are written as three letters for the directions in which the camera's +x, +
 d(own) or u(p), f(orward) or b(ackward). OpenCV's are rdf. Some have names.
 """
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import permutations, product
@@ -12,7 +12,7 @@ from itertools import permutations, product
 import numpy as np
 
 from nerfcli.cameras import rigid
-from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture
 from nerfcli.errors import UserError
 
@@ -127,22 +127,17 @@ def for_picture(camera: Camera, intrinsics_scale: float) -> Camera:
     """
     if intrinsics_scale == 1 or camera.is_spherical:
         return camera
-    in_the_middle = camera.principal_point == (camera.width / 2, camera.height / 2)
+    in_the_middle = camera == camera.centred()
     scaled = ("f", "fx", "fy") if in_the_middle else ("f", "fx", "fy", "cx", "cy")
-    return _changed(camera, scaled, lambda value: value / intrinsics_scale)
+    return camera.with_values({n: value / intrinsics_scale for n, value in camera.values.items() if n in scaled})
 
 
 def shifted(camera: Camera, shift_px: float) -> Camera:
     """Return the camera with its principal point moved by the same number of pixels in x and y."""
     if shift_px == 0 or camera.is_spherical:
         return camera
-    return _changed(camera, ("cx", "cy"), lambda value: value + shift_px)
-
-
-def _changed(camera: Camera, names: Collection[str], change: Callable[[float], float]) -> Camera:
-    values = zip(parameter_names(camera.model), camera.params, strict=True)
-    params = tuple(change(value) if name in names else value for name, value in values)
-    return Camera(camera.model, camera.width, camera.height, params)
+    cx, cy = camera.principal_point
+    return camera.with_principal_point(cx + shift_px, cy + shift_px)
 
 
 def _with_views(capture: Capture, poses: np.ndarray, cameras: dict[Camera, Camera], shift: float) -> Capture:

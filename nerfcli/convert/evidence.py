@@ -129,8 +129,7 @@ class FrustumEvidence:
         cameras, camera_of_frame = distinct(self._cameras)
         shown = np.zeros(len(self.groups), dtype=bool)
         for camera, rows in zip(cameras, rows_of_each(camera_of_frame[self.groups], len(cameras)), strict=True):
-            pixels, valid = camera.project(in_camera[rows])
-            shown[rows] = valid & np.all((pixels >= 0) & (pixels <= (camera.width, camera.height)), axis=1)
+            shown[rows] = camera.shows(in_camera[rows])
         return np.where(shown, 0.0, np.inf)
 
 

@@ -71,7 +71,7 @@ def match_neighbours(
 def _move(matched: tuple[np.ndarray, np.ndarray], camera: Camera) -> float:
     """Return the median movement of matched features from photo to photo, as a fraction of the longer side."""
     moves = np.linalg.norm(matched[1] - matched[0], axis=1)
-    return float(np.median(moves)) / max(camera.width, camera.height)
+    return float(np.median(moves)) / max(camera.size)
 
 
 def _photo(frame: Frame) -> tuple[Camera, Features]:

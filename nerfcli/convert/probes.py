@@ -89,7 +89,7 @@ def _synthetic(capture: Capture, rng: np.random.Generator) -> tuple[np.ndarray, 
     its own.
     """
     cameras = [frame.camera for frame in capture.frames]
-    size = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
+    size = np.array([camera.size for camera in cameras], dtype=np.float64)
     centre = np.array([camera.principal_point for camera in cameras])
     focal_px = np.array([camera.focal_px for camera in cameras])
     fraction = rng.random((len(cameras), SYNTHETIC_PER_VIEW, 2))
@@ -105,7 +105,7 @@ def _seen(capture: Capture, frame_index: np.ndarray, point_index: np.ndarray, po
     """Return the pairs whose point appears inside the picture of its view."""
     tried = Probes(frame_index, point_index, points, np.zeros((len(points), 2)), np.zeros(len(points)))
     pixels, kept, distances = projected(capture, tried)
-    sizes = np.array([(frame.camera.width, frame.camera.height) for frame in capture.frames])
+    sizes = np.array([frame.camera.size for frame in capture.frames])
     kept &= np.all((pixels >= 0) & (pixels <= sizes[frame_index]), axis=1)
     return Probes(frame_index[kept], point_index[kept], points[kept], pixels[kept], distances[kept])
 

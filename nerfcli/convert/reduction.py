@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
-from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.scene_folder import named_for_scene
 
@@ -95,30 +95,21 @@ def _pinhole(camera: Camera) -> Camera:
 
 def _to_transforms(camera: Camera) -> Camera:
     """Keep OpenCV's k1, k2, p1, p2, k3, or its fisheye's k1 to k4; a camera without other terms is unchanged."""
-    value = dict(zip(parameter_names(camera.model), camera.params, strict=True))
     if camera.is_spherical or camera.model in _HELD:
         return camera
-    head = (value["fx"] if "fx" in value else value["f"], value["fy"] if "fy" in value else value["f"])
-    head = (*head, value["cx"], value["cy"])
+    value, head = camera.values, (*camera.focal_lengths, *camera.principal_point)
     if "FISHEYE" in camera.model:
         keys = ("k0", "k1", "k2", "k3") if camera.model.startswith("RAD_TAN") else ("k1", "k2", "k3", "k4")
         return Camera("OPENCV_FISHEYE", camera.width, camera.height, (*head, *(value.get(key, 0.0) for key in keys)))
     if camera.model == "FULL_OPENCV":
-        return _without(camera, ("k4", "k5", "k6"))
+        return camera.with_values(dict.fromkeys(("k4", "k5", "k6"), 0.0))
     return Camera("PINHOLE", camera.width, camera.height, head)
 
 
 def _to_opensfm(camera: Camera) -> Camera:
     """Keep Brown's terms without those of the denominator, or the six radial terms of the fisheye."""
     if camera.model == "FULL_OPENCV":
-        return _without(camera, ("k4", "k5", "k6"))
+        return camera.with_values(dict.fromkeys(("k4", "k5", "k6"), 0.0))
     if camera.model == "RAD_TAN_THIN_PRISM_FISHEYE":
-        return _without(camera, ("p0", "p1", "s0", "s1", "s2", "s3"))
+        return camera.with_values(dict.fromkeys(("p0", "p1", "s0", "s1", "s2", "s3"), 0.0))
     return camera
-
-
-def _without(camera: Camera, lost: Collection[str]) -> Camera:
-    """Return the camera with some terms set to 0."""
-    values = zip(parameter_names(camera.model), camera.params, strict=True)
-    params = tuple(0.0 if name in lost else value for name, value in values)
-    return Camera(camera.model, camera.width, camera.height, params)

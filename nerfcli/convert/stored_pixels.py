@@ -126,7 +126,7 @@ def _turned_observations(capture: Capture, turns: np.ndarray) -> Observations | 
     if seen is None:
         return None
     pixels = seen.pixels.copy()
-    sizes = np.array([(frame.camera.width, frame.camera.height) for frame in capture.frames])
+    sizes = np.array([frame.camera.size for frame in capture.frames])
     for orientation in set(turns.tolist()) - {1}:
         rows = turns[seen.frame_index] == orientation
         pixels[rows] = turned_pixels(pixels[rows], sizes[seen.frame_index[rows]], orientation=orientation)

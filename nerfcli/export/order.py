@@ -86,7 +86,7 @@ class Order:
         if self.settings.video is None:
             return
         check_encoders(self.settings.video.formats)
-        sizes = sorted({(frame.camera.width, frame.camera.height) for frame in self.frames})
+        sizes = sorted({frame.camera.size for frame in self.frames})
         if len(sizes) > 1:
             listed = ", ".join(f"{width}x{height}" for width, height in sizes[:4])
             raise UserError(

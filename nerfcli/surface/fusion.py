@@ -131,7 +131,7 @@ def _add(view: DepthView, grid: Grid, corners: np.ndarray, *, inside: Tensor, di
     turn = torch.from_numpy((rotation * grid.voxel_size).astype(np.float32))
     offset = rotation @ (grid.low + 0.5 * grid.voxel_size - pose[:3, 3])
     middles = (rotation * grid.voxel_size) @ (corners + (SIDE - 1) / 2).T + offset[:, None]
-    seen = np.flatnonzero(_may_see(camera.params, (camera.width, camera.height), middles, grid.voxel_size))
+    seen = np.flatnonzero(_may_see(camera.params, camera.size, middles, grid.voxel_size))
     maps, width, height = _maps(view, grid.voxel_size), camera.width, camera.height
     fx, fy, cx, cy = camera.params
     starts = (middles - turn.numpy() @ np.full((3, 1), (SIDE - 1) / 2)).T.astype(np.float32)

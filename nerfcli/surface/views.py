@@ -86,7 +86,7 @@ def depth_views(
 
 def small_pinhole(camera: Camera, max_size: int) -> Camera:
     """Return the pinhole camera for a lens, with a longer side of at most `max_size` pixels."""
-    factor = max(1.0, max(camera.width, camera.height) / max_size)
+    factor = max(1.0, max(camera.size) / max_size)
     pinhole = pinhole_of(camera)
     return pinhole.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
 

@@ -75,7 +75,7 @@ def write_npz(capture: Capture, path: Path) -> None:
         "world_from_cam": np.array([frame.world_from_cam for frame in capture.frames]).reshape(-1, 4, 4),
         "camera_index": np.array(camera_index, dtype=np.int64),
         "camera_models": np.array([camera.model for camera in cameras], dtype=np.str_),
-        "camera_sizes": np.array([(camera.width, camera.height) for camera in cameras], dtype=np.int64).reshape(-1, 2),
+        "camera_sizes": np.array([camera.size for camera in cameras], dtype=np.int64).reshape(-1, 2),
         "camera_params": params,
         "points": np.asarray(capture.points, dtype=np.float64),
         "missing": np.array(capture.missing, dtype=np.str_),

@@ -14,7 +14,6 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from nerfcli.atomic import write_json
-from nerfcli.cameras.camera import parameter_names
 from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.transforms import (
@@ -153,9 +152,7 @@ def _file_path(frame: Frame, folder: Path) -> str:
 
 def _angle(frame: Frame) -> float:
     """Return the horizontal field of view of a frame in radians, as if its principal point were in the middle."""
-    camera = frame.camera
-    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
-    return 2 * math.atan(camera.width / 2 / values.get("fx", values.get("f", math.inf)))
+    return 2 * math.atan(frame.camera.width / 2 / frame.camera.focal_lengths[0])
 
 
 def _shared_angle(frames: list[Frame]) -> float:

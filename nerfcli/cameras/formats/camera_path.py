@@ -25,10 +25,11 @@ from typing import Any
 import numpy as np
 
 from nerfcli.atomic import write_json
-from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
 from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.rigid_poses import rigid_pose
+from nerfcli.cameras.formats.unsupported import distortion, projection
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
@@ -92,10 +93,10 @@ def losses_camera_path(capture: Capture) -> tuple[str, ...]:
     kept = _common_cameras(frames)
     counts = {
         "type of lens": sum(_kind(f.camera) != _kind(k) for f, k in zip(frames, kept, strict=True)),
-        "lens distortion": sum(_distorted(f.camera) for f in frames),
-        "principal point": sum(not f.camera.is_spherical and _off_middle(f.camera) for f in frames),
-        "focal lengths that differ in x and y": sum(_oblong(f.camera) for f in frames),
-        "picture size": sum(_size(f.camera) != _size(k) for f, k in zip(frames, kept, strict=True)),
+        "lens distortion": sum(bool(distortion(f.camera)) for f in frames),
+        "principal point": sum(f.camera != f.camera.centred() for f in frames),
+        "focal lengths that differ in x and y": sum(len(set(f.camera.focal_lengths)) > 1 for f in frames),
+        "picture size": sum(f.camera.size != k.size for f, k in zip(frames, kept, strict=True)),
         "photo": sum(f.image is not None for f in frames),
         "mask": sum(f.mask is not None for f in frames),
         "split": sum(f.split is not None for f in frames),
@@ -125,7 +126,7 @@ def write_camera_path(capture: Capture, path: Path, *, fps: float = _DEFAULT_FPS
     if not capture.frames:
         raise UserError(f"there are no views to write to {path}", "a camera path needs at least one view")
     cameras = _common_cameras(capture.frames)
-    width, height = _size(cameras[0])
+    width, height = cameras[0].size
     records = []
     for frame, camera in zip(capture.frames, cameras, strict=True):
         pose = opengl_from_opencv_pose(frame.world_from_cam).ravel().tolist()
@@ -239,7 +240,7 @@ def _common_cameras(frames: Sequence[Frame]) -> tuple[Camera, ...]:
     if not frames:
         return ()
     kind = Counter(_kind(frame.camera) for frame in frames).most_common(1)[0][0]
-    width, height = Counter(_size(frame.camera) for frame in frames).most_common(1)[0][0]
+    width, height = Counter(frame.camera.size for frame in frames).most_common(1)[0][0]
     kept = []
     for camera in (frame.camera for frame in frames):
         # The format keeps the vertical field of view, whatever the picture's size.
@@ -250,24 +251,4 @@ def _common_cameras(frames: Sequence[Frame]) -> tuple[Camera, ...]:
 
 
 def _kind(camera: Camera) -> str:
-    if camera.is_spherical:
-        return "equirectangular"
-    return "fisheye" if "FISHEYE" in camera.model else "perspective"
-
-
-def _size(camera: Camera) -> tuple[int, int]:
-    return camera.width, camera.height
-
-
-def _distorted(camera: Camera) -> bool:
-    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
-    return not camera.is_spherical and any(v for k, v in values.items() if k not in ("f", "fx", "fy", "cx", "cy"))
-
-
-def _off_middle(camera: Camera) -> bool:
-    return camera.principal_point != (camera.width / 2, camera.height / 2)
-
-
-def _oblong(camera: Camera) -> bool:
-    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
-    return "fx" in values and values["fx"] != values["fy"]
+    return "equirectangular" if camera.is_spherical else projection(camera)

@@ -13,7 +13,7 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
-from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
 from nerfcli.cameras.formats.limits import checked_camera, plausible
 from nerfcli.cameras.formats.npy import array_from_npy
@@ -108,7 +108,7 @@ def write_llff(capture: Capture, folder: Path) -> None:
         )
     bounds = _percentile_bounds(capture) if capture.depth_bounds is None else capture.depth_bounds
     poses = llff_from_opencv_pose(np.array([frame.world_from_cam for frame in capture.frames]))
-    sizes = [(frame.camera.height, frame.camera.width, _focal_x(frame.camera)) for frame in capture.frames]
+    sizes = [(frame.camera.height, frame.camera.width, frame.camera.focal_lengths[0]) for frame in capture.frames]
     matrices = np.concatenate([poses[:, :3], np.array(sizes, dtype=np.float64)[:, :, None]], axis=2)  # (F, 3, 5)
     rows = np.concatenate([matrices.reshape(-1, 15), bounds], axis=1)
     order = sorted(range(len(rows)), key=lambda index: Path(capture.frames[index].name).name)
@@ -180,11 +180,6 @@ def _camera(size_and_focal: Iterable[float], where: str) -> Camera:
     return checked_camera("PINHOLE", round(width), round(height), params, where=where)
 
 
-def _focal_x(camera: Camera) -> float:
-    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
-    return values["fx"] if "fx" in values else values["f"]
-
-
 def _percentile_bounds(capture: Capture) -> np.ndarray:
     """Return the nearest and farthest depth of each view, (frames, 2), from the points."""
     bounds = np.full((len(capture.frames), 2), np.nan)
@@ -214,9 +209,7 @@ def _points_seen(capture: Capture) -> list[np.ndarray]:
         order = np.argsort(frame_index, kind="stable")
         starts = np.searchsorted(frame_index[order], np.arange(1, len(capture.frames)))
         return np.split(point_index[order], starts)
-    inside = []
-    for frame in capture.frames:
-        pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points))
-        within = (pixels >= 0).all(axis=1) & (pixels <= (frame.camera.width, frame.camera.height)).all(axis=1)
-        inside.append(np.flatnonzero(valid & within))
-    return inside
+    return [
+        np.flatnonzero(frame.camera.shows(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points)))
+        for frame in capture.frames
+    ]

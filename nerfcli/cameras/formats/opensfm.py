@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
-from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats import lenses
 from nerfcli.cameras.formats.fields import (
     check_unique_names,
@@ -198,11 +198,11 @@ def _camera_record(camera: Camera) -> dict[str, Any]:
             f"camera model {camera.model} cannot be written to OpenSfM's reconstruction.json",
             "write undistorted cameras, or keep the COLMAP model",
         )
-    scale = max(camera.width, camera.height)
-    value = dict(zip(parameter_names(camera.model), camera.params, strict=True))
+    scale = max(camera.size)
+    value, (fx, fy) = camera.values, camera.focal_lengths
     intrinsics = {
-        "focal_x": value.get("fx", value.get("f", 0.0)) / scale,
-        "focal_y": value.get("fy", value.get("f", 0.0)) / scale,
+        "focal_x": fx / scale,
+        "focal_y": fy / scale,
         "c_x": (value["cx"] - camera.width / 2) / scale,
         "c_y": (value["cy"] - camera.height / 2) / scale,
     }

@@ -6,7 +6,7 @@ Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips
 import math
 from typing import Any
 
-from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import malformed
 from nerfcli.cameras.formats.limits import checked_camera
 from nerfcli.cameras.formats.unsupported import distortion, projection
@@ -85,12 +85,11 @@ def record_of_camera(camera: Camera) -> dict[str, Any]:
     size = {"w": camera.width, "h": camera.height}
     if camera.is_spherical:
         return {"camera_model": "EQUIRECTANGULAR", **size}
-    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
-    fx, fy = values.get("fx", values.get("f")), values.get("fy", values.get("f"))
+    (fx, fy), (cx, cy) = camera.focal_lengths, camera.principal_point
     keys = _KEY_OF_TERM.get(camera.model, {})
     terms = {keys[name]: value for name, value in distortion(camera).items() if name in keys}
     model = "OPENCV_FISHEYE" if projection(camera) == "fisheye" else "OPENCV" if terms else "PINHOLE"
-    return {"camera_model": model, **size, "fl_x": fx, "fl_y": fy, "cx": values["cx"], "cy": values["cy"], **terms}
+    return {"camera_model": model, **size, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, **terms}
 
 
 def lost_to_transforms(camera: Camera) -> list[str]:

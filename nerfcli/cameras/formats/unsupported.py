@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 
-from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture
 
 # Parameters that every format of perspective pictures has a place for.
@@ -49,8 +49,7 @@ def distortion(camera: Camera) -> dict[str, float]:
     """Return the non-zero parameters other than focal lengths and principal point, by name."""
     if camera.is_spherical:
         return {}
-    values = zip(parameter_names(camera.model), camera.params, strict=True)
-    return {name: value for name, value in values if name not in _PINHOLE and value}
+    return {name: value for name, value in camera.values.items() if name not in _PINHOLE and value}
 
 
 def projection(camera: Camera) -> str:
@@ -64,10 +63,9 @@ def lost_to_pinhole(camera: Camera) -> list[str]:
         return ["the spherical projection"]
     lost = ["the fisheye projection"] if projection(camera) == "fisheye" else []
     lost += distortion(camera)
-    if camera.principal_point != (camera.width / 2, camera.height / 2):
+    if camera != camera.centred():
         lost.append("the principal point")
-    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
-    if values.get("fx") != values.get("fy"):
+    if len(set(camera.focal_lengths)) > 1:
         lost.append("the second focal length")
     return lost
 
