@@ -138,14 +138,8 @@ def _listed(line: str, where: str) -> str:
 def _frame(name: str, lines: list[Numbered], size: tuple[int, int], image: Path, path: Path) -> Frame:
     focal, k1, k2 = numbers(*_line(lines, 0, 3, path))
     where = f"{path}: line {lines[0][0]}"
-    camera = lenses.brown_camera(
-        size,
-        (focal, focal),
-        (size[0] / 2, size[1] / 2),
-        radial=(k1, k2, 0.0),
-        tangential=(0.0, 0.0),
-        where=where,
-    )
+    middle = (size[0] / 2, size[1] / 2)
+    camera = lenses.brown_camera(size, (focal, focal), middle, radial=(k1, k2, 0.0), where=where)
     rows = np.array([numbers(*_line(lines, row, 3, path)) for row in range(1, 5)])
     cam_from_world = rigid_pose(np.column_stack([rows[:3], rows[3]]), f"{path}: line {lines[1][0]}")
     return Frame(name, camera, opencv_from_opengl_pose(rigid.inverse(cam_from_world)), image=image)

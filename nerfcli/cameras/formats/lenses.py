@@ -35,7 +35,7 @@ def brown_camera(
     centre: Pair,
     *,
     radial: tuple[float, float, float],
-    tangential: Pair,
+    tangential: Pair = (0.0, 0.0),
     where: str,
 ) -> Camera:
     """Return a perspective camera with Brown's distortion.
@@ -69,8 +69,8 @@ def fisheye_camera(
     centre: Pair,
     *,
     radial: tuple[float, float, float, float],
-    tangential: Pair,
-    prism: Pair,
+    tangential: Pair = (0.0, 0.0),
+    prism: Pair = (0.0, 0.0),
     where: str,
 ) -> Camera:
     """Return a camera with equidistant projection and Brown's distortion, thin prisms (sx, sy) included.
@@ -88,18 +88,6 @@ def fisheye_camera(
         params = (*focal, *centre, *radial[:2], *tangential, *radial[2:], *prism)
         return checked_camera("THIN_PRISM_FISHEYE", *size, params, where=where)
     return checked_camera("OPENCV_FISHEYE", *size, (*focal, *centre, *radial), where=where)
-
-
-def long_fisheye_camera(
-    size: tuple[int, int], focal: Pair, centre: Pair, *, radial: tuple[float, ...], where: str
-) -> Camera:
-    """Create a camera like `fisheye_camera`, with six radial terms up to k6 r^12 and no other.
-
-    Raises:
-        UserError: invalid parameters of a camera; `where` is named.
-    """
-    params = (*focal, *centre, *radial, *(0.0,) * 6)
-    return checked_camera("RAD_TAN_THIN_PRISM_FISHEYE", *size, params, where=where)
 
 
 def spherical_camera(size: tuple[int, int], where: str) -> Camera:

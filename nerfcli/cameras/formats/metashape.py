@@ -170,9 +170,7 @@ def _camera(sensor: Element, where: str) -> Camera:
     focals, tangential = (focal + value["b1"], focal), (value["p2"], value["p1"])
     if kind in _FISHEYE:
         radial = (value["k1"], value["k2"], value["k3"], value["k4"])
-        return lenses.fisheye_camera(
-            size, focals, centre, radial=radial, tangential=tangential, prism=(0.0, 0.0), where=where
-        )
+        return lenses.fisheye_camera(size, focals, centre, radial=radial, tangential=tangential, where=where)
     _refuse_term("k4", value["k4"] * focal, "a fourth radial term of a frame camera", where)
     radial = (value["k1"], value["k2"], value["k3"])
     return lenses.brown_camera(size, focals, centre, radial=radial, tangential=tangential, where=where)

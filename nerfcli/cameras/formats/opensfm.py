@@ -9,7 +9,6 @@ opensfm/src/geometry/camera_{projections,distortions}_functions.h.
 """
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +30,8 @@ from nerfcli.cameras.formats.fields import (
     size_of,
     vector,
 )
-from nerfcli.cameras.formats.limits import plausible
-from nerfcli.cameras.formats.unsupported import distortion, lost_of_cameras, lost_parts
+from nerfcli.cameras.formats.limits import checked_camera, plausible
+from nerfcli.cameras.formats.unsupported import distortion, lost_of_cameras, lost_parts, projection
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import UserError
 
@@ -40,14 +39,34 @@ IMAGE_FOLDER = "images"
 
 _EXPECTED = "expected the reconstruction.json of an OpenSfM dataset: a list of reconstructions"
 
-_BROWN = ("perspective", "simple_radial", "radial", "brown")
-_FISHEYE = ("fisheye", "fisheye_opencv", "fisheye62", "fisheye624")
+# The types of lenses and their distortion terms. Files have all but the last four in every lens.
+_BROWN = {
+    "perspective": ("k1", "k2"),
+    "simple_radial": ("k1",),
+    "radial": ("k1", "k2"),
+    "brown": ("k1", "k2", "p1", "p2", "k3"),
+}
+_ALL_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
+_TERMS = {
+    **_BROWN,
+    "fisheye": ("k1", "k2"),
+    "fisheye_opencv": ("k1", "k2", "k3", "k4"),
+    "fisheye62": _ALL_TERMS[:8],
+    "fisheye624": _ALL_TERMS,
+}
 _SPHERICAL = ("spherical", "equirectangular")
 
 # Terms that OpenSfM lacks. The tangential and prism terms of RAD_TAN_THIN_PRISM_FISHEYE act on other coordinates.
 _LOST_TERMS = {
     "FULL_OPENCV": ("k4", "k5", "k6"),
     "RAD_TAN_THIN_PRISM_FISHEYE": ("p0", "p1", "s0", "s1", "s2", "s3"),
+}
+# The types of the lenses of COLMAP's models that are not written as "brown" or "fisheye_opencv".
+_TYPES = {
+    "SIMPLE_RADIAL": "simple_radial",
+    "RADIAL": "radial",
+    "THIN_PRISM_FISHEYE": "fisheye624",
+    "RAD_TAN_THIN_PRISM_FISHEYE": "fisheye62",
 }
 _NO_WORDS = ("FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM")
 
@@ -135,57 +154,32 @@ def _camera(value: Any, where: str) -> Camera:
     size = size_of(number(record, "width", where), number(record, "height", where), where)
     if kind in _SPHERICAL:
         return lenses.spherical_camera(size, where)
-    if kind not in _BROWN + _FISHEYE:
-        supported = ", ".join(_BROWN + _FISHEYE + _SPHERICAL)
+    if kind not in tuple(_TERMS):
+        supported = ", ".join((*_TERMS, *_SPHERICAL))
         raise malformed(where, f"projection_type {shown(kind)} is not supported", f"expected one of {supported}")
-    term = {key: number(record, key, where, default=0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
-    scale = max(size)
+    listed = _ALL_TERMS if kind == "fisheye624" else _ALL_TERMS[:8]
+    term = {key: number(record, key, where, default=0.0) for key in listed}
+    k1, k2, k3, k4, k5, k6, p1, p2, s0, s1, s2, s3 = (term[key] if key in _TERMS[kind] else 0.0 for key in _ALL_TERMS)
+    scale, middle = max(size), (size[0] / 2, size[1] / 2)
     if kind in ("perspective", "fisheye"):
-        focal_px = scale * number(record, "focal", where)
-        focal = (focal_px, focal_px)
-        centre = (size[0] / 2, size[1] / 2)
+        focal, centre = (scale * number(record, "focal", where),) * 2, middle
     else:
         focal = (scale * number(record, "focal_x", where), scale * number(record, "focal_y", where))
-        centre = (
-            size[0] / 2 + scale * number(record, "c_x", where, default=0.0),
-            size[1] / 2 + scale * number(record, "c_y", where, default=0.0),
-        )
-    tangential = (term["p1"], term["p2"])
-    if kind == "brown":
-        radial = (term["k1"], term["k2"], term["k3"])
-        return lenses.brown_camera(size, focal, centre, radial=radial, tangential=tangential, where=where)
+        x, y = (scale * number(record, key, where, default=0.0) for key in ("c_x", "c_y"))
+        centre = (middle[0] + x, middle[1] + y)
     if kind in _BROWN:
-        radial = (term["k1"], 0.0 if kind == "simple_radial" else term["k2"], 0.0)
-        return lenses.brown_camera(size, focal, centre, radial=radial, tangential=(0.0, 0.0), where=where)
+        return lenses.brown_camera(size, focal, centre, radial=(k1, k2, k3), tangential=(p1, p2), where=where)
+    radial, others = (k1, k2, k3, k4), (p1, p2, s0, s1, s2, s3)
     if kind in ("fisheye", "fisheye_opencv"):
-        radial = (term["k1"], term["k2"], *((0.0, 0.0) if kind == "fisheye" else (term["k3"], term["k4"])))
-        return lenses.fisheye_camera(
-            size, focal, centre, radial=radial, tangential=(0.0, 0.0), prism=(0.0, 0.0), where=where
-        )
-    prism = [number(record, key, where, default=0.0) for key in ("s0", "s1", "s2", "s3")] if kind[-1] == "4" else [0.0]
-    return _long_fisheye(size, focal, centre, term, prism, where)
-
-
-def _long_fisheye(
-    size: tuple[int, int],
-    focal: tuple[float, float],
-    centre: tuple[float, float],
-    term: dict[str, float],
-    prism: Sequence[float],
-    where: str,
-) -> Camera:
-    """Return the camera of fisheye62 or fisheye624, whose terms no COLMAP model has all at once."""
-    tangential = (term["p1"], term["p2"])
-    if not any(tangential) and not any(prism):
-        radial = tuple(term[f"k{index}"] for index in range(1, 7))
-        return lenses.long_fisheye_camera(size, focal, centre, radial=radial, where=where)
-    s0, s1, s2, s3 = prism if len(prism) == 4 else (0.0,) * 4
-    if term["k5"] or term["k6"] or s1 or s3:
+        return lenses.fisheye_camera(size, focal, centre, radial=radial, where=where)
+    if not any(others):
+        params = (*focal, *centre, *radial, k5, k6, *others)
+        return checked_camera("RAD_TAN_THIN_PRISM_FISHEYE", *size, params, where=where)
+    if k5 or k6 or s1 or s3:
         raise malformed(
             where, "k5, k6, s1 or s3 beside p1, p2, s0 or s2", "no supported camera model has all of these terms"
         )
-    radial = (term["k1"], term["k2"], term["k3"], term["k4"])
-    return lenses.fisheye_camera(size, focal, centre, radial=radial, tangential=tangential, prism=(s0, s2), where=where)
+    return lenses.fisheye_camera(size, focal, centre, radial=radial, tangential=(p1, p2), prism=(s0, s2), where=where)
 
 
 def _camera_record(camera: Camera) -> dict[str, Any]:
@@ -198,31 +192,21 @@ def _camera_record(camera: Camera) -> dict[str, Any]:
             f"camera model {camera.model} cannot be written to OpenSfM's reconstruction.json",
             "write undistorted cameras, or keep the COLMAP model",
         )
-    scale = max(camera.size)
-    value, (fx, fy) = camera.values, camera.focal_lengths
+    scale, value, (fx, fy), (cx, cy) = max(camera.size), camera.values, camera.focal_lengths, camera.principal_point
     intrinsics = {
         "focal_x": fx / scale,
         "focal_y": fy / scale,
-        "c_x": (value["cx"] - camera.width / 2) / scale,
-        "c_y": (value["cy"] - camera.height / 2) / scale,
+        "c_x": (cx - camera.width / 2) / scale,
+        "c_y": (cy - camera.height / 2) / scale,
     }
-    if camera.model == "RAD_TAN_THIN_PRISM_FISHEYE":
-        kind, terms = "fisheye62", {f"k{index + 1}": value[f"k{index}"] for index in range(6)} | {"p1": 0.0, "p2": 0.0}
-    elif camera.model == "THIN_PRISM_FISHEYE":
-        kind = "fisheye624"
-        terms = {key: value.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
-        terms |= {"s0": value["sx1"], "s1": 0.0, "s2": value["sy1"], "s3": 0.0}
-    elif camera.model.endswith("FISHEYE"):
-        kind = "fisheye_opencv"
-        terms = {key: value.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")}
-    elif camera.model in ("SIMPLE_RADIAL", "RADIAL"):
-        kind = camera.model.lower()
-        terms = {key: value[key] for key in ("k1", "k2") if key in value}
-    else:
-        kind = "brown"
-        terms = {key: value.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")}
-    if "k" in value:
-        terms["k1"] = value["k"]
+    kind = _TYPES.get(camera.model, "fisheye_opencv" if projection(camera) == "fisheye" else "brown")
+    if kind == "fisheye62":
+        value = {f"k{index + 1}": value[f"k{index}"] for index in range(6)}
+    elif kind == "fisheye624":
+        value |= {"s0": value["sx1"], "s2": value["sy1"]}
+    elif "k" in value:
+        value["k1"] = value["k"]
+    terms = {key: value.get(key, 0.0) for key in _TERMS[kind]}
     return {"projection_type": kind, **size, **intrinsics, **terms}
 
 

@@ -110,7 +110,7 @@ def _cells(line: str, where: str) -> list[str]:
 
 def _camera(value: dict[str, float], size: tuple[int, int], where: str) -> Camera:
     scale = max(size)
-    focal_px = value["f"] / 36 * scale
+    focal = (value["f"] / 36 * scale,) * 2
     centre = (size[0] / 2 + value["px"] * scale, size[1] / 2 + value["py"] * scale)
     if value["k4"] != 0:
         raise malformed(
@@ -118,11 +118,5 @@ def _camera(value: dict[str, float], size: tuple[int, int], where: str) -> Camer
             f"k4 is {shown(value['k4'])}: a fourth radial term, which is not supported",
             "align with the distortion model Brown3 or Brown3 with tangential2, and export again",
         )
-    return lenses.brown_camera(
-        size,
-        (focal_px, focal_px),
-        centre,
-        radial=(value["k1"], value["k2"], value["k3"]),
-        tangential=(value["t2"], value["t1"]),
-        where=where,
-    )
+    radial, tangential = (value["k1"], value["k2"], value["k3"]), (value["t2"], value["t1"])
+    return lenses.brown_camera(size, focal, centre, radial=radial, tangential=tangential, where=where)
