@@ -51,7 +51,6 @@ def parse_alicevision(path: Path, *, images: Path | None = None) -> Capture:
     Photos are where the file says, or, as it usually comes from another machine, in `images` or beside the file.
 
     Args:
-        path: the file.
         images: the folder of the photos.
 
     Raises:

@@ -43,8 +43,6 @@ def parse_bundler(
     `missing`, and their observations are left out.
 
     Args:
-        path: the .out file.
-        measure: returns an image's upright size and EXIF orientation.
         images: the folder that the names are relative to; by default the folder of the list.
         image_list: the list of images; by default X.list.txt, which COLMAP writes beside X.bundle.out, or list.txt
             beside the file or in the folder above.

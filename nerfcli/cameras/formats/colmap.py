@@ -36,7 +36,6 @@ def read_colmap(model_dir: Path, image_dir: Path, measure: Measure) -> Capture:
     Args:
         model_dir: holds cameras, images and points3D, as .bin (which wins) or .txt.
         image_dir: image names are relative to it; they may contain subfolders.
-        measure: returns an image's upright size and EXIF orientation.
 
     Raises:
         UserError: a file of the model is missing or damaged, or no image is on disk.

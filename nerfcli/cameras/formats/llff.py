@@ -6,7 +6,7 @@ the sorted file names. Source: Fyusion/LLFF README, "Using your own poses withou
 llff/poses/pose_utils.py, save_poses.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
 from nerfcli.cameras.formats.limits import checked_camera, plausible
 from nerfcli.cameras.formats.npy import array_from_npy
+from nerfcli.cameras.formats.photo_names import ListImages
 from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole
 from nerfcli.cameras.frame import Capture, Frame
@@ -30,13 +31,8 @@ IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 _NEAR_PERCENT, _FAR_PERCENT = 0.1, 99.9
 
 
-def read_llff(folder: Path, measure: Measure, list_images: Callable[[Path], list[Path]]) -> Capture:
+def read_llff(folder: Path, measure: Measure, list_images: ListImages) -> Capture:
     """Read a capture in LLFF's format, with the first image folder that holds one image per row.
-
-    Args:
-        folder: holds poses_bounds.npy.
-        measure: returns an image's upright size and EXIF orientation.
-        list_images: returns the image files of a folder, sorted by name.
 
     Raises:
         UserError: the array is damaged or of another shape, or no image folder has as many images as it has rows.
@@ -53,15 +49,11 @@ def read_llff(folder: Path, measure: Measure, list_images: Callable[[Path], list
     return Capture(tuple(frames), np.zeros((0, 3)), (), bounds, "llff", pixels="upright", rescaled=counted(rescaled))
 
 
-def parse_llff(folder: Path, list_images: Callable[[Path], list[Path]]) -> Capture:
+def parse_llff(folder: Path, list_images: ListImages) -> Capture:
     """Read poses_bounds.npy; cameras are for the full-size photos.
 
     The file does not name the photos. They are those of the first image folder that holds one per row. If there is no
     image folder at all, frames are named image000, image001, ... and have no image.
-
-    Args:
-        folder: holds poses_bounds.npy.
-        list_images: returns the image files of a folder, sorted by name.
 
     Raises:
         UserError: the array is damaged or of another shape, or image folders hold other numbers of images.
@@ -150,7 +142,7 @@ def _views(path: Path, rows: np.ndarray) -> list[tuple[Camera, np.ndarray]]:
     return [(cameras[tuple(row)], pose) for row, pose in zip(matrices[:, :, 4].tolist(), poses, strict=True)]
 
 
-def _images_of_rows(folder: Path, count: int, list_images: Callable[[Path], list[Path]]) -> list[Path]:
+def _images_of_rows(folder: Path, count: int, list_images: ListImages) -> list[Path]:
     found = []
     for name in IMAGE_FOLDERS:
         if not (folder / name).is_dir():

@@ -11,7 +11,6 @@
 Source: YoYo000/MVSNet README, "File Formats", and colmap2mvsnet.py (principal points as in COLMAP).
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ import numpy as np
 from nerfcli.cameras import rigid
 from nerfcli.cameras.formats.fields import check_unique_names, malformed, numbers, read_text
 from nerfcli.cameras.formats.lenses import camera_of_matrix
-from nerfcli.cameras.formats.photo_names import PhotoOfStem, photos_missing
+from nerfcli.cameras.formats.photo_names import ListImages, PhotoOfStem
 from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, stored_size
@@ -28,43 +27,30 @@ CAMERA_FOLDER = "cams"
 CAMERA_FILES = "*_cam.txt"
 IMAGE_FOLDERS = ("images", "blended_images")
 
-_SUFFIX = "_cam.txt"
 _EXPECTED = "expected the word extrinsic, 16 numbers, the word intrinsic, 9 numbers, and a line of 2 to 4 depths"
 
 
-def parse_mvsnet(
-    folder: Path, measure: Measure, list_images: Callable[[Path], list[Path]], *, images: Path | None = None
-) -> Capture:
+def parse_mvsnet(folder: Path, measure: Measure, list_images: ListImages, *, images: Path | None = None) -> Capture:
     """Read the cameras in cams/, with their depth bounds where all files have them.
 
-    Args:
-        folder: holds cams/.
-        measure: returns an image's upright size and EXIF orientation.
-        list_images: returns the image files of a folder, sorted by name.
-        images: the folder of the photos; by default images/ or blended_images/.
+    The photos are in `images`, by default images/ or blended_images/.
 
     Raises:
         UserError: a file is damaged (it is named), or no photo is on disk.
     """
-    files = sorted((folder / CAMERA_FOLDER).glob(CAMERA_FILES))
-    places = (folder / name for name in IMAGE_FOLDERS)
-    photos = PhotoOfStem(images or next((place for place in places if place.is_dir()), folder), list_images)
-    frames, bounds, missing = [], [], []
-    for file in files:
-        stem = file.name.removesuffix(_SUFFIX)
+    photos = PhotoOfStem(images, list_images, home=folder, names=IMAGE_FOLDERS)
+    frames, bounds = [], []
+    for file in sorted((folder / CAMERA_FOLDER).glob(CAMERA_FILES)):
         cam_from_world, matrix, depths = _read(file)
-        image = photos.find(stem)
-        if image is None:
-            missing.append(stem)
-            continue
-        camera = camera_of_matrix(matrix, stored_size(image, measure), f"{file}: intrinsic")
-        frames.append(Frame(image.name, camera, rigid.inverse(cam_from_world), image=image))
-        bounds.append(depths)
-    if not frames:
-        raise photos_missing(missing, photos.folder, str(folder))
+        image = photos.find(file.name.removesuffix(CAMERA_FILES[1:]))
+        if image is not None:
+            camera = camera_of_matrix(matrix, stored_size(image, measure), f"{file}: intrinsic")
+            frames.append(Frame(image.name, camera, rigid.inverse(cam_from_world), image=image))
+            bounds.append(depths)
+    missing = photos.missing(str(folder))
     check_unique_names((frame.name for frame in frames), folder)
     known = np.array(bounds) if None not in bounds else None
-    return Capture(tuple(frames), np.zeros((0, 3)), tuple(missing), known, "mvsnet")
+    return Capture(tuple(frames), np.zeros((0, 3)), missing, known, "mvsnet")
 
 
 def _read(file: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, float] | None]:

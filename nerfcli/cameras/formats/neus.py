@@ -7,7 +7,6 @@ The numbers belong to the photos of image/ in the order of their names, and to t
 Source: Totoro97/NeuS models/dataset.py, load_K_Rt_from_P; lioryariv/idr DATA_CONVENTION.md.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from nerfcli.cameras.formats.archive import Arrays
 from nerfcli.cameras.formats.fields import malformed
 from nerfcli.cameras.formats.lenses import camera_of_matrix
 from nerfcli.cameras.formats.limits import plausible
+from nerfcli.cameras.formats.photo_names import ListImages
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, stored_size
 from nerfcli.errors import UserError
@@ -33,15 +33,10 @@ _SINGULAR = 1e-9
 _ROUNDING_PX = 0.01
 
 
-def parse_neus(
-    path: Path, measure: Measure, list_images: Callable[[Path], list[Path]], *, images: Path | None = None
-) -> Capture:
+def parse_neus(path: Path, measure: Measure, list_images: ListImages, *, images: Path | None = None) -> Capture:
     """Read the cameras of the file, in its world; the photos are those beside it, in order.
 
     Args:
-        path: the .npz file.
-        measure: returns an image's upright size and EXIF orientation.
-        list_images: returns the image files of a folder, sorted by name.
         images: the folder of the photos; by default image/, images/ or rgb/ beside the file.
 
     Raises:
@@ -77,7 +72,7 @@ def _without_rounding(matrices: np.ndarray) -> np.ndarray:
     return np.broadcast_to(shared, matrices.shape) if same else matrices
 
 
-def _pictures(folder: Path, names: tuple[str | Path, ...], list_images: Callable[[Path], list[Path]]) -> list[Path]:
+def _pictures(folder: Path, names: tuple[str | Path, ...], list_images: ListImages) -> list[Path]:
     """Return the pictures in the first of these folders that there is."""
     place = next((folder / name for name in names if (folder / name).is_dir()), None)
     return [] if place is None else list_images(place)

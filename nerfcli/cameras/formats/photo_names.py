@@ -6,34 +6,46 @@ from pathlib import Path
 
 from nerfcli.cameras.formats.fields import malformed, shown
 from nerfcli.cameras.orientation import Measure, stored_size
-from nerfcli.errors import UserError
+
+# Returns the image files of a folder, sorted by name.
+ListImages = Callable[[Path], list[Path]]
 
 
 class PhotoOfStem:
     """The photos in a folder by their names without suffix, for formats that leave the suffix open.
 
     Args:
-        folder: the folder; it may be absent.
-        list_images: returns the image files of a folder, sorted by name.
+        images: the folder, which may be absent; None for the first of the folders `names` in `home`, or else `home`.
     """
 
-    def __init__(self, folder: Path, list_images: Callable[[Path], list[Path]]):
-        self.folder = folder
-        photos = list_images(folder) if folder.is_dir() else []
+    def __init__(self, images: Path | None, list_images: ListImages, *, home: Path, names: Sequence[str] = ()):
+        places = (home / name for name in names)
+        self._folder = images or next((place for place in places if place.is_dir()), home)
+        photos = list_images(self._folder) if self._folder.is_dir() else []
         self._photos = {photo.stem: photo for photo in reversed(photos)}  # of a.jpg and a.png, the first
+        self._any_found, self._missing = False, list[str]()
 
-    def find(self, *stems: str) -> Path | None:
-        """Return the photo with the first of these names that there is."""
-        return next((self._photos[stem] for stem in stems if stem in self._photos), None)
+    def find(self, stem: str, *others: str) -> Path | None:
+        """Return the photo with the first of these names that there is; without any, `stem` is missing."""
+        image = next((self._photos[name] for name in (stem, *others) if name in self._photos), None)
+        if image is None:
+            self._missing.append(stem)
+        self._any_found |= image is not None
+        return image
 
+    def missing(self, where: str) -> tuple[str, ...]:
+        """Return the names without suffix that were not found.
 
-def photos_missing(names: Sequence[str], folder: Path, where: str) -> UserError:
-    """Create the error for a capture without any of its photos; `names` lists them without suffix."""
-    return malformed(
-        where,
-        f"none of its {len(names)} photos exists in {folder}, such as {shown(names[0])}",
-        "the photos are needed, as they give the names; give their folder with --images",
-    )
+        Raises:
+            UserError: none was found; the message begins with `where`.
+        """
+        if not self._any_found:
+            raise malformed(
+                where,
+                f"none of its {len(self._missing)} photos exists in {self._folder}, such as {shown(self._missing[0])}",
+                "the photos are needed, as they give the names; give their folder with --images",
+            )
+        return tuple(self._missing)
 
 
 def measured_sizes(
@@ -43,7 +55,6 @@ def measured_sizes(
 
     Args:
         names: of the photos, relative to `folder`.
-        measure: returns an image's upright size and EXIF orientation.
         path: the file that lists them, for the error.
 
     Raises:

@@ -7,7 +7,6 @@ have cameras/ and images/ only.
 Source: PolyCam/polyform README.md, "Polycam's data format", and polyform/convertors/instant_ngp.py.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats.fields import check_unique_names, number, read_json_object, size_of
 from nerfcli.cameras.formats.limits import checked_camera
-from nerfcli.cameras.formats.photo_names import PhotoOfStem, photos_missing
+from nerfcli.cameras.formats.photo_names import ListImages, PhotoOfStem
 from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 
@@ -32,35 +31,28 @@ def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
     return next((pair for pair in pairs if pair[1].is_dir()), pairs[0] if pairs else None)
 
 
-def parse_polycam(folder: Path, list_images: Callable[[Path], list[Path]], *, images: Path | None = None) -> Capture:
+def parse_polycam(folder: Path, list_images: ListImages, *, images: Path | None = None) -> Capture:
     """Read the keyframes of a capture; the unit is the metre, by LiDAR.
 
-    Args:
-        folder: holds keyframes/.
-        list_images: returns the image files of a folder, sorted by name.
-        images: the folder of the photos, if it is another one.
+    The photos are in the folder beside the cameras, or in `images`.
 
     Raises:
         UserError: a file is damaged (file and field are named), or no photo is on disk.
     """
     found = polycam_folders(folder)
     assert found is not None
-    photos = PhotoOfStem(images or found[1], list_images)
-    frames, missing = [], []
+    photos, frames = PhotoOfStem(images, list_images, home=found[1]), []
     for file in sorted(found[0].glob("*.json"), key=lambda file: (len(file.stem), file.stem)):
         where, record = str(file), read_json_object(file)
         fx, fy, cx, cy, *pose = (number(record, key, where) for key in ("fx", "fy", "cx", "cy", *_POSE))
         size = size_of(number(record, "width", where), number(record, "height", where), where)
         camera = checked_camera("PINHOLE", *size, (fx, fy, cx, cy), where=where)
         image = photos.find(file.stem)
-        if image is None:
-            missing.append(file.stem)
-            continue
-        world_from_cam = opencv_from_opengl_pose(rigid_pose(np.array(pose).reshape(3, 4), where))
-        frames.append(Frame(image.name, camera, world_from_cam, image=image))
-    if not frames:
-        raise photos_missing(missing, photos.folder, str(folder))
+        if image is not None:
+            world_from_cam = opencv_from_opengl_pose(rigid_pose(np.array(pose).reshape(3, 4), where))
+            frames.append(Frame(image.name, camera, world_from_cam, image=image))
+    missing = photos.missing(str(folder))
     check_unique_names((frame.name for frame in frames), folder)
     return Capture(
-        tuple(frames), np.zeros((0, 3)), tuple(missing), None, "polycam", unit="metre", unit_source="LiDAR (Polycam)"
+        tuple(frames), np.zeros((0, 3)), missing, None, "polycam", unit="metre", unit_source="LiDAR (Polycam)"
     )

@@ -21,7 +21,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, size_of
 from nerfcli.cameras.formats.lenses import camera_of_matrix
 from nerfcli.cameras.formats.limits import checked_camera
-from nerfcli.cameras.formats.photo_names import PhotoOfStem, photos_missing
+from nerfcli.cameras.formats.photo_names import ListImages, PhotoOfStem
 from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, stored_size
@@ -56,7 +56,7 @@ def is_pose(path: Path) -> bool:
 def parse_pose_files(
     folder: Path,
     measure: Measure,
-    list_images: Callable[[Path], list[Path]],
+    list_images: ListImages,
     *,
     camera: Camera | None = None,
     images: Path | None = None,
@@ -68,8 +68,6 @@ def parse_pose_files(
 
     Args:
         folder: holds the poses, see `pose_files`.
-        measure: returns an image's upright size and EXIF orientation.
-        list_images: returns the image files of a folder, sorted by name.
         camera: of all photos, resized to them; None for the intrinsics in the folder.
         images: the folder of the photos; by default color/, rgb/, images/ or image/, else that of the poses.
 
@@ -77,33 +75,23 @@ def parse_pose_files(
         UserError: a file is damaged (file and line are named), there are no intrinsics, or no photo is on disk.
     """
     files = pose_files(folder)
-    photos = PhotoOfStem(_image_folder(folder, files, images, list_images), list_images)
+    if images is None:
+        places = (folder / name for name in IMAGE_FOLDERS)
+        images = next((place for place in places if place.is_dir() and list_images(place)), files[0].parent)
+    photos, frames = PhotoOfStem(images, list_images, home=folder), []
     camera_of_size = _cameras(folder, camera)
     names_give_splits = all(file.name[:2] in _SPLITS for file in files)
-    frames, missing = [], []
     for file in files:
         world_from_cam = _pose(file)
         stem = file.name.removesuffix(".txt").removesuffix(".pose")
         image = photos.find(stem, f"{stem}.color")
-        if image is None:
-            missing.append(stem)
-        elif world_from_cam is not None:
+        if image is not None and world_from_cam is not None:
             own_camera = camera_of_size(stored_size(image, measure))
             split = _SPLITS[stem[:2]] if names_give_splits else None
             frames.append(Frame(image.name, own_camera, world_from_cam, image=image, split=split))
-    if len(missing) == len(files):
-        raise photos_missing(missing, photos.folder, str(folder))
+    missing = photos.missing(str(folder))
     check_unique_names((frame.name for frame in frames), folder)
-    return Capture(tuple(frames), np.zeros((0, 3)), tuple(missing), None, "pose-files")
-
-
-def _image_folder(
-    folder: Path, files: Sequence[Path], images: Path | None, list_images: Callable[[Path], list[Path]]
-) -> Path:
-    if images is not None:
-        return images
-    places = (folder / name for name in IMAGE_FOLDERS)
-    return next((place for place in places if place.is_dir() and list_images(place)), files[0].parent)
+    return Capture(tuple(frames), np.zeros((0, 3)), missing, None, "pose-files")
 
 
 def _pose(file: Path) -> np.ndarray | None:

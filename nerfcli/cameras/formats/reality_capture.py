@@ -47,8 +47,6 @@ def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None =
     say which model it is.
 
     Args:
-        path: the .csv file.
-        measure: returns an image's upright size and EXIF orientation.
         images: the folder that the names in the file are relative to; by default the file's own.
 
     Raises:

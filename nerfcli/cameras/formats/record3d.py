@@ -6,17 +6,15 @@ absent. w and h: the size of the pictures that these numbers are for. Read only.
 Source: nerfstudio process_data/record3d_utils.py; record3d.app, "Format of .r3d files".
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats.fields import malformed, number, read_json_object, shown, size_of, vector
 from nerfcli.cameras.formats.limits import checked_camera
-from nerfcli.cameras.formats.photo_names import PhotoOfStem, photos_missing
+from nerfcli.cameras.formats.photo_names import ListImages, PhotoOfStem
 from nerfcli.cameras.formats.rigid_poses import quaternion_pose
 from nerfcli.cameras.frame import Capture, Frame
 
@@ -31,12 +29,11 @@ def is_record3d(content: dict[str, Any]) -> bool:
     return all(key in content for key in (_POSES, "K", "w", "h"))
 
 
-def parse_record3d(path: Path, list_images: Callable[[Path], list[Path]], *, images: Path | None = None) -> Capture:
+def parse_record3d(path: Path, list_images: ListImages, *, images: Path | None = None) -> Capture:
     """Read the frames of a capture; the unit is the metre, by LiDAR or ARKit.
 
     Args:
         path: metadata.json, or metadata as in an unpacked .r3d file.
-        list_images: returns the image files of a folder, sorted by name.
         images: the folder of the photos; by default rgb/, rgbd/ or images/ beside the file.
 
     Raises:
@@ -48,27 +45,20 @@ def parse_record3d(path: Path, list_images: Callable[[Path], list[Path]], *, ima
     poses = content.get(_POSES)
     if not isinstance(poses, list) or not poses:
         raise malformed(where, f"{_POSES} is {shown(poses)}", "expected a list of poses")
-    places = (path.parent / name for name in IMAGE_FOLDERS)
-    photos = PhotoOfStem(images or next((place for place in places if place.is_dir()), path.parent), list_images)
-    intrinsics = _intrinsics(content, len(poses), where)
-    frames, missing = [], []
+    photos = PhotoOfStem(images, list_images, home=path.parent, names=IMAGE_FOLDERS)
+    intrinsics, frames = _intrinsics(content, len(poses), where).tolist(), []
     for index, pose in enumerate(poses):
-        world_from_cam = opencv_from_opengl_pose(_pose(pose, f"{where}: {_POSES}[{index}]"))
+        place = f"{where}: {_POSES}[{index}]"
+        row = vector({"pose": pose}, "pose", 7, place)
+        world_from_cam = opencv_from_opengl_pose(quaternion_pose(row[:4], row[4:], place))
         image = photos.find(str(index))
-        if image is None:
-            missing.append(str(index))
-        else:
-            frames.append(Frame(image.name, _camera(intrinsics[index], size, where), world_from_cam, image=image))
-    if not frames:
-        raise photos_missing(missing, photos.folder, where)
+        if image is not None:
+            camera = checked_camera("PINHOLE", *size, tuple(intrinsics[index]), where=where)
+            frames.append(Frame(image.name, camera, world_from_cam, image=image))
+    missing = photos.missing(where)
     return Capture(
-        tuple(frames), np.zeros((0, 3)), tuple(missing), None, "record3d", unit="metre", unit_source="ARKit (Record3D)"
+        tuple(frames), np.zeros((0, 3)), missing, None, "record3d", unit="metre", unit_source="ARKit (Record3D)"
     )
-
-
-def _pose(value: Any, where: str) -> np.ndarray:
-    row = vector({"pose": value}, "pose", 7, where)
-    return quaternion_pose(row[:4], row[4:], where)
 
 
 def _intrinsics(content: dict[str, Any], count: int, where: str) -> np.ndarray:
@@ -79,7 +69,3 @@ def _intrinsics(content: dict[str, Any], count: int, where: str) -> np.ndarray:
     if not isinstance(rows, list) or len(rows) != count:
         raise malformed(where, f"{_INTRINSICS} is {shown(rows)}", f"expected a list of {count}, one for each pose")
     return np.array([vector({"row": row}, "row", 4, f"{where}: {_INTRINSICS}[{i}]") for i, row in enumerate(rows)])
-
-
-def _camera(row: np.ndarray, size: tuple[int, int], where: str) -> Camera:
-    return checked_camera("PINHOLE", *size, tuple(row.tolist()), where=where)

@@ -26,7 +26,6 @@ class Description:
     """Content of a scene.json.
 
     Args:
-        path: the file.
         image_folder: folder of the photos, which the names of the model's images are relative to; need not exist.
         model_dir: the COLMAP model, whose cameras refer to upright photos.
         unit, unit_source: as in `Scene`.

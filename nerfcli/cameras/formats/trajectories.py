@@ -31,7 +31,6 @@ def parse_tum(path: Path, camera: Camera | None) -> Capture:
     """Read a trajectory in the TUM format; a frame's name is its timestamp as written in the file.
 
     Args:
-        path: the text file.
         camera: of all frames, since the file has none.
 
     Raises:
@@ -43,12 +42,7 @@ def parse_tum(path: Path, camera: Camera | None) -> Capture:
 def parse_kitti(path: Path, camera: Camera | None) -> Capture:
     """Read a trajectory in the KITTI format; a frame's name is its index in six digits, as KITTI names its pictures.
 
-    Args:
-        path: the text file.
-        camera: of all frames, since the file has none.
-
-    Raises:
-        UserError: the file is damaged (file and line are named), or no camera is given.
+    `camera` and the errors are those of `parse_tum`.
     """
     return _parse(path, camera, _kitti_pose, expected=_KITTI_EXPECTED, kind="kitti")
 

@@ -41,7 +41,6 @@ def read_transforms(path: Path, measure: Measure) -> Capture:
 
     Args:
         path: the JSON file; image paths in it are relative to its folder.
-        measure: returns an image's upright size and EXIF orientation.
 
     Raises:
         UserError: the file is malformed (file and field are named), or none of its images is on disk.
