@@ -23,7 +23,7 @@ from town_capture import hit, photo, walk
 
 from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import apply, inverse
 from nerfcli.field.background import colours_behind

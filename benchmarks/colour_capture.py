@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from nerfcli.media.srgb import linear_light
+from nerfcli.media.colours import linear_light
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from PIL import ExifTags, Image
 from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
-from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.media.images import downscale, read_image

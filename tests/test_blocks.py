@@ -14,7 +14,7 @@ from commands import error_of, listing, nerfcli
 from PIL import Image
 
 from nerfcli import scene as scenes
-from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import BAD_INPUT
 from nerfcli.field.blocks_field import BlocksField

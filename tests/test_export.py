@@ -19,7 +19,7 @@ from nerfcli.export.frames import export_frames
 from nerfcli.export.order import Order
 from nerfcli.export.presentation import value_range
 from nerfcli.export.settings import ExportSettings, VideoSettings
-from nerfcli.media.colour_maps import levels_of
+from nerfcli.media.colours import levels_of
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
 from nerfcli.media.preview import preview

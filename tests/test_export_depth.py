@@ -20,10 +20,10 @@ from nerfcli.export.depth_files import Levels, map_path, read_map, write_levels,
 from nerfcli.export.frames import export_frames
 from nerfcli.export.order import Order
 from nerfcli.export.settings import MEASURED, ExportSettings, depth_meta, floor_of
+from nerfcli.media.colours import linear_light
 from nerfcli.media.depth_pictures import DepthMeta
 from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.float_tiff import write_tiff
-from nerfcli.media.srgb import linear_light
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import DepthRequest, RenderedPicture, render_picture
 

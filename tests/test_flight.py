@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.flight import fly
-from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.frame_names import frames_named
+from nerfcli.cameras.frame import Frame, frames_named
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 

@@ -10,8 +10,7 @@ import pytest
 from captures import CAMERAS, assert_same, ring
 from corruption import assert_refused_or_sound, corrupted_binary
 
-from nerfcli.cameras.formats.archive import losses_npz, parse_npz, write_npz
-from nerfcli.cameras.formats.npy import array_from_npy
+from nerfcli.cameras.formats.archive import array_from_npy, losses_npz, parse_npz, write_npz
 from nerfcli.cameras.frame import Capture
 from nerfcli.errors import UserError
 

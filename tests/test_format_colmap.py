@@ -10,10 +10,10 @@ from captures import CAMERAS, assert_same, reprojection_px, ring
 from corruption import assert_refused_or_sound, corrupted_binary, corrupted_text
 
 from nerfcli.cameras import rigid
-from nerfcli.cameras.formats.colmap import parse_colmap
-from nerfcli.cameras.formats.colmap_write import (
+from nerfcli.cameras.formats.colmap import (
     losses_colmap,
     losses_colmap_text,
+    parse_colmap,
     write_colmap_binary,
     write_colmap_text,
 )

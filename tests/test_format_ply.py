@@ -9,7 +9,7 @@ import pytest
 from captures import CAMERAS, ring
 from corruption import assert_refused_or_sound, corrupted_binary, corrupted_text
 
-from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.formats.ply import losses_ply, read_ply_points, write_ply
 from nerfcli.cameras.frame import Capture
 from nerfcli.errors import UserError

@@ -9,8 +9,7 @@ from captures import CAMERAS, reprojection_px, ring, with_photos
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.archive import parse_npz, write_npz
 from nerfcli.cameras.formats.blender import parse_blender, write_blender
-from nerfcli.cameras.formats.colmap import parse_colmap
-from nerfcli.cameras.formats.colmap_write import write_colmap_binary, write_colmap_text
+from nerfcli.cameras.formats.colmap import parse_colmap, write_colmap_binary, write_colmap_text
 from nerfcli.cameras.formats.llff import parse_llff, write_llff
 from nerfcli.cameras.formats.transforms import parse_transforms, write_transforms
 from nerfcli.cameras.formats.transforms_cameras import lost_to_transforms

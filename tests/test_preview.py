@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from matplotlib import colormaps
 from skimage.color import rgb2lab
 
-from nerfcli.media.colour_maps import COLOUR_MAPS, levels_of
+from nerfcli.media.colours import COLOUR_MAPS, levels_of
 from nerfcli.media.depth_pictures import DepthMeta
 from nerfcli.media.preview import beside, preview
 

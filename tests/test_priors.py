@@ -12,7 +12,7 @@ from PIL import Image
 
 from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError

@@ -18,7 +18,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.export.settings import depth_meta
-from nerfcli.media.colour_maps import levels_of
+from nerfcli.media.colours import levels_of
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.visibility import depth_maps
 from nerfcli.report.drawings import Curve, curves, from_above

@@ -13,7 +13,7 @@ from PIL import Image
 from nerfcli import scene as scenes
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.formats.transforms import parse_transforms
 from nerfcli.errors import BAD_INPUT, UserError
 

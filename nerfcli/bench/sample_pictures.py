@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.atomic import atomic_path
-from nerfcli.media.colour_maps import levels_of
+from nerfcli.media.colours import levels_of
 from nerfcli.pages.embedded_pictures import fitted, jpeg_bytes
 
 FOLDER = "pictures"

@@ -203,7 +203,7 @@ def render(
     """
     values = dict(locals())
     from nerfcli.export.settings import OUTPUTS, ExportSettings
-    from nerfcli.media.colour_maps import COLOUR_MAPS
+    from nerfcli.media.colours import COLOUR_MAPS
     from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
     from nerfcli.render.pictures import Quality
     from nerfcli.runs.run import Run, load_run

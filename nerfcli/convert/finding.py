@@ -12,7 +12,7 @@ from nerfcli.cameras.formats.alicevision import FILES as ALICEVISION_FILES
 from nerfcli.cameras.formats.alicevision import is_alicevision
 from nerfcli.cameras.formats.bundler import BEGINS as BUNDLER_BEGINS
 from nerfcli.cameras.formats.camera_path import is_camera_path
-from nerfcli.cameras.formats.colmap import is_model
+from nerfcli.cameras.formats.colmap import MODEL_FILES, is_model
 from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.mvsnet import CAMERA_FILES, CAMERA_FOLDER
 from nerfcli.cameras.formats.neus import FILES as NEUS_FILES
@@ -23,10 +23,6 @@ from nerfcli.cameras.formats.record3d import FILES as RECORD3D_FILES
 from nerfcli.cameras.formats.record3d import is_record3d
 from nerfcli.errors import UserError
 from nerfcli.scene import SCENE_FILE
-
-MODEL_FILES = tuple(
-    f"{name}{suffix}" for name in ("cameras", "images", "points3D", "rigs", "frames") for suffix in (".bin", ".txt")
-)
 
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 

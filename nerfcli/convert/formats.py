@@ -11,7 +11,8 @@ from nerfcli.cameras.formats.archive import losses_npz, parse_npz, write_npz
 from nerfcli.cameras.formats.blender import losses_blender, parse_blender, write_blender
 from nerfcli.cameras.formats.bundler import parse_bundler
 from nerfcli.cameras.formats.camera_path import parse_camera_path
-from nerfcli.cameras.formats.colmap_write import (
+from nerfcli.cameras.formats.colmap import (
+    MODEL_FILES,
     losses_colmap,
     losses_colmap_text,
     write_colmap_binary,
@@ -44,7 +45,6 @@ from nerfcli.cameras.formats.transforms import (
 )
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.finding import (
-    MODEL_FILES,
     by_suffix,
     find_alicevision,
     find_blender,
@@ -61,8 +61,7 @@ from nerfcli.convert.finding import (
     find_record3d,
     find_scene,
 )
-from nerfcli.convert.model_photos import parse_model
-from nerfcli.convert.scene_folder import SCENE_FILES, losses_scene, parse_scene, write_scene
+from nerfcli.convert.scene_folder import SCENE_FILES, losses_scene, parse_model, parse_scene, write_scene
 from nerfcli.convert.stored_pixels import STORED, UPRIGHT, measure
 from nerfcli.errors import UserError, in_shell
 from nerfcli.media.images import list_images

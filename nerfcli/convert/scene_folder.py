@@ -1,4 +1,4 @@
-"""Read and write a nerfcli scene as a capture: sparse/0 and scene.json, as `nerfcli poses` writes them."""
+"""Read and write a nerfcli scene as a capture (sparse/0 and scene.json, as `nerfcli poses` writes them); read a model."""
 
 import os
 from collections.abc import Mapping
@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli import __version__, scene
-from nerfcli.cameras.formats.colmap import parse_colmap
-from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.formats.colmap import parse_colmap, write_colmap_binary
+from nerfcli.cameras.formats.llff import IMAGE_FOLDERS
 from nerfcli.cameras.formats.scene_json import read_description
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.stored_pixels import UPRIGHT
@@ -130,3 +130,20 @@ def _named(capture: Capture) -> tuple[Path, list[str]]:
     except ValueError as error:  # on several drives
         raise UserError("the photos are on several drives", "put them into one folder") from error
     return root, [Path(image).relative_to(root).as_posix() for image in images]
+
+
+def parse_model(path: Path, *, images: Path | None = None) -> Capture:
+    """Read a COLMAP model, with its photos in the first folder in which its names lead to one.
+
+    The folders tried are the given one (`images`); or images/ and the like in the model's folder or up to three folders
+    above it, then these folders themselves.
+    """
+    capture = parse_colmap(path)
+    homes = (path, *path.resolve().parents[:3])
+    folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
+    places = [images] if images is not None else [*folders, *homes]
+    leading = [place for place in places if any((place / frame.name).is_file() for frame in capture.frames[:100])]
+    place = next(iter([*leading, *folders]), None)
+    if place is None:
+        return capture
+    return replace(capture, frames=tuple(replace(frame, image=place / frame.name) for frame in capture.frames))

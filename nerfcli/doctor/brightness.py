@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from nerfcli.media.srgb import linear_light
+from nerfcli.media.colours import linear_light
 
 # A channel shows no detail at or above the first level, or at or below the second, of 255.
 WHITE_LEVEL = 253

@@ -11,8 +11,8 @@ import numpy as np
 
 from nerfcli.doctor import brightness, sharpness
 from nerfcli.errors import UserError
-from nerfcli.media.digital_zoom import with_digital_zoom
 from nerfcli.media.exif import Exif, read_exif
+from nerfcli.media.focal_evidence import with_digital_zoom
 from nerfcli.media.images import downscale, read_image
 from nerfcli.media.panoramas import MOST_OF_A_CAMERA, is_panorama
 from nerfcli.multiview.features import find_features

@@ -6,7 +6,7 @@ picture is measured on the right half, which the fit did not see.
 
 import numpy as np
 
-from nerfcli.media.srgb import linear_light
+from nerfcli.media.colours import linear_light
 
 # Levels between which the ratio of two pixels determines the gain; other pixels are noisy or saturated.
 DARKEST, BRIGHTEST = 20 / 255, 240 / 255

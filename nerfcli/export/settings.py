@@ -55,7 +55,7 @@ class ExportSettings:
         depth: the definition of depth, if "depth" is among the outputs.
         formats: some of `FORMATS`, for measured outputs. 16-bit levels are computed from float files, which are kept.
         depth_scale: scene units per level of 16-bit files; None chooses the same for all frames.
-        colour_map: one of `media.colour_maps.COLOUR_MAPS`, for measured outputs.
+        colour_map: one of `media.colours.COLOUR_MAPS`, for measured outputs.
         colour_range: the depths with the first and the last colour, in scene units; None chooses them from the views.
         video: settings of the videos; None for no videos.
         quality: the rendering effort per picture.

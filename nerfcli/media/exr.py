@@ -30,8 +30,8 @@ import OpenEXR
 from nerfcli import __version__
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
+from nerfcli.media.colours import linear_light
 from nerfcli.media.depth_pictures import KEY, DepthMeta, check_map
-from nerfcli.media.srgb import linear_light
 
 CHANNELS = {
     "depth": "Z",

@@ -14,7 +14,7 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
-from nerfcli.media.srgb import linear_light
+from nerfcli.media.colours import linear_light
 
 KEY = "nerfcli"
 _WORDS = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int", "u2": "ushort"}

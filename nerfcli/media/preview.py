@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from nerfcli.media.colour_maps import levels_of
+from nerfcli.media.colours import levels_of
 from nerfcli.media.depth_pictures import AXES, UNIT_OF, DepthMeta
 
 _HATCH = np.array([[112, 112, 112], [160, 160, 160]], dtype=np.uint8)
@@ -27,7 +27,7 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_
         meta: the definition of the values, for the legend.
         lo: the depth with the first colour, in the unit of `meta`.
         hi: the depth with the last colour, >= lo.
-        colour_map: one of `colour_maps.COLOUR_MAPS`.
+        colour_map: one of `colours.COLOUR_MAPS`.
 
     Returns:
         uint8 RGB (height + legend, at least width, 3).

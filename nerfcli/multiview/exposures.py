@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from nerfcli.cameras.rigid import apply, inverse
-from nerfcli.media.srgb import linear_light
+from nerfcli.media.colours import linear_light
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.multiview.stereo import DenseDepth
 from nerfcli.photos.loading import LoadedPhoto

@@ -9,7 +9,7 @@ from string import Template
 import numpy as np
 
 from nerfcli import __version__
-from nerfcli.media.colour_maps import levels_of
+from nerfcli.media.colours import levels_of
 from nerfcli.media.depth_pictures import DepthMeta
 from nerfcli.media.preview import coloured
 from nerfcli.pages import page

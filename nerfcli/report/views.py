@@ -9,7 +9,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
 from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
 from nerfcli.export.visibility import with_visibility
-from nerfcli.media.colour_maps import levels_of
+from nerfcli.media.colours import levels_of
 from nerfcli.media.preview import coloured
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model

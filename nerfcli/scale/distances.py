@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.frame_names import frames_named
+from nerfcli.cameras.frame import Frame, frames_named
 from nerfcli.cameras.world import point_of
 from nerfcli.errors import UserError
 from nerfcli.scale.estimate import ScaleEstimate

@@ -1,13 +1,17 @@
-"""Turn signed distances into triangles by marching cubes, where all corners were seen; remove small pieces."""
+"""Turn signed distances into triangles by marching cubes, where all corners were seen; drop small pieces, simplify."""
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import pycolmap
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
+from nerfcli.media.mesh_files import read_ply_mesh, write_ply
 from nerfcli.surface.fusion import SIDE, FusedVolume
 
 # Voxels along a side of a brick, the unit of marching.
@@ -121,3 +125,24 @@ def _march(fused: FusedVolume, first: np.ndarray) -> tuple[np.ndarray, np.ndarra
     mask[1:, 1:, 1:] = cubes  # the library reads the mask at a cube's last corner
     vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=mask, allow_degenerate=False)
     return vertices.astype(np.float64), faces
+
+
+def simplified(mesh: Mesh, faces: int, *, threads: int) -> Mesh:
+    """Simplify a mesh to about `faces` faces; one with no more than that is returned unchanged.
+
+    Source: Garland and Heckbert 1997, Surface simplification using quadric error metrics; COLMAP's implementation.
+    """
+    if len(mesh.faces) <= faces:
+        return mesh
+    # COLMAP's files have float32 positions, which would lose millimetres in a scene far from its origin.
+    middle = mesh.vertices.mean(axis=0)
+    with tempfile.TemporaryDirectory() as folder:
+        given, made = Path(folder) / "given.ply", Path(folder) / "made.ply"
+        columns: dict[str, np.ndarray] = dict(zip("xyz", (mesh.vertices - middle).astype("<f4").T, strict=True))
+        write_ply(given, columns, faces=mesh.faces)
+        options = pycolmap.MeshSimplificationOptions()
+        options.target_face_ratio = faces / len(mesh.faces)
+        options.num_threads = threads
+        pycolmap.simplify_mesh(given, made, options)
+        vertices, triangles = read_ply_mesh(made)
+    return mesh_of(vertices.astype(np.float64) + middle, triangles)

@@ -13,8 +13,7 @@ from nerfcli.cameras import paths
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.camera_path import losses_camera_path, read_normalisation, read_path, write_camera_path
 from nerfcli.cameras.formats.transforms import write_transforms
-from nerfcli.cameras.frame import Capture, Frame
-from nerfcli.cameras.frame_names import frames_named
+from nerfcli.cameras.frame import Capture, Frame, frames_named
 from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
 from nerfcli.convert.finding import find_camera_path
 from nerfcli.convert.formats import UserInputs, recognise

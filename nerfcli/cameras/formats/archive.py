@@ -1,4 +1,4 @@
-"""A capture as one plain .npz file: every number exactly, no pickle, readable with NumPy alone.
+"""A capture as one plain .npz file: every number exactly, no pickle, readable with NumPy alone. Files are untrusted.
 
 version                 1
 kind, unit              text
@@ -22,19 +22,23 @@ missing                 (K,) text
 
 """
 
+import io
 import lzma
+import math
 import os
 import struct
+import tokenize
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
 
 import numpy as np
+from numpy.lib import format as npy_format
 
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.limits import checked_camera, plausible
-from nerfcli.cameras.formats.npy import array_from_npy
 from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.errors import UserError
@@ -287,3 +291,33 @@ def _relative(path: Path | None, folder: Path) -> str:
 
 def _joined(folder: Path, text: str) -> Path | None:
     return Path(os.path.normpath(folder / text)) if text else None
+
+
+_HEADERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
+
+
+def array_from_npy(data: bytes) -> np.ndarray:
+    """Return the array that the bytes of an .npy file hold; it shares their memory and is read-only.
+
+    Raises:
+        ValueError: not an .npy file, an array of Python objects, or more or fewer bytes than the header's shape needs.
+    """
+    stream = io.BytesIO(data)
+    try:
+        version = npy_format.read_magic(stream)
+        if version not in _HEADERS:
+            raise ValueError(f"version {version} of the format")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # about headers that Python 2 wrote
+            shape, by_columns, dtype = _HEADERS[version](stream)
+    except (TypeError, KeyError, SyntaxError, OverflowError, RecursionError, MemoryError, tokenize.TokenError) as error:
+        raise ValueError(f"its header is invalid ({type(error).__name__})") from error
+    start = stream.tell()
+    if dtype.hasobject or dtype.itemsize == 0:
+        raise ValueError(f"it contains values of type {dtype}")
+    if any(length < 0 for length in shape) or math.prod(shape) * dtype.itemsize != len(data) - start:
+        raise ValueError(f"its header announces {shape} values of {dtype}, but {len(data) - start} bytes follow")
+    if math.prod(shape) == 0:
+        return np.zeros(shape, dtype)
+    values = np.frombuffer(data, dtype=dtype, offset=start)
+    return values.reshape(shape[::-1]).T if by_columns else values.reshape(shape)

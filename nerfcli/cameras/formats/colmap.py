@@ -13,21 +13,27 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
+from nerfcli.atomic import atomic_folder
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats import colmap_binary, colmap_text
-from nerfcli.cameras.formats.colmap_model import ColmapImage, ColmapModel, capture_of
+from nerfcli.cameras.formats.colmap_model import ColmapImage, ColmapModel, capture_of, model_of
+from nerfcli.cameras.formats.unsupported import lost_parts
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling
 from nerfcli.errors import UserError
 
 FILES = ("cameras", "images", "points3D")
+# Models are replaced as a whole: new files would be wrong together with remaining files of another model.
+MODEL_FILES = tuple(f"{name}{suffix}" for name in (*FILES, "rigs", "frames") for suffix in (".bin", ".txt"))
+
+_ENCODINGS = {".bin": colmap_binary, ".txt": colmap_text}
 
 T = TypeVar("T")
 
 
 def is_model(folder: Path) -> bool:
     """Return whether a folder contains the three files of a COLMAP model, binary or text."""
-    return any(all((folder / f"{name}{suffix}").is_file() for name in FILES) for suffix in (".bin", ".txt"))
+    return any(all((folder / f"{name}{suffix}").is_file() for name in FILES) for suffix in _ENCODINGS)
 
 
 def read_colmap(model_dir: Path, image_dir: Path, measure: Measure) -> Capture:
@@ -96,14 +102,10 @@ def read_model(model_dir: Path) -> ColmapModel:
         UserError: a file is missing, truncated or inconsistent; the file is named.
     """
     cameras_file, images_file, points_file = (_file(model_dir, name) for name in FILES)
-    if cameras_file.suffix == ".bin":
-        cameras = _parse(cameras_file, colmap_binary.cameras_from_bytes)
-        images = _parse(images_file, colmap_binary.images_from_bytes)
-        point_ids, points, colours = _parse(points_file, colmap_binary.points_from_bytes)
-    else:
-        cameras = _parse(cameras_file, colmap_text.cameras_from_text)
-        images = _parse(images_file, colmap_text.images_from_text)
-        point_ids, points, colours = _parse(points_file, colmap_text.points_from_text)
+    encoding = _ENCODINGS[cameras_file.suffix]
+    cameras = _parse(cameras_file, encoding.cameras_from_bytes)
+    images = _parse(images_file, encoding.images_from_bytes)
+    point_ids, points, colours = _parse(points_file, encoding.points_from_bytes)
     if not images:
         raise UserError(f"{model_dir} has no registered images", "the reconstruction is empty; run it again")
     for image in images:
@@ -125,12 +127,12 @@ def read_cameras(path: Path) -> tuple[dict[int, Camera], dict[str, int]]:
     Raises:
         UserError: a file is not readable, truncated or inconsistent; the file is named.
     """
-    binary = path.suffix == ".bin"
-    cameras = _parse(path, colmap_binary.cameras_from_bytes if binary else colmap_text.cameras_from_text)
+    encoding = _ENCODINGS[path.suffix]
+    cameras = _parse(path, encoding.cameras_from_bytes)
     images_file = path.with_name(f"images{path.suffix}")
     if not images_file.is_file():
         return cameras, {}
-    images = _parse(images_file, colmap_binary.images_from_bytes if binary else colmap_text.images_from_text)
+    images = _parse(images_file, encoding.images_from_bytes)
     for image in images:
         _check_camera(image, cameras, images_file)
     return cameras, {image.name: image.camera_id for image in images}
@@ -165,3 +167,56 @@ def _parse(path: Path, reader: Callable[[bytes], T]) -> T:
         ) from error
     except UserError as error:
         raise UserError(f"{path}: {error.message}", error.hint) from error
+
+
+def losses_colmap(capture: Capture) -> tuple[str, ...]:
+    """List the parts of a capture that a binary COLMAP model cannot hold."""
+    return tuple(lost_parts(capture, holds=("points", "colours", "observations")))
+
+
+def losses_colmap_text(capture: Capture) -> tuple[str, ...]:
+    """List the parts of a capture that a COLMAP text model cannot hold: COLMAP truncates names at their first space."""
+    spaced = sum(" " in frame.name for frame in capture.frames)
+    names = [f"{spaced} names with spaces (COLMAP truncates them at the first space)"] if spaced else []
+    return (*losses_colmap(capture), *names)
+
+
+def write_colmap_binary(capture: Capture, path: Path) -> None:
+    """Write a capture as cameras.bin, images.bin and points3D.bin into the folder `path`, all or none.
+
+    Ids count from 1 in the order of the frames, equal cameras have one id, points without colours are black and their
+    reprojection errors -1 (not measured), as in COLMAP.
+
+    Raises:
+        UserError: a name that the files cannot hold, or a folder that cannot be written or holds other files.
+    """
+    _write(capture, path, ".bin", wrong=[f.name for f in capture.frames if not f.name or "\0" in f.name])
+
+
+def write_colmap_text(capture: Capture, path: Path) -> None:
+    """Write a capture as cameras.txt, images.txt and points3D.txt into the folder `path`, all or none.
+
+    As `write_colmap_binary`; numbers are written with full precision.
+
+    Raises:
+        UserError: a name that the files cannot hold, or a folder that cannot be written or holds other files.
+    """
+    names = [frame.name for frame in capture.frames]
+    wrong = [name for name in names if not name or name != name.strip() or "\n" in name or "\r" in name]
+    _write(capture, path, ".txt", wrong=wrong)
+
+
+def _write(capture: Capture, path: Path, suffix: str, *, wrong: list[str]) -> None:
+    if wrong:
+        raise UserError(f"the name {wrong[0]!r} cannot be written to a COLMAP model", "rename the photo")
+    others = {item.name for item in path.iterdir()} - set(MODEL_FILES) if path.is_dir() else set()
+    if others:
+        raise UserError(
+            f"{path} contains files other than a COLMAP model, such as {min(others)}",
+            "use a separate folder, such as sparse/0 in it",
+        )
+    encoding, model = _ENCODINGS[suffix], model_of(capture)
+    with atomic_folder(path) as partial:
+        (partial / f"cameras{suffix}").write_bytes(encoding.cameras_to_bytes(model))
+        (partial / f"images{suffix}").write_bytes(encoding.images_to_bytes(model))
+        (partial / f"points3D{suffix}").write_bytes(encoding.points_to_bytes(model))

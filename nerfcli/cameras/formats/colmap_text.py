@@ -15,7 +15,7 @@ from nerfcli.cameras.formats.limits import checked_camera, plausible
 _MOST_ID = 2**53
 
 
-def cameras_from_text(data: bytes) -> dict[int, Camera]:
+def cameras_from_bytes(data: bytes) -> dict[int, Camera]:
     """Return the cameras by id. Raises ValueError or UserError where a line is damaged."""
     cameras = {}
     for line in _filled(_lines(data)):
@@ -28,7 +28,7 @@ def cameras_from_text(data: bytes) -> dict[int, Camera]:
     return cameras
 
 
-def images_from_text(data: bytes) -> list[ColmapImage]:
+def images_from_bytes(data: bytes) -> list[ColmapImage]:
     """Return the images, in the file's order. Raises ValueError where a line is damaged."""
     image_ids, names, camera_ids, poses, features = [], [], [], [], []
     lines = iter(_lines(data))
@@ -52,7 +52,7 @@ def images_from_text(data: bytes) -> list[ColmapImage]:
     return images_of_parts(image_ids, names, camera_ids, cam_from_world=cam_from_world, features=features)
 
 
-def points_from_text(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def points_from_bytes(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ids (N,), positions (N, 3) and colours (N, 3). Raises ValueError where a line is damaged."""
     lines = _filled(_lines(data))
     rows = [list(map(float, line.split(maxsplit=8)[:8])) for line in lines]
@@ -67,7 +67,7 @@ def points_from_text(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return _ids(table[:, 0], "a point"), points.copy(), colours.astype(np.uint8)
 
 
-def cameras_to_text(model: ColmapModel) -> bytes:
+def cameras_to_bytes(model: ColmapModel) -> bytes:
     """Return the bytes of cameras.txt."""
     lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     lines.append(f"# Number of cameras: {len(model.cameras)}")
@@ -76,7 +76,7 @@ def cameras_to_text(model: ColmapModel) -> bytes:
     return _encoded(lines)
 
 
-def images_to_text(model: ColmapModel) -> bytes:
+def images_to_bytes(model: ColmapModel) -> bytes:
     """Return the bytes of images.txt."""
     lines = [
         "# Image list with two lines of data per image:",
@@ -94,7 +94,7 @@ def images_to_text(model: ColmapModel) -> bytes:
     return _encoded(lines)
 
 
-def points_to_text(model: ColmapModel) -> bytes:
+def points_to_bytes(model: ColmapModel) -> bytes:
     """Return the bytes of points3D.txt; the tracks are those of the images' features, and errors -1 (not measured)."""
     elements, lengths = tracks(model)
     words = list(map(str, elements.ravel().tolist()))

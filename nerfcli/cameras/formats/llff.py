@@ -15,8 +15,8 @@ from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
+from nerfcli.cameras.formats.archive import array_from_npy
 from nerfcli.cameras.formats.limits import checked_camera, plausible
-from nerfcli.cameras.formats.npy import array_from_npy
 from nerfcli.cameras.formats.photo_names import ListImages
 from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole

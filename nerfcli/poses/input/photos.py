@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
-from nerfcli.media.digital_zoom import with_digital_zoom
 from nerfcli.media.exif import Exif, read_exif
-from nerfcli.media.focal_evidence import focal_evidence
+from nerfcli.media.focal_evidence import focal_evidence, with_digital_zoom
 from nerfcli.media.images import read_image
 from nerfcli.media.panoramas import is_panorama
 from nerfcli.media.photo_folders import list_photos, list_unsupported, name_in, where_photos_may_be
