@@ -81,8 +81,6 @@ def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
     a picture of the same height, twice as wide.
 
     Args:
-        camera: the picture's camera.
-        lens: one of `LENSES`.
         fov_deg: angle between the left and right edge in degrees; None for the default of the lens.
 
     Raises:

@@ -29,7 +29,6 @@ def changed(camera: Camera, names: Sequence[str], values: np.ndarray) -> Camera:
     The focal length is multiplied by exp(values[focal]), and values[k] is added to a radial term k.
 
     Args:
-        camera: before the change.
         names: some of `changeable`.
         values: one per name; zeros change nothing.
 

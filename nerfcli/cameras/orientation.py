@@ -87,8 +87,6 @@ def turned(camera: Camera, world_from_cam: np.ndarray, *, orientation: int) -> t
     """Return the camera and pose of the upright picture, given those of the stored one.
 
     Args:
-        camera: of the stored pixels.
-        world_from_cam: (4, 4) of the camera of the stored pixels.
         orientation: EXIF: 1, 3, 6 or 8.
 
     Raises:

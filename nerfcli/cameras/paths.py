@@ -41,7 +41,6 @@ def orbit(
     their distances. If they are on one side, it is a small ellipse within the angles from which they view the focus.
 
     Args:
-        frames: the capture's frames, at least one.
         count: number of views; the last one is followed by the first.
         depth_hint: the distance to the focus, in scene units, for cameras with parallel axes.
         up: (3,) what is up in the world; the cameras' own up if None.
@@ -81,7 +80,6 @@ def ellipse(
     their distances from the focus along it. Unlike `orbit` it always goes all the way around, behind the scene too.
 
     Args:
-        frames: the capture's frames, at least one.
         count: number of views; the last one is followed by the first.
         depth_hint: the distance to the focus, in scene units, for cameras with parallel axes.
         up: (3,) what is up in the world; the cameras' own up if None.
@@ -125,7 +123,6 @@ def spiral(
     cameras surround the scene, their mean would be inside it, so only the quarter nearest to the middle frame is used.
 
     Args:
-        frames: the capture's frames, at least one.
         count: number of views; the last one is followed by the first.
         turns: number of turns.
         depth_hint: the distance to the focus, in scene units, for cameras with parallel axes.

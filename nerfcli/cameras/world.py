@@ -69,7 +69,6 @@ def moved_to_origin(frames: Sequence[Frame], origin: str, *, depth_hint: float |
     """Return the translation that moves a place of the old frame to the origin of the new one.
 
     Args:
-        frames: the capture's cameras.
         origin: centre-of-cameras: the mean of their centres; focus: the point that they look at; or the coordinates
             "x,y,z" of the place in the old frame.
         depth_hint: the distance to the focus in scene units, for cameras with parallel axes.

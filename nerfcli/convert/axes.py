@@ -80,8 +80,6 @@ def reinterpreted(capture: Capture, true_convention: Convention, *, parsed_axes:
     """Return the capture that a file describes if its numbers are in another convention than its format's.
 
     Args:
-        capture: as it was parsed, by the format's own convention.
-        true_convention: the one that its numbers are in.
         parsed_axes: the camera axes that the format prescribes.
 
     Raises:

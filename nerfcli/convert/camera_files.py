@@ -36,7 +36,6 @@ def read_calibration(path: Path, *, images: Path | None = None) -> Calibration:
     It may be JSON {"model", "width", "height", "params"}, COLMAP's cameras.txt or cameras.bin, or any capture.
 
     Args:
-        path: the file or folder.
         images: the folder of the photos, for formats whose files do not state the photos' sizes.
 
     Raises:

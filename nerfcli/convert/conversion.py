@@ -38,12 +38,10 @@ class TargetOptions:
     """Format and conventions of the written file.
 
     Args:
-        form: its format.
         axes, pixel_centre: see `Convention`; None for the format's own.
         allow_loss: whether content that the format cannot hold may be dropped; observations always may.
         overwrite: whether an existing result may be replaced.
         verified: whether the file is read back and compared.
-        tolerance_px: the largest residual that passes.
         pixels: which pixels of EXIF-turned photos the cameras refer to; None for those that programs of the format use.
     """
 
@@ -62,13 +60,10 @@ class Conversion:
     """Result of a conversion.
 
     Args:
-        path: the file or folder that was written.
-        source_format: the format that was read.
         capture: the capture before losses.
         losses: its contents that the format cannot hold, which were dropped.
         loss_px: the largest shift of a pixel by the dropped lens terms.
         verification: of the written file; None if not requested.
-        notes: further notes for the user.
     """
 
     path: Path
@@ -111,10 +106,7 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Targe
     The file is kept only if the content read back from it agrees; otherwise the previous files are restored.
 
     Args:
-        capture: to be written.
         target: the file; or the folder, for formats that fill one and for a file with the format's usual name.
-        source_format: the format that the capture was read from, for the report.
-        wanted: format, convention, and what is allowed.
 
     Raises:
         UserError: losses are not allowed, the result exists, or the target cannot be written; with exit code 7, the

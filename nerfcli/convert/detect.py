@@ -97,7 +97,6 @@ def detect(capture: Capture, *, axes: str, progress: Callable[[float, str], None
     the visibility of its points in its pictures.
 
     Args:
-        capture: as it was parsed, by its format's own convention.
         axes: the camera axes that the format prescribes.
         progress: called with the fraction of the work that is done, and a short text.
 

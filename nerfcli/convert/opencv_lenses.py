@@ -22,7 +22,6 @@ class FileLens:
     """A lens as a file describes it.
 
     Args:
-        model: COLMAP's name.
         width, height: of the picture, pixels.
         params: in COLMAP's order.
     """

@@ -1,4 +1,4 @@
-"""Read and write a nerfcli scene as a capture (sparse/0 and scene.json, as `nerfcli poses` writes them); read a model."""
+"""Read and write a nerfcli scene as a capture, sparse/0 and scene.json as `nerfcli poses` writes them; read a model."""
 
 import os
 from collections.abc import Mapping
@@ -64,8 +64,6 @@ def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any]
     Masks are listed one by one. A split in the capture is kept; otherwise every 8th photo is held out.
 
     Args:
-        capture: to be written.
-        folder: the folder of the scene.
         provenance: further entries of the provenance in scene.json, besides the command and the version.
 
     Raises:

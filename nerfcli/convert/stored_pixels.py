@@ -36,7 +36,6 @@ class ReorientedCapture:
     """Capture whose cameras refer to the requested pixels.
 
     Args:
-        capture: the capture.
         num_turned: number of cameras that were turned according to their photos' EXIF orientation.
         num_unknown: number of photos that are not on disk, so that their orientation is unknown.
         masks_left_out: names of frames whose mask was dropped, as its orientation differs from the turned camera's.

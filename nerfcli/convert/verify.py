@@ -73,9 +73,7 @@ def verify(capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px
 
     Args:
         capture: the expected content, without accepted losses.
-        back: the content of the file.
         listed: (frames,) the indices of the capture's frames in the order in which the format lists them.
-        tolerance_px: the largest residual that passes.
     """
     probes = probes_of(capture)
     tolerance_px = max(tolerance_px, _rounding_px(capture, probes))
@@ -215,10 +213,7 @@ def compared_parts(
     """Compare all contents of a capture besides cameras, poses and points with those read back.
 
     Args:
-        capture: the expected content.
-        back: the content of the file.
         order: (frames,) index of the read-back view of each frame of the capture.
-        tolerance_px: the largest difference of observations that passes.
 
     Returns:
         The first difference as a clause, "" if there is none; and the parts compared, such as "157412 observations".

@@ -53,7 +53,6 @@ class Moved:
     """A capture in another world frame.
 
     Args:
-        capture: in the new frame.
         new_from_old: the change.
         scale: the estimate of the scale if lengths became metres.
         origin: where the origin is on Earth, if the capture was georeferenced.

@@ -58,10 +58,7 @@ def write_maps(
     """Write the maps of a picture in the float formats of `settings`; each file atomically.
 
     Args:
-        picture: a picture with depth.
-        folder: the folder of the export.
         name: file name without suffix, with "/" between folders.
-        settings: the outputs and formats.
         meta: the definition of the depth of this frame, see `frame_meta`.
 
     Returns:
@@ -94,11 +91,6 @@ def write_maps(
 
 def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
     """Read a map (height, width), NaN where invalid, from the first float format that `write_maps` wrote.
-
-    Args:
-        folder: the folder of the export.
-        name: name of the frame's files.
-        meaning: the definition of the map, common to all frames of the clip.
 
     Raises:
         UserError: the file is missing or damaged, or has another definition.
@@ -137,10 +129,7 @@ def write_levels(folder: Path, names: Sequence[str], *, settings: ExportSettings
     these files.
 
     Args:
-        folder: the folder of the export.
         names: names of the frames, all of which `write_maps` has written.
-        settings: the length of a level, or None to choose it for all frames.
-        meaning: the definition of the depth, common to all frames.
 
     Returns:
         The length of a level in scene units, and the number of pixels that did not fit.

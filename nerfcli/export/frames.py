@@ -74,11 +74,8 @@ def export_frames(
     number of frames.
 
     Args:
-        model: the trained model.
-        order: the rendering job.
         folder: the folder to write; an existing folder is replaced at the end.
         on_rays: called with numbers of finished rays, including those of frames that already exist.
-        notify: called with lines for the user.
         workers: processes and threads to render with; the files do not depend on them.
 
     Returns:

@@ -23,9 +23,7 @@ def with_deviations(
 
     Args:
         picture: picture of the run's own field, which is not a member.
-        frame: the frame that it shows.
         members: at least two.
-        settings: definition of depth, quality, background.
         on_rays: called with the number of rays after each tile.
     """
     seen = [

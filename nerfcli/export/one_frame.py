@@ -24,10 +24,6 @@ def render_frame(
     The files depend only on the model and the order, not on other frames or on the process that renders them.
 
     Args:
-        model: the trained model.
-        order: the rendering job.
-        index: index of the frame.
-        unfinished: the folder that collects the frames of the order.
         on_rays: called with the number of rays after each tile.
 
     Raises:

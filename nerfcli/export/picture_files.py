@@ -31,9 +31,7 @@ def write_picture(
         picture: the rendered picture; rgb with or without straight alpha.
         folder: the folder of the export; the files are folder/OUTPUT/name.SUFFIX.
         name: file name without suffix, with "/" between folders.
-        settings: the outputs, and the formats of depth.
         meta: the definition of the depth of this frame, see `depth_files.frame_meta`.
-        background: the background of the picture.
 
     Returns:
         The files, complete.

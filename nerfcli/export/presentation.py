@@ -30,8 +30,6 @@ def write_previews(folder: Path, order: Order, meta: DepthMeta, *, threads: int 
 
     Args:
         folder: holds the complete files of every frame.
-        order: the rendering job.
-        meta: the definition of the depth.
         threads: number of previews that are written at the same time.
 
     Returns:
@@ -87,9 +85,7 @@ def write_videos(
     Args:
         folder: holds every picture and preview.
         order: the rendering job; `order.check` has passed.
-        meta: the definition of the depth.
         ranges: colour ranges from `write_previews`, for the videos' comments.
-        notify: called with lines for the user.
 
     Raises:
         UserError: a video cannot be written.

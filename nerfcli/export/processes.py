@@ -52,14 +52,8 @@ def render_in_processes(
     """Render frames of an order in several processes; see `render_frame`. None of them outlives the call.
 
     Args:
-        model: the trained model.
-        order: the rendering job.
-        indices: indices of the frames to render.
-        unfinished: the folder that collects the frames of the order.
-        jobs: number of processes.
         threads: number of threads of all processes together; each process has at least one.
         on_rays: called with the number of rays of each finished frame.
-        notify: called with lines for the user.
 
     Raises:
         UserError: a file cannot be written, or processes keep dying at a frame.

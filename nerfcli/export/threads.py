@@ -28,9 +28,6 @@ def render_in_threads(
 
     Args:
         model: the trained model, on the CPU.
-        order: the rendering job.
-        indices: indices of the frames to render.
-        unfinished: the folder that collects the frames of the order.
         at_a_time: number of frames in progress.
         threads: number of threads of all frames together; each frame has at least one.
         on_rays: called with the number of rays of each tile, by one thread at a time.

@@ -35,8 +35,6 @@ class UnfinishedFrames:
         """Note that a frame is complete.
 
         Args:
-            name: name of the frame's files, without suffix.
-            files: paths of all its files in the folder.
             facts: further facts about the picture, plain values for render.json.
         """
         digests = {str(path.relative_to(self.folder)): _digest(path.read_bytes()) for path in files}

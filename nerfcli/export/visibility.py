@@ -21,8 +21,6 @@ def with_visibility(
 
     Args:
         picture: a picture with median depth.
-        frame: the frame that it shows.
-        axis: axis of its depth, "ray" or "z".
         photo_depths: depth maps of all training photos.
     """
     assert picture.median is not None

@@ -37,7 +37,6 @@ def write_npz(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
     """Write the maps of a picture and their definition into one archive, losslessly compressed; atomic.
 
     Args:
-        path: the file; its folder is created if needed.
         maps: float32 arrays by name: those of `exr.CHANNELS` (H, W) and rgb (H, W, 3 or 4).
         meta: the definition of the depth, or of another map if depth is not among them.
 

@@ -44,7 +44,6 @@ def write_exr(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
     """Write the maps of a picture into one file, losslessly compressed; atomic.
 
     Args:
-        path: the file; its folder is created if needed.
         maps: float32 arrays by name: those of `CHANNELS` (H, W), every bit of which is preserved, and rgb
             (H, W, 3 or 4), sRGB in [0, 1] with straight alpha.
         meta: the definition of the depth, or of another map if depth is not among them.

@@ -18,9 +18,7 @@ def write_tiff(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
     """Write a depth map as float TIFF; atomic.
 
     Args:
-        path: the file; its folder is created if needed.
         depth: float32 (height, width); every bit is preserved, including NaN.
-        meta: the definition of the values.
 
     Raises:
         UserError: the file cannot be written.

@@ -44,13 +44,7 @@ class MapPlace:
 
 
 def geo_keys(epsg: int | None, system: str, *, in_degrees: bool) -> tuple[list[int], str]:
-    """Return the values of the tags `KEYS` and `TEXT`, which LAS files have too, for a coordinate system.
-
-    Args:
-        epsg: its code; None if it has none.
-        system: its name.
-        in_degrees: whether it is geographic, in degrees.
-    """
+    """Return the values of the tags `KEYS` and `TEXT`, which LAS files have too, for a coordinate system."""
     text = system.encode("ascii", "replace").decode() + "|"
     model = _IS_OWN if epsg is None else _IS_GEOGRAPHIC if in_degrees else _IS_PROJECTED
     keys = [(_MODEL, 0, 1, model), (_RASTER, 0, 1, _IS_AREA), (_CITATION, TEXT, len(text), 0)]
@@ -63,7 +57,6 @@ def write_geotiff(path: Path, values: np.ndarray, place: MapPlace, *, descriptio
     """Write a picture, atomically.
 
     Args:
-        path: the file.
         values: (H, W, 4) uint8 sRGB with straight alpha, or (H, W) float32, NaN where undefined.
         place: its position; row 0 is in the north.
         description: plain values, for the ImageDescription as JSON.

@@ -111,7 +111,6 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
     Args:
         pixels: uint8 (height, width), or with 3 or 4 channels.
-        orientation: the EXIF orientation of their file.
     """
     _check_pixels(pixels)
     transpose = _UPRIGHT_FROM_STORED.get(orientation)
@@ -152,9 +151,7 @@ def write_png(path: Path, image: np.ndarray, *, metadata: dict[str, str] | None 
     """Write a picture as PNG, atomically, with `metadata` as its text chunks (any Unicode; keys in Latin-1).
 
     Args:
-        path: the file; its folder is created if needed.
         image: uint8 (height, width), (height, width, 3) or (height, width, 4) with straight alpha.
-        metadata: texts about the picture, by keyword.
 
     Raises:
         UserError: the file cannot be written.

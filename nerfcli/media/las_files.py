@@ -50,7 +50,6 @@ def write_las(
     """Write points, compressed if the suffix is .laz; atomic.
 
     Args:
-        path: the file; its folder is created if needed.
         columns: arrays (N,) by name: x, y, z, rounded to between 1e-8 and 1e-7 of the largest extent; red, green, blue,
             uint8; all others become extra dimensions with their own dtype.
         description: plain values, stored as JSON in a variable-length record of the user "nerfcli".

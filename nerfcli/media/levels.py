@@ -49,7 +49,6 @@ def write_png16(path: Path, depth: np.ndarray, meta: DepthMeta, *, units_per_lev
     """Write a depth map as 16-bit grey PNG with its definition in the text chunk "nerfcli"; atomic.
 
     Args:
-        path: the file; its folder is created if needed.
         depth: float32 (height, width), NaN where there is none.
         meta: the definition of the values; the scale, the invalid value and the largest rounding error are added.
         units_per_level: the length of a level in the unit of `meta`, > 0.

@@ -39,7 +39,6 @@ def read_mask(path: Path, photo: Path) -> np.ndarray:
 
     Args:
         path: the mask. If its largest level is 1, then 1 means white.
-        photo: its photo.
 
     Returns:
         uint8 (height, width), upright: 0 for pixels to ignore, 255 for pixels to use, values in between on edges.

@@ -62,10 +62,8 @@ def write_ply(
     """Write vertices, and triangles if there are any, as a binary PLY, atomically.
 
     Args:
-        path: the file.
         columns: vertex properties by name, (N,) float32, float64, int32, uint16 or uint8.
         faces: (F, 3).
-        description: plain values.
 
     Raises:
         UserError: the file cannot be written.
@@ -142,11 +140,9 @@ def write_obj(
     """Write a mesh as OBJ, atomically, with a colour after each position, which most programs can read.
 
     Args:
-        path: the file.
         vertices: (N, 3).
         faces: (F, 3).
         colours: (N, 3) uint8 sRGB.
-        description: plain values.
 
     Raises:
         UserError: the file cannot be written.
@@ -174,13 +170,11 @@ def write_glb(
     glTF requires, and the material is unlit because the colours already contain the scene's lighting.
 
     Args:
-        path: the file.
         vertices: (N, 3).
         faces: (F, 3).
         normals: (N, 3) unit.
         colours: (N, 3) uint8 sRGB.
         y_up_from_frame: (3, 3) rotation.
-        description: plain values.
 
     Raises:
         UserError: the file cannot be written.

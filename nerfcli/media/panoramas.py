@@ -33,7 +33,6 @@ def is_panorama(path: Path, picture: NDArray[np.uint8]) -> bool:
     """Return whether a photo shows the whole sphere: its metadata says so, or its edges and poles show it.
 
     Args:
-        path: of the photo.
         picture: (H, W, C) its upright pixels.
     """
     height, width = picture.shape[:2]

@@ -24,7 +24,6 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_
 
     Args:
         depth: (height, width).
-        meta: the definition of the values, for the legend.
         lo: the depth with the first colour, in the unit of `meta`.
         hi: the depth with the last colour, >= lo.
         colour_map: one of `colours.COLOUR_MAPS`.

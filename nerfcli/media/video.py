@@ -112,7 +112,6 @@ def write_video(
         fps: frames per second, > 0.
         crf: constant quality from 0, best, to `form.worst_crf`; the format's default if None.
         plays: how many times the clip is shown: repeated in the file, or stated in a gif, where 0 means forever.
-        comment: the container's comment.
 
     Raises:
         UserError: the file cannot be written, there is no ffmpeg, or it fails.

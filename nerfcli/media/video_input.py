@@ -102,9 +102,7 @@ def measure_frames(
     """Apply `measure` to every frame, in order.
 
     Args:
-        video: from `open_video`.
         measure: gets uint8 (height, width): the frame in grey, averaged down where it is larger than `longer_side`.
-        longer_side: pixels.
         progress: called with the fraction that is done, 0...1, if the video states its duration and frame rate.
 
     Raises:
@@ -130,7 +128,6 @@ def read_frames(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
     """Yield some frames in full size, one at a time.
 
     Args:
-        video: from `open_video`.
         numbers: indices of the frames, from 0, in ascending order.
 
     Yields:

@@ -29,7 +29,6 @@ class Volume:
         maps: by name, (X, Y, Z) or (X, Y, Z, C).
         origin: (3,) centre of the first voxel, in the frame that the description names.
         voxel_size: distance between the centres of adjacent voxels.
-        description: plain values.
     """
 
     maps: Mapping[str, np.ndarray]

@@ -54,7 +54,6 @@ def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str)
     In a given photo, a marker is not used if it appears twice or its edges are not visible.
 
     Args:
-        frames: with their photos.
         side: length of the black square's side in metres.
         dictionary: OpenCV's name, such as DICT_4X4_50.
 

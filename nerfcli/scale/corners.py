@@ -50,9 +50,6 @@ def scale_from_corners(
     excludes errors that all sides share, such as from a wrong focal length. Residuals are means over sides of one name.
 
     Args:
-        frames: with their poses and lenses.
-        sightings: of the corners in the photos.
-        sides: pairs of corners at known distances.
         pattern: its description for messages and the source, such as "ArUco markers of 0.05 m".
 
     Raises:

@@ -61,8 +61,6 @@ def georeference_by_points(frames: Sequence[Frame], control: ControlPoints, sour
 
     Args:
         frames: with the size of the photos that pixels were measured in.
-        control: the points.
-        source: name of their file, for messages.
 
     Raises:
         UserError: fewer than three points can be triangulated, they are on a line, or they contradict each other.

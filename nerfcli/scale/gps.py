@@ -68,7 +68,6 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
 
     Args:
         frames: the cameras; those without a position are not used.
-        positions: by frame name, see `gps_positions`.
 
     Raises:
         UserError: fewer than two positions, all cameras or positions at one place, or a spread of the photos below 3

@@ -75,13 +75,7 @@ class FusedVolume:
 def fuse(
     views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda fraction: None
 ) -> FusedVolume:
-    """Fuse depth maps.
-
-    Args:
-        views: the depth maps.
-        grid: the voxels.
-        on_progress: called with the fraction done.
-    """
+    """Fuse depth maps."""
     index = _blocks_near(views, grid)
     corners = np.stack(np.nonzero(index >= 0), axis=-1)[np.argsort(index[index >= 0], kind="stable")] * SIDE
     distance = torch.zeros(len(corners), SIDE**3)

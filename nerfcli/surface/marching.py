@@ -40,12 +40,7 @@ class Mesh:
 
 
 def surface_of(fused: FusedVolume, *, on_progress: Callable[[float], None] = lambda fraction: None) -> Mesh:
-    """Return the mesh on which the signed distance is 0, between seen voxels.
-
-    Args:
-        fused: the distances.
-        on_progress: called with the fraction done.
-    """
+    """Return the mesh on which the signed distance is 0, between seen voxels."""
     keys, vertices, faces, count = [], [], [], 0
     bricks = np.argwhere(_any_block(fused.index)) * _BRICK
     for done, first in enumerate(bricks):

@@ -25,7 +25,6 @@ def candidate_frames(frames: Sequence[Frame], *, depth_hint: float) -> list[Fram
     """Return views between and around the photos: on a path through them, an orbit, and the orbit tilted up and down.
 
     Args:
-        frames: the training photos.
         depth_hint: distance of the scene, for cameras with parallel axes.
     """
     flight = paths.interpolate(frames, count=PER_PATH)

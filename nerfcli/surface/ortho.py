@@ -74,10 +74,7 @@ def automatic_pixel(frames: Sequence[Frame], factor: int, depth: float, box: tup
     """Return the size of a pixel: that of the photos at a depth, or larger if the map had too many pixels.
 
     Args:
-        frames: of the photos.
         factor: by which photos were reduced for the training.
-        depth: scene units.
-        box: the region.
     """
     focal = float(np.median([frame.camera.focal_px for frame in frames])) / factor
     return max(depth / focal, max(box[3] - box[0], box[4] - box[1]) / MOST_SIDE)
@@ -96,12 +93,10 @@ def ortho_of(
     """Render a map of a box; what is above the box is left out.
 
     Args:
-        model: the trained model.
         views: depths of the photos, which tell what they see.
         box: x0, y0, z0, x1, y1, z1 in the scene's frame.
         pixel_size: scene units.
         height_above: typical height of the photos above the surface, scene units.
-        on_progress: called with the fraction done.
 
     Raises:
         UserError: it would have too many pixels.
@@ -144,7 +139,6 @@ def _from_above(model: Model, places: np.ndarray, *, reach: float, height: float
     A distance is NaN where less than half of the light ends within `reach`.
 
     Args:
-        model: the trained model.
         places: scene's frame.
         reach: height of the box.
         height: of the photos above the surface, whose rays were cut as finely as these are.

@@ -43,13 +43,7 @@ class Points:
 def agreed_points(
     views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda fraction: None
 ) -> Points:
-    """Return at most one point per voxel: the one with the smallest spread of depth, if two photos see it.
-
-    Args:
-        views: depth views of the photos.
-        grid: voxels that thin out the points.
-        on_progress: called with the fraction done.
-    """
+    """Return at most one point per voxel: the one with the smallest spread of depth, if two photos see it."""
     candidates = _thinned(views, grid)
     seen = np.zeros((len(candidates.places), len(views)), dtype=bool)
     for index, view in enumerate(views):

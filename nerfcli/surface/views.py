@@ -65,11 +65,9 @@ def depth_views(
     """Render the views of frames with pinhole cameras.
 
     Args:
-        model: the trained model.
         frames: frames of the photos, with any lens.
         max_size: largest longer side of the pictures, pixels.
         depth: definition of the depth, along the optical axis.
-        on_progress: called with the fraction done.
     """
     views = []
     for frame in frames:

@@ -26,7 +26,6 @@ def surface_colours(model: Model, points: np.ndarray, normals: np.ndarray, *, vo
     ray is nearly transparent, it is the field's colour at the point.
 
     Args:
-        model: the trained model.
         points, normals: (N, 3) in the scene's frame; normals of unit length, outwards.
         voxel_size: scene units.
     """

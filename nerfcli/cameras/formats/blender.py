@@ -55,7 +55,6 @@ def parse_blender(folder: Path, measure: Measure, *, images: Path | None = None)
     """Read all views of a Blender capture, from the file of every split that exists.
 
     Args:
-        folder: holds at least one of the three files.
         measure: returns an image's upright size and EXIF orientation, which the files do not give. An image that is not
             on disk gets the size of the other images in its file.
         images: folder of the images, if they are not where the files say: under the listed paths, or their last parts.

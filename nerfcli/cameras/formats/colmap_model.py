@@ -21,7 +21,6 @@ class ColmapImage:
     Args:
         image_id: unique in the model.
         name: with forward slashes, relative to the folder of the photos.
-        camera_id: of its camera.
         world_from_cam: (4, 4).
         pixels: (F, 2) positions of its features, float64.
         point_ids: (F,) int64 ids of their points, -1 where a feature has none.
@@ -102,10 +101,6 @@ def capture_of(model: ColmapModel, image_dir: Path | None) -> Capture:
     Cameras stay shared: frames of one camera id hold the same object. If the model has no points at all (some people
     empty that file), features have no point. COLMAP leaves points black until it has looked up their colours, so if all
     are black, the capture has no colours.
-
-    Args:
-        model: the model to convert.
-        image_dir: the folder of the photos, if it is known.
 
     Raises:
         ValueError: a feature has a point that is not in the model, or two points have the same id.

@@ -55,7 +55,6 @@ def measured_sizes(
 
     Args:
         names: of the photos, relative to `folder`.
-        path: the file that lists them, for the error.
 
     Raises:
         UserError: none of them is on disk, or one is not a readable photo.

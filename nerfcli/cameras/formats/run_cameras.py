@@ -36,7 +36,6 @@ def write_cameras(
     Rendering needs nothing else from the scene; evaluation finds the photos through this file.
 
     Args:
-        run: the folder.
         train, test: frames as the field knows them.
         given: by name, the frames that training refined, as the scene has them.
     """

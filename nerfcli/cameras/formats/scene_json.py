@@ -46,12 +46,7 @@ class Description:
     provenance: Mapping[str, Any]
 
     def described(self, frames: Sequence[Frame], find_mask: FindMask) -> tuple[Frame, ...]:
-        """Return the frames of the model with their masks and splits; the split of unused frames is None.
-
-        Args:
-            frames: of the model.
-            find_mask: finds the mask of a photo, given its name and the folder of masks.
-        """
+        """Return the frames of the model with their masks and splits; the split of unused frames is None."""
         return tuple(replace(f, mask=self._mask_of(f.name, find_mask), split=self._split_of(f.name)) for f in frames)
 
     def bounds_of(self, frames: Sequence[Frame]) -> np.ndarray | None:

@@ -200,8 +200,6 @@ def listed_frames(
     """Return all frames of a file as listed; frames with equal intrinsics share one camera.
 
     Args:
-        path: of the file.
-        content: of the file.
         measure: returns an image's size, if the file does not give it. An image that is not on disk either gets the
             size of the other images, if they all have the same.
         suffix: appended to a file_path without a suffix if no such image is on disk, as the format does.

@@ -39,7 +39,6 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str) 
     Args:
         record: the frame's keys, merged over those of the whole file.
         size: of the picture that the numbers are for.
-        where: file and frame, to begin error messages.
 
     Raises:
         UserError: no focal length, an invalid number, or an unknown lens model.

@@ -14,7 +14,6 @@ def lost_parts(capture: Capture, *, holds: Collection[str]) -> list[str]:
     """List the losses beyond cameras and poses of a capture.
 
     Args:
-        capture: to be written.
         holds: the parts that the format has a place for: "masks", "points", "colours", "observations", "splits",
             "depth bounds", "unit".
     """
@@ -37,7 +36,6 @@ def lost_of_cameras(capture: Capture, lost: Callable[[Camera], Iterable[str]]) -
     """List the losses of cameras as clauses "k3 of 2 cameras", with the number of distinct cameras affected.
 
     Args:
-        capture: to be written.
         lost: returns the properties of a camera that the format cannot hold.
     """
     cameras = {frame.camera for frame in capture.frames}
