@@ -674,7 +674,7 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "export/visibility.py",
+        "export/one_frame.py",
         ("tests/test_visibility.py",),
         "render",
         (),

@@ -17,11 +17,10 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.archive import write_npz
 from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture, Frame, Observations
-from nerfcli.convert import matches
+from nerfcli.convert import evidence
 from nerfcli.convert.axes import Convention, expressed, for_picture, opencv_from_axes, poses_of, reinterpreted
 from nerfcli.convert.detect import Detection, detect
-from nerfcli.convert.evidence import Intrinsics, MatchEvidence
-from nerfcli.convert.matches import LEAST_MOVE, match_neighbours
+from nerfcli.convert.evidence import LEAST_MOVE, Intrinsics, MatchEvidence, match_neighbours
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.multiview.features import Features, Matches, find_features
 
@@ -229,7 +228,7 @@ def _features_found_once() -> Iterator[None]:
         return kept[key]
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(matches, "find_features", found)
+        patched.setattr(evidence, "find_features", found)
         yield
 
 

@@ -14,8 +14,8 @@ from nerfcli.cameras.formats.run_cameras import RunCameras
 from nerfcli.errors import UserError
 from nerfcli.evaluate import depth_errors
 from nerfcli.evaluate.depth_errors import measure_depth_errors, surface_tracks
-from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.exr import read_exr
+from nerfcli.media.file_facts import depth_meta_of
 from nerfcli.multiview.stereo import DenseDepth
 from nerfcli.multiview.tracks import Tracks
 from nerfcli.multiview.triangulation import triangulate

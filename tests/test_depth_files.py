@@ -21,8 +21,8 @@ from PIL import Image
 from nerfcli.errors import UserError
 from nerfcli.media.colours import linear_light
 from nerfcli.media.depth_pictures import DepthMeta, difference_of, refuse_mixing
-from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.exr import write_exr
+from nerfcli.media.file_facts import depth_meta_of
 from nerfcli.media.float_tiff import read_tiff, write_tiff
 from nerfcli.media.levels import LARGEST_LEVEL, chosen_scale, depth_of_levels, write_png16
 

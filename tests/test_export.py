@@ -14,9 +14,8 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
-from nerfcli.export.file_names import file_names
 from nerfcli.export.frames import export_frames
-from nerfcli.export.order import Order
+from nerfcli.export.order import Order, file_names
 from nerfcli.export.presentation import value_range
 from nerfcli.export.settings import ExportSettings, VideoSettings
 from nerfcli.media.colours import levels_of

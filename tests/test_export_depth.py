@@ -22,7 +22,7 @@ from nerfcli.export.order import Order
 from nerfcli.export.settings import MEASURED, ExportSettings, depth_meta, floor_of
 from nerfcli.media.colours import linear_light
 from nerfcli.media.depth_pictures import DepthMeta
-from nerfcli.media.descriptions import depth_meta_of
+from nerfcli.media.file_facts import depth_meta_of
 from nerfcli.media.float_tiff import write_tiff
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import DepthRequest, RenderedPicture, render_picture

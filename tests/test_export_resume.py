@@ -24,14 +24,14 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.export import threads
+from nerfcli.export import workers
 from nerfcli.export.frames import RAYS_PER_PROCESS, Workers, automatic_workers, export_frames, export_part
 from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import Order
 from nerfcli.export.presentation import playing_order
 from nerfcli.export.settings import ExportSettings, VideoSettings
 from nerfcli.interrupts import Terminated, install_handlers
-from nerfcli.media.descriptions import description_of
+from nerfcli.media.file_facts import description_of
 from nerfcli.media.images import read_image
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
@@ -215,7 +215,7 @@ def test_frames_in_progress_render_in_threads_of_their_own(model, tmp_path):
         render_frame(*given, **options)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nerfcli.export.threads.render_frame", render)
+        patch.setattr("nerfcli.export.frames.render_frame", render)
         export_frames(
             *(model, order(2), tmp_path / "views"), on_rays=on_rays, notify=lambda text: None, workers=workers
         )
@@ -246,7 +246,7 @@ def test_threads_stop_before_the_main_thread_hears_of_an_error(model, tmp_path, 
             time.sleep(1.0)
             yield future
 
-    monkeypatch.setattr(threads, "as_completed", late)
+    monkeypatch.setattr(workers, "as_completed", late)
     with pytest.raises(KeyboardInterrupt):
         export_frames(
             *(model, order(8), tmp_path / "views"),

@@ -20,9 +20,8 @@ from typer.testing import CliRunner, Result
 from nerfcli import cli
 from nerfcli.cli.info_text import lines_of
 from nerfcli.media.depth_pictures import KEY
-from nerfcli.media.descriptions import description_of
 from nerfcli.media.exr import write_exr
-from nerfcli.media.file_facts import NOT_STATED, RENDERS
+from nerfcli.media.file_facts import NOT_STATED, RENDERS, description_of
 from nerfcli.media.float_tiff import write_tiff
 from nerfcli.media.images import write_png
 from nerfcli.media.levels import write_png16

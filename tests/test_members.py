@@ -11,12 +11,12 @@ from fog import fog, foggy_cells
 
 from nerfcli import scene as scenes
 from nerfcli.errors import BAD_INPUT, OUT_OF_MEMORY
-from nerfcli.export.members import deviation
+from nerfcli.export.one_frame import deviation
 from nerfcli.field.hash_field import RANDOM_LEVELS, HashField, HashFieldSettings
 from nerfcli.fit.extent import object_frame
 from nerfcli.fit.fitting import Fitting
-from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.exr import read_exr
+from nerfcli.media.file_facts import depth_meta_of
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
 from nerfcli.runs.members import members_of

@@ -22,7 +22,7 @@ from nerfcli.cameras.formats.camera_path import read_path
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
 from nerfcli.errors import UserError
-from nerfcli.export.visibility import with_visibility
+from nerfcli.export.one_frame import with_visibility
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.field.hash_field import HashField, HashFieldSettings

@@ -17,7 +17,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.run_cameras import RunCameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.media.descriptions import depth_meta_of
+from nerfcli.media.file_facts import depth_meta_of
 from nerfcli.media.mesh_files import read_ply_header
 from nerfcli.render.visibility import (
     DepthMap,

@@ -13,8 +13,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import Convention, all_axes, opencv_from_axes, poses_of, reinterpreted_poses
-from nerfcli.convert.evidence import FrustumEvidence, Intrinsics, MatchEvidence, ObservationEvidence
-from nerfcli.convert.matches import match_neighbours
+from nerfcli.convert.evidence import FrustumEvidence, Intrinsics, MatchEvidence, ObservationEvidence, match_neighbours
 from nerfcli.errors import UserError
 
 # Intrinsics for another size belong to photos before or after downscaling by a power of two.

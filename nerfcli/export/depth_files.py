@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.export.file_names import with_suffix
+from nerfcli.export.order import with_suffix
 from nerfcli.export.settings import FLOAT_FORMATS, LEVELS_FOLDER, TOGETHER, ExportSettings, meaning_of
 from nerfcli.media.arrays import read_arrays, write_npy, write_npz
 from nerfcli.media.depth_pictures import DepthMeta, difference_of, mixed
-from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.exr import CHANNELS, read_exr, write_exr
+from nerfcli.media.file_facts import depth_meta_of
 from nerfcli.media.float_tiff import read_tiff, write_tiff
 from nerfcli.media.levels import LARGEST_LEVEL, chosen_scale, write_png16
 from nerfcli.media.quantiles import quantiles

@@ -2,19 +2,18 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from nerfcli.atomic import write_json
 from nerfcli.exclusive import exclusive
 from nerfcli.export.depth_files import write_levels
-from nerfcli.export.one_frame import render_frame
+from nerfcli.export.one_frame import removed_in_words, render_frame
 from nerfcli.export.order import DESCRIPTION, Order
 from nerfcli.export.presentation import write_previews, write_videos
-from nerfcli.export.processes import render_in_processes
 from nerfcli.export.settings import depth_meta
-from nerfcli.export.threads import render_in_threads
 from nerfcli.export.unfinished import UnfinishedFrames, take_over, unfinished_of
-from nerfcli.export.visibility import removed_in_words
+from nerfcli.export.workers import render_in_processes, render_in_threads
 from nerfcli.media.levels import scale_in_words
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.model import Model
@@ -162,29 +161,13 @@ def _render_missing(
     if held:
         notify(f"resuming: {len(held)} of {len(part)} frames are already in {unfinished.folder}")
         on_rays(sum(map(order.rays, held)))
-    if workers.jobs > 1 and len(missing) > 1:
-        render_in_processes(
-            model,
-            order,
-            missing,
-            unfinished=unfinished,
-            jobs=min(workers.jobs, len(missing)),
-            threads=workers.threads,
-            on_rays=on_rays,
-            notify=notify,
-        )
-        return
-    at_a_time = min(workers.threads, MOST_AT_A_TIME, len(missing))
-    if at_a_time > 1 and model.thread_safe:
-        render_in_threads(
-            model,
-            order,
-            missing,
-            unfinished=unfinished,
-            at_a_time=at_a_time,
-            threads=workers.threads,
-            on_rays=on_rays,
-        )
-        return
-    for index in missing:
-        render_frame(model, order, index, unfinished=unfinished, on_rays=on_rays)
+    render_one = partial(render_frame, model, order, unfinished=unfinished)
+    jobs, threads = min(workers.jobs, len(missing)), workers.threads
+    at_a_time = min(threads, MOST_AT_A_TIME, len(missing))
+    if jobs > 1:
+        render_in_processes(render_one, order, missing, jobs=jobs, threads=threads, on_rays=on_rays, notify=notify)
+    elif at_a_time > 1 and model.thread_safe:
+        render_in_threads(render_one, missing, at_a_time=at_a_time, threads=threads, on_rays=on_rays)
+    else:
+        for index in missing:
+            render_one(index, on_rays=on_rays)

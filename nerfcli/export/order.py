@@ -2,21 +2,48 @@
 
 import hashlib
 import json
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from nerfcli import __version__
 from nerfcli.atomic import read_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
-from nerfcli.export.file_names import describe_frames, file_names
 from nerfcli.export.settings import ExportSettings
 from nerfcli.media.video import FORMATS, check_encoders
 from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.model import Model
 from nerfcli.render.visibility import DepthMap
+
+
+def file_names(frames: Sequence[Frame]) -> list[str]:
+    """Return the frames' names without suffix, with subfolders; the suffix stays where names would be the same.
+
+    ".." in a name ("../images") is replaced by "up", so that nothing is written outside the export.
+    """
+    names = ["/".join("up" if part == ".." else part for part in PurePosixPath(frame.name).parts) for frame in frames]
+    stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
+    taken = Counter([*stems, *names])
+    # A name without a suffix is its own stem, and counts twice.
+    return [stem if taken[stem] == 1 + (stem == name) else name for stem, name in zip(stems, names, strict=True)]
+
+
+def describe_frames(frames: Sequence[Frame]) -> list[dict[str, Any]]:
+    """Return files, cameras and poses of the pictures, as stored in render.json."""
+    return [
+        {"file": name, "camera": frame.camera.to_json(), "world_from_cam": frame.world_from_cam.tolist()}
+        for frame, name in zip(frames, file_names(frames), strict=True)
+    ]
+
+
+def with_suffix(stem: Path, suffix: str) -> Path:
+    """Add a suffix to a name; an existing suffix is kept, since it distinguishes a.jpg from a.png."""
+    return stem.with_name(stem.name + suffix)
+
 
 DESCRIPTION = "render.json"
 _IN_WORDS = {"colour_map": "colours", "colour_range": "range of colours", "levels": "16-bit levels", "video": "videos"}

@@ -13,7 +13,7 @@ import numpy as np
 import tifffile
 
 from nerfcli.atomic import atomic_path
-from nerfcli.media.descriptions import DAMAGED, damaged
+from nerfcli.media.file_facts import DAMAGED, damaged
 
 _TILE_PX = 256
 # Tags: ModelPixelScale, ModelTiepoint, GeoKeyDirectory, GeoAsciiParams, and GDAL's value of undefined pixels.

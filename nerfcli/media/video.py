@@ -12,11 +12,33 @@ from itertools import chain
 from pathlib import Path
 from typing import IO
 
+import imageio_ffmpeg
 import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
-from nerfcli.media.ffmpeg import ANOTHER_FFMPEG, ffmpeg_program
+
+ANOTHER_FFMPEG = "install ffmpeg, and set the environment variable IMAGEIO_FFMPEG_EXE to its path"
+
+
+def ffmpeg_program(purpose: str, *, instead: str = "") -> str:
+    """Return the path of ffmpeg.
+
+    Args:
+        purpose: what fails without it, such as "cannot write videos".
+        instead: what else the user can do, for the end of the hint.
+
+    Raises:
+        UserError: ffmpeg is not found, or IMAGEIO_FFMPEG_EXE names no program.
+    """
+    try:
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise UserError(f"{purpose}: ffmpeg not found", ANOTHER_FFMPEG + instead) from error
+    if shutil.which(program) is None:
+        raise UserError(f"{purpose}: {program} is not a program", ANOTHER_FFMPEG + instead)
+    return program
+
 
 # By default ffmpeg converts with the matrix of standard-definition television and writes no tags, and players assume
 # another matrix. Pictures are sRGB, so its transfer curve is used; "setparams" tags the frames, where encoders look.

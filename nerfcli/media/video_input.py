@@ -19,8 +19,8 @@ from typing import IO, Generic, TypeVar
 import numpy as np
 
 from nerfcli.errors import UserError
-from nerfcli.media.ffmpeg import ffmpeg_program
 from nerfcli.media.images import IMAGE_SUFFIXES
+from nerfcli.media.video import ffmpeg_program
 
 T = TypeVar("T")
 

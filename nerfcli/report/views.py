@@ -8,7 +8,7 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
 from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
-from nerfcli.export.visibility import with_visibility
+from nerfcli.export.one_frame import with_visibility
 from nerfcli.media.colours import levels_of
 from nerfcli.media.preview import coloured
 from nerfcli.render.depth import DepthRequest

@@ -1,27 +1,83 @@
-"""Distribute frames over processes, one frame at a time; a crashed process is reported and its frame rendered again."""
+"""Distribute frames over threads or processes, one frame at a time for each.
+
+Kernels release Python's lock, so that threads suffice for most fields. A crashed process is reported and its frame
+rendered again.
+"""
 
 import atexit
 import gc
 import multiprocessing
 import signal
+import threading
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import Order
-from nerfcli.export.unfinished import UnfinishedFrames
 from nerfcli.interrupts import deferred_interrupts
-from nerfcli.render.model import Model
+
+
+class RenderOne(Protocol):
+    """`one_frame.render_frame` for a certain model, order and unfinished folder."""
+
+    def __call__(self, index: int, *, on_rays: Callable[[int], None]) -> None:
+        """Render the frame with this index."""
+        ...
+
+
+def render_in_threads(
+    render_one: RenderOne, indices: Sequence[int], *, at_a_time: int, threads: int, on_rays: Callable[[int], None]
+) -> None:
+    """Render frames on the CPU, several at a time.
+
+    The first exception stops all threads after their current tile; complete frames are kept.
+
+    Args:
+        at_a_time: number of frames in progress.
+        threads: number of threads of all frames together; each frame has at least one.
+        on_rays: called with the number of rays of each tile, by one thread at a time.
+    """
+    stopped, lock, before = threading.Event(), threading.Lock(), torch.get_num_threads()
+
+    def count(rays: int) -> None:
+        if stopped.is_set():
+            raise CancelledError
+        with lock:
+            on_rays(rays)
+
+    def render(index: int) -> None:
+        if stopped.is_set():
+            return
+        try:
+            render_one(index, on_rays=count)
+        except CancelledError:
+            return  # because of another frame's exception, which is raised below
+        except BaseException:
+            stopped.set()  # here, since the main thread may hear of it only after the others have rendered more
+            raise
+
+    each = max(1, threads // at_a_time)
+    with ThreadPoolExecutor(at_a_time, initializer=torch.set_num_threads, initargs=(each,)) as pool:
+        try:
+            for future in as_completed([pool.submit(render, index) for index in indices]):
+                future.result()
+        except BaseException:
+            stopped.set()  # Ctrl-C arrives in this thread
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        finally:
+            torch.set_num_threads(before)
+
 
 # A frame at which processes died this many times is not retried.
 _MOST_DEATHS = 2
@@ -39,17 +95,16 @@ class _Worker:
 
 
 def render_in_processes(
-    model: Model,
+    render_one: RenderOne,
     order: Order,
     indices: Sequence[int],
     *,
-    unfinished: UnfinishedFrames,
     jobs: int,
     threads: int,
     on_rays: Callable[[int], None],
     notify: Callable[[str], None],
 ) -> None:
-    """Render frames of an order in several processes; see `render_frame`. None of them outlives the call.
+    """Render frames of an order in several processes. None of them outlives the call.
 
     Args:
         threads: number of threads of all processes together; each process has at least one.
@@ -65,7 +120,7 @@ def render_in_processes(
     def start() -> None:
         ours, theirs = context.Pipe()
         fraction = max(1, threads // jobs)
-        process = context.Process(target=_serve, args=(theirs, model, order, unfinished, fraction), daemon=True)
+        process = context.Process(target=_serve, args=(theirs, render_one, fraction), daemon=True)
         with _interrupts_kept():  # a deferred interrupt is raised at the end, when the process is in the list
             process.start()
             workers.append(_Worker(process, ours))
@@ -125,7 +180,7 @@ class _Failure:
         return UserError(self.text, self.hint, self.exit_code)
 
 
-def _serve(connection: Any, model: Model, order: Order, unfinished: UnfinishedFrames, threads: int) -> None:
+def _serve(connection: Any, render_one: RenderOne, threads: int) -> None:
     """Render the frames whose indices are received, until the connection is closed."""
     atexit.register(gc.freeze)  # as in `nerfcli.__main__`
     torch.set_num_threads(threads)
@@ -138,7 +193,7 @@ def _serve(connection: Any, model: Model, order: Order, unfinished: UnfinishedFr
         except (EOFError, ConnectionError):
             return
         try:
-            render_frame(model, order, index, unfinished=unfinished, on_rays=lambda rays: None)
+            render_one(index, on_rays=lambda rays: None)
             report = None
         except UserError as error:
             report = _Failure(error.message, error.hint, error.exit_code)
