@@ -20,7 +20,7 @@ from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.convert import evidence
 from nerfcli.convert.axes import Convention, expressed, for_picture, opencv_from_axes, poses_of, reinterpreted
 from nerfcli.convert.detect import Detection, detect
-from nerfcli.convert.evidence import LEAST_MOVE, Intrinsics, MatchEvidence, match_neighbours
+from nerfcli.convert.evidence import LEAST_MOVE, MatchEvidence, match_neighbours
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.multiview.features import Features, Matches, find_features
 
@@ -134,7 +134,7 @@ def test_epipolar_errors_vanish_in_the_right_convention_alone(meant):
     capture = capture_of([PINHOLE, BROWN], count=8)
     spoiled = misread(capture, meant, "opengl")
     evidence = MatchEvidence(matched_pairs(capture), dict(enumerate(f.camera for f in spoiled.frames)), 8)
-    directions = evidence.directions(Intrinsics())
+    directions = evidence.directions(Convention("opengl"))
     right = evidence.errors_px(directions, poses_of(reinterpreted(spoiled, meant, parsed_axes="opengl")))
     assert right.max() < 1e-8
     for other in CONVENTIONS[:7]:
@@ -158,7 +158,7 @@ def test_the_epipolar_error_is_the_distance_in_pixels():
     second_pixels[:, 1] += 3.0
     pair = Matches((0, 1), (first_pixels, second_pixels))
     evidence = MatchEvidence([pair], {0: camera, 1: camera}, 2)
-    errors = evidence.errors_px(evidence.directions(Intrinsics()), np.stack([np.eye(4), second]))
+    errors = evidence.errors_px(evidence.directions(Convention("opencv")), np.stack([np.eye(4), second]))
     np.testing.assert_allclose(errors, 3 / np.sqrt(2), rtol=2e-3)
 
 
@@ -244,7 +244,7 @@ def test_matches_lie_where_both_photos_show_the_same_place(photographed):
     pairs, cameras = match_neighbours(photographed.frames, progress=silent)
     assert len(pairs) >= 3
     evidence = MatchEvidence(pairs, cameras, 6)
-    errors = evidence.errors_px(evidence.directions(Intrinsics()), poses_of(photographed))
+    errors = evidence.errors_px(evidence.directions(Convention("opencv")), poses_of(photographed))
     assert np.median(errors) < 0.035
 
 
@@ -279,7 +279,7 @@ def test_matches_are_found_where_opencvs_best_estimator_gives_up(photographed, m
     monkeypatch.setattr(cv2, "findFundamentalMat", asserting)
     pairs, cameras = match_neighbours(photographed.frames[:3], progress=silent)
     evidence = MatchEvidence(pairs, cameras, 3)
-    assert np.median(evidence.errors_px(evidence.directions(Intrinsics()), poses_of(photographed)[:3])) < 0.05
+    assert np.median(evidence.errors_px(evidence.directions(Convention("opencv")), poses_of(photographed)[:3])) < 0.05
 
 
 @pytest.mark.parametrize("meant", [Convention("opengl"), Convention("opencv", inverted=True)], ids=str)

@@ -125,10 +125,7 @@ class Camera:
         return self._opening_deg(across), self._opening_deg(down)
 
     def bearings(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the viewing directions of pixels, through the exact lens model.
-
-        Args:
-            pixels: (N, 2) positions x, y in pixels.
+        """Return the viewing directions of pixels (N, 2), x and y, through the exact lens model.
 
         Returns:
             directions (N, 3), unit, in camera axes, also behind the camera if the lens sees there; valid (N,) bool.
@@ -149,10 +146,7 @@ class Camera:
         return directions, valid
 
     def project(self, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project points to pixels.
-
-        Args:
-            points_cam: (N, 3) in camera axes.
+        """Project points (N, 3) in camera axes to pixels.
 
         Returns:
             pixels (N, 2), which may lie outside the picture; valid (N,) bool. A point at the camera's centre, beyond
@@ -174,10 +168,7 @@ class Camera:
         return valid & ((pixels >= 0) & (pixels <= self.size)).all(axis=1)
 
     def project_jacobian(self, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute the Jacobian of pixels with respect to points and camera parameters.
-
-        Args:
-            points_cam: (N, 3) in camera axes.
+        """Compute the Jacobian of pixels with respect to points (N, 3) in camera axes and camera parameters.
 
         Returns:
             d pixel / d point (N, 2, 3), pixels per unit of the points; d pixel / d parameters (N, 2, P) in the order of
@@ -194,10 +185,7 @@ class Camera:
         return np.moveaxis(by_point, -1, 0), np.moveaxis(by_parameters * valid, -1, 0), valid
 
     def bearing_jacobian(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the Jacobian of bearings with respect to pixels.
-
-        Args:
-            pixels: (N, 2).
+        """Compute the Jacobian of bearings with respect to pixels (N, 2).
 
         Returns:
             d direction / d pixel (N, 3, 2) in radians per pixel, whose columns are normal to the direction; valid (N,)
@@ -205,12 +193,8 @@ class Camera:
 
         It is the inverse of d pixel / d direction on the plane normal to the direction: J^T (J J^T)^-1.
         """
-        directions, valid = self.bearings(pixels)
-        by_direction, _, smooth = self.project_jacobian(directions)
-        valid &= smooth
-        by_direction[~valid] = np.eye(2, 3)
         # With the rows a and b of J: (|b|^2 a - (a.b) b, |a|^2 b - (a.b) a) / |a x b|^2.
-        a, b = by_direction[:, 0], by_direction[:, 1]
+        a, b, valid = self._rows_by_direction(pixels)
         mixed = (a * b).sum(axis=1, keepdims=True)
         area = (np.cross(a, b) ** 2).sum(axis=1, keepdims=True)
         by_x = ((b * b).sum(axis=1, keepdims=True) * a - mixed * b) / area
@@ -218,22 +202,16 @@ class Camera:
         return np.stack([by_x, by_y], axis=-1) * valid[:, None, None], valid
 
     def pixel_footprint(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the solid angle that each pixel covers, evaluated at its centre.
+        """Return the solid angle that each of the pixels (N, 2) covers, evaluated at its centre.
 
         It is 1 / |a x b|, with a and b the rows of d pixel / d direction. A cone of the same solid angle has the radius
         sqrt(footprint / pi) at distance 1.
 
-        Args:
-            pixels: (N, 2).
-
         Returns:
             solid angles (N,) in steradians; valid (N,) bool as in `bearings`. Zero where not valid.
         """
-        directions, valid = self.bearings(pixels)
-        by_direction, _, smooth = self.project_jacobian(directions)
-        valid &= smooth
-        by_direction[~valid] = np.eye(2, 3)
-        return valid / np.linalg.norm(np.cross(by_direction[:, 0], by_direction[:, 1]), axis=1), valid
+        a, b, valid = self._rows_by_direction(pixels)
+        return valid / np.linalg.norm(np.cross(a, b), axis=1), valid
 
     def pixel_bearings(self) -> tuple[np.ndarray, np.ndarray]:
         """Return `bearings` of all pixel centres by rows: directions (height * width, 3), valid (height * width,)."""
@@ -296,6 +274,14 @@ class Camera:
                 'expected {"model": COLMAP\'s name, "width": pixels, "height": pixels, "params": [numbers]}',
             ) from error
         return Camera(model, width, height, params)
+
+    def _rows_by_direction(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the rows of d pixel / d direction, (N, 3) twice, unit vectors where not valid; valid (N,) bool."""
+        directions, valid = self.bearings(pixels)
+        by_direction, _, smooth = self.project_jacobian(directions)
+        valid &= smooth
+        by_direction[~valid] = np.eye(2, 3)
+        return by_direction[:, 0], by_direction[:, 1], valid
 
     def _opening_deg(self, pixels: np.ndarray) -> float:
         directions, valid = self.bearings(pixels)

@@ -1,6 +1,10 @@
 """Camera paths for renders and videos: an orbit, an ellipse, a spiral, and a flight through the frames.
 
-All move at constant speed and use the first frame's picture size and focal length, without its distortion.
+All move at constant speed and use the first frame's picture size and focal length, without its distortion. `count` is
+the number of views; the last view of a closed path is followed by the first. `depth_hint` is the distance to the focus,
+in scene units, for cameras with parallel axes; `up` (3,) is what is up in the world, by default the cameras' own up.
+
+All raise a ValueError without a frame, or if count is below 1.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,13 +44,7 @@ def orbit(
     If the cameras surround the focus, the path goes around it once, at their mean elevation, on an ellipse fitted to
     their distances. If they are on one side, it is a small ellipse within the angles from which they view the focus.
 
-    Args:
-        count: number of views; the last one is followed by the first.
-        depth_hint: the distance to the focus, in scene units, for cameras with parallel axes.
-        up: (3,) what is up in the world; the cameras' own up if None.
-
     Raises:
-        ValueError: no frame, or count below 1.
         UserError: all cameras are in one place.
     """
     _check(frames, count)
@@ -79,13 +77,7 @@ def ellipse(
     Its axes are the principal axes of the camera centres on the ground, and each half axis is the 90th percentile of
     their distances from the focus along it. Unlike `orbit` it always goes all the way around, behind the scene too.
 
-    Args:
-        count: number of views; the last one is followed by the first.
-        depth_hint: the distance to the focus, in scene units, for cameras with parallel axes.
-        up: (3,) what is up in the world; the cameras' own up if None.
-
     Raises:
-        ValueError: no frame, or count below 1.
         UserError: the cameras and the focus are on a line, so there is no ellipse.
 
     Source: generate_ellipse_path of google-research/multinerf, internal/camera_utils.py (mip-NeRF 360, Zip-NeRF), where
@@ -122,14 +114,6 @@ def spiral(
     All views look at a point straight ahead of the mean camera, as deep as the focus or at least 2 |radii|. If the
     cameras surround the scene, their mean would be inside it, so only the quarter nearest to the middle frame is used.
 
-    Args:
-        count: number of views; the last one is followed by the first.
-        turns: number of turns.
-        depth_hint: the distance to the focus, in scene units, for cameras with parallel axes.
-
-    Raises:
-        ValueError: no frame, or count below 1.
-
     Source: the render path of Fyusion/LLFF and of bmild/nerf, load_llff.py.
     """
     _check(frames, count)
@@ -157,11 +141,7 @@ def spiral(
 
 
 def interpolate(frames: Sequence[Frame], *, count: int) -> tuple[Frame, ...]:
-    """Return a smooth flight at constant speed through the frames in order, from the first to the last; see `fly`.
-
-    Raises:
-        ValueError: no frame, or count below 1.
-    """
+    """Return a smooth flight at constant speed through the frames in order, from the first to the last; see `fly`."""
     _check(frames, count)
     poses = fly(np.stack([frame.world_from_cam for frame in frames]), count)
     return tuple(_path_frame(frames[0], pose, f"flight_{i:04d}") for i, pose in enumerate(poses))

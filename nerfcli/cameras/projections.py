@@ -36,11 +36,11 @@ class Projection(Protocol):
 
     def parameter_jacobian(self, directions: np.ndarray) -> np.ndarray:
         """Return d plane / d parameters in the order of the class's fields, (2, parameters, N)."""
-        ...
+        return np.zeros((2, 0, directions.shape[1]))
 
 
 @dataclass(frozen=True)
-class Perspective:
+class Perspective(Projection):
     """q = (x, y) / z, in front of the camera."""
 
     def sees(self, directions: np.ndarray) -> np.ndarray:
@@ -56,12 +56,9 @@ class Perspective:
         z = directions[2]
         return _jacobian(1 / z, np.zeros_like(z), directions[:2], by_z=-1 / (z * z))
 
-    def parameter_jacobian(self, directions: np.ndarray) -> np.ndarray:
-        return np.zeros((2, 0, directions.shape[1]))
-
 
 @dataclass(frozen=True)
-class Equidistant:
+class Equidistant(Projection):
     """q = theta (x, y) / rho: the radius in the plane is the angle, for all directions except straight behind.
 
     Source: Kannala and Brandt 2006, A generic camera model for wide-angle lenses, eq. 6, which OpenCV's fisheye
@@ -82,12 +79,9 @@ class Equidistant:
         square = (directions**2).sum(axis=0)
         return _jacobian(_angle_over_rho(directions), _angle_bend(directions), directions[:2], by_z=-1 / square)
 
-    def parameter_jacobian(self, directions: np.ndarray) -> np.ndarray:
-        return np.zeros((2, 0, directions.shape[1]))
-
 
 @dataclass(frozen=True)
-class FieldOfView:
+class FieldOfView(Projection):
     """q = atan(t rho / z) / omega * (x, y) / rho with t = 2 tan(omega / 2), in front of the camera.
 
     It is the equidistant projection of the direction (t x, t y, z), divided by omega; at omega = 0 it is the
@@ -143,7 +137,7 @@ class FieldOfView:
 
 
 @dataclass(frozen=True)
-class EnhancedUnified:
+class EnhancedUnified(Projection):
     """q = (x, y) / (alpha d + (1 - alpha) z) with d = sqrt(beta rho^2 + z^2).
 
     It sees z > -w d. The limit is w = alpha / (1 - alpha), where the denominator becomes 0, or, for alpha > 1/2,
@@ -196,7 +190,7 @@ class EnhancedUnified:
 
 
 @dataclass(frozen=True)
-class Division:
+class Division(Projection):
     """q with (q, 1 + k |q|^2) along the direction: q = 2 (x, y) / (z + S) with S = sqrt(z^2 - 4 k rho^2).
 
     With k < 0 (a barrel) the third component falls below zero at |q| = (-k)^-1/2, and the model goes on behind the
@@ -243,7 +237,7 @@ class Division:
 
 
 @dataclass(frozen=True)
-class Equirectangular:
+class Equirectangular(Projection):
     """q = (atan2(x, z) / 2 pi, atan2(y, |(x, z)|) / pi): the whole sphere except its two poles, on [-1/2, 1/2]^2."""
 
     def sees(self, directions: np.ndarray) -> np.ndarray:
@@ -265,9 +259,6 @@ class Equirectangular:
         by_azimuth = np.stack([z, np.zeros_like(z), -x]) / (2 * np.pi * level**2)
         by_elevation = np.stack([-x * y / level, level, -z * y / level]) / (np.pi * (level**2 + y**2))
         return np.stack([by_azimuth, by_elevation])
-
-    def parameter_jacobian(self, directions: np.ndarray) -> np.ndarray:
-        return np.zeros((2, 0, directions.shape[1]))
 
 
 def _unit(plane: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

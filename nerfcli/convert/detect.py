@@ -13,7 +13,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import Convention, all_axes, opencv_from_axes, poses_of, reinterpreted_poses
-from nerfcli.convert.evidence import FrustumEvidence, Intrinsics, MatchEvidence, ObservationEvidence, match_neighbours
+from nerfcli.convert.evidence import FrustumEvidence, MatchEvidence, ObservationEvidence, match_neighbours
 from nerfcli.errors import UserError
 
 # Intrinsics for another size belong to photos before or after downscaling by a power of two.
@@ -37,7 +37,7 @@ class HypothesisScore:
         convention: the assumed convention of the file's numbers.
         as_format_says: whether it is what the format prescribes.
         median_px: median error of the items; infinite if most are behind a camera.
-        inlier_share: the fraction of items with a small error.
+        inlier_fraction: the fraction of items with a small error.
     """
 
     convention: Convention
@@ -167,7 +167,7 @@ def _axes_and_scale(
     """Return the best convention, including its scale, and the question of axes and direction at that scale."""
     tried = []
     for scale in SCALES:
-        directions = evidence.directions(Intrinsics(scale))
+        directions = evidence.directions(replace(declared, intrinsics_scale=scale))
         for convention in conventions:
             errors = evidence.errors_px(directions, reinterpreted_poses(poses, convention, parsed_axes=declared.axes))
             tried.append((replace(convention, intrinsics_scale=scale), errors))
@@ -179,8 +179,9 @@ def _axes_and_scale(
 def _errors(
     evidence: ObservationEvidence | MatchEvidence, poses: np.ndarray, convention: Convention, parsed_axes: str
 ) -> np.ndarray:
-    directions = evidence.directions(Intrinsics(convention.intrinsics_scale, convention.pixel_centre))
-    return evidence.errors_px(directions, reinterpreted_poses(poses, convention, parsed_axes=parsed_axes))
+    return evidence.errors_px(
+        evidence.directions(convention), reinterpreted_poses(poses, convention, parsed_axes=parsed_axes)
+    )
 
 
 def _rank(errors: np.ndarray, threshold_px: float) -> tuple[float, float]:

@@ -5,7 +5,6 @@ depend only on the intrinsics. An item behind a camera has an infinite error.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,7 @@ import numpy as np
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture, Frame
-from nerfcli.convert.axes import for_picture, shifted
+from nerfcli.convert.axes import Convention, for_picture, shifted
 from nerfcli.convert.probes import distinct, rows_of_each
 from nerfcli.errors import UserError
 from nerfcli.multiview.epipolar import fundamental_matrix, sampson_angles
@@ -128,14 +127,6 @@ _MOST_FRAMES = 60
 _LEAST_PARALLAX_PX = 3.0
 
 
-@dataclass(frozen=True)
-class Intrinsics:
-    """A hypothesis about intrinsics: see `Convention`."""
-
-    scale: float = 1.0
-    pixel_centre: float = 0.5
-
-
 class ObservationEvidence:
     """Observations of world points in photos.
 
@@ -157,9 +148,9 @@ class ObservationEvidence:
         self._cameras = [frame.camera for frame in capture.frames]
         self.name = f"{len(rows)} observations of points in {len(np.unique(self.groups))} photos"
 
-    def directions(self, intrinsics: Intrinsics) -> tuple[np.ndarray, ...]:
+    def directions(self, convention: Convention) -> tuple[np.ndarray, ...]:
         """Return the unit viewing directions of the pixels, (M, 3), their validity and their pixels per radian."""
-        return _directions(self._cameras, self.groups, self._pixels, intrinsics)
+        return _directions(self._cameras, self.groups, self._pixels, convention)
 
     def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
         """Return the error of each observation, (M,)."""
@@ -190,10 +181,10 @@ class MatchEvidence:
         self._cameras = [cameras.get(index, stand_in) for index in range(num_frames)]
         self.name = f"{len(self.groups)} SIFT matches in {len(pairs)} pairs of photos"
 
-    def directions(self, intrinsics: Intrinsics) -> tuple[np.ndarray, ...]:
+    def directions(self, convention: Convention) -> tuple[np.ndarray, ...]:
         """Return unit viewing directions of both pixels of each match, (M, 3) twice, validity, pixels per radian."""
-        first, valid1, focal1 = _directions(self._cameras, self._first, self._first_pixels, intrinsics)
-        second, valid2, focal2 = _directions(self._cameras, self._second, self._second_pixels, intrinsics)
+        first, valid1, focal1 = _directions(self._cameras, self._first, self._first_pixels, convention)
+        second, valid2, focal2 = _directions(self._cameras, self._second, self._second_pixels, convention)
         return first, second, valid1 & valid2, (focal1 + focal2) / 2
 
     def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
@@ -237,14 +228,14 @@ class FrustumEvidence:
 
 
 def _directions(
-    cameras: Sequence[Camera], frame_index: np.ndarray, pixels: np.ndarray, intrinsics: Intrinsics
+    cameras: Sequence[Camera], frame_index: np.ndarray, pixels: np.ndarray, convention: Convention
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the unit viewing directions (M, 3) of pixels of frames, their validity, and pixels per radian."""
     each, camera_of_frame = distinct(cameras)
     directions, valid = np.zeros((len(pixels), 3)), np.zeros(len(pixels), dtype=bool)
     focal_px = np.zeros(len(pixels))
     for camera, rows in zip(each, rows_of_each(camera_of_frame[frame_index], len(each)), strict=True):
-        corrected = for_picture(shifted(camera, 0.5 - intrinsics.pixel_centre), intrinsics.scale)
+        corrected = for_picture(shifted(camera, 0.5 - convention.pixel_centre), convention.intrinsics_scale)
         directions[rows], valid[rows] = corrected.bearings(pixels[rows])
         focal_px[rows] = corrected.focal_px
     return directions, valid, focal_px

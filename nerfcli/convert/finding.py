@@ -8,19 +8,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from nerfcli.cameras.formats.alicevision import FILES as ALICEVISION_FILES
-from nerfcli.cameras.formats.alicevision import is_alicevision
-from nerfcli.cameras.formats.bundler import BEGINS as BUNDLER_BEGINS
-from nerfcli.cameras.formats.camera_path import is_camera_path
-from nerfcli.cameras.formats.colmap import MODEL_FILES, is_model
+from nerfcli.cameras.formats import (
+    alicevision,
+    bundler,
+    camera_path,
+    colmap,
+    mvsnet,
+    neus,
+    polycam,
+    pose_files,
+    record3d,
+)
 from nerfcli.cameras.formats.fields import read_json_object
-from nerfcli.cameras.formats.mvsnet import CAMERA_FILES, CAMERA_FOLDER
-from nerfcli.cameras.formats.neus import FILES as NEUS_FILES
-from nerfcli.cameras.formats.neus import FIRST as NEUS_FIRST
-from nerfcli.cameras.formats.polycam import KEYFRAMES, polycam_folders
-from nerfcli.cameras.formats.pose_files import POSE_FOLDERS, is_pose, pose_files
-from nerfcli.cameras.formats.record3d import FILES as RECORD3D_FILES
-from nerfcli.cameras.formats.record3d import is_record3d
 from nerfcli.errors import UserError
 from nerfcli.scene import SCENE_FILE
 
@@ -51,8 +50,8 @@ def find_scene(path: Path) -> Path | None:
 def find_model(path: Path) -> Path | None:
     """Find the folder of a COLMAP model, or the one that a file of it is in."""
     if path.is_file():
-        return path.parent if path.name in MODEL_FILES and is_model(path.parent) else None
-    return next((path / name for name in _MODEL_FOLDERS if is_model(path / name)), None)
+        return path.parent if path.name in colmap.MODEL_FILES and colmap.is_model(path.parent) else None
+    return next((path / name for name in _MODEL_FOLDERS if colmap.is_model(path / name)), None)
 
 
 def find_blender(path: Path) -> Path | None:
@@ -72,7 +71,7 @@ def find_bundler(path: Path) -> Path | None:
     found = by_suffix(".out", "bundle.out", "bundle/bundle.out")(path)
     if found is not None or not path.is_dir():
         return found
-    others = [other for other in sorted(path.glob("*.out")) if other.is_file() and _begins(other, BUNDLER_BEGINS)]
+    others = [other for other in sorted(path.glob("*.out")) if other.is_file() and _begins(other, bundler.BEGINS)]
     return others[0] if len(others) == 1 else None
 
 
@@ -93,16 +92,16 @@ def find_json(path: Path, *, opening: str, name: str) -> Path | None:
 
 def find_alicevision(path: Path) -> Path | None:
     """Find a file .sfm, or a .json that is a reconstruction of AliceVision."""
-    found = by_suffix(".sfm", *ALICEVISION_FILES)(path)
+    found = by_suffix(".sfm", *alicevision.FILES)(path)
     if found is None and path.is_file() and path.suffix.lower() == ".json":
-        return path if _has_keys(path, b'"featuresFolders"', is_alicevision) else None
+        return path if _has_keys(path, b'"featuresFolders"', alicevision.is_alicevision) else None
     return found
 
 
 def find_record3d(path: Path) -> Path | None:
     """Find the file metadata.json, or metadata, of a capture by Record3D."""
-    found = path if path.is_file() and path.name in RECORD3D_FILES else named(*RECORD3D_FILES)(path)
-    return found if found is not None and _has_keys(found, b'"poses"', is_record3d) else None
+    found = path if path.is_file() and path.name in record3d.FILES else named(*record3d.FILES)(path)
+    return found if found is not None and _has_keys(found, b'"poses"', record3d.is_record3d) else None
 
 
 def _has_keys(path: Path, text: bytes, test: Callable[[dict[str, Any]], bool]) -> bool:
@@ -115,29 +114,29 @@ def _has_keys(path: Path, text: bytes, test: Callable[[dict[str, Any]], bool]) -
 
 def find_polycam(path: Path) -> Path | None:
     """Find the folder that holds the keyframes of Polycam, or the one that they are in."""
-    folder = path.parent if path.name == KEYFRAMES else path
-    return folder if polycam_folders(folder) is not None else None
+    folder = path.parent if path.name == polycam.KEYFRAMES else path
+    return folder if polycam.polycam_folders(folder) is not None else None
 
 
 def find_neus(path: Path) -> Path | None:
     """Find a file .npz with the projections of IDR and NeuS, or a folder's file with one of their names."""
-    found = named(*NEUS_FILES)(path) if path.is_dir() else path
+    found = named(*neus.FILES)(path) if path.is_dir() else path
     if found is None or found.suffix.lower() != ".npz" or not zipfile.is_zipfile(found):
         return None
     with zipfile.ZipFile(found) as archive:
-        return found if f"{NEUS_FIRST}.npy" in archive.namelist() else None
+        return found if f"{neus.FIRST}.npy" in archive.namelist() else None
 
 
 def find_mvsnet(path: Path) -> Path | None:
     """Find the folder that holds cams/ of MVSNet."""
-    return path if any((path / CAMERA_FOLDER).glob(CAMERA_FILES)) else None
+    return path if any((path / mvsnet.CAMERA_FOLDER).glob(mvsnet.CAMERA_FILES)) else None
 
 
 def find_pose_files(path: Path) -> Path | None:
     """Find a folder with a text file for each pose, or the one that the folder of these files is in."""
-    folder = path.parent if path.name in POSE_FOLDERS else path
-    files = pose_files(folder) if folder.is_dir() else []
-    return folder if files and is_pose(files[0]) else None
+    folder = path.parent if path.name in pose_files.POSE_FOLDERS else path
+    files = pose_files.pose_files(folder) if folder.is_dir() else []
+    return folder if files and pose_files.is_pose(files[0]) else None
 
 
 def find_camera_path(path: Path) -> Path | None:
@@ -145,7 +144,7 @@ def find_camera_path(path: Path) -> Path | None:
     found = find_json(path, opening="{", name="camera_path.json")
     if found is None or path.is_dir():
         return found
-    return found if _has_keys(found, b'"camera_path"', is_camera_path) else None
+    return found if _has_keys(found, b'"camera_path"', camera_path.is_camera_path) else None
 
 
 def find_lines(path: Path, *, columns: int) -> Path | None:
