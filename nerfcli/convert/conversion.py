@@ -170,11 +170,7 @@ def _orientation_notes(turned: ReorientedCapture) -> tuple[str, ...]:
 
 
 def _convention(form: Format, wanted: TargetOptions) -> Convention:
-    """Return the convention of the file to be written.
-
-    Raises:
-        UserError: the requested convention is not one that the format allows.
-    """
+    """Return the convention of the file to be written."""
     axes = form.axes if wanted.axes is None else wanted.axes
     if not np.array_equal(opencv_from_axes(axes), opencv_from_axes(form.axes)) and not form.open_axes:
         raise UserError(
@@ -218,10 +214,7 @@ def _does_not_hold(path: Path, verification: Verification) -> UserError:
 
 
 def _loss_px(capture: Capture, left: Capture) -> float:
-    """Return the largest distance, in pixels, between projections of a point by a capture and by its reduced form.
-
-    Only points inside the pictures of the capture are compared.
-    """
+    """Return the largest distance, in pixels, between projections of a point by a capture and by its reduced form."""
     if all(one.camera == other.camera for one, other in zip(capture.frames, left.frames, strict=True)):
         return 0.0
     probes = probes_of(capture)
@@ -236,10 +229,7 @@ def _files(form: Format, path: Path) -> list[Path]:
 
 @contextmanager
 def _kept_on_success(path: Path, there: list[Path], files: list[Path]) -> Iterator[None]:
-    """Set existing files aside; on any exception remove the written files and put the old ones back.
-
-    Folders that were created meanwhile are also removed.
-    """
+    """Set existing files aside; on any exception remove written files and new folders, and put the old files back."""
     folders = {folder for file in files for folder in file.parents} | {path, *path.parents}
     missing = sorted((folder for folder in folders if not folder.exists()), key=lambda folder: -len(folder.parts))
     place = path.with_name(f".{path.name}.aside-{os.getpid()}")  # not the name that atomic_folder uses

@@ -19,12 +19,7 @@ _ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEY
 
 @dataclass(frozen=True)
 class FileLens:
-    """A lens as a file describes it.
-
-    Args:
-        width, height: of the picture, pixels.
-        params: in COLMAP's order.
-    """
+    """A lens as a file describes it, with COLMAP's name and order of parameters."""
 
     model: str
     width: int

@@ -25,24 +25,6 @@ class UnreadableError(Exception):
 
 
 @dataclass(frozen=True)
-class OptionalContent:
-    """Optional content of a file besides cameras, poses and points; None where its format has no place for it.
-
-    Args:
-        images, masks: of each view, as paths; "" for none.
-        splits: of each view: "train", "val", "test", or "" for none.
-        depth_bounds: (views, 2).
-        unit: "arbitrary" or "metre".
-    """
-
-    images: tuple[str, ...] | None = None
-    masks: tuple[str, ...] | None = None
-    splits: tuple[str, ...] | None = None
-    depth_bounds: np.ndarray | None = None
-    unit: str | None = None
-
-
-@dataclass(frozen=True)
 class ReadBack:
     """The views in a file.
 
@@ -55,7 +37,10 @@ class ReadBack:
         colours: (N, 3), 0...255; None if the format has none.
         features: returns the positions (F, 2) of a view's features and the indices of their points (F,), -1 for none;
             None if the format has no observations.
-        beside: optional content of the file.
+        images, masks: of each view, as paths, "" for none; None, like the following, if the format does not state them.
+        splits: of each view: "train", "val", "test", or "" for none.
+        depth_bounds: (views, 2).
+        unit: "arbitrary" or "metre".
     """
 
     labels: tuple[str, ...] | None
@@ -65,7 +50,11 @@ class ReadBack:
     points: np.ndarray | None
     colours: np.ndarray | None = None
     features: Callable[[int], tuple[np.ndarray, np.ndarray]] | None = None
-    beside: OptionalContent = OptionalContent()
+    images: tuple[str, ...] | None = None
+    masks: tuple[str, ...] | None = None
+    splits: tuple[str, ...] | None = None
+    depth_bounds: np.ndarray | None = None
+    unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -108,15 +97,14 @@ def read_scene(path: Path, unstated: UnstatedFacts) -> ReadBack:
     names = back.labels or ()
     masks, bounds, root = content["masks"] or {}, content.get("depth_bounds"), os.path.realpath(path)
     parts = {name: part for part in ("test", "val", "unused") for name in content["split"].get(part, [])}
-    splits = tuple(parts.get(name, "train").replace("unused", "") for name in names)
-    beside = OptionalContent(
+    return replace(
+        back,
         images=tuple(os.path.join(root, content["image_folder"], name) for name in names),
         masks=tuple(os.path.join(root, masks[name]) if name in masks else "" for name in names),
-        splits=splits,
+        splits=tuple(parts.get(name, "train").replace("unused", "") for name in names),
         depth_bounds=None if bounds is None else np.array([bounds[name] for name in names]),
         unit=content["unit"],
     )
-    return replace(back, beside=beside)
 
 
 def _features(image: Any, places: dict[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -133,14 +121,16 @@ def read_transforms(path: Path, unstated: UnstatedFacts) -> ReadBack:
     points, colours = (np.zeros((0, 3)), None) if cloud is None else read_ply(path.parent / cloud)
     parts = {name: part for part in ("train", "val", "test") for name in content.get(f"{part}_filenames", [])}
     records = content["frames"]
-    beside = OptionalContent(
+    return replace(
+        _from_transforms([content], unstated),
+        points=points,
+        colours=colours,
         images=tuple(os.path.join(path.parent, record["file_path"]) for record in records),
         masks=tuple(
             os.path.join(path.parent, record["mask_path"]) if "mask_path" in record else "" for record in records
         ),
         splits=tuple(parts.get(record["file_path"], "") for record in records),
     )
-    return replace(_from_transforms([content], unstated), points=points, colours=colours, beside=beside)
 
 
 def read_blender(path: Path, unstated: UnstatedFacts) -> ReadBack:
@@ -151,7 +141,7 @@ def read_blender(path: Path, unstated: UnstatedFacts) -> ReadBack:
     splits = [split for split, content in zip(named, contents, strict=True) for _ in content["frames"]]
     for content in contents:
         content["frames"] = [{**record, "angle": content["camera_angle_x"]} for record in content["frames"]]
-    return replace(_from_transforms(contents, unstated), beside=OptionalContent(splits=tuple(splits)))
+    return replace(_from_transforms(contents, unstated), splits=tuple(splits))
 
 
 def read_llff(path: Path, unstated: UnstatedFacts) -> ReadBack:
@@ -162,7 +152,7 @@ def read_llff(path: Path, unstated: UnstatedFacts) -> ReadBack:
     lenses = []
     for height, width, focal in matrices[:, :, 4]:
         lenses.append(FileLens("SIMPLE_PINHOLE", int(width), int(height), (focal, width / 2, height / 2)))
-    return ReadBack(None, rotations, centres, tuple(lenses), None, beside=OptionalContent(depth_bounds=rows[:, 15:]))
+    return ReadBack(None, rotations, centres, tuple(lenses), None, depth_bounds=rows[:, 15:])
 
 
 def read_tum(path: Path, unstated: UnstatedFacts) -> ReadBack:
@@ -216,13 +206,11 @@ def read_npz(path: Path, unstated: UnstatedFacts) -> ReadBack:
             points=arrays["points"],
             colours=arrays.get("colours"),
             features=_features_of_arrays(arrays, 0.5 - unstated.pixel_centre),
-            beside=OptionalContent(
-                images=tuple(os.path.join(path.parent, text) if text else "" for text in arrays["images"].tolist()),
-                masks=tuple(os.path.join(path.parent, text) if text else "" for text in arrays["masks"].tolist()),
-                splits=tuple(arrays["splits"].tolist()),
-                depth_bounds=arrays.get("depth_bounds"),
-                unit=str(arrays["unit"]),
-            ),
+            images=tuple(os.path.join(path.parent, text) if text else "" for text in arrays["images"].tolist()),
+            masks=tuple(os.path.join(path.parent, text) if text else "" for text in arrays["masks"].tolist()),
+            splits=tuple(arrays["splits"].tolist()),
+            depth_bounds=arrays.get("depth_bounds"),
+            unit=str(arrays["unit"]),
         )
 
 

@@ -102,13 +102,7 @@ def _split(splits: dict[str, str | None]) -> dict[str, str | None]:
 
 
 def _named(capture: Capture) -> tuple[Path, list[str]]:
-    """Return a common folder of the photos, and the name of each photo relative to it.
-
-    It is the folder from which the frames' own names lead to the photos, if there is one.
-
-    Raises:
-        UserError: a frame has no photo, or the photos have no common folder.
-    """
+    """Return a folder of the photos, from which the frames' names lead to them if possible, and their names in it."""
     images = []
     for frame in capture.frames:
         if frame.image is None:

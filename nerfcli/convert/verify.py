@@ -144,11 +144,7 @@ def listed_order(capture: Capture, format_name: str) -> np.ndarray:
 
 
 def _order(capture: Capture, back: ReadBack, listed: np.ndarray) -> np.ndarray:
-    """Return the index of the read-back view of each frame of the capture, (frames,).
-
-    Raises:
-        UnreadableError: a view is missing, or belongs to another photo.
-    """
+    """Return the index of the read-back view of each frame of the capture, (frames,)."""
     if len(back.centres) != len(capture.frames):
         raise UnreadableError(f"it contains {len(back.centres)} views instead of {len(capture.frames)}")
     names = [frame.name for frame in capture.frames]
@@ -261,7 +257,7 @@ def _observations(capture: Capture, back: ReadBack, order: np.ndarray, *, tolera
 
 
 def _paths(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[str, str]:
-    images = back.beside.images
+    images = back.images
     if images is None or not any(frame.image for frame in capture.frames):
         return "", ""
     same = _same_file()
@@ -272,7 +268,7 @@ def _paths(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[str, st
 
 
 def _masks(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[str, str]:
-    masks, count = back.beside.masks, sum(frame.mask is not None for frame in capture.frames)
+    masks, count = back.masks, sum(frame.mask is not None for frame in capture.frames)
     if masks is None:
         return ("it has no masks" if count else ""), ""
     same = _same_file()
@@ -285,7 +281,7 @@ def _masks(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[str, st
 
 
 def _splits(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[str, str]:
-    splits = back.beside.splits
+    splits = back.splits
     if splits is None:
         return ("it has no split" if any(frame.split for frame in capture.frames) else ""), ""
     for frame, view in zip(capture.frames, order, strict=True):
@@ -297,13 +293,13 @@ def _splits(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[str, s
 def _depth_bounds(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[str, str]:
     if capture.depth_bounds is None:
         return "", ""
-    bounds = back.beside.depth_bounds
+    bounds = back.depth_bounds
     same = bounds is not None and np.array_equal(bounds[order], capture.depth_bounds)
     return ("" if same else "its depth bounds differ"), "depth bounds"
 
 
 def _unit(capture: Capture, back: ReadBack) -> tuple[str, str]:
-    unit = back.beside.unit
+    unit = back.unit
     if unit is None:
         return ("" if capture.unit == "arbitrary" else "it has no unit of length"), ""
     return ("" if unit == capture.unit else f"its unit is {unit}, not {capture.unit}"), f"the unit ({unit})"

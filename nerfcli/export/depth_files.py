@@ -30,13 +30,9 @@ _AXES_OF_VIEW = "OpenCV: +x right, +y down, +z forward; the top-left pixel's cen
 
 def map_path(folder: Path, output: str, name: str, file_format: str) -> Path:
     """Return the path of a map of a picture."""
-    match file_format:
-        case "exr" | "npz":
-            return with_suffix(folder / file_format / name, f".{file_format}")
-        case "png16":
-            return with_suffix(folder / LEVELS_FOLDER / name, ".png")
-        case _:
-            return with_suffix(folder / output / name, f".{file_format}")
+    if file_format == "png16":
+        return with_suffix(folder / LEVELS_FOLDER / name, ".png")
+    return with_suffix(folder / (file_format if file_format in TOGETHER else output) / name, f".{file_format}")
 
 
 def frame_meta(

@@ -171,11 +171,7 @@ class Order:
 
 
 def _made(folder: Path) -> dict[str, Any] | None:
-    """Return the description of a finished folder; None if there is none.
-
-    Raises:
-        UserError: the description is damaged.
-    """
+    """Return the description of a finished folder; None if there is none."""
     if not (folder / DESCRIPTION).exists():
         return None
     hint = "add --overwrite to render again, or choose another folder with -o"

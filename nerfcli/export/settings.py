@@ -3,17 +3,14 @@
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from nerfcli.media.depth_pictures import DepthMeta
+from nerfcli.media.depth_pictures import CONVENTION_OF, QUANTITIES, DepthMeta
 from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import Quality
 
-OUTPUTS = (
-    *("rgb", "depth", "opacity", "spread", "disagreement", "coverage", "parallax", "lower", "upper"),
-    *("confidence", "depth_deviation", "colour_deviation"),
-)
+OUTPUTS = ("rgb", "depth", "opacity", *CONVENTION_OF)
 # Measured outputs, which are stored as floats, with previews in false colours.
-MEASURED = tuple(output for output in OUTPUTS if output not in ("rgb", "opacity"))
+MEASURED = QUANTITIES
 FLOAT_FORMATS = ("tiff", "exr", "npy", "npz")
 FORMATS = (*FLOAT_FORMATS, "png16")
 # A file in one of these formats holds all requested outputs of a view; its folder has the name of the format.

@@ -20,10 +20,6 @@ FORMAT = "nerfcli depth 2"
 # The key of a description in PNG text chunks and OpenEXR attributes.
 KEY = "nerfcli"
 AXES = {"ray": "along the ray", "z": "along the optical axis (z)"}
-QUANTITIES = (
-    *("depth", "spread", "disagreement", "coverage", "parallax", "lower", "upper"),
-    *("confidence", "depth_deviation", "colour_deviation"),
-)
 # The convention of quantities other than depth.
 CONVENTION_OF = {
     "spread": "standard-deviation",
@@ -36,6 +32,7 @@ CONVENTION_OF = {
     "depth_deviation": "deviation-of-members",
     "colour_deviation": "deviation-of-members",
 }
+QUANTITIES = ("depth", *CONVENTION_OF)
 # The unit of quantities that are not lengths.
 UNIT_OF = {
     "coverage": "photos",

@@ -31,13 +31,9 @@ from nerfcli import __version__
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 from nerfcli.media.colours import linear_light
-from nerfcli.media.depth_pictures import KEY, DepthMeta, check_map
+from nerfcli.media.depth_pictures import CONVENTION_OF, KEY, DepthMeta, check_map
 
-CHANNELS = {
-    "depth": "Z",
-    **{name: f"{name}.V" for name in ("opacity", "spread", "disagreement", "coverage", "parallax", "lower", "upper")},
-    **{name: f"{name}.V" for name in ("confidence", "depth_deviation", "colour_deviation")},
-}
+CHANNELS = {"depth": "Z", **{name: f"{name}.V" for name in ("opacity", *CONVENTION_OF)}}
 
 
 def write_exr(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> None:
@@ -97,11 +93,7 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
 
 @contextlib.contextmanager
 def _captured_stderr() -> Iterator[Callable[[], str]]:
-    """Capture OpenEXR's messages about a damaged file, which say more than its exceptions, instead of printing them.
-
-    Yields:
-        A function that returns the last line so far.
-    """
+    """Capture OpenEXR's messages about a damaged file, better than its exceptions; yield what returns the last line."""
     sys.stderr.flush()
     terminal = os.dup(2)
     with tempfile.TemporaryFile() as log, contextlib.redirect_stdout(io.StringIO()):

@@ -246,11 +246,7 @@ def _depth_metas(folder: Path) -> Iterator[tuple[Path, DepthMeta]]:
 
 
 def _meta(path: Path, entries: dict[str, Any] | None) -> DepthMeta | None:
-    """Return the definition of depth in a description; None if there is none.
-
-    Raises:
-        UserError: the description is in a format of a later version of nerfcli.
-    """
+    """Return the definition of depth in a description; None if there is none."""
     if entries is None:
         return None
     stated = entries.get("format", FORMAT)

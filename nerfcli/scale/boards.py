@@ -124,11 +124,7 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def _photos(frames: Sequence[Frame]) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the index and grey picture (H, W) uint8 of each frame with a photo.
-
-    Raises:
-        UserError: a photo cannot be read, or has another size than its camera.
-    """
+    """Yield the index and grey picture (H, W) uint8 of each frame with a photo."""
     for index, frame in enumerate(frames):
         if frame.image is None:
             continue

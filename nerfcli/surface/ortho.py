@@ -136,12 +136,8 @@ def ortho_of(
 def _from_above(model: Model, places: np.ndarray, *, reach: float, height: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the colours (N, 3) uint8 below places (N, 3) at the top of a box, and how far below (N,) the surface is.
 
-    A distance is NaN where less than half of the light ends within `reach`.
-
-    Args:
-        places: scene's frame.
-        reach: height of the box.
-        height: of the photos above the surface, whose rays were cut as finely as these are.
+    A distance is NaN where less than half of the light ends within `reach`. Rays are cut as finely as those of photos
+    taken from `height`.
     """
     similarity, marching = model.training_from_scene, model.marching
     down = np.array([0.0, 0.0, -1.0])

@@ -76,27 +76,19 @@ def write_ply(capture: Capture, path: Path) -> None:
     Raises:
         UserError: the file cannot be written.
     """
-    fields = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
+    fields = [(name, "<f8") for name in "xyz"]
+    columns = [*capture.points.T]
     if capture.colours is not None:
-        fields += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+        fields += [(name, "u1") for name in _COLOURS[0]]
+        columns += [*capture.colours.T]
     vertices = np.zeros(len(capture.points), np.dtype(fields))
-    for axis, name in enumerate("xyz"):
-        vertices[name] = capture.points[:, axis]
-    if capture.colours is not None:
-        for channel, name in enumerate(_COLOURS[0]):
-            vertices[name] = capture.colours[:, channel]
-    _write(path, {"vertex": vertices})
-
-
-def _write(path: Path, elements: dict[str, np.ndarray]) -> None:
-    words = {"<f8": "double", "|u1": "uchar", "<i4": "int"}
-    lines = ["ply", "format binary_little_endian 1.0", "comment written by nerfcli"]
-    for name, table in elements.items():
-        lines.append(f"element {name} {len(table)}")
-        lines += [f"property {words[table.dtype[field].str]} {field}" for field in table.dtype.names or ()]
+    for (name, _), column in zip(fields, columns, strict=True):
+        vertices[name] = column
+    lines = ["ply", "format binary_little_endian 1.0", "comment written by nerfcli", f"element vertex {len(vertices)}"]
+    lines += [f"property {'double' if kind == '<f8' else 'uchar'} {name}" for name, kind in fields]
     header = "\n".join([*lines, "end_header", ""])
     with atomic_path(path) as partial:
-        partial.write_bytes(header.encode("ascii") + b"".join(table.tobytes() for table in elements.values()))
+        partial.write_bytes(header.encode("ascii") + vertices.tobytes())
 
 
 def _points(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
