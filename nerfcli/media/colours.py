@@ -19,11 +19,7 @@ COLOUR_MAPS = {"turbo": "turbo", "viridis": "viridis", "grey": "gray"}
 
 @cache
 def levels_of(colour_map: str) -> np.ndarray:
-    """Return the colours of a map, uint8 sRGB (256, 3), from the lowest level to the highest.
-
-    Args:
-        colour_map: one of `COLOUR_MAPS`.
-    """
+    """Return the colours of one of `COLOUR_MAPS`, uint8 sRGB (256, 3), from the lowest level to the highest."""
     from matplotlib import colormaps  # imported here because it takes 0.2 s
 
     # Not bytes=True, which rounds down.

@@ -87,10 +87,7 @@ FORMATS = {
 
 
 def check_encoders(formats: Iterable[str]) -> None:
-    """Check that this machine's ffmpeg supports these formats, before hours of rendering.
-
-    Args:
-        formats: keys of `FORMATS`.
+    """Check that this machine's ffmpeg supports these of `FORMATS`, before hours of rendering.
 
     Raises:
         UserError: there is no ffmpeg, it does not run, or lacks an encoder.

@@ -22,12 +22,9 @@ _POINT = re.compile(r"[^,]+,[^,]+,[^,]+")
 
 @dataclass(frozen=True)
 class KnownDistance:
-    """A distance in scene units and in metres.
+    """A distance in scene units and in metres, between the ends that `name` says for people.
 
     Args:
-        name: its two ends, as text for people.
-        units: its length in scene units.
-        metres: its true length.
         tolerance: standard error of `metres` in metres, or None where unknown.
     """
 

@@ -44,39 +44,29 @@ def agreed_points(
     views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda fraction: None
 ) -> Points:
     """Return at most one point per voxel: the one with the smallest spread of depth, if two photos see it."""
-    candidates = _thinned(views, grid)
-    seen = np.zeros((len(candidates.places), len(views)), dtype=bool)
+    places, normals, colours, spread = _thinned(views, grid)
+    seen = np.zeros((len(places), len(views)), dtype=bool)
     for index, view in enumerate(views):
-        ray = candidates.places - view.frame.centre
-        facing = -(ray * candidates.normals).sum(axis=1)
-        seen[:, index] = sees(view.distances(), candidates.places)
+        ray = places - view.frame.centre
+        facing = -(ray * normals).sum(axis=1)
+        seen[:, index] = sees(view.distances(), places)
         seen[:, index] &= facing > _FLATTEST * np.linalg.norm(ray, axis=1)
         on_progress((index + 1) / len(views))
     photos = seen.sum(axis=1)
     kept = photos >= LEAST_PHOTOS
     return Points(
-        places=candidates.places[kept],
-        normals=candidates.normals[kept],
-        colours=candidates.colours[kept],
+        places=places[kept],
+        normals=normals[kept],
+        colours=colours[kept],
         photos=photos[kept].astype(np.uint16),
-        parallax_deg=largest_angle_deg(
-            seen[kept], candidates.places[kept], np.stack([view.frame.centre for view in views])
-        ),
-        spread=candidates.spread[kept],
+        parallax_deg=largest_angle_deg(seen[kept], places[kept], np.stack([view.frame.centre for view in views])),
+        spread=spread[kept],
         seen=seen[kept],
     )
 
 
-@dataclass(frozen=True)
-class _Candidates:
-    places: np.ndarray
-    normals: np.ndarray
-    colours: np.ndarray
-    spread: np.ndarray
-
-
-def _thinned(views: Sequence[DepthView], grid: Grid) -> _Candidates:
-    """Return the point with the smallest spread in each voxel, among reliable depths."""
+def _thinned(views: Sequence[DepthView], grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points with the smallest spread in each voxel, among reliable depths: the first fields of `Points`."""
     parts: list[tuple[np.ndarray, ...]] = []
     for view in views:
         with np.errstate(invalid="ignore"):
@@ -94,7 +84,7 @@ def _thinned(views: Sequence[DepthView], grid: Grid) -> _Candidates:
         parts.append((keys[best], places[inside][best], normals[best], levels[best], spread[best]))
     keys, places, normals, levels, spread = (np.concatenate(column) for column in zip(*parts, strict=True))
     best = _best(keys, spread)
-    return _Candidates(places[best], normals[best].astype(np.float32), levels[best], spread[best].astype(np.float32))
+    return places[best], normals[best].astype(np.float32), levels[best], spread[best].astype(np.float32)
 
 
 def _best(keys: np.ndarray, spread: np.ndarray) -> np.ndarray:

@@ -39,6 +39,7 @@ from numpy.lib import format as npy_format
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.limits import checked_camera, plausible
+from nerfcli.cameras.formats.photo_names import seen_from
 from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.errors import UserError
@@ -73,8 +74,8 @@ def write_npz(capture: Capture, path: Path) -> None:
         "unit_source": np.array(capture.unit_source or ""),
         "pixels": np.array(capture.pixels),
         "names": np.array([frame.name for frame in capture.frames], dtype=np.str_),
-        "images": np.array([_relative(frame.image, path.parent) for frame in capture.frames], dtype=np.str_),
-        "masks": np.array([_relative(frame.mask, path.parent) for frame in capture.frames], dtype=np.str_),
+        "images": np.array([seen_from(path.parent, frame.image) for frame in capture.frames], dtype=np.str_),
+        "masks": np.array([seen_from(path.parent, frame.mask) for frame in capture.frames], dtype=np.str_),
         "splits": np.array([frame.split or "" for frame in capture.frames], dtype=np.str_),
         "world_from_cam": np.array([frame.world_from_cam for frame in capture.frames]).reshape(-1, 4, 4),
         "camera_index": np.array(camera_index, dtype=np.int64),
@@ -277,16 +278,6 @@ def _observations(arrays: Arrays, num_frames: int, *, num_points: int) -> Observ
     if ((point_index < -1) | (point_index >= num_points)).any():
         raise arrays.damaged("observation_points", f"a point index outside the list of {num_points}")
     return Observations(frame_index, point_index, pixels)
-
-
-def _relative(path: Path | None, folder: Path) -> str:
-    """Return a path relative to a folder, with forward slashes; absolute if on another drive, empty for None."""
-    if path is None:
-        return ""
-    try:
-        return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve())).as_posix()
-    except ValueError:
-        return path.absolute().as_posix()
 
 
 def _joined(folder: Path, text: str) -> Path | None:

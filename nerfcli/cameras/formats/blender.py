@@ -18,14 +18,13 @@ from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.transforms import (
     SPLITS,
-    FoundFrames,
     capture_on_disk,
     check_unique_names,
     frames_on_disk,
     listed_frames,
     relative_path,
 )
-from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole
+from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.cameras.frame import Capture, Frame, Size
 from nerfcli.cameras.orientation import Measure
 from nerfcli.errors import UserError
@@ -37,18 +36,16 @@ def read_blender(folder: Path, measure: Measure) -> Capture:
     Raises:
         UserError: a file is malformed or lists no image that is on disk.
     """
-    frames: list[Frame] = []
-    missing: list[str] = []
-    rescaled: Counter[tuple[Size, Size]] = Counter()
+    frames, missing, rescaled = list[Frame](), list[str](), list[tuple[Size, Size] | None]()
     for split in ("train", "test"):
         path = _file(folder, split)
         if split == "test" and not path.exists():
             continue
-        found = frames_on_disk(path, read_json_object(path), measure)
-        frames += [replace(frame, split=split) for frame in found.frames]
-        missing += found.missing
-        rescaled.update(found.rescaled)
-    return capture_on_disk(_file(folder, "train"), FoundFrames(frames, missing, dict(rescaled)), kind="blender")
+        found, names, sizes = frames_on_disk(path, read_json_object(path), measure)
+        frames += [replace(frame, split=split) for frame in found]
+        missing += names
+        rescaled += sizes
+    return capture_on_disk(_file(folder, "train"), frames, missing, rescaled=rescaled, kind="blender")
 
 
 def parse_blender(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
@@ -101,12 +98,7 @@ def write_blender(capture: Capture, folder: Path) -> None:
     Raises:
         UserError: a spherical camera, an existing file of a split without frames, or a file that cannot be written.
     """
-    spherical = [frame.name for frame in capture.frames if frame.camera.is_spherical]
-    if spherical:
-        raise UserError(
-            f"the spherical picture {spherical[0]} has no field of view, which this format requires",
-            "write transforms.json instead",
-        )
+    refuse_spherical(capture, "field of view")
     by_split = _by_split(capture)
     stale = [_file(folder, split) for split in SPLITS if split not in by_split and _file(folder, split).exists()]
     if stale:

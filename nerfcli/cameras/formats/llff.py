@@ -19,7 +19,7 @@ from nerfcli.cameras.formats.archive import array_from_npy
 from nerfcli.cameras.formats.limits import checked_camera, plausible
 from nerfcli.cameras.formats.photo_names import ListImages
 from nerfcli.cameras.formats.rigid_poses import rigid_poses
-from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole
+from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling
 from nerfcli.errors import UserError
@@ -92,12 +92,7 @@ def write_llff(capture: Capture, folder: Path) -> None:
     Raises:
         UserError: neither depth bounds nor points, a spherical camera, or a file that cannot be written.
     """
-    spherical = [frame.name for frame in capture.frames if frame.camera.is_spherical]
-    if spherical:
-        raise UserError(
-            f"the spherical picture {spherical[0]} has no focal length, which this format requires",
-            "write transforms.json instead",
-        )
+    refuse_spherical(capture, "focal length")
     bounds = _percentile_bounds(capture) if capture.depth_bounds is None else capture.depth_bounds
     poses = llff_from_opencv_pose(np.array([frame.world_from_cam for frame in capture.frames]))
     sizes = [(frame.camera.height, frame.camera.width, frame.camera.focal_lengths[0]) for frame in capture.frames]
@@ -135,11 +130,9 @@ def _views(path: Path, rows: np.ndarray) -> list[tuple[Camera, np.ndarray]]:
             f"{path}: row {index}: depth bounds {near:g} and {far:g}",
             "expected 0 < near < far in the last two columns",
         )
-    cameras: dict[tuple[float, ...], Camera] = {}
-    for index, size_and_focal in enumerate(map(tuple, matrices[:, :, 4].tolist())):
-        if size_and_focal not in cameras:
-            cameras[size_and_focal] = _camera(size_and_focal, f"{path}: row {index}")
-    return [(cameras[tuple(row)], pose) for row, pose in zip(matrices[:, :, 4].tolist(), poses, strict=True)]
+    numbers = [tuple(row) for row in matrices[:, :, 4].tolist()]
+    cameras = {row: _camera(row, f"{path}: row {numbers.index(row)}") for row in dict.fromkeys(numbers)}
+    return [(cameras[row], pose) for row, pose in zip(numbers, poses, strict=True)]
 
 
 def _images_of_rows(folder: Path, count: int, list_images: ListImages) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Find the photos that a capture lists, and measure their stored sizes, for formats that do not give them."""
+"""Paths of the photos that a capture lists, and their stored sizes, for formats that do not give them."""
 
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -46,6 +46,16 @@ class PhotoOfStem:
                 "the photos are needed, as they give the names; give their folder with --images",
             )
         return tuple(self._missing)
+
+
+def seen_from(folder: Path, path: Path | None) -> str:
+    """Return a path relative to a folder, with forward slashes; absolute if on another drive, empty for None."""
+    if path is None:
+        return ""
+    try:
+        return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve())).as_posix()
+    except ValueError:
+        return path.absolute().as_posix()
 
 
 def measured_sizes(

@@ -4,10 +4,9 @@ Poses in these files are world_from_cam with OpenGL axes. Pixel positions are as
 Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips.md and scripts/colmap2nerf.py.
 """
 
-import os
 from collections import Counter
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,6 +16,7 @@ from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
 from nerfcli.cameras.formats.fields import malformed, read_json_object
+from nerfcli.cameras.formats.photo_names import seen_from
 from nerfcli.cameras.formats.ply import read_ply_points, write_ply
 from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.formats.transforms_cameras import (
@@ -46,10 +46,10 @@ def read_transforms(path: Path, measure: Measure) -> Capture:
         UserError: the file is malformed (file and field are named), or none of its images is on disk.
     """
     content = read_json_object(path)
-    found = frames_on_disk(path, content, measure)
+    frames, missing, rescaled = frames_on_disk(path, content, measure)
     splits = _listed_splits(path, content)
-    frames = [replace(frame, split=splits.get(frame.name)) for frame in found.frames]
-    capture = capture_on_disk(path, replace(found, frames=frames), kind="transforms")
+    frames = [replace(frame, split=splits.get(frame.name)) for frame in frames]
+    capture = capture_on_disk(path, frames, missing, rescaled=rescaled, kind="transforms")
     points, colours = _points_beside(path, content)
     return replace(capture, points=points, colours=colours)
 
@@ -107,7 +107,7 @@ def write_transforms(capture: Capture, path: Path) -> None:
         record = {} if shared else dict(intrinsics[frame.camera])
         record["file_path"] = file_path
         if frame.mask is not None:
-            record["mask_path"] = _seen_from(path.parent, frame.mask)
+            record["mask_path"] = seen_from(path.parent, frame.mask)
         record["transform_matrix"] = opengl_from_opencv_pose(frame.world_from_cam).tolist()
         records.append(record)
     cloud = path.with_name(f"{path.stem}_points.ply")
@@ -136,20 +136,10 @@ def records_of(path: Path, content: dict[str, Any]) -> list[dict[str, Any]]:
     return records
 
 
-@dataclass(frozen=True)
-class FoundFrames:
-    """The frames of a file whose image is on disk, fitted to it, and the names of those whose image is missing.
-
-    `rescaled` is as in `Capture`.
-    """
-
-    frames: list[Frame]
-    missing: list[str]
-    rescaled: dict[tuple[Size, Size], int]
-
-
-def frames_on_disk(path: Path, content: dict[str, Any], measure: Measure) -> FoundFrames:
-    """Return the frames of a file whose image is on disk."""
+def frames_on_disk(
+    path: Path, content: dict[str, Any], measure: Measure
+) -> tuple[list[Frame], list[str], list[tuple[Size, Size] | None]]:
+    """Return the frames whose image is on disk, fitted to it, the names of the others, and how each was rescaled."""
     frames, missing, rescaled = [], [], []
     records = records_of(path, content)
     poses = _poses(path, records)
@@ -167,25 +157,21 @@ def frames_on_disk(path: Path, content: dict[str, Any], measure: Measure) -> Fou
         mask = _find_mask(path.parent, record.get("mask_path"), where)
         name = _name_of(listed, where, suffix=image.suffix)
         frames.append(Frame(name, camera, world_from_cam, image=image, mask=mask))
-    return FoundFrames(frames, missing, counted(rescaled))
+    return frames, missing, rescaled
 
 
-def capture_on_disk(path: Path, found: FoundFrames, *, kind: str) -> Capture:
+def capture_on_disk(
+    path: Path, frames: list[Frame], missing: list[str], *, rescaled: list[tuple[Size, Size] | None], kind: str
+) -> Capture:
     """Return the capture of `frames_on_disk`; raise a UserError if it has no frames or two with the same name."""
-    if not found.frames:
+    if not frames:
         raise UserError(
-            f"{path}: none of the {len(found.missing)} listed images exists, such as {found.missing[0]}",
+            f"{path}: none of the {len(missing)} listed images exists, such as {missing[0]}",
             "put the images where file_path points, relative to this file",
         )
-    check_unique_names(path, found.frames)
+    check_unique_names(path, frames)
     return Capture(
-        tuple(found.frames),
-        np.zeros((0, 3)),
-        tuple(found.missing),
-        None,
-        kind,
-        pixels="upright",
-        rescaled=found.rescaled,
+        tuple(frames), np.zeros((0, 3)), tuple(missing), None, kind, pixels="upright", rescaled=counted(rescaled)
     )
 
 
@@ -238,14 +224,7 @@ def listed_frames(
 
 def relative_path(frame: Frame, folder: Path) -> str:
     """Return a frame's image path relative to a folder, with forward slashes, or its name if it has no image."""
-    return frame.name if frame.image is None else _seen_from(folder, frame.image)
-
-
-def _seen_from(folder: Path, path: Path) -> str:
-    try:
-        return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve())).as_posix()
-    except ValueError:  # on another drive
-        return path.absolute().as_posix()
+    return frame.name if frame.image is None else seen_from(folder, frame.image)
 
 
 def _sizes(

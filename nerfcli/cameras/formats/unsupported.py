@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Iterable
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture
+from nerfcli.errors import UserError
 
 # Parameters that every format of perspective pictures has a place for.
 _PINHOLE = ("f", "fx", "fy", "cx", "cy")
@@ -66,6 +67,16 @@ def lost_to_pinhole(camera: Camera) -> list[str]:
     if len(set(camera.focal_lengths)) > 1:
         lost.append("the second focal length")
     return lost
+
+
+def refuse_spherical(capture: Capture, what: str) -> None:
+    """Refuse a capture with a spherical picture, which has no focal length or field of view, for a format of these."""
+    for frame in capture.frames:
+        if frame.camera.is_spherical:
+            raise UserError(
+                f"the spherical picture {frame.name} has no {what}, which this format requires",
+                "write transforms.json instead",
+            )
 
 
 def _cameras(count: int) -> str:
