@@ -97,7 +97,7 @@ POSES: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "media/photo_folders.py",
+        "media/images.py",
         ("tests/test_pose_subfolders.py", "tests/test_photos.py"),
         "",
         (),
@@ -341,7 +341,7 @@ POSES: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "cameras/origin.py",
+        "cameras/world.py",
         ("tests/test_ortho.py",),
         "codes",
         (),

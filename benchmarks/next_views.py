@@ -29,8 +29,7 @@ from nerfcli.cameras.layout import focus_point, up_direction
 from nerfcli.render.visibility import coverage_and_parallax, depth_maps, sees
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.surface.extent import scene_box
-from nerfcli.surface.grid import Grid
+from nerfcli.surface.extent import Grid, scene_box
 from nerfcli.surface.next_views import next_views, surface_points
 from nerfcli.workflows.evaluate import evaluate_run
 from nerfcli.workflows.next_views import CANDIDATE_PX, CELLS

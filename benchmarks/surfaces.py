@@ -26,9 +26,8 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.media.float_tiff import read_any_tiff
 from nerfcli.render.depth import DepthRequest
 from nerfcli.runs.run import load_run
-from nerfcli.surface.extent import scene_box
+from nerfcli.surface.extent import Grid, scene_box
 from nerfcli.surface.fusion import fuse
-from nerfcli.surface.grid import Grid
 from nerfcli.surface.marching import Mesh, mesh_of, simplified, surface_of, without_small_pieces
 from nerfcli.surface.views import depth_views
 from nerfcli.surface.volume import density_at

@@ -18,8 +18,8 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.archive import parse_npz, write_npz
 from nerfcli.cameras.frame import Capture, Frame
-from nerfcli.cameras.origin import Origin
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.cameras.world import Origin
 from nerfcli.errors import UserError
 from nerfcli.media.geodesy import ecef
 from nerfcli.scale.control_points import read_control_points

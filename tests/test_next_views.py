@@ -15,7 +15,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import look_at
 from nerfcli.render.visibility import DepthMap, coverage_and_parallax, sees, without_steep
 from nerfcli.surface import next_views as candidates
-from nerfcli.surface.grid import Grid
+from nerfcli.surface.extent import Grid
 from nerfcli.surface.next_views import ENOUGH, candidate_frames, in_free_space, next_views, surface_points
 from nerfcli.workflows import next_views as workflow
 

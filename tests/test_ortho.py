@@ -17,8 +17,8 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.run_cameras import write_cameras
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.origin import Origin
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.cameras.world import Origin
 from nerfcli.errors import UserError
 from nerfcli.media.geodesy import degrees_per_metre, east_north_up
 from nerfcli.media.geotiff import MapPlace, write_geotiff

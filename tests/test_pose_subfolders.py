@@ -17,8 +17,8 @@ from nerfcli import scene as scenes
 from nerfcli.cameras.calibration import Calibration, Picture, calibrated
 from nerfcli.cameras.camera import Camera
 from nerfcli.errors import BAD_INPUT
+from nerfcli.media.images import list_photos
 from nerfcli.media.masks import find_mask
-from nerfcli.media.photo_folders import list_photos
 from nerfcli.poses.input.photos import camera_groups, find_photos
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import is_same_scene

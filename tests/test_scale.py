@@ -21,10 +21,9 @@ from nerfcli.cameras.world import transformed
 from nerfcli.errors import UserError
 from nerfcli.media.geodesy import Position, east_north_up, ecef
 from nerfcli.media.images import write_png
-from nerfcli.scale.boards import CharucoBoard, scale_from_charuco, scale_from_markers
+from nerfcli.scale.boards import CharucoBoard, refined_corners, scale_from_charuco, scale_from_markers
 from nerfcli.scale.corners import Side, nearest_in_pixels, scale_from_corners
 from nerfcli.scale.distances import KnownDistance, known_distance, scale_from_distances
-from nerfcli.scale.edges import refined_corners
 from nerfcli.scale.estimate import ScaleEstimate
 from nerfcli.scale.gps import gps_positions, scale_from_gps
 

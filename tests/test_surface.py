@@ -26,9 +26,8 @@ from nerfcli.runs.files import FIELD
 from nerfcli.runs.run import Run
 from nerfcli.surface import extent
 from nerfcli.surface.colmap_dense import read_map, write_map, write_photo, write_sparse, write_stereo
-from nerfcli.surface.extent import scene_box
+from nerfcli.surface.extent import Grid, scene_box
 from nerfcli.surface.fusion import FusedVolume, fuse
-from nerfcli.surface.grid import Grid
 from nerfcli.surface.marching import mesh_of, simplified, surface_of, without_small_pieces
 from nerfcli.surface.points import agreed_points
 from nerfcli.surface.settings import SurfaceSettings

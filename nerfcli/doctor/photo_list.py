@@ -6,7 +6,7 @@ from pathlib import Path
 from nerfcli import scene as scenes
 from nerfcli.doctor.photo_facts import Source
 from nerfcli.errors import UserError, in_shell
-from nerfcli.media.photo_folders import list_photos, list_unsupported, name_in, where_photos_may_be
+from nerfcli.media.images import list_photos, list_unsupported, name_in, where_photos_may_be
 
 
 @dataclass(frozen=True)

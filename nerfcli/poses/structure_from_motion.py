@@ -17,7 +17,7 @@ from nerfcli import scene
 from nerfcli.atomic import write_json
 from nerfcli.errors import UserError
 from nerfcli.holdout import names_held_out
-from nerfcli.media.photo_folders import list_photos, name_in
+from nerfcli.media.images import list_photos, name_in
 from nerfcli.poses.engine.strict import held_out_last
 from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
 from nerfcli.poses.engine.turntable import MASKS, advised

@@ -11,7 +11,7 @@ from typing import Any
 from nerfcli import __version__
 from nerfcli.cameras.formats.run_cameras import MEND
 from nerfcli.cameras.orientation import describe_rescaling
-from nerfcli.cameras.origin import Origin
+from nerfcli.cameras.world import Origin
 from nerfcli.errors import UserError, in_shell
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.origin import Origin
+from nerfcli.cameras.world import Origin
 from nerfcli.errors import UserError
 from nerfcli.media.geodesy import east_north_up
 from nerfcli.scale.corners import Sightings

@@ -7,8 +7,8 @@ import numpy as np
 
 from nerfcli.cameras.alignment import Alignment, align, align_robustly
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.origin import Origin
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.cameras.world import Origin
 from nerfcli.errors import UserError
 from nerfcli.media.geodesy import Position
 from nerfcli.scale.control_points import ControlPoints

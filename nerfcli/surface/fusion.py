@@ -18,7 +18,7 @@ import torch
 from scipy.ndimage import minimum_filter
 from torch import Tensor
 
-from nerfcli.surface.grid import Grid
+from nerfcli.surface.extent import Grid
 from nerfcli.surface.views import DepthView, plane_rays
 
 # Voxels along a side of a block.

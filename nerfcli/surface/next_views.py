@@ -11,7 +11,7 @@ from nerfcli.cameras.layout import focus_point, up_direction
 from nerfcli.cameras.rigid import look_at, rotation_from_vector
 from nerfcli.errors import UserError
 from nerfcli.render.visibility import DepthMap
-from nerfcli.surface.grid import Grid
+from nerfcli.surface.extent import Grid
 
 # A point that this many photos see gains nothing from another one.
 ENOUGH = 2

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.render.visibility import largest_angle_deg, sees
-from nerfcli.surface.grid import Grid
+from nerfcli.surface.extent import Grid
 from nerfcli.surface.views import DepthView
 
 # A depth counts if the pixel is at least this opaque, and median and mean differ by at most this fraction of it.

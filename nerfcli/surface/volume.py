@@ -8,7 +8,7 @@ import torch
 from nerfcli.kernels import grid_coordinates
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import render_cut_rays
-from nerfcli.surface.grid import Grid
+from nerfcli.surface.extent import Grid
 
 _BLOCK = 2**15
 # Rendering tolerance, far below a level of 8-bit colours.

@@ -7,7 +7,7 @@ from typing import Any
 from nerfcli.cameras.formats.scene_json import read_description
 from nerfcli.cameras.frame import Capture
 from nerfcli.cameras.orientation import describe_rescaling
-from nerfcli.cameras.origin import Origin
+from nerfcli.cameras.world import Origin
 from nerfcli.convert import detect
 from nerfcli.convert.conversion import ConventionOverrides, Conversion, TargetOptions, convert, load
 from nerfcli.convert.formats import Format, UserInputs, recording

@@ -10,8 +10,7 @@ from nerfcli.pages.page import write_page
 from nerfcli.photos.undistorted import pinhole_frame
 from nerfcli.render.model import Model
 from nerfcli.runs.run import Run
-from nerfcli.surface.extent import scene_box
-from nerfcli.surface.grid import check_box
+from nerfcli.surface.extent import check_box, scene_box
 from nerfcli.surface.settings import SurfaceSettings
 from nerfcli.viewer.coverage import seen_cells
 from nerfcli.viewer.packing import pack_model

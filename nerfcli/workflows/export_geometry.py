@@ -24,9 +24,8 @@ from nerfcli.render.model import Model
 from nerfcli.render.visibility import coverage_and_parallax
 from nerfcli.runs.run import Run
 from nerfcli.surface.colmap_dense import photo_name, write_photo, write_sparse, write_stereo
-from nerfcli.surface.extent import automatic_voxel, scene_box
+from nerfcli.surface.extent import Grid, automatic_voxel, scene_box
 from nerfcli.surface.fusion import fuse
-from nerfcli.surface.grid import Grid
 from nerfcli.surface.marching import SEEN, Mesh, simplified, surface_of, without_small_pieces
 from nerfcli.surface.points import agreed_points
 from nerfcli.surface.settings import MOST_VIEWS, SurfaceSettings

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.atomic import atomic_folder
-from nerfcli.cameras.origin import Origin
+from nerfcli.cameras.world import Origin
 from nerfcli.errors import UserError
 from nerfcli.media.geodesy import degrees_per_metre
 from nerfcli.media.geotiff import MapPlace, write_geotiff

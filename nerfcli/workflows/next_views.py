@@ -17,8 +17,7 @@ from nerfcli.render.visibility import DepthMap, coverage_and_parallax, depth_map
 from nerfcli.report.next_views import NextView, next_views_html
 from nerfcli.report.views import coverage_map
 from nerfcli.runs.run import Run
-from nerfcli.surface.extent import scene_box
-from nerfcli.surface.grid import Grid
+from nerfcli.surface.extent import Grid, scene_box
 from nerfcli.surface.next_views import candidate_frames, in_free_space, next_views, surface_points
 from nerfcli.workflows.machine import thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent

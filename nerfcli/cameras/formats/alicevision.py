@@ -29,7 +29,7 @@ from nerfcli.cameras.formats.fields import (
     shown,
     size_of,
 )
-from nerfcli.cameras.formats.rigid_poses import rigid_pose
+from nerfcli.cameras.formats.limits import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 
 FILES = ("cameras.sfm", "sfm.sfm", "sfm.json")

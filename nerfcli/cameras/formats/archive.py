@@ -38,9 +38,8 @@ from numpy.lib import format as npy_format
 
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.limits import checked_camera, plausible
+from nerfcli.cameras.formats.limits import checked_camera, plausible, rigid_poses
 from nerfcli.cameras.formats.photo_names import seen_from
-from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.errors import UserError
 

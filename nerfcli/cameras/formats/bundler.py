@@ -17,8 +17,8 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats import lenses
 from nerfcli.cameras.formats.fields import check_unique_names, content_lines, malformed, name_of, numbers, read_text
+from nerfcli.cameras.formats.limits import rigid_pose
 from nerfcli.cameras.formats.photo_names import measured_sizes
-from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.orientation import Measure
 

@@ -28,7 +28,7 @@ from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
 from nerfcli.cameras.formats.fields import read_json_object
-from nerfcli.cameras.formats.rigid_poses import rigid_pose
+from nerfcli.cameras.formats.limits import rigid_pose
 from nerfcli.cameras.formats.unsupported import distortion, projection
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity

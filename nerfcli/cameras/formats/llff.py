@@ -16,9 +16,8 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
 from nerfcli.cameras.formats.archive import array_from_npy
-from nerfcli.cameras.formats.limits import checked_camera, plausible
+from nerfcli.cameras.formats.limits import checked_camera, plausible, rigid_poses
 from nerfcli.cameras.formats.photo_names import ListImages
-from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling

@@ -23,7 +23,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats import lenses
 from nerfcli.cameras.formats.fields import check_unique_names, malformed, name_of, numbers, shown, size_of
-from nerfcli.cameras.formats.rigid_poses import rigid_pose
+from nerfcli.cameras.formats.limits import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 
 Element = ElementTree.Element

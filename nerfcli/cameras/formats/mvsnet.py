@@ -18,8 +18,8 @@ import numpy as np
 from nerfcli.cameras import rigid
 from nerfcli.cameras.formats.fields import check_unique_names, malformed, numbers, read_text
 from nerfcli.cameras.formats.lenses import camera_of_matrix
+from nerfcli.cameras.formats.limits import rigid_pose
 from nerfcli.cameras.formats.photo_names import ListImages, PhotoOfStem
-from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, stored_size
 

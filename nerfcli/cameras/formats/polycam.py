@@ -13,9 +13,8 @@ import numpy as np
 
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats.fields import check_unique_names, number, read_json_object, size_of
-from nerfcli.cameras.formats.limits import checked_camera
+from nerfcli.cameras.formats.limits import checked_camera, rigid_pose
 from nerfcli.cameras.formats.photo_names import ListImages, PhotoOfStem
-from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 
 FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))

@@ -20,9 +20,8 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, size_of
 from nerfcli.cameras.formats.lenses import camera_of_matrix
-from nerfcli.cameras.formats.limits import checked_camera
+from nerfcli.cameras.formats.limits import checked_camera, rigid_pose
 from nerfcli.cameras.formats.photo_names import ListImages, PhotoOfStem
-from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, stored_size
 from nerfcli.errors import UserError

@@ -13,9 +13,8 @@ import numpy as np
 
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats.fields import malformed, number, read_json_object, shown, size_of, vector
-from nerfcli.cameras.formats.limits import checked_camera
+from nerfcli.cameras.formats.limits import checked_camera, quaternion_pose
 from nerfcli.cameras.formats.photo_names import ListImages, PhotoOfStem
-from nerfcli.cameras.formats.rigid_poses import quaternion_pose
 from nerfcli.cameras.frame import Capture, Frame
 
 FILES = ("metadata.json", "metadata")

@@ -15,7 +15,7 @@ from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, shown
-from nerfcli.cameras.formats.rigid_poses import quaternion_pose, rigid_pose
+from nerfcli.cameras.formats.limits import quaternion_pose, rigid_pose
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import UserError

@@ -16,9 +16,9 @@ from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
 from nerfcli.cameras.formats.fields import malformed, read_json_object
+from nerfcli.cameras.formats.limits import rigid_poses
 from nerfcli.cameras.formats.photo_names import seen_from
 from nerfcli.cameras.formats.ply import read_ply_points, write_ply
-from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.formats.transforms_cameras import (
     camera_of_record,
     given_size,

@@ -9,9 +9,8 @@ from pathlib import Path, PurePosixPath
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.media.exif import Exif, read_exif
 from nerfcli.media.focal_evidence import focal_evidence, with_digital_zoom
-from nerfcli.media.images import read_image
+from nerfcli.media.images import list_photos, list_unsupported, name_in, read_image, where_photos_may_be
 from nerfcli.media.panoramas import is_panorama
-from nerfcli.media.photo_folders import list_photos, list_unsupported, name_in, where_photos_may_be
 
 # Three views determine a scene up to scale, but leave nothing to check them with; four are the fewest that do.
 MIN_PHOTOS = 4
