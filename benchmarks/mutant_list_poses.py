@@ -299,7 +299,7 @@ POSES: tuple[Group, ...] = (
         "",
         (),
         (
-            Mutant("if _has_photo(f) else f", "if True else f"),
+            Mutant("if f.has_photo else f", "if True else f"),
             Mutant('given |= {"--world-up"', 'given |= {"--worlds-up"'),
             Mutant("found.origin.in_source(_source(found.estimate))", "_source(found.estimate)"),
         ),

@@ -114,16 +114,7 @@ def _fits(calibration: Calibration, number: int, picture: Picture) -> bool:
     shapes = [(picture.width, picture.height)]
     if not calibration.upright and picture.orientation >= 5:
         shapes.append((picture.height, picture.width))
-    return any(_is_shape(camera, *shape) for shape in shapes)
-
-
-def _is_shape(camera: Camera, width: int, height: int) -> bool:
-    """Return whether this size has the camera's aspect ratio, up to rounding to whole pixels."""
-    try:
-        camera.resized(width, height)
-    except UserError:
-        return False
-    return True
+    return any(camera.has_shape(*shape) for shape in shapes)
 
 
 def _fitted(calibration: Calibration, number: int, picture: Picture) -> Camera:

@@ -218,6 +218,12 @@ class Camera:
         x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         return self.bearings(np.stack([x.ravel(), y.ravel()], axis=-1))
 
+    def has_shape(self, width: int, height: int) -> bool:
+        """Return whether a picture of this size has the camera's aspect ratio, up to rounding to whole pixels."""
+        off_height = abs(self.height * width / self.width - height)
+        off_width = abs(self.width * height / self.height - width)
+        return min(off_height, off_width) <= 1.0
+
     def resized(self, width: int, height: int) -> "Camera":
         """Return the camera of the same picture resampled to another size.
 
@@ -226,9 +232,7 @@ class Camera:
         """
         if (width, height) == (self.width, self.height):
             return self
-        off_height = abs(self.height * width / self.width - height)
-        off_width = abs(self.width * height / self.height - width)
-        if min(off_height, off_width) > 1.0:
+        if not self.has_shape(width, height):
             raise UserError(
                 f"a picture of {width}x{height} pixels does not match a camera of {self.width}x{self.height} pixels",
                 "the aspect ratios differ: the picture was cropped or rotated, not resized; use the picture that the "

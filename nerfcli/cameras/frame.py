@@ -35,6 +35,11 @@ class Frame:
     split: str | None = None
 
     @property
+    def has_photo(self) -> bool:
+        """True if its picture is on disk."""
+        return self.image is not None and self.image.is_file()
+
+    @property
     def centre(self) -> np.ndarray:
         """The camera's centre in the world, (3,)."""
         return self.world_from_cam[:3, 3]

@@ -6,6 +6,7 @@ from nerfcli.cameras.calibration import Calibration
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.colmap import read_cameras
 from nerfcli.cameras.formats.fields import read_json_object
+from nerfcli.convert.finding import find_json, named
 from nerfcli.convert.formats import UserInputs, recognise
 from nerfcli.convert.stored_pixels import UPRIGHT
 from nerfcli.errors import UserError
@@ -41,14 +42,13 @@ def read_calibration(path: Path, *, images: Path | None = None) -> Calibration:
     Raises:
         UserError: there is no camera, or the file is damaged.
     """
-    if path.is_file() and path.suffix.lower() == ".json":
-        content = read_json_object(path) if _is_object(path) else {}
-        if "params" in content:
-            try:
-                return Calibration(path, (Camera.from_json(content),), {})
-            except UserError as error:
-                raise UserError(f"{path}: {error.message}", error.hint) from error
-    cameras_file = path if path.name in _CAMERAS_FILES else _alone(path)
+    content = read_json_object(path) if path.is_file() and find_json(path, opening="{", name="") else {}
+    if "params" in content:
+        try:
+            return Calibration(path, (Camera.from_json(content),), {})
+        except UserError as error:
+            raise UserError(f"{path}: {error.message}", error.hint) from error
+    cameras_file = path if path.name in _CAMERAS_FILES else named(*_CAMERAS_FILES)(path)
     if cameras_file is not None and cameras_file.is_file():
         cameras, of_image = read_cameras(cameras_file)
         upright = _is_own(cameras_file.parent)
@@ -72,16 +72,6 @@ def _no_cameras(path: Path) -> UserError:
     return UserError(f"{path} has no cameras", "give a file of intrinsics, such as COLMAP's cameras.txt")
 
 
-def _alone(folder: Path) -> Path | None:
-    """Return COLMAP's cameras file in a folder; None if it has none."""
-    return next((folder / name for name in _CAMERAS_FILES if (folder / name).is_file()), None)
-
-
 def _is_own(model_dir: Path) -> bool:
     """Return whether a model belongs to a scene that nerfcli wrote."""
     return (model_dir.resolve().parent.parent / SCENE_FILE).is_file() and model_dir.resolve().match(MODEL_FOLDER)
-
-
-def _is_object(path: Path) -> bool:
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        return stream.read(1000).lstrip().startswith("{")

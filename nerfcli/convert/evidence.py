@@ -44,7 +44,7 @@ def match_neighbours(
     Raises:
         UserError: a photo cannot be read or has another shape than its camera.
     """
-    present = [i for i, frame in enumerate(frames) if frame.image is not None and frame.image.is_file()]
+    present = [i for i, frame in enumerate(frames) if frame.has_photo]
     present.sort(key=lambda index: (len(frames[index].name), frames[index].name))  # 9.jpg before 10.jpg
     photos: dict[int, tuple[Camera, Features]] = {}
 

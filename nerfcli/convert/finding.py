@@ -21,7 +21,6 @@ from nerfcli.cameras.formats import (
 )
 from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.errors import UserError
-from nerfcli.scene import SCENE_FILE
 
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 
@@ -41,10 +40,14 @@ def by_suffix(suffix: str, *names: str) -> Callable[[Path], Path | None]:
     return lambda path: path if path.is_file() and path.suffix.lower() == suffix else in_folder(path)
 
 
-def find_scene(path: Path) -> Path | None:
-    """Find the folder of a nerfcli scene."""
-    folder = path.parent if path.name == SCENE_FILE else path
-    return folder if (folder / SCENE_FILE).is_file() else None
+def folder_of(name: str) -> Callable[[Path], Path | None]:
+    """Return a finder of the folder that holds this file, given the folder or the file."""
+
+    def find(path: Path) -> Path | None:
+        folder = path.parent if path.name == name else path
+        return folder if (folder / name).is_file() else None
+
+    return find
 
 
 def find_model(path: Path) -> Path | None:
@@ -57,13 +60,6 @@ def find_model(path: Path) -> Path | None:
 def find_blender(path: Path) -> Path | None:
     """Find a folder with a file of the Blender scenes."""
     return path if any((path / f"transforms_{split}.json").is_file() for split in ("train", "test", "val")) else None
-
-
-def find_llff(path: Path) -> Path | None:
-    """Find the folder of a poses_bounds.npy."""
-    if path.is_file():
-        return path.parent if path.name == "poses_bounds.npy" else None
-    return path if (path / "poses_bounds.npy").is_file() else None
 
 
 def find_bundler(path: Path) -> Path | None:

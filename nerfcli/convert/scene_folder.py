@@ -70,7 +70,7 @@ def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any]
         UserError: a frame has no photo, no photo is on disk, or the folder cannot be written.
     """
     image_folder, _ = _named(capture)
-    if not any(frame.image is not None and frame.image.is_file() for frame in capture.frames):
+    if not any(frame.has_photo for frame in capture.frames):
         raise UserError(
             f"none of the {len(capture.frames)} photos exists, such as {capture.frames[0].image}",
             "a scene needs its photos; give their folder with --images",

@@ -53,14 +53,10 @@ def measure(path: Path) -> tuple[int, int, int]:
     return exif.width, exif.height, exif.orientation
 
 
-def measure_upright(path: Path) -> tuple[int, int, int]:
-    """Return the same as `measure` for cameras of upright photos, with orientation 1: nothing is left to turn."""
-    return (*image_size(path), 1)
-
-
 def measure_of(capture: Capture) -> Measure:
     """Return the function that measures photos so that a capture's cameras can be fitted to the upright photos."""
-    return measure_upright if capture.pixels == UPRIGHT else measure
+    # Cameras of upright photos have orientation 1: nothing is left to turn.
+    return (lambda path: (*image_size(path), 1)) if capture.pixels == UPRIGHT else measure
 
 
 def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
@@ -76,7 +72,7 @@ def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
     frames, masks_left_out, num_unknown = list(capture.frames), [], 0
     turns = np.ones(len(frames), dtype=np.int64)
     for index, frame in enumerate(capture.frames):
-        if frame.image is None or not frame.image.is_file():
+        if not frame.has_photo:
             num_unknown += 1
             continue
         orientation = _turn(frame, pixels)
@@ -110,7 +106,7 @@ def other_sizes(capture: Capture) -> dict[tuple[Size, Size], int]:
     chosen = np.unique(np.linspace(0, len(capture.frames) - 1, _MOST_MEASURED).round().astype(int))
     sizes = []
     for frame in (capture.frames[index] for index in chosen):
-        if frame.image is None or not frame.image.is_file():
+        if not frame.has_photo:
             continue
         try:
             sizes.append(rescaling(frame.camera, upright(frame, measure_of(capture)).camera))
@@ -160,8 +156,5 @@ def _closer_in_shape(mask: Path, camera: Camera, before: Camera) -> bool:
     if not mask.is_file():
         return False
     width, height = image_size(mask)
-
-    def off(of: Camera) -> float:
-        return abs(width * of.height - height * of.width)
-
-    return off(camera) < off(before)
+    off, off_before = (abs(width * of.height - height * of.width) for of in (camera, before))
+    return off < off_before

@@ -105,7 +105,7 @@ def _georeference(capture: Capture, text: str) -> Georeference:
         return georeference_by_gps(frames, gps_positions(frames))
     path = Path(text)
     control = read_control_points(path)
-    frames = [upright(f, measure_of(capture)) if _has_photo(f) else f for f in capture.frames]
+    frames = [upright(f, measure_of(capture)) if f.has_photo else f for f in capture.frames]
     return georeference_by_points(frames, control, path.name)
 
 
@@ -127,11 +127,7 @@ def _estimate(capture: Capture, wanted: WorldFrame) -> ScaleEstimate | None:
 
 
 def _with_photos(capture: Capture) -> list[Frame]:
-    return [frame for frame in capture.frames if _has_photo(frame)]
-
-
-def _has_photo(frame: Frame) -> bool:
-    return frame.image is not None and frame.image.is_file()
+    return [frame for frame in capture.frames if frame.has_photo]
 
 
 def _scale_from_markers(frames: Sequence[Frame], text: str) -> ScaleEstimate:

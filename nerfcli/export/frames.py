@@ -102,7 +102,8 @@ def export_frames(
             if written.pixels_beyond:
                 notify(f"{written.pixels_beyond} pixels are too distant for 16-bit files and have no depth there")
         write_videos(unfinished.folder, order, meta, ranges=ranges, notify=notify)
-        facts = {name: unfinished.facts(name) for name in order.names}
+        notes = {name: unfinished.noted(name) for name in order.names}
+        facts = {name: note["facts"] for name, note in notes.items()}
         if words := removed_in_words(order.settings.depth, list(facts.values())):
             notify(words)
         description = {
@@ -113,7 +114,7 @@ def export_frames(
             "ranges": ranges,
             "error_meaning": ERROR_IN_WORDS,
             "facts": facts,
-            "files": {name: unfinished.files(name) for name in order.names},
+            "files": {name: note["files"] for name, note in notes.items()},
         }
         write_json(unfinished.folder / DESCRIPTION, description)
         unfinished.finish(folder)

@@ -43,20 +43,16 @@ class UnfinishedFrames:
     def has(self, name: str) -> bool:
         """Return whether a frame is complete and undamaged."""
         try:
-            note = json.loads(self._path(name).read_text(encoding="utf-8"))
+            note = self.noted(name)
             return note["note"] == _digest_of_note(note["files"], note["facts"]) and all(
                 _digest((self.folder / file).read_bytes()) == digest for file, digest in note["files"].items()
             )
         except (OSError, ValueError, LookupError, TypeError, AttributeError):
             return False  # it is rendered again
 
-    def facts(self, name: str) -> dict[str, Any]:
-        """Return the facts that `note` stored for a frame."""
-        return json.loads(self._path(name).read_text(encoding="utf-8"))["facts"]
-
-    def files(self, name: str) -> dict[str, str]:
-        """Return the files of a frame, relative to the folder, with digests of their contents."""
-        return json.loads(self._path(name).read_text(encoding="utf-8"))["files"]
+    def noted(self, name: str) -> dict[str, Any]:
+        """Return the note on a frame: "facts", and "files" relative to the folder, with digests of their contents."""
+        return json.loads(self._path(name).read_text(encoding="utf-8"))
 
     @property
     def lock(self) -> Path:

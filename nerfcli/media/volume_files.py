@@ -15,8 +15,8 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
+from nerfcli.media.mesh_files import KEY
 
-KEY = "nerfcli"
 META = "meta"
 _TYPES = {"<f4": "float", "|u1": "uchar", "<f8": "double"}
 

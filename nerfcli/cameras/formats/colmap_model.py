@@ -36,15 +36,7 @@ class ColmapImage:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """Cameras by id, images, and points.
-
-    Args:
-        cameras: by id.
-        images: in any order.
-        points: (N, 3) float64.
-        point_ids: (N,) int64.
-        colours: (N, 3) uint8.
-    """
+    """Cameras by id, images in any order, and points (N, 3) float64 with ids (N,) int64 and colours (N, 3) uint8."""
 
     cameras: dict[int, Camera]
     images: tuple[ColmapImage, ...]

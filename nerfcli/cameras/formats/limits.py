@@ -1,4 +1,4 @@
-"""Limits of the numbers in captures, beyond which they are damaged even if the file parses; poses made exactly rigid."""
+"""Limits of the numbers in captures, beyond which they are damaged even if the file parses; exactly rigid poses."""
 
 from collections.abc import Callable
 
