@@ -106,7 +106,7 @@ POSES: tuple[Group, ...] = (
             Mutant('any(p.startswith(".") for p in', "any(False for p in"),
             Mutant("return path.relative_to(folder).as_posix()", "return path.name"),
             Mutant("in _UNSUPPORTED_SUFFIXES and path.stem not in read", "in _UNSUPPORTED_SUFFIXES"),
-            Mutant(' if not path.name.startswith(".")', ""),
+            Mutant('iterdir() if not path.name.startswith(".")', "iterdir()"),
             Mutant(
                 "return sorted(paths, key=lambda path: name_in(folder, path))\n\n\ndef list_uns",
                 "return paths\n\n\ndef list_uns",

@@ -23,7 +23,7 @@ from nerfcli.cameras.formats.archive import write_npz
 from nerfcli.cameras.formats.ply import write_ply
 from nerfcli.cameras.frame import Capture, Observations
 from nerfcli.cli.convert import FORMATS_WRITTEN
-from nerfcli.convert import opencv_lenses
+from nerfcli.convert import readback
 from nerfcli.convert.axes import Convention, all_axes, expressed, opencv_from_axes, reinterpreted
 from nerfcli.convert.conversion import ConventionOverrides, TargetOptions, convert, load
 from nerfcli.convert.formats import FORMATS, UserInputs, format_named, recognise
@@ -103,12 +103,12 @@ def test_reading_in_a_convention_undoes_writing_in_it(axes, centre):
 
 
 def test_the_other_side_projects_fisheyes_as_opencv_does():
-    lens = opencv_lenses.FileLens(FISHEYE.model, FISHEYE.width, FISHEYE.height, FISHEYE.params)
+    lens = readback.FileLens(FISHEYE.model, FISHEYE.width, FISHEYE.height, FISHEYE.params)
     points = np.random.default_rng(0).normal((0, 0, 3), (1, 1, 0.5), (200, 3))
     fx, fy, cx, cy, *terms = FISHEYE.params
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     expected, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, np.array(terms))
-    np.testing.assert_allclose(opencv_lenses.project(lens, points), expected[:, 0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(readback.project(lens, points), expected[:, 0], rtol=0, atol=1e-9)
 
 
 # Round trips

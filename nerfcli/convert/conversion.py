@@ -40,8 +40,6 @@ class TargetOptions:
     Args:
         axes, pixel_centre: see `Convention`; None for the format's own.
         allow_loss: whether content that the format cannot hold may be dropped; observations always may.
-        overwrite: whether an existing result may be replaced.
-        verified: whether the file is read back and compared.
         pixels: which pixels of EXIF-turned photos the cameras refer to; None for those that programs of the format use.
     """
 
@@ -63,7 +61,6 @@ class Conversion:
         capture: the capture before losses.
         losses: its contents that the format cannot hold, which were dropped.
         loss_px: the largest shift of a pixel by the dropped lens terms.
-        verification: of the written file; None if not requested.
     """
 
     path: Path
@@ -218,7 +215,9 @@ def _loss_px(capture: Capture, left: Capture) -> float:
     if all(one.camera == other.camera for one, other in zip(capture.frames, left.frames, strict=True)):
         return 0.0
     probes = probes_of(capture)
-    return float(np.linalg.norm(projected(left, probes)[0] - probes.pixels, axis=1).max(initial=0.0))
+    return float(
+        np.linalg.norm(projected(left, probes.frame_index, probes.points)[0] - probes.pixels, axis=1).max(initial=0.0)
+    )
 
 
 def _files(form: Format, path: Path) -> list[Path]:

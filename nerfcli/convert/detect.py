@@ -34,8 +34,6 @@ class HypothesisScore:
     """One hypothesis and the evidence for it.
 
     Args:
-        convention: the assumed convention of the file's numbers.
-        as_format_says: whether it is what the format prescribes.
         median_px: median error of the items; infinite if most are behind a camera.
         inlier_fraction: the fraction of items with a small error.
     """
@@ -71,9 +69,7 @@ class Detection:
 
     Args:
         evidence: the kind of evidence, with numbers of items.
-        questions: in the order in which they were answered.
         convention: the answers that hold; the format's own where no answer holds.
-        declared: the format's own convention.
     """
 
     evidence: str

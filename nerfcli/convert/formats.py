@@ -54,8 +54,6 @@ class Format:
     """A format of captures.
 
     Args:
-        name: the user's name of the format.
-        title: a description.
         looked_for: what it is recognised by, in a few words for people.
         find: returns where such a capture is in a file or folder; None if there is none.
         parse: reads what `find` found; None for formats that are only written.

@@ -53,7 +53,10 @@ def probes_of(capture: Capture) -> Probes:
     frame_index = np.concatenate([frame_index, synthetic_frames])
     point_index = np.concatenate([point_index, np.full(len(synthetic_frames), -1)])
     points = np.concatenate([capture.points[point_index[: num_frames * per_frame]], synthetic_points])
-    return _seen(capture, frame_index, point_index, points)
+    pixels, kept, distances = projected(capture, frame_index, points)
+    sizes = np.array([frame.camera.size for frame in capture.frames])
+    kept &= np.all((pixels >= 0) & (pixels <= sizes[frame_index]), axis=1)
+    return Probes(frame_index[kept], point_index[kept], points[kept], pixels[kept], distances[kept])
 
 
 def distinct(items: Sequence[Hashable]) -> tuple[list, np.ndarray]:
@@ -101,21 +104,14 @@ def _synthetic(capture: Capture, rng: np.random.Generator) -> tuple[np.ndarray, 
     return np.repeat(np.arange(len(cameras)), SYNTHETIC_PER_VIEW), points.reshape(-1, 3)
 
 
-def _seen(capture: Capture, frame_index: np.ndarray, point_index: np.ndarray, points: np.ndarray) -> Probes:
-    """Return the pairs whose point appears inside the picture of its view."""
-    tried = Probes(frame_index, point_index, points, np.zeros((len(points), 2)), np.zeros(len(points)))
-    pixels, kept, distances = projected(capture, tried)
-    sizes = np.array([frame.camera.size for frame in capture.frames])
-    kept &= np.all((pixels >= 0) & (pixels <= sizes[frame_index]), axis=1)
-    return Probes(frame_index[kept], point_index[kept], points[kept], pixels[kept], distances[kept])
-
-
-def projected(capture: Capture, probes: Probes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project points into the views of a capture: pixels (M, 2), their validity (M,) bool, distances (M,)."""
-    cam_from_world = rigid.inverse(poses_of(capture))[probes.frame_index]
-    in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], probes.points) + cam_from_world[:, :3, 3]
+def projected(
+    capture: Capture, frame_index: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project points (M, 3) into views (M,): pixels (M, 2), their validity (M,) bool, distances (M,)."""
+    cam_from_world = rigid.inverse(poses_of(capture))[frame_index]
+    in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], points) + cam_from_world[:, :3, 3]
     cameras, camera_of_frame = distinct([frame.camera for frame in capture.frames])
     pixels, valid = np.zeros((len(in_camera), 2)), np.zeros(len(in_camera), dtype=bool)
-    for camera, rows in zip(cameras, rows_of_each(camera_of_frame[probes.frame_index], len(cameras)), strict=True):
+    for camera, rows in zip(cameras, rows_of_each(camera_of_frame[frame_index], len(cameras)), strict=True):
         pixels[rows], valid[rows] = camera.project(in_camera[rows])
     return pixels, valid, np.linalg.norm(in_camera, axis=1)

@@ -1,7 +1,7 @@
 """Verification of a conversion: a written file and its source capture must project points to the same pixels.
 
 The capture projects its points with nerfcli's cameras; the file is read back (`readback`) and projects the same points
-with OpenCV's (`opencv_lenses`). The two sides share no code that depends on a convention. All other
+with OpenCV's. The two sides share no code that depends on a convention. All other
 contents are compared as they are.
 """
 
@@ -14,10 +14,9 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from nerfcli.cameras.frame import Capture
-from nerfcli.convert import opencv_lenses
 from nerfcli.convert.axes import poses_of
 from nerfcli.convert.probes import Probes, distinct, probes_of, rows_of_each
-from nerfcli.convert.readback import ReadBack, UnreadableError
+from nerfcli.convert.readback import FileLens, ReadBack, UnreadableError, project
 
 TOLERANCE_PX = 1e-6
 
@@ -170,13 +169,13 @@ def _projected(capture: Capture, probes: Probes, back: ReadBack, order: np.ndarr
     in_camera = np.einsum("mij,mj->mi", back.cam_from_world[view], points - back.centres[view])
     if back.lenses is None:
         own = [frame.camera for frame in capture.frames]
-        per_frame = [opencv_lenses.FileLens(camera.model, camera.width, camera.height, camera.params) for camera in own]
+        per_frame = [FileLens(camera.model, camera.width, camera.height, camera.params) for camera in own]
     else:
         per_frame = [back.lenses[index] for index in order]
     each, lens_of_frame = distinct(per_frame)
     pixels = np.zeros((len(points), 2))
     for lens, rows in zip(each, rows_of_each(lens_of_frame[probes.frame_index], len(each)), strict=True):
-        pixels[rows] = opencv_lenses.project(lens, in_camera[rows])
+        pixels[rows] = project(lens, in_camera[rows])
         if lens.model == "EQUIRECTANGULAR":  # the left edge and the right edge coincide
             turns = np.round((pixels[rows, 0] - probes.pixels[rows, 0]) / lens.width)
             pixels[rows, 0] -= turns * lens.width

@@ -52,7 +52,6 @@ class Moved:
     """A capture in another world frame.
 
     Args:
-        new_from_old: the change.
         scale: the estimate of the scale if lengths became metres.
         origin: where the origin is on Earth, if the capture was georeferenced.
     """

@@ -45,8 +45,6 @@ def automatic_workers(rays: int, *, threads: int, thread_safe: bool) -> Workers:
     One picture per thread is faster than several threads per picture, because some steps of a picture use one thread.
 
     Args:
-        rays: number of rays of all pictures together.
-        threads: number of threads to distribute.
         thread_safe: see `Model.thread_safe`; also True for a GPU, which is used by one process.
     """
     if thread_safe:

@@ -99,7 +99,6 @@ def with_deviations(
     Args:
         picture: picture of the run's own field, which is not a member.
         members: at least two.
-        on_rays: called with the number of rays after each tile.
     """
     seen = [
         render_picture(
@@ -170,9 +169,6 @@ def render_frame(
     """Render a frame and write its files to the unfinished folder.
 
     The files depend only on the model and the order, not on other frames or on the process that renders them.
-
-    Args:
-        on_rays: called with the number of rays after each tile.
 
     Raises:
         UserError: a file cannot be written.

@@ -55,7 +55,6 @@ class Order:
 
     Args:
         frames: cameras and poses in the scene's frame.
-        settings: the outputs to write.
         provenance: all else that determines the pictures, such as the run and the hash of its field; plain values.
         photo_depths: depth maps of the training photos, if `ExportSettings.needs_visibility`; the provenance names the
             photos.

@@ -30,7 +30,6 @@ class VideoSettings:
         formats: some of `media.video.FORMATS`; a video in each.
         layout: one of `LAYOUTS`: a video of each output, or all outputs in one.
         direction: one of `DIRECTIONS`; "ping-pong" runs back without repeating the ends, so that it loops evenly.
-        fps: frames per second.
         crf: constant quality, 0 is best; the format's default if None.
         plays: how many times the clip is shown; 0 means forever, in a gif only. None: forever in a gif, else once.
     """
@@ -54,8 +53,6 @@ class ExportSettings:
         depth_scale: scene units per level of 16-bit files; None chooses the same for all frames.
         colour_map: one of `media.colours.COLOUR_MAPS`, for measured outputs.
         colour_range: the depths with the first and the last colour, in scene units; None chooses them from the views.
-        video: settings of the videos; None for no videos.
-        quality: the rendering effort per picture.
         rgba: colours without the background, with the opacity as straight alpha.
     """
 

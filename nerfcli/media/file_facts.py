@@ -5,6 +5,7 @@ A file of another program is reported as numbers without a stated convention.
 
 import io
 import json
+import re
 import struct
 import subprocess
 import zipfile
@@ -69,7 +70,10 @@ def depth_meta_of(path: Path) -> DepthMeta | None:
     Raises:
         UserError: see `description_of`.
     """
-    entries = description_of(path)
+    return _stated(description_of(path))
+
+
+def _stated(entries: dict[str, Any] | None) -> DepthMeta | None:
     try:
         return None if entries is None else DepthMeta.from_json(entries)
     except (ValueError, TypeError):
@@ -130,22 +134,8 @@ def _of_video(path: Path) -> str | None:
 
 def comment_of_ffmetadata(text: str) -> str | None:
     """Return the value of "comment" in ffmpeg's own metadata format, in which =, ;, #, \\ and line ends are escaped."""
-    value, inside, escaped = "", False, False
-    for line in text.splitlines(keepends=True):
-        if not inside:
-            if not line.lower().startswith("comment="):
-                continue
-            inside, line = True, line[len("comment=") :]
-        for character in line:
-            if escaped:
-                value, escaped = value + character, False
-            elif character == "\\":
-                escaped = True
-            elif character == "\n":
-                return value
-            else:
-                value += character
-    return value if inside else None
+    found = re.search(r"^comment=((?:\\.|[^\\\n])*)", text, re.IGNORECASE | re.MULTILINE | re.DOTALL)
+    return None if found is None else re.sub(r"\\(.)", r"\1", found[1], flags=re.DOTALL)
 
 
 _READERS: dict[str, Callable[[Path], str | None]] = {
@@ -247,15 +237,10 @@ def _depth_metas(folder: Path) -> Iterator[tuple[Path, DepthMeta]]:
 
 def _meta(path: Path, entries: dict[str, Any] | None) -> DepthMeta | None:
     """Return the definition of depth in a description; None if there is none."""
-    if entries is None:
-        return None
-    stated = entries.get("format", FORMAT)
+    stated = (entries or {}).get("format", FORMAT)
     if isinstance(stated, str) and stated.startswith("nerfcli depth") and stated > FORMAT:
         raise UserError(f"{path} is of format {stated!r}, but this version reads {FORMAT!r}", "update nerfcli")
-    try:
-        return DepthMeta.from_json(entries)
-    except (ValueError, TypeError):
-        return None
+    return _stated(entries)
 
 
 def _maps(path: Path, meta: DepthMeta | None) -> dict[str, np.ndarray]:
@@ -302,15 +287,8 @@ def _video_facts(path: Path) -> dict[str, Any]:
             fps = 1 / seconds if seconds else None
     else:
         video = cv2.VideoCapture(str(path))
-        width, height, frames, fps = (
-            video.get(key)
-            for key in (
-                cv2.CAP_PROP_FRAME_WIDTH,
-                cv2.CAP_PROP_FRAME_HEIGHT,
-                cv2.CAP_PROP_FRAME_COUNT,
-                cv2.CAP_PROP_FPS,
-            )
-        )
+        width, height = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        frames, fps = video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)
         video.release()
     facts = {"kind": "video", "format": path.suffix[1:].lower(), "width": int(width), "height": int(height)}
     return facts | {"frames": int(frames), "fps": None if fps is None else round(fps, 3)}
@@ -338,5 +316,4 @@ def _range(array: np.ndarray) -> dict[str, Any]:
     facts["valid_share"] = finite.size / array.size
     if finite.size == 0:
         return facts
-    reductions: dict[str, Callable[[np.ndarray], Any]] = {"min": np.min, "median": np.median, "max": np.max}
-    return facts | {name: float(reduce(finite)) for name, reduce in reductions.items()}
+    return facts | {"min": float(finite.min()), "median": float(np.median(finite)), "max": float(finite.max())}

@@ -33,7 +33,6 @@ class MapPlace:
         pixel: width and height of a pixel, > 0, in the same unit.
         epsg: code of the coordinate system; None if it has none.
         in_degrees: whether that system is geographic, in degrees.
-        system: its name, for people.
     """
 
     corner: tuple[float, float]

@@ -61,7 +61,6 @@ class VideoFormat:
         encoder: the name that `ffmpeg -encoders` lists.
         crf: constant quality that is visually close to the pictures, 0 is best; None if there is no such scale.
         worst_crf: the worst value on that scale.
-        arguments: further arguments of ffmpeg.
     """
 
     suffix: str

@@ -29,8 +29,6 @@ class Georeference:
     Args:
         estimate: of the scale. For control points, residuals are the distances in metres to where the other points
             predict each one, or to where the fit puts it if there are only three.
-        metres_from_world: from the scene's frame.
-        origin: where the new frame's origin is.
     """
 
     estimate: ScaleEstimate

@@ -40,7 +40,6 @@ class FusedVolume:
     """Signed distances in the blocks of a grid.
 
     Args:
-        grid: grid of all voxels.
         index: (Bx, By, Bz) int32, the row of each block; -1 where there is none.
         distance: (blocks, 8, 8, 8) float32, scene units, at most the truncation; 0 where the weight is 0.
         weight: (blocks, 8, 8, 8) float32, the sum of the views' weights.

@@ -23,7 +23,6 @@ class DepthView:
     """View of a field by a pinhole camera: (H, W) float32, scene units along the optical axis, NaN where undefined.
 
     Args:
-        frame: the camera and its pose.
         rgb: (H, W, 3) sRGB on the background.
         opacity: opacity of each pixel, in [0, 1].
         depth: the requested depth, by default the median, which needs an opacity of at least 0.5.

@@ -53,7 +53,8 @@ def parse_bundler(
     lines = _lines(path)
     num_cameras, num_points = _counts(lines, path)
     image_list = image_list or _find_list(path)
-    names = [_listed(line, f"{image_list}: line {number}") for number, line in _list_lines(image_list)]
+    listed = enumerate(read_text(image_list, _LIST_EXPECTED).splitlines(), start=1)
+    names = [_listed(line, f"{image_list}: line {number}") for number, line in listed if line.strip()]
     if len(names) != num_cameras:
         raise malformed(
             str(path), f"has {num_cameras} cameras, but {image_list} has {len(names)} images", _LIST_EXPECTED
@@ -119,11 +120,6 @@ def _find_list(path: Path) -> Path:
         f"the list of images next to it is missing ({candidates[1]})",
         "write one: the names of the photos in the order of the cameras, one per line",
     )
-
-
-def _list_lines(path: Path) -> list[Numbered]:
-    lines = enumerate(read_text(path, _LIST_EXPECTED).splitlines(), start=1)
-    return [(number, line) for number, line in lines if line.strip()]
 
 
 def _listed(line: str, where: str) -> str:

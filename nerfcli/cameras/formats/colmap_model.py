@@ -19,7 +19,6 @@ class ColmapImage:
     """A registered image of a model.
 
     Args:
-        image_id: unique in the model.
         name: with forward slashes, relative to the folder of the photos.
         world_from_cam: (4, 4).
         pixels: (F, 2) positions of its features, float64.
