@@ -102,21 +102,15 @@ def detect(capture: Capture, *, axes: str, progress: Callable[[float, str], None
     declared = Convention(axes)
     poses = poses_of(capture)
     conventions = [Convention(name, inverted) for inverted in (False, True) for name in _different_axes(axes)]
-    if isinstance(evidence, FrustumEvidence):
-        tried = [
-            (convention, evidence.errors_px(reinterpreted_poses(poses, convention, parsed_axes=axes)))
-            for convention in conventions
-        ]
-        question = _question("axes and direction", tried, declared, evidence)
-        found = question.answers[0].convention if question.verdict == "holds" else declared
-        return Detection(evidence.name, (question,), found, declared)
-
     best, question = _axes_and_scale(evidence, poses, conventions, declared)
-    questions = [question]
-    for name, variants in (
-        ("image size", [replace(best, intrinsics_scale=scale) for scale in SCALES]),
-        ("pixel centre", [replace(best, pixel_centre=centre) for centre in (0.5, 0.0)]),
-    ):
+    questions, further = (
+        [question],
+        [
+            ("image size", [replace(best, intrinsics_scale=scale) for scale in SCALES]),
+            ("pixel centre", [replace(best, pixel_centre=centre) for centre in (0.5, 0.0)]),
+        ],
+    )
+    for name, variants in further if evidence.shows_intrinsics else ():
         tried = [(variant, _errors(evidence, poses, variant, axes)) for variant in variants]
         question = _question(name, tried, declared, evidence)
         questions.append(question)
@@ -155,14 +149,11 @@ def _different_axes(declared: str) -> Iterable[str]:
 
 
 def _axes_and_scale(
-    evidence: ObservationEvidence | MatchEvidence,
-    poses: np.ndarray,
-    conventions: list[Convention],
-    declared: Convention,
+    evidence: Evidence, poses: np.ndarray, conventions: list[Convention], declared: Convention
 ) -> tuple[Convention, Question]:
     """Return the best convention, including its scale, and the question of axes and direction at that scale."""
     tried = []
-    for scale in SCALES:
+    for scale in SCALES if evidence.shows_intrinsics else (1.0,):
         directions = evidence.directions(replace(declared, intrinsics_scale=scale))
         for convention in conventions:
             errors = evidence.errors_px(directions, reinterpreted_poses(poses, convention, parsed_axes=declared.axes))
@@ -172,9 +163,7 @@ def _axes_and_scale(
     return best, _question("axes and direction", at_its_scale, declared, evidence)
 
 
-def _errors(
-    evidence: ObservationEvidence | MatchEvidence, poses: np.ndarray, convention: Convention, parsed_axes: str
-) -> np.ndarray:
+def _errors(evidence: Evidence, poses: np.ndarray, convention: Convention, parsed_axes: str) -> np.ndarray:
     return evidence.errors_px(
         evidence.directions(convention), reinterpreted_poses(poses, convention, parsed_axes=parsed_axes)
     )
@@ -208,7 +197,7 @@ def _question(
         ratio = answers[1].median_px / max(answers[0].median_px, 1e-9)
         low, high = _interval(best, second, evidence.groups, _median)
         what = f"the medians differ by {answers[1].median_px - answers[0].median_px:.2g} px"
-    if answers[0].inlier_fraction < LEAST_FRACTION and not isinstance(evidence, FrustumEvidence):
+    if answers[0].inlier_fraction < LEAST_FRACTION and evidence.shows_intrinsics:
         return Question(name, answers, "none holds", ratio, "most of the evidence contradicts each of them")
     if not (low > 0 and ratio >= LEAST_RATIO):
         noise = (high - low) / 2

@@ -14,7 +14,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.convert.axes import Convention, for_picture, shifted
-from nerfcli.convert.probes import distinct, rows_of_each
+from nerfcli.convert.probes import rows_of_each
 from nerfcli.errors import UserError
 from nerfcli.multiview.epipolar import fundamental_matrix, sampson_angles
 from nerfcli.multiview.features import Features, Matches, find_features, mutual_matches
@@ -134,7 +134,7 @@ class ObservationEvidence:
     times the focal length.
     """
 
-    threshold_px = 4.0
+    threshold_px, shows_intrinsics = 4.0, True
 
     def __init__(self, capture: Capture):
         seen = capture.observations
@@ -169,7 +169,7 @@ class MatchEvidence:
     length.
     """
 
-    threshold_px = 4.0
+    threshold_px, shows_intrinsics = 4.0, True
 
     def __init__(self, pairs: Sequence[Matches], cameras: dict[int, Camera], num_frames: int):
         self.groups = np.repeat(np.arange(len(pairs)), [len(pair.pixels[0]) for pair in pairs])
@@ -205,7 +205,7 @@ class FrustumEvidence:
     It determines axes and directions, but not intrinsics: the wider the pictures, the more points they show.
     """
 
-    threshold_px = 0.0
+    threshold_px, shows_intrinsics = 0.0, False
 
     def __init__(self, capture: Capture):
         rng = np.random.default_rng(0)
@@ -216,13 +216,16 @@ class FrustumEvidence:
         self._cameras = [frame.camera for frame in capture.frames]
         self.name = f"the visibility of {len(chosen)} points in {len(frames)} photos"
 
-    def errors_px(self, world_from_cam: np.ndarray) -> np.ndarray:
+    def directions(self, convention: Convention) -> tuple[np.ndarray, ...]:
+        """Return nothing: intrinsics are those of the capture."""
+        return ()
+
+    def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
         """Return 0 or infinity for each pair of a photo and a point, (M,)."""
         cam_from_world = rigid.inverse(world_from_cam)[self.groups]
         in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], self._points) + cam_from_world[:, :3, 3]
-        cameras, camera_of_frame = distinct(self._cameras)
         shown = np.zeros(len(self.groups), dtype=bool)
-        for camera, rows in zip(cameras, rows_of_each(camera_of_frame[self.groups], len(cameras)), strict=True):
+        for camera, rows in rows_of_each(self._cameras, self.groups):
             shown[rows] = camera.shows(in_camera[rows])
         return np.where(shown, 0.0, np.inf)
 
@@ -231,10 +234,9 @@ def _directions(
     cameras: Sequence[Camera], frame_index: np.ndarray, pixels: np.ndarray, convention: Convention
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the unit viewing directions (M, 3) of pixels of frames, their validity, and pixels per radian."""
-    each, camera_of_frame = distinct(cameras)
     directions, valid = np.zeros((len(pixels), 3)), np.zeros(len(pixels), dtype=bool)
     focal_px = np.zeros(len(pixels))
-    for camera, rows in zip(each, rows_of_each(camera_of_frame[frame_index], len(each)), strict=True):
+    for camera, rows in rows_of_each(cameras, frame_index):
         corrected = for_picture(shifted(camera, 0.5 - convention.pixel_centre), convention.intrinsics_scale)
         directions[rows], valid[rows] = corrected.bearings(pixels[rows])
         focal_px[rows] = corrected.focal_px

@@ -1,7 +1,8 @@
 """Points at which two descriptions of a capture are compared: pairs of a view and a point that it sees."""
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -59,17 +60,12 @@ def probes_of(capture: Capture) -> Probes:
     return Probes(frame_index[kept], point_index[kept], points[kept], pixels[kept], distances[kept])
 
 
-def distinct(items: Sequence[Hashable]) -> tuple[list, np.ndarray]:
-    """Return the distinct items in the order of their first appearance, and the index of each item among them."""
+def rows_of_each(items: Sequence[Hashable], index: np.ndarray) -> Iterator[tuple[Any, np.ndarray]]:
+    """Yield each distinct item, in the order of first appearance, and the rows of `index` (M,) that refer to it."""
     places: dict[Hashable, int] = {}
-    index = np.array([places.setdefault(item, len(places)) for item in items], dtype=np.int64)
-    return list(places), index
-
-
-def rows_of_each(labels: np.ndarray, count: int) -> list[np.ndarray]:
-    """Return, for each label 0 ... count - 1, the rows that have it."""
+    labels = np.array([places.setdefault(item, len(places)) for item in items], dtype=np.int64)[index]
     order = np.argsort(labels, kind="stable")
-    return np.split(order, np.searchsorted(labels[order], np.arange(1, count)))
+    yield from zip(places, np.split(order, np.searchsorted(labels[order], np.arange(1, len(places)))), strict=True)
 
 
 def scene_distance(capture: Capture) -> float:
@@ -110,8 +106,7 @@ def projected(
     """Project points (M, 3) into views (M,): pixels (M, 2), their validity (M,) bool, distances (M,)."""
     cam_from_world = rigid.inverse(poses_of(capture))[frame_index]
     in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], points) + cam_from_world[:, :3, 3]
-    cameras, camera_of_frame = distinct([frame.camera for frame in capture.frames])
     pixels, valid = np.zeros((len(in_camera), 2)), np.zeros(len(in_camera), dtype=bool)
-    for camera, rows in zip(cameras, rows_of_each(camera_of_frame[frame_index], len(cameras)), strict=True):
+    for camera, rows in rows_of_each([frame.camera for frame in capture.frames], frame_index):
         pixels[rows], valid[rows] = camera.project(in_camera[rows])
     return pixels, valid, np.linalg.norm(in_camera, axis=1)

@@ -15,7 +15,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import poses_of
-from nerfcli.convert.probes import Probes, distinct, probes_of, rows_of_each
+from nerfcli.convert.probes import Probes, probes_of, rows_of_each
 from nerfcli.convert.readback import FileLens, ReadBack, UnreadableError, project
 
 TOLERANCE_PX = 1e-6
@@ -172,9 +172,8 @@ def _projected(capture: Capture, probes: Probes, back: ReadBack, order: np.ndarr
         per_frame = [FileLens(camera.model, camera.width, camera.height, camera.params) for camera in own]
     else:
         per_frame = [back.lenses[index] for index in order]
-    each, lens_of_frame = distinct(per_frame)
     pixels = np.zeros((len(points), 2))
-    for lens, rows in zip(each, rows_of_each(lens_of_frame[probes.frame_index], len(each)), strict=True):
+    for lens, rows in rows_of_each(per_frame, probes.frame_index):
         pixels[rows] = project(lens, in_camera[rows])
         if lens.model == "EQUIRECTANGULAR":  # the left edge and the right edge coincide
             turns = np.round((pixels[rows, 0] - probes.pixels[rows, 0]) / lens.width)

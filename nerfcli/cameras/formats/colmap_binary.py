@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 
 from nerfcli.cameras.camera import Camera, parameter_names
-from nerfcli.cameras.formats.colmap_model import ColmapImage, ColmapModel, images_of_parts, pose_rows, tracks
+from nerfcli.cameras.formats.colmap_model import ColmapImage, ColmapModel, ImageRow, images_of_rows, pose_rows, tracks
 from nerfcli.cameras.formats.limits import checked_camera, plausible
 
 _FEATURE = np.dtype([("pixel", "<f8", 2), ("point_id", "<i8")])
@@ -42,8 +42,7 @@ def cameras_from_bytes(data: bytes) -> dict[int, Camera]:
 
 def images_from_bytes(data: bytes) -> list[ColmapImage]:
     """Return the images, in the file's order. Raises ValueError or struct.error where the bytes are damaged."""
-    image_ids, names, camera_ids, poses, features = [], [], [], [], []
-    offset = 8
+    rows, offset = list[ImageRow](), 8
     for _ in range(_count(data, 73)):
         image_id, *pose, camera_id = struct.unpack_from("<I7dI", data, offset)
         end = data.index(b"\0", offset + 64)
@@ -53,14 +52,9 @@ def images_from_bytes(data: bytes) -> list[ColmapImage]:
         if offset > len(data):
             raise ValueError(f"it ends within image {name}")
         block = np.frombuffer(data, _FEATURE, count=num_features, offset=end + 9)
-        image_ids.append(image_id)
-        names.append(name)
-        camera_ids.append(camera_id)
-        poses.append(pose)
-        features.append((block["pixel"], block["point_id"]))
+        rows.append((image_id, name, camera_id, pose, block["pixel"], block["point_id"]))
     _at_end(data, offset)
-    cam_from_world = np.array(poses, dtype=np.float64)
-    return images_of_parts(image_ids, names, camera_ids, cam_from_world=cam_from_world, features=features)
+    return images_of_rows(rows)
 
 
 def points_from_bytes(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,5 +1,6 @@
 """A COLMAP model in memory, as its files hold it, and conversions between it and a capture."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,42 +45,33 @@ class ColmapModel:
     colours: np.ndarray
 
 
-def images_of_parts(
-    image_ids: list[int],
-    names: list[str],
-    camera_ids: list[int],
-    *,
-    cam_from_world: np.ndarray,
-    features: list[tuple[np.ndarray, np.ndarray]],
-) -> list[ColmapImage]:
-    """Return the images of a file, from lists with one item per image.
+# An image as a file holds it: its id, name, camera's id, `cam_from_world` as a quaternion wxyz and a translation (7,),
+# positions (F, 2) of its features, and ids (F,) of their points.
+ImageRow = tuple[int, str, int, Sequence[float], np.ndarray, np.ndarray]
 
-    Args:
-        image_ids, names, camera_ids: one per image.
-        cam_from_world: (images, 7) quaternions wxyz and translations.
-        features: pixels (F, 2) and ids of their points (F,), per image.
+
+def images_of_rows(rows: list[ImageRow]) -> list[ColmapImage]:
+    """Return the images of a file.
 
     Raises:
         ValueError: a number is invalid, in which case its image is named, or two images have the same id.
     """
-    if len(set(image_ids)) < len(image_ids):
+    if len({row[0] for row in rows}) < len(rows):
         raise ValueError("two images have the same id")
-    cam_from_world = cam_from_world.reshape(-1, 7)
+    cam_from_world = np.array([row[3] for row in rows], dtype=np.float64).reshape(-1, 7)
     wrong = ~plausible(cam_from_world)
     if wrong.any():
         values = ", ".join(f"{value:g}" for value in cam_from_world[np.argmax(wrong)])
         raise ValueError(
-            f"the pose of image {names[np.argmax(wrong)]} is not 7 finite numbers in a plausible range: {values}"
+            f"the pose of image {rows[np.argmax(wrong)][1]} is not 7 finite numbers in a plausible range: {values}"
         )
     zero = ~cam_from_world[:, :4].any(axis=1)
     if zero.any():
-        raise ValueError(f"a quaternion of length 0 in the pose of image {names[np.argmax(zero)]}")
+        raise ValueError(f"a quaternion of length 0 in the pose of image {rows[np.argmax(zero)][1]}")
     rotations = rigid.rotation_from_quaternion(cam_from_world[:, :4])
     poses = rigid.inverse(rigid.from_parts(rotations, cam_from_world[:, 4:]))
     images = []
-    for image_id, name, camera_id, pose, (pixels, point_ids) in zip(
-        image_ids, names, camera_ids, poses, features, strict=True
-    ):
+    for (image_id, name, camera_id, _, pixels, point_ids), pose in zip(rows, poses, strict=True):
         if not name or not plausible(pixels.reshape(1, -1)).all():
             raise ValueError(f"image {image_id} ({name!r}) has no name, or a feature with invalid coordinates")
         images.append(ColmapImage(image_id, name, camera_id, pose, pixels, point_ids))

@@ -8,7 +8,7 @@ colmap src/colmap/scene/reconstruction_io_text.cc.
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.colmap_model import ColmapImage, ColmapModel, images_of_parts, pose_rows, tracks
+from nerfcli.cameras.formats.colmap_model import ColmapImage, ColmapModel, ImageRow, images_of_rows, pose_rows, tracks
 from nerfcli.cameras.formats.limits import checked_camera, plausible
 
 # Ids have 32 bits, those of points 64, of which float64 holds 53 exactly.
@@ -30,8 +30,7 @@ def cameras_from_bytes(data: bytes) -> dict[int, Camera]:
 
 def images_from_bytes(data: bytes) -> list[ColmapImage]:
     """Return the images, in the file's order. Raises ValueError where a line is damaged."""
-    image_ids, names, camera_ids, poses, features = [], [], [], [], []
-    lines = iter(_lines(data))
+    rows, lines = list[ImageRow](), iter(_lines(data))
     for line in lines:
         if not line.strip() or line.startswith("#"):
             continue
@@ -43,13 +42,9 @@ def images_from_bytes(data: bytes) -> list[ColmapImage]:
         if len(values) % 3:
             raise ValueError(f"the features of image {name} are {len(values)} numbers, expected x, y, point id of each")
         values = values.reshape(-1, 3)
-        image_ids.append(int(image_id))
-        names.append(name)
-        camera_ids.append(int(camera_id))
-        poses.append([float(value) for value in pose])
-        features.append((values[:, :2], _ids(values[:, 2], f"a point of image {name}")))
-    cam_from_world = np.array(poses, dtype=np.float64)
-    return images_of_parts(image_ids, names, camera_ids, cam_from_world=cam_from_world, features=features)
+        point_ids = _ids(values[:, 2], f"a point of image {name}")
+        rows.append((int(image_id), name, int(camera_id), list(map(float, pose)), values[:, :2], point_ids))
+    return images_of_rows(rows)
 
 
 def points_from_bytes(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
