@@ -69,7 +69,7 @@ def calibrated(calibration: Calibration, pictures: Sequence[Picture]) -> tuple[P
     """
     listed: dict[str, dict[str, int]] = {}
     for name, number in calibration.of_image.items():
-        listed.setdefault(_last_part(name), {})[name] = number
+        listed.setdefault(name.replace("\\", "/").rpartition("/")[2], {})[name] = number
     return tuple(_of_picture(calibration, picture, listed.get(picture.path.name, {})) for picture in pictures)
 
 
@@ -122,7 +122,3 @@ def _fitted(calibration: Calibration, number: int, picture: Picture) -> Camera:
     measured = (picture.width, picture.height, orientation)
     camera, _ = fit_to_picture(calibration.cameras[number], np.eye(4), path=picture.path, measure=lambda path: measured)
     return camera
-
-
-def _last_part(name: str) -> str:
-    return name.replace("\\", "/").rpartition("/")[2]

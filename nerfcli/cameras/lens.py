@@ -3,6 +3,7 @@
 Arrays have coordinates first here: directions are (3, N), pixels (2, N).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +46,14 @@ DISTORTIONS: dict[str, tuple[dict[str, tuple[str, ...]], ...]] = {
     "DIVISION": (),
     "EUCM": (),
     "EQUIRECTANGULAR": (),
+}
+# The projections that are neither perspective nor equidistant, and their parameters.
+_PROJECTIONS: dict[str, tuple[Callable[..., Projection], tuple[str, ...]]] = {
+    "FOV": (FieldOfView, ("omega",)),
+    "SIMPLE_DIVISION": (Division, ("k",)),
+    "DIVISION": (Division, ("k",)),
+    "EUCM": (EnhancedUnified, ("alpha", "beta")),
+    "EQUIRECTANGULAR": (Equirectangular, ()),
 }
 
 
@@ -131,7 +140,9 @@ def lens_of(model: str, values: dict[str, float]) -> Lens:
     distortions = tuple(
         Distortion(**{term: tuple(values[name] for name in names) for term, names in group.items()}) for group in groups
     )
-    projection, inner = _projection(model, values)
+    usual = Equidistant if model.endswith("FISHEYE") else Perspective
+    project, parameters = _PROJECTIONS.get(model, (usual, ()))
+    inner = [{name: 1.0} for name in parameters]
     inner += [{name: 1.0} for group in groups for names in group.values() for name in names]
     if model == "EQUIRECTANGULAR":
         width, height = values["w"], values["h"]
@@ -142,20 +153,8 @@ def lens_of(model: str, values: dict[str, float]) -> Lens:
         focal, centre = tuple(values[name] for name in focal_names), (values["cx"], values["cy"])
         inner += [{name: 1.0} for name in (*focal_names, "cx", "cy")]
     spread = np.array([[fractions.get(name, 0.0) for name in values] for fractions in inner])
+    projection = project(*(values[name] for name in parameters))
     return Lens(projection, distortions, np.array(focal)[:, None], np.array(centre)[:, None], spread)
-
-
-def _projection(model: str, values: dict[str, float]) -> tuple[Projection, list[dict[str, float]]]:
-    """Return a model's projection, and the derivatives of each of its parameters by the model's parameters."""
-    if model == "EQUIRECTANGULAR":
-        return Equirectangular(), []
-    if model == "FOV":
-        return FieldOfView(values["omega"]), [{"omega": 1.0}]
-    if model == "EUCM":
-        return EnhancedUnified(values["alpha"], values["beta"]), [{"alpha": 1.0}, {"beta": 1.0}]
-    if model in ("SIMPLE_DIVISION", "DIVISION"):
-        return Division(values["k"]), [{"k": 1.0}]
-    return (Equidistant() if model.endswith("FISHEYE") else Perspective()), []
 
 
 def _where_seen(directions: np.ndarray, seen: np.ndarray) -> np.ndarray:

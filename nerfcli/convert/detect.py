@@ -26,6 +26,13 @@ LEAST_RATIO = 1.2
 _RESAMPLES = 400
 _LEAST_GROUPS = 5
 
+# The properties of a convention that each question is about.
+_FIELDS = {
+    "axes and direction": ("axes", "inverted"),
+    "image size": ("intrinsics_scale",),
+    "pixel centre": ("pixel_centre",),
+}
+
 Evidence = ObservationEvidence | MatchEvidence | FrustumEvidence
 
 
@@ -123,9 +130,6 @@ def detect(capture: Capture, *, axes: str, progress: Callable[[float, str], None
     return Detection(evidence.name, tuple(questions), best, declared)
 
 
-_FIELDS = {"image size": ("intrinsics_scale",), "pixel centre": ("pixel_centre",)}
-
-
 def _evidence(capture: Capture, progress: Callable[[float, str], None]) -> Evidence:
     seen = capture.observations
     if seen is not None and (seen.point_index >= 0).sum() >= 20:
@@ -181,7 +185,7 @@ def _question(
     answers = tuple(
         HypothesisScore(
             convention,
-            _same(name, convention, declared),
+            all(getattr(convention, field) == getattr(declared, field) for field in _FIELDS[name]),
             float(np.median(errors)),
             float(np.mean(errors <= evidence.threshold_px)),
         )
@@ -205,11 +209,6 @@ def _question(
         reason = f"{what}, {too_little}"
         return Question(name, answers, "not decidable", ratio, reason)
     return Question(name, answers, "holds", ratio, "")
-
-
-def _same(name: str, convention: Convention, declared: Convention) -> bool:
-    fields = _FIELDS.get(name, ("axes", "inverted"))
-    return all(getattr(convention, field) == getattr(declared, field) for field in fields)
 
 
 def _interval(

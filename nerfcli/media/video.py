@@ -216,16 +216,11 @@ def _encode(frames: Iterable[np.ndarray], output: Path, arguments: list[str], *,
                 raise _failure(target, log)
         finally:
             if process is not None:
-                _stop(process)
-
-
-def _stop(process: subprocess.Popen[bytes]) -> None:
-    """Kill the encoder if it is still running, and wait for it."""
-    process.kill()
-    assert process.stdin is not None
-    with suppress(OSError):
-        process.stdin.close()
-    process.wait()
+                process.kill()
+                assert process.stdin is not None
+                with suppress(OSError):
+                    process.stdin.close()
+                process.wait()
 
 
 def _even(frame: np.ndarray) -> np.ndarray:

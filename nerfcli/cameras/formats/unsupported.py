@@ -41,7 +41,7 @@ def lost_of_cameras(capture: Capture, lost: Callable[[Camera], Iterable[str]]) -
     """
     cameras = {frame.camera for frame in capture.frames}
     counts = Counter(name for camera in cameras for name in lost(camera))
-    return [f"{name} of {_cameras(count)}" for name, count in sorted(counts.items())]
+    return [f"{name} of {count} camera{'s' if count > 1 else ''}" for name, count in sorted(counts.items())]
 
 
 def distortion(camera: Camera) -> dict[str, float]:
@@ -77,7 +77,3 @@ def refuse_spherical(capture: Capture, what: str) -> None:
                 f"the spherical picture {frame.name} has no {what}, which this format requires",
                 "write transforms.json instead",
             )
-
-
-def _cameras(count: int) -> str:
-    return "1 camera" if count == 1 else f"{count} cameras"
