@@ -18,6 +18,8 @@ from nerfcli.errors import UserError
 _SEPARATOR = "; origin "
 # Three-dimensional geographic systems and their two-dimensional counterparts: WGS 84, ETRS89.
 _WITHOUT_HEIGHT = {4979: 4326, 4937: 4258}
+WORLD_AXES = {f"{sign}{'xyz'[i]}": float(f"{sign}1") * np.eye(3)[i] for sign in ("", "-") for i in range(3)}
+ORIGINS = ("centre-of-cameras", "focus")
 
 
 def without_origin(unit_source: str | None) -> str | None:
@@ -74,10 +76,6 @@ class Origin:
         if self.in_degrees:
             return f"at latitude {a:.8f}, longitude {b:.8f}, height {height:.3f} m"
         return f"at {a:.0f}, {b:.0f}, {height:.0f} in {self.system}"
-
-
-WORLD_AXES = {f"{sign}{'xyz'[i]}": float(f"{sign}1") * np.eye(3)[i] for sign in ("", "-") for i in range(3)}
-ORIGINS = ("centre-of-cameras", "focus")
 
 
 def transformed(capture: Capture, new_from_world: Similarity) -> Capture:

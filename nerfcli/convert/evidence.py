@@ -29,6 +29,11 @@ LEAST_MOVE = 0.04
 # Fewer matches than this may agree on a common epipolar geometry by chance.
 _LEAST_MATCHES = 20
 _EPIPOLAR_PX = 2.0
+# Most observations used: enough for a median, few enough to try hundreds of hypotheses.
+_MOST_OBSERVATIONS = 20_000
+_MOST_FRAMES = 60
+# The rays of a match must be this far from parallel for their distances to the intersection to be meaningful.
+_LEAST_PARALLAX_PX = 3.0
 
 
 def match_neighbours(
@@ -117,14 +122,6 @@ def _matched(first: tuple[Camera, Features], second: tuple[Camera, Features]) ->
         pixels[0] * scales[0], pixels[1] * scales[1], within_px=_EPIPOLAR_PX, trials=5000, least=_LEAST_MATCHES
     )
     return (pixels[0][agree], pixels[1][agree]) if agree.sum() >= _LEAST_MATCHES else None
-
-
-# Most observations used: enough for a median, few enough to try hundreds of hypotheses.
-_MOST_OBSERVATIONS = 20_000
-_MOST_FRAMES = 60
-
-# The rays of a match must be this far from parallel for their distances to the intersection to be meaningful.
-_LEAST_PARALLAX_PX = 3.0
 
 
 class ObservationEvidence:

@@ -22,6 +22,8 @@ TOLERANCE_PX = 1e-6
 
 # Coordinates are rounded to 2^-53 of their size, several times, on both sides.
 _ROUNDINGS = 16 * 2.0**-53
+# About the most observations compared, of whole views: pycolmap returns them one by one, 2 microseconds each.
+_MOST_OBSERVATIONS = 300_000
 
 
 @dataclass(frozen=True)
@@ -195,10 +197,6 @@ def _rounding_px(capture: Capture, probes: Probes) -> float:
     centres = poses_of(capture)[:, :3, 3]
     largest = np.maximum(np.abs(probes.points).max(axis=1), np.abs(centres).max(axis=1)[probes.frame_index])
     return float(_ROUNDINGS * np.max(focal_px * largest / probes.distances))
-
-
-# About the most observations compared, of whole views: pycolmap returns them one by one, 2 microseconds each.
-_MOST_OBSERVATIONS = 300_000
 
 
 def compared_parts(

@@ -19,6 +19,9 @@ from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.model import Model
 from nerfcli.render.visibility import DepthMap
 
+DESCRIPTION = "render.json"
+_IN_WORDS = {"colour_map": "colours", "colour_range": "range of colours", "levels": "16-bit levels", "video": "videos"}
+
 
 def file_names(frames: Sequence[Frame]) -> list[str]:
     """Return the frames' names without suffix, with subfolders; the suffix stays where names would be the same.
@@ -43,10 +46,6 @@ def describe_frames(frames: Sequence[Frame]) -> list[dict[str, Any]]:
 def with_suffix(stem: Path, suffix: str) -> Path:
     """Add a suffix to a name; an existing suffix is kept, since it distinguishes a.jpg from a.png."""
     return stem.with_name(stem.name + suffix)
-
-
-DESCRIPTION = "render.json"
-_IN_WORDS = {"colour_map": "colours", "colour_range": "range of colours", "levels": "16-bit levels", "video": "videos"}
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,12 @@ from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.export.order import Order
 from nerfcli.interrupts import deferred_interrupts
 
+# A frame at which processes died this many times is not retried.
+_MOST_DEATHS = 2
+# The exception that ends a process may be lost: Python drops those raised in callbacks and while freeing objects. The
+# process then ends after its frame, because the connection is closed; a process that hangs is killed.
+_SECONDS_TO_LEAVE = 60
+
 
 class RenderOne(Protocol):
     """`one_frame.render_frame` for a certain model, order and unfinished folder."""
@@ -77,14 +83,6 @@ def render_in_threads(
             raise
         finally:
             torch.set_num_threads(before)
-
-
-# A frame at which processes died this many times is not retried.
-_MOST_DEATHS = 2
-
-# The exception that ends a process may be lost: Python drops those raised in callbacks and while freeing objects. The
-# process then ends after its frame, because the connection is closed; a process that hangs is killed.
-_SECONDS_TO_LEAVE = 60
 
 
 @dataclass

@@ -4,17 +4,16 @@ from functools import cache
 
 import numpy as np
 
+# Our names -> matplotlib's. turbo shows the most detail (Mikhailov 2019); viridis has perceptually even steps, also for
+# colour-blind people.
+COLOUR_MAPS = {"turbo": "turbo", "viridis": "viridis", "grey": "gray"}
+
 
 def linear_light(srgb: np.ndarray) -> np.ndarray:
     """Return the linear light of sRGB values in [0, 1], in their dtype. Source: IEC 61966-2-1."""
     low = srgb / 12.92
     high = ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4
     return np.where(srgb <= 0.04045, low, high).astype(srgb.dtype)
-
-
-# Our names -> matplotlib's. turbo shows the most detail (Mikhailov 2019); viridis has perceptually even steps, also for
-# colour-blind people.
-COLOUR_MAPS = {"turbo": "turbo", "viridis": "viridis", "grey": "gray"}
 
 
 @cache

@@ -35,6 +35,13 @@ DAMAGED = (
     *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError, NotImplementedError),
     *(struct.error, zlib.error, zipfile.BadZipFile, tifffile.TiffFileError, Image.DecompressionBombError),
 )
+_KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".exr": "OpenEXR", ".npz": "NPZ", ".npy": "NPY", ".png": "PNG"}
+# The file in which an export describes itself, beside the folders of its outputs.
+RENDERS = "render.json"
+NOT_STATED = (
+    "the file does not state the definition of depth (mean, median, ...), its axis (ray or optical axis) or its unit"
+)
+_LEVELS_NOT_STATED = "the length of a level is not stated either: often 1 mm, 0.2 mm in the TUM data sets"
 
 
 def description_of(path: Path) -> dict[str, Any] | None:
@@ -148,15 +155,6 @@ _READERS: dict[str, Callable[[Path], str | None]] = {
     ".png": _of_png,
     ".gif": _of_gif,
 }
-
-
-_KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".exr": "OpenEXR", ".npz": "NPZ", ".npy": "NPY", ".png": "PNG"}
-# The file in which an export describes itself, beside the folders of its outputs.
-RENDERS = "render.json"
-NOT_STATED = (
-    "the file does not state the definition of depth (mean, median, ...), its axis (ray or optical axis) or its unit"
-)
-_LEVELS_NOT_STATED = "the length of a level is not stated either: often 1 mm, 0.2 mm in the TUM data sets"
 
 
 def file_facts(path: Path) -> dict[str, Any]:

@@ -25,6 +25,8 @@ _SAME_SHAPE = 0.01
 _FOCAL_RANGE = (0.25, 40.0)
 # Widths of camera sensors, from small phones to medium format.
 _SENSOR_RANGE_MM = (2.5, 60.0)
+# Zooms that differ by less say nothing about the 35 mm equivalent, which is rounded to millimetres.
+_LEAST_RANGE = 1.05
 
 
 @dataclass(frozen=True)
@@ -100,10 +102,6 @@ def _focal_px(exif: Exif, whole_px: tuple[float, float]) -> float | None:
 
 def _same(side: float, other: float) -> bool:
     return abs(side - other) <= max(_ROUNDING_PX, _SAME_SIDE * other)
-
-
-# Zooms that differ by less say nothing about the 35 mm equivalent, which is rounded to millimetres.
-_LEAST_RANGE = 1.05
 
 
 def with_digital_zoom(exifs: Sequence[Exif]) -> list[Exif]:

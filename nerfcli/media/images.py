@@ -52,6 +52,8 @@ _SAME_COLOUR_LEVELS = 2
 # zlib level, and PNG's filter "up": files are 9 % larger than with a filter chosen per line, but take half the time.
 _PNG_LEVEL, _PNG_UP = 4, 2
 _PNG_COLOURS = {1: 0, 3: 2, 4: 6}  # PNG's colour types by number of channels
+# Formats of phones and cameras that are not read.
+_UNSUPPORTED_SUFFIXES = frozenset({".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"})
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -270,10 +272,6 @@ def exif_entries(image: Image.Image, which: int | None) -> dict[int, Any]:
         return dict(exif) if which is None else dict(exif.get_ifd(which))
     except _DAMAGED:
         return {}
-
-
-# Formats of phones and cameras that are not read.
-_UNSUPPORTED_SUFFIXES = frozenset({".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"})
 
 
 def list_photos(folder: Path, *, subfolders: bool = False) -> list[Path]:

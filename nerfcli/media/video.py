@@ -19,6 +19,16 @@ from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 
 ANOTHER_FFMPEG = "install ffmpeg, and set the environment variable IMAGEIO_FFMPEG_EXE to its path"
+# By default ffmpeg converts with the matrix of standard-definition television and writes no tags, and players assume
+# another matrix. Pictures are sRGB, so its transfer curve is used; "setparams" tags the frames, where encoders look.
+_COLOURS = (
+    "scale=out_color_matrix=bt709:out_range=tv,"
+    "setparams=colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1:range=tv"
+)
+# Players treat a delay below 2 hundredths of a second as 10 hundredths.
+GIF_FASTEST_FPS = 50.0
+# Ordered dither does not crawl over static areas, as error diffusion does.
+_DITHER = "[0:v][1:v]paletteuse=dither=bayer:bayer_scale=4"
 
 
 def ffmpeg_program(purpose: str, *, instead: str = "") -> str:
@@ -38,18 +48,6 @@ def ffmpeg_program(purpose: str, *, instead: str = "") -> str:
     if shutil.which(program) is None:
         raise UserError(f"{purpose}: {program} is not a program", ANOTHER_FFMPEG + instead)
     return program
-
-
-# By default ffmpeg converts with the matrix of standard-definition television and writes no tags, and players assume
-# another matrix. Pictures are sRGB, so its transfer curve is used; "setparams" tags the frames, where encoders look.
-_COLOURS = (
-    "scale=out_color_matrix=bt709:out_range=tv,"
-    "setparams=colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1:range=tv"
-)
-# Players treat a delay below 2 hundredths of a second as 10 hundredths.
-GIF_FASTEST_FPS = 50.0
-# Ordered dither does not crawl over static areas, as error diffusion does.
-_DITHER = "[0:v][1:v]paletteuse=dither=bayer:bayer_scale=4"
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,8 @@ _ROUNDS = 4
 # Least contrast across an edge in grey levels of 255, and least number of the 48 profiles that must show the edge.
 _LEAST_CONTRAST = 20.0
 _LEAST_PROFILES = 12
+# OpenCV puts the centre of the top-left pixel at (0, 0).
+_OPENCV_PIXEL_CENTRE = 0.5
 
 
 def refined_corners(grey: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
@@ -89,10 +91,6 @@ def _edge(grey: np.ndarray, a: np.ndarray, b: np.ndarray, middle: np.ndarray) ->
         off = np.abs(points @ normal - line[2])
         near = off <= 3 * 1.4826 * np.median(off) + 1e-3
     return line
-
-
-# OpenCV puts the centre of the top-left pixel at (0, 0).
-_OPENCV_PIXEL_CENTRE = 0.5
 
 
 @dataclass(frozen=True)

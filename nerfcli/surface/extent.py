@@ -13,6 +13,16 @@ from nerfcli.surface.views import DepthView, depth_views, spread_frames
 
 # Most voxels along a side; beyond, not even the index of the blocks fits into memory.
 MOST_CELLS = 2048
+# Number of cameras, and pixels along the longer side, for finding the extent.
+LOOK_VIEWS, LOOK_PX = 24, 64
+# Fraction of the seen points outside each side of the box, and margin by which the box is then enlarged.
+_OUTSIDE, _MARGIN = 0.01, 0.05
+# Cameras look out of the ball if it contains less than this fraction of the seen points.
+_LEAST_INSIDE = 0.05
+# Largest and smallest default number of voxels along the longest side of a box.
+FINEST_CELLS, COARSEST_CELLS = 384, 64
+# Default width of a voxel in pixels.
+_PIXELS_PER_VOXEL = 1.5
 
 
 @dataclass(frozen=True)
@@ -70,18 +80,6 @@ def check_box(box: tuple[float, ...]) -> tuple[float, ...]:
             exit_code=2,
         )
     return tuple(values.tolist())
-
-
-# Number of cameras, and pixels along the longer side, for finding the extent.
-LOOK_VIEWS, LOOK_PX = 24, 64
-# Fraction of the seen points outside each side of the box, and margin by which the box is then enlarged.
-_OUTSIDE, _MARGIN = 0.01, 0.05
-# Cameras look out of the ball if it contains less than this fraction of the seen points.
-_LEAST_INSIDE = 0.05
-# Largest and smallest default number of voxels along the longest side of a box.
-FINEST_CELLS, COARSEST_CELLS = 384, 64
-# Default width of a voxel in pixels.
-_PIXELS_PER_VOXEL = 1.5
 
 
 def scene_box(model: Model, frames: Sequence[Frame]) -> tuple[float, ...]:

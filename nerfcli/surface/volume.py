@@ -17,6 +17,11 @@ _TOLERANCE = 1e-4
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 # Rays to a surface cover this many voxels before and behind it, in this many steps.
 _REACH_VOXELS, _STEPS = 3.0, 24
+# Default number of voxels along the longest side.
+CELLS = 160
+_LAYERS_AT_A_TIME = 8
+# Voxels with a smaller optical depth get no colour, since it would not be visible.
+_VISIBLE = 1e-3
 
 
 def surface_colours(model: Model, points: np.ndarray, normals: np.ndarray, *, voxel_size: float) -> np.ndarray:
@@ -79,13 +84,6 @@ def _looked_at(
     if not colours:
         return np.zeros((0, 3)), np.zeros(0)
     return np.concatenate(colours).astype(np.float64), np.concatenate(opacities).astype(np.float64)
-
-
-# Default number of voxels along the longest side.
-CELLS = 160
-_LAYERS_AT_A_TIME = 8
-# Voxels with a smaller optical depth get no colour, since it would not be visible.
-_VISIBLE = 1e-3
 
 
 def automatic_volume_voxel(box: tuple[float, ...]) -> float:

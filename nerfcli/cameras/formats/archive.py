@@ -48,6 +48,7 @@ ARCHIVE_VERSION = 1
 _HINT = "the file is cut off or was changed; write it again with nerfcli"
 _UNITS = ("arbitrary", "metre")
 _SPLITS = ("", "train", "val", "test")
+_HEADERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
 
 
 def losses_npz(capture: Capture) -> tuple[str, ...]:
@@ -281,9 +282,6 @@ def _observations(arrays: Arrays, num_frames: int, *, num_points: int) -> Observ
 
 def _joined(folder: Path, text: str) -> Path | None:
     return Path(os.path.normpath(folder / text)) if text else None
-
-
-_HEADERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
 
 
 def array_from_npy(data: bytes) -> np.ndarray:

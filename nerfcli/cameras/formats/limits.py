@@ -16,6 +16,11 @@ MOST_PIXELS = 10**7
 
 # Focal lengths in pixels, principal points, distortion terms.
 MOST_PARAMETER = 1e12
+# Largest deviation of a rotation from orthonormal, or of a quaternion's length from 1: files print 4 digits or more,
+# so more is a mistake, not rounding.
+_MAX_DEVIATION = 1e-2
+# Rotations that deviate by less are kept, bit for bit.
+_ROUNDING = 1e-13
 
 
 def plausible(positions: np.ndarray) -> np.ndarray:
@@ -47,14 +52,6 @@ def checked_camera(model: str, width: int, height: int, params: tuple[float, ...
 
 def _short(number: int) -> str:
     return str(number) if number < 10**12 else f"{float(number):.3g}" if number < 10**300 else "1e300 or more"
-
-
-# Largest deviation of a rotation from orthonormal, or of a quaternion's length from 1: files print 4 digits or more,
-# so more is a mistake, not rounding.
-_MAX_DEVIATION = 1e-2
-
-# Rotations that deviate by less are kept, bit for bit.
-_ROUNDING = 1e-13
 
 
 def rigid_poses(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
