@@ -25,7 +25,7 @@ class Exif:
     or None), north and east positive. taken is the time of the shot in seconds of the camera's own clock, comparable
     between photos of one camera. taken_px is the (width, height) that EXIF records for the picture, as the camera
     stored it; sensor_px_per_mm is the number of its pixels per millimetre of the sensor. digital_zoom is 1 or more, see
-    `digital_zoom.with_digital_zoom`.
+    `focal_evidence.with_digital_zoom`.
     """
 
     make: str | None
