@@ -123,8 +123,7 @@ def job(matched: tuple[list[View], Path], tmp_path: Path) -> Job:
 
 
 def verified(job: Job) -> dict[tuple[int, int], int]:
-    with closing(pycolmap.Database.open(str(job.database))) as database:
-        return {(pair.one, pair.other): pair.matches for pair in read_verified_pairs(database, min_matches=1)}
+    return {(pair.one, pair.other): pair.matches for pair in read_verified_pairs(job.database, min_matches=1)}
 
 
 def focal_px_of(job: Job) -> list[float]:

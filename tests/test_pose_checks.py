@@ -31,7 +31,7 @@ from nerfcli.poses import structure_from_motion
 from nerfcli.poses.engine import worker
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
-from nerfcli.poses.engine.separate_models import describe_components
+from nerfcli.poses.engine.selected_component import describe_components
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.judge import acceptance, examine

@@ -16,8 +16,8 @@ from synthetic_captures import WIDE, Noise, View
 from nerfcli.poses.engine import second_chance, selected_component
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import MappedModels
-from nerfcli.poses.engine.second_chance import AlternativeMapping
-from nerfcli.poses.engine.selected_component import ChosenModel, choose_component
+from nerfcli.poses.engine.second_chance import ChosenModel
+from nerfcli.poses.engine.selected_component import choose_component
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.examine import examine
 
@@ -126,8 +126,8 @@ def test_a_component_has_most_of_its_photos_for_itself(
         grown.deregister_frame(grown.image(image_id).frame_id)
     accepted = examine(right.models[:1], right.job, lambda *progress: None)
 
-    def chance(mapped: MappedModels, *arguments: object, **options: object) -> AlternativeMapping:
-        return AlternativeMapping(replace(mapped, models=[grown]), accepted)
+    def chance(mapped: MappedModels, *arguments: object, **options: object) -> ChosenModel:
+        return ChosenModel(replace(mapped, models=[grown]), accepted)
 
     monkeypatch.setattr(selected_component, "second_chance", chance)
     found, _ = choose(misled, 1)

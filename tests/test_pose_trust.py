@@ -127,8 +127,7 @@ def test_the_triangulation_angle_is_the_median_of_the_widest_angles_at_points(so
 
 
 def test_every_rotation_of_a_pair_agrees_with_a_right_result(solved: Solved):
-    with pycolmap.Database.open(str(solved.job.database)) as database:
-        pairs = read_verified_pairs(database, min_matches=30)
+    pairs = read_verified_pairs(solved.job.database, min_matches=30)
     errors = rotation_errors(solved.model, pairs, seed=0)
     assert len(errors) > 15
     assert np.median([error.degrees for error in errors]) < 1
@@ -139,8 +138,7 @@ def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
     """Two parts, each right by itself: the reprojection error is low, but matches between them contradict the poses."""
     wrong = synthetic.bent(solved.model, 6)
     assert wrong.compute_mean_reprojection_error() < 1.05 * solved.model.compute_mean_reprojection_error()
-    with pycolmap.Database.open(str(solved.job.database)) as database:
-        pairs = read_verified_pairs(database, min_matches=15)
+    pairs = read_verified_pairs(solved.job.database, min_matches=15)
     same, left_out = leave_out_contradicting(wrong, pairs)
     assert same is wrong
     assert left_out == {}
@@ -406,8 +404,7 @@ def test_groups_hold_together_against_what_speaks_against_them():
 def test_one_photo_that_contradicts_is_left_out(solved: Solved):
     """A tenth of the photos; the others are accepted."""
     wrong = synthetic.bent(solved.model, 10)
-    with pycolmap.Database.open(str(solved.job.database)) as database:
-        pairs = read_verified_pairs(database, min_matches=15)
+    pairs = read_verified_pairs(solved.job.database, min_matches=15)
     rest, left_out = leave_out_contradicting(wrong, pairs)
     assert set(left_out) == {10}
     assert left_out[10].startswith("contradicts the rest: its ")
@@ -420,8 +417,7 @@ def test_a_photo_far_from_all_others_is_left_out(solved: Solved):
     frame = wrong.frame(wrong.image(10).frame_id)
     pose = wrong.image(10).cam_from_world()
     frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([0.0, 0.0, 300.0]))
-    with pycolmap.Database.open(str(solved.job.database)) as database:
-        pairs = read_verified_pairs(database, min_matches=15)
+    pairs = read_verified_pairs(solved.job.database, min_matches=15)
     rest, left_out = leave_out_contradicting(wrong, pairs)
     assert rest.num_reg_images() == 9
     assert "times as far away as the other cameras" in left_out[10]
@@ -488,8 +484,7 @@ def test_a_scene_that_repeats_itself_is_recognised(tmp_path: Path):
 
 def test_a_photo_placed_by_points_is_judged_with_what_holds_it(solved: Solved):
     """Photo 10 has a mistaken pair of 20 matches, which refuses the model unless the pairs that hold it count."""
-    with pycolmap.Database.open(str(solved.job.database)) as database:
-        pairs = read_verified_pairs(database, min_matches=15)
+    pairs = read_verified_pairs(solved.job.database, min_matches=15)
     held = [pair for pair in pairs if pair.other == 10]
     rest = [pair for pair in pairs if pair.other != 10]
     strongest = max(held, key=lambda pair: pair.matches)
@@ -510,8 +505,7 @@ def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
     still = solve(tmp_path, views, synthetic.room(900, seed=0))
     assert still.kinds[0] == "no baseline (pure rotation)"
     assert [rung["what"] for rung in still.climbed.attempts] == ["default thresholds"]  # no other attempt can help
-    with pycolmap.Database.open(str(still.job.database)) as database:
-        pairs = read_verified_pairs(database, min_matches=30)
+    pairs = read_verified_pairs(still.job.database, min_matches=30)
     turn = best_rotation_fit(pairs, dict.fromkeys(still.job.image_ids, (WIDE.width, WIDE.height)))
     assert turn is not None
     assert turn.parallax_px < 1.5

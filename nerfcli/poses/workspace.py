@@ -83,7 +83,7 @@ def keep_refused(scene_dir: Path, folder: Path) -> Path:
     found = scene_dir / "work" / "sparse" / "0"
     with atomic_folder(folder / REFUSED) as target:
         shutil.copytree(found, target, dirs_exist_ok=True)
-        pycolmap.Reconstruction(str(found)).export_PLY(str(target / POINTS_FILE))
+        pycolmap.Reconstruction(found).export_PLY(target / POINTS_FILE)
     return folder / REFUSED
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import pycolmap
 
 from nerfcli.poses.input.job import CameraGroup, Job, usual_focal_px
+from nerfcli.poses.model.two_views import count_matches
 
 # In pycolmap a pair's id is this times the smaller image id, plus the larger one.
 _PAIR_FACTOR = 2147483647
@@ -35,7 +36,7 @@ def register_photos(job: Job) -> None:
         image_id: (file, camera_ids[number], _described(cameras[camera_ids[number]]))
         for number, (image_id, file) in enumerate(zip(job.image_ids, job.files, strict=True))
     }
-    with closing(pycolmap.Database.open(str(job.database))) as database:
+    with pycolmap.Database.open(job.database) as database:
         before = {camera.camera_id: camera for camera in database.read_all_cameras()}
         there = {
             image.image_id: (image.name, image.camera_id, _described(before[image.camera_id]))
@@ -53,7 +54,7 @@ def register_photos(job: Job) -> None:
     with _edited(job) as database:
         for table in ("frame_data", "frames", "rig_sensors", "rigs", "images", "cameras", "pose_priors"):
             database.execute(f"DELETE FROM {table}")
-    with closing(pycolmap.Database.open(str(job.database))) as database, pycolmap.DatabaseTransaction(database):
+    with pycolmap.Database.open(job.database) as database, pycolmap.DatabaseTransaction(database):
         for number, camera in cameras.items():
             camera.camera_id = number
             database.write_camera(camera, use_camera_id=True)
@@ -146,19 +147,17 @@ def name_images(job: Job) -> None:
 
 def evidence(job: Job) -> list[dict[str, Any]]:
     """Return, per photo, its number of features, and the photo with which it has the most verified matches."""
-    numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
-    with closing(pycolmap.Database.open(str(job.database))) as database:
-        features = {number: database.num_keypoints_for_image(image_id) for image_id, number in numbers.items()}
-        pair_ids, inliers = database.read_two_view_geometry_num_inliers()
-    best: dict[int, tuple[int, str | None]] = dict.fromkeys(features, (0, None))
-    for pair_id, count in zip(pair_ids, inliers, strict=True):
-        i, j = (numbers[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id))
+    with pycolmap.Database.open(job.database) as database:
+        features = [database.num_keypoints_for_image(image_id) for image_id in job.image_ids]
+    best: list[tuple[int, str | None]] = [(0, None)] * len(features)
+    for first, second, count in count_matches(job.database):
+        i, j = job.numbers[first], job.numbers[second]
         for one, other in ((i, j), (j, i)):
             if count > best[one][0]:
                 best[one] = (count, job.names[other])
     return [
-        {"features": features[number], "best_matches": best[number][0], "best_partner": best[number][1]}
-        for number in sorted(features)
+        {"features": found, "best_matches": matches, "best_partner": partner}
+        for found, (matches, partner) in zip(features, best, strict=True)
     ]
 
 

@@ -4,7 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
@@ -127,11 +127,11 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
     verification.ransac.random_seed = job.seed
     pair_list = Path(job.folder) / "pairs.txt"
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = str(pair_list)
+    pairing.match_list_path = pair_list
     pairing.block_size = _PAIRS_PER_BLOCK
     ids = job.image_ids
     cut_short = None
-    with closing(pycolmap.Database.open(str(job.database))) as database:
+    with pycolmap.Database.open(job.database) as database:
         pending = {(ids[i], ids[j]) for i, j in pairs}
 
         def done() -> int:
@@ -147,7 +147,7 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
                 part = pairs[first : first + _PAIRS_PER_CALL]
                 pair_list.write_text("\n".join(f"{job.files[i]} {job.files[j]}" for i, j in part), encoding="utf-8")
                 pycolmap.match_image_pairs(
-                    str(job.database),
+                    job.database,
                     matching_options=options,
                     pairing_options=pairing,
                     verification_options=verification,
@@ -158,7 +158,7 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
 
 def feature_counts(job: Job) -> list[int]:
     """Return the number of features of each photo in the database."""
-    with closing(pycolmap.Database.open(str(job.database))) as database:
+    with pycolmap.Database.open(job.database) as database:
         return [database.num_keypoints_for_image(image_id) for image_id in job.image_ids]
 
 
@@ -171,8 +171,8 @@ def _extract(job: Job, numbers: Iterable[int], search: _Search, *, watched: Sequ
     options.sift.first_octave = search.first_octave
     options.sift.peak_threshold = search.contrast
     reader = pycolmap.ImageReaderOptions()
-    reader.mask_path = str(job.mask_folder) if job.masks else ""
-    with closing(pycolmap.Database.open(str(job.database))) as database:
+    reader.mask_path = job.mask_folder if job.masks else ""
+    with pycolmap.Database.open(job.database) as database:
         pending = {job.image_ids[number] for number in watched}
 
         def done() -> int:
@@ -183,8 +183,8 @@ def _extract(job: Job, numbers: Iterable[int], search: _Search, *, watched: Sequ
             for limit, members in _by_limit(job, numbers).items():
                 options.sift.max_num_features = limit
                 pycolmap.extract_features(
-                    str(job.database),
-                    str(job.photos),
+                    job.database,
+                    job.photos,
                     image_names=members,
                     reader_options=reader,
                     extraction_options=options,

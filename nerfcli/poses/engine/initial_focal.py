@@ -1,10 +1,7 @@
 """Initial focal lengths for mapping, where EXIF has no reliable one."""
 
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import replace
-
-import pycolmap
 
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.input.job import CameraGroup, Job, Tell
@@ -31,8 +28,7 @@ def with_focal_lengths(job: Job, tell: Tell) -> Job:
     ]
     if not unknown:
         return job
-    with closing(pycolmap.Database.open(str(job.database))) as database:
-        pairs = read_verified_pairs(database, min_matches=FEW_MATCHES)
+    pairs = read_verified_pairs(job.database, min_matches=FEW_MATCHES)
     groups = tuple(_estimated(group, job, pairs, tell) if group in unknown else group for group in job.groups)
     if groups == job.groups:
         return job

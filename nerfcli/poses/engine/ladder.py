@@ -7,7 +7,6 @@ and features.
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ from nerfcli.poses.model.lens_family import as_fisheye
 from nerfcli.poses.model.localise import left_out, localise
 from nerfcli.poses.model.merging import merge_models
 from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
-from nerfcli.poses.model.two_views import read_verified_pairs
+from nerfcli.poses.model.two_views import count_matches, read_verified_pairs
 
 # Registered fraction below which mapping is tried again; if only a photo or two are missing, they are often at fault.
 _GOOD_FRACTION = 0.9
@@ -259,10 +258,7 @@ def _tell_of_exif(given: Job, best: MappedModels, tell: Tell) -> None:
 
 def _only_turns(job: Job) -> bool:
     """Return whether rotations of the camera explain all matches, so that no attempt can give an accepted model."""
-    with closing(pycolmap.Database.open(str(job.database))) as database:
-        pairs = read_verified_pairs(database, min_matches=FEW_MATCHES)
-    sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}
-    turn = best_rotation_fit(pairs, sizes)
+    turn = best_rotation_fit(read_verified_pairs(job.database, min_matches=FEW_MATCHES), job.sizes)
     return turn is not None and turn.explains_all
 
 
@@ -295,7 +291,7 @@ def _search_seconds(job: Job) -> float:
 
 def _other_starts(ladder: _Ladder, job: Job, tell: Tell) -> None:
     """Try other ways to start, until nearly all photos that are connected by matches are placed."""
-    candidates = len(connected_groups(job.image_ids, [(one, other) for _, one, other in _strong_pairs(job)])[0])
+    candidates = len(connected_groups(job.image_ids, [pair[:2] for pair in _strong_pairs(job)])[0])
     if len(job.files) >= _MANY_PHOTOS and _FEW_FRACTION <= ladder.fraction(candidates) < _GOOD_FRACTION:
         ladder.tell_results()
         takes = duration(mapping_seconds(len(job.files)))
@@ -353,19 +349,16 @@ def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, fraction: float)
 def _from_left_out(ladder: _Ladder, job: Job) -> None:
     """Start from the strongest pair with a photo that the best model lacks."""
     placed = set(ladder.best.models[0].reg_image_ids()) if ladder.best.models else set()
-    left = [pair for pair in _strong_pairs(job) if not {pair[1], pair[2]} <= placed]
+    left = [pair for pair in _strong_pairs(job) if not set(pair[:2]) <= placed]
     if left:
-        _, one, other = max(left, key=lambda pair: (pair[0], -pair[1], -pair[2]))
+        one, other, _ = max(left, key=lambda pair: pair[2])
         start = replace(SMALLER_BASELINE, init_pair=(one, other))
         ladder.attempt("start from the strongest unused pair", job, start)
 
 
 def _strong_pairs(job: Job) -> list[tuple[int, int, int]]:
-    """Return (verified matches, image id, image id) of the pairs with enough matches to place a photo."""
-    with closing(pycolmap.Database.open(str(job.database))) as database:
-        pair_ids, counts = database.read_two_view_geometry_num_inliers()
-    pairs = [(count, *pycolmap.pair_id_to_image_pair(pair_id)) for pair_id, count in zip(pair_ids, counts, strict=True)]
-    return [pair for pair in pairs if pair[0] >= FEW_MATCHES]
+    """Return (image id, image id, verified matches) of the pairs with enough matches to place a photo."""
+    return [pair for pair in count_matches(job.database) if pair[2] >= FEW_MATCHES]
 
 
 def _can_have_more_features(job: Job) -> bool:

@@ -92,7 +92,7 @@ def write_models(
     for index, model in enumerate(models):
         target = folder / str(index)
         target.mkdir(parents=True)
-        model.write_binary(str(target))
+        model.write_binary(target)
     write_stage(stage, key, {**(also or {}), "models": len(models), "files": file_keys(folder)})
 
 
@@ -101,7 +101,7 @@ def read_models(folder: Path, key: str) -> tuple[list[pycolmap.Reconstruction], 
     content = read_stage(folder.with_suffix(".json"), key)
     if content is None or content["files"] != file_keys(folder):
         return None
-    return [pycolmap.Reconstruction(str(folder / str(index))) for index in range(content["models"])], content
+    return [pycolmap.Reconstruction(folder / str(index)) for index in range(content["models"])], content
 
 
 def mapping_key(job: Job) -> str:

@@ -34,8 +34,7 @@ class MapperOptions:
 
 def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
     """Return the numbers of the photos that a model places, in ascending order."""
-    numbers = {file: number for number, file in enumerate(job.files)}
-    return sorted(numbers[model.image(image_id).name] for image_id in model.reg_image_ids())
+    return sorted(job.numbers[image_id] for image_id in model.reg_image_ids())
 
 
 def describe_cameras(
@@ -78,7 +77,7 @@ def with_colours(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstru
     if 2 * black <= model.num_points3D():
         return model
     copy = pycolmap.Reconstruction(model)
-    copy.extract_colors_for_all_images(str(job.photos), num_threads=job.threads)
+    copy.extract_colors_for_all_images(job.photos, num_threads=job.threads)
     return copy
 
 
@@ -90,7 +89,7 @@ def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
     folder = _model_folder(job)
     shutil.rmtree(folder, ignore_errors=True)  # left by a run that was killed before it was complete
     folder.mkdir(parents=True)
-    model.write_binary(str(folder))
+    model.write_binary(folder)
 
 
 def model_keys(job: Job) -> dict[str, str]:
@@ -115,7 +114,7 @@ def map_photos(
     base_folder = output.with_name(f"{output.name}_base")
     if base is not None:
         base_folder.mkdir(exist_ok=True)
-        base.write(str(base_folder))
+        base.write(base_folder)
     key = stage_key(mapping_key(job), attempt, asdict(start), base is not None and file_keys(base_folder))
     if (found := read_models(output, key)) is None:
         placed = 0 if base is None else base.num_reg_images()
@@ -144,7 +143,7 @@ def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
     options.mapper.global_positioning.use_gpu = False
     options.mapper.bundle_adjustment.ceres.use_gpu = False
     with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
-        models = pycolmap.global_mapping(str(job.database), str(job.photos), output, options)
+        models = pycolmap.global_mapping(job.database, job.photos, output, options)
     for model in models.values():
         model.update_point_3d_errors()
     return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
@@ -197,11 +196,11 @@ def _run_mapper(
 
     with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
         models = pycolmap.incremental_mapping(
-            str(job.database),
-            str(job.photos),
+            job.database,
+            job.photos,
             output,
             options=options,
-            input_path="" if base_folder is None else str(base_folder),
+            input_path="" if base_folder is None else base_folder,
             initial_image_pair_callback=started,
             next_image_callback=placed_one,
         )

@@ -9,7 +9,6 @@ Descriptors are integers, so their squared distances are exact: the result does 
 """
 
 from collections.abc import Collection, Iterable, Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -117,7 +116,7 @@ def _coarsest(job: Job) -> list[np.ndarray]:
     """Return, per photo, the descriptors of its largest-scale features."""
     most = retrieval_feature_count(len(job.files))
     found: list[np.ndarray] = []
-    with closing(pycolmap.Database.open(str(job.database))) as database:
+    with pycolmap.Database.open(job.database) as database:
         for image_id in job.image_ids:
             if not database.exists_descriptors(image_id):
                 found.append(np.zeros((0, 128), np.uint8))

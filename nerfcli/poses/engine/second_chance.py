@@ -7,9 +7,9 @@ out different evidence and maps again; its model must pass the same checks, agai
 import shutil
 import time
 from collections.abc import Callable, Iterable
-from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import pycolmap
 
@@ -32,7 +32,7 @@ from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import NO_PARALLAX_PX
 from nerfcli.poses.model.intrinsics import settle
-from nerfcli.poses.model.two_views import agreements, read_verified_pairs
+from nerfcli.poses.model.two_views import agreements, count_matches, read_verified_pairs
 from nerfcli.poses.model.view_graph import consistent_groups
 
 # First number of the mapper's runs here, after those of the ladder; the numbers are added to the seed.
@@ -51,8 +51,8 @@ _LEAST_APART = 0.05
 
 
 @dataclass(frozen=True)
-class AlternativeMapping:
-    """Result of an alternative mapping."""
+class ChosenModel:
+    """The examined model, and all models in the order of their numbers, including the examined one."""
 
     mapped: MappedModels
     examined: ExaminedModel
@@ -66,15 +66,13 @@ def second_chance(
     *,
     checks: Callable[[], Checks],
     component: int = 1,
-) -> AlternativeMapping:
+) -> ChosenModel:
     """Map again under one hypothesis after the other until the checks accept a model.
 
     Args:
         mapped: the model that the checks refused, and the smaller ones.
         first: the result of these checks.
-        report: called with (stage, done, total).
-        tell: called with messages for the user.
-        checks: makes a check runner for one more model.
+        report, tell, checks: see `selected_component.choose_component`.
         component: the number of this model for the user. From 2 on, its photos are mapped again by themselves.
 
     Returns:
@@ -107,7 +105,11 @@ def second_chance(
         ("from the largest consistent part", rest * scratch, lambda: _regrown(mapped, core, report)),
         (_ALL_AT_ONCE, all_at_once, lambda: _all_at_once(mapped, core)),
         ("from the largest consistent part of that", rest * scratch, grown_from_all),
-        ("from scratch, with other initial pairs", scratch, lambda: _from_nothing(mapped, core, report)),
+        (
+            "from scratch, with other initial pairs",
+            scratch,
+            lambda: _mapped_without(mapped, core.suspects, report, base=None),
+        ),
         (
             "only the largest consistent part of the first model",
             0.0,
@@ -123,30 +125,21 @@ def second_chance(
         tell(f"next: {what}" + (f" (about {duration(takes)})" if takes else ""))
         runner = checks()
         limit = max(left, _LEAST_LIMIT_SECONDS) if what == _ALL_AT_ONCE else _mapping_limit_seconds(mapped.job)
-        found = runner.run(what, partial(_kept, mapped.job, f"{names}-{number}", make), otherwise=None, seconds=limit)
-        if found is None or not found.models:
-            tell(f"{what}: {runner.not_computed.get(what, 'nothing to map')}")
+        found = _tried(what, make, mapped.job, tell, name=f"{names}-{number}", runner=runner, seconds=limit)
+        if found is None:
             continue
         if what == _ALL_AT_ONCE:
             at_once.append(found)
-        examined = examine(found.models[:1], found.job, report, checks=runner)
-        size = 0 if examined.model is None else examined.model.num_reg_images()
-        attempts.append({"what": what, "models": [size, *(m.num_reg_images() for m in found.models[1:])]})
-        verdict = "accepted" if examined.verdict.accepted else examined.verdict.failures[0].kind
-        tell(f"{what}: {size} of {len(mapped.job.files)} photos registered, {verdict}")
+        examined, attempt = _examined(what, found, report, tell, runner=runner)
+        attempts.append(attempt)
         if examined.verdict.accepted:
-            return AlternativeMapping(replace(found, attempts=attempts), examined)
-    return AlternativeMapping(replace(mapped, attempts=attempts), first)
+            return ChosenModel(replace(found, attempts=attempts), examined)
+    return ChosenModel(replace(mapped, attempts=attempts), first)
 
 
 def grow(
-    mapped: MappedModels,
-    first: ExaminedModel,
-    report: Report,
-    tell: Tell,
-    *,
-    checks: Callable[[], Checks],
-) -> AlternativeMapping:
+    mapped: MappedModels, first: ExaminedModel, report: Report, tell: Tell, *, checks: Callable[[], Checks]
+) -> ChosenModel:
     """Extend an accepted model to the photos of smaller models, if these are many and match its photos.
 
     Where a few photos fail in a row, the mapper gives up and begins another model; starting from the adjusted model,
@@ -159,7 +152,7 @@ def grow(
     Returns:
         A larger accepted model, or the given one.
     """
-    given = AlternativeMapping(mapped, first)
+    given = ChosenModel(mapped, first)
     model = first.model
     if model is None:  # no photo was placed at all
         return given
@@ -172,26 +165,49 @@ def grow(
     tell(f"{len(apart)} photos are in smaller models, next: {what} (about {duration(takes)})")
 
     def make() -> MappedModels:
-        base = _Core(pycolmap.Reconstruction(model), frozenset())
-        return _mapped_without(mapped, base, report, attempt=_FIRST_ATTEMPT, base=base.model)
+        return _mapped_without(mapped, frozenset(), report, base=pycolmap.Reconstruction(model))
 
-    runner = checks()
-    limit = _mapping_limit_seconds(mapped.job)
-    found = runner.run(what, partial(_kept, mapped.job, "grown", make), otherwise=None, seconds=limit)
-    if found is None or not found.models:
-        tell(f"{what}: {runner.not_computed.get(what, 'nothing to map')}")
+    runner, limit = checks(), _mapping_limit_seconds(mapped.job)
+    found = _tried(what, make, mapped.job, tell, name="grown", runner=runner, seconds=limit)
+    if found is None:
         return given
     if found.models[0].num_reg_images() <= len(placed):
         tell(f"{what}: no further photo registered")
         return given
+    examined, attempt = _examined(what, found, report, tell, runner=runner)
+    attempts = [*mapped.attempts, attempt]
+    if not examined.verdict.accepted or attempt["models"][0] <= len(placed):
+        return ChosenModel(replace(mapped, attempts=attempts), first)
+    return ChosenModel(replace(found, attempts=attempts), examined)
+
+
+def _tried(
+    what: str,
+    make: Callable[[], MappedModels | None],
+    job: Job,
+    tell: Tell,
+    *,
+    name: str,
+    runner: Checks,
+    seconds: float,
+) -> MappedModels | None:
+    """Return the models of a hypothesis, which are stored under `name`; None, and tell the user why, without any."""
+    found = runner.run(what, partial(_kept, job, name, make), otherwise=None, seconds=seconds)
+    if found is None or not found.models:
+        tell(f"{what}: {runner.not_computed.get(what, 'nothing to map')}")
+        return None
+    return found
+
+
+def _examined(
+    what: str, found: MappedModels, report: Report, tell: Tell, *, runner: Checks
+) -> tuple[ExaminedModel, dict[str, Any]]:
+    """Examine the first model of a hypothesis; also return the record of the attempt."""
     examined = examine(found.models[:1], found.job, report, checks=runner)
     size = 0 if examined.model is None else examined.model.num_reg_images()
     verdict = "accepted" if examined.verdict.accepted else examined.verdict.failures[0].kind
-    tell(f"{what}: {size} of {len(mapped.job.files)} photos registered, {verdict}")
-    attempts = [*mapped.attempts, {"what": what, "models": [size, *(m.num_reg_images() for m in found.models[1:])]}]
-    if not examined.verdict.accepted or size <= len(placed):
-        return AlternativeMapping(replace(mapped, attempts=attempts), first)
-    return AlternativeMapping(replace(found, attempts=attempts), examined)
+    tell(f"{what}: {size} of {len(found.job.files)} photos registered, {verdict}")
+    return examined, {"what": what, "models": [size, *(model.num_reg_images() for model in found.models[1:])]}
 
 
 def _mapping_limit_seconds(job: Job) -> float:
@@ -201,10 +217,10 @@ def _mapping_limit_seconds(job: Job) -> float:
 
 def _match(some: set[int], others: set[int], job: Job) -> bool:
     """Return whether any of `some` matches any of `others` (image ids)."""
-    with closing(pycolmap.Database.open(str(job.database))) as database:
-        pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
     return any(
-        (pair.one in some and pair.other in others) or (pair.one in others and pair.other in some) for pair in pairs
+        (one in some and other in others) or (one in others and other in some)
+        for one, other, count in count_matches(job.database)
+        if count >= MIN_MATCHES
     )
 
 
@@ -239,9 +255,7 @@ class _Core:
 
 
 def _core(model: pycolmap.Reconstruction, job: Job) -> _Core:
-    with closing(pycolmap.Database.open(str(job.database))) as database:
-        pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
-    found = agreements(model, pairs)
+    found = agreements(model, read_verified_pairs(job.database, min_matches=MIN_MATCHES))
     joins = [(a.one, a.other, -a.matches if a.contradicts else a.matches * a.fraction) for a in found]
     groups = consistent_groups(sorted(model.reg_image_ids()), joins)
     group_of = {photo: number for number, group in enumerate(groups) for photo in group}
@@ -249,9 +263,10 @@ def _core(model: pycolmap.Reconstruction, job: Job) -> _Core:
     for photo in sorted(set(model.reg_image_ids()) - set(groups[0])):
         rest.deregister_frame(rest.image(photo).frame_id)
     rest.tear_down()
-    numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
     suspects = {
-        (numbers[a.one], numbers[a.other]) for a in found if a.contradicts == (group_of[a.one] == group_of[a.other])
+        (job.numbers[a.one], job.numbers[a.other])
+        for a in found
+        if a.contradicts == (group_of[a.one] == group_of[a.other])
     }
     return _Core(rest, frozenset(suspects - _neighbours_in_order(job, suspects)))
 
@@ -271,22 +286,19 @@ def _regrown(mapped: MappedModels, core: _Core, report: Report) -> MappedModels 
         return None
     base = pycolmap.Reconstruction(core.model)
     settle(base, threads=mapped.job.threads, fixed=mapped.job.fixed_cameras)
-    return _mapped_without(mapped, core, report, attempt=_FIRST_ATTEMPT, base=base)
-
-
-def _from_nothing(mapped: MappedModels, core: _Core, report: Report) -> MappedModels | None:
-    """Map from scratch without the suspects, with another seed and a smaller initial baseline."""
-    return _mapped_without(mapped, core, report, attempt=_FIRST_ATTEMPT + 1, base=None)
+    return _mapped_without(mapped, core.suspects, report, base=base)
 
 
 def _mapped_without(
-    mapped: MappedModels, core: _Core, report: Report, *, attempt: int, base: pycolmap.Reconstruction | None
+    mapped: MappedModels, suspects: frozenset[tuple[int, int]], report: Report, *, base: pycolmap.Reconstruction | None
 ) -> MappedModels:
-    job = _with_own_database(mapped.job, without=core.suspects)
-    if base is not None:
+    """Extend a model without the suspects, or map from scratch with another seed and a smaller initial baseline."""
+    job = _with_own_database(mapped.job, without=suspects)
+    if base is None:
+        models = map_photos(job, report, attempt=_FIRST_ATTEMPT + 1, start=SMALLER_BASELINE)
+    else:
         _set_cameras(job, base)
-    start = MapperOptions() if base is not None else SMALLER_BASELINE
-    models = map_photos(job, report, attempt=attempt, start=start, base=base)
+        models = map_photos(job, report, attempt=_FIRST_ATTEMPT, start=MapperOptions(), base=base)
     job.database.unlink()
     return MappedModels(models, mapped.job, mapped.attempts)
 
@@ -304,7 +316,7 @@ def _all_at_once(mapped: MappedModels, core: _Core) -> MappedModels | None:
 
 def _set_cameras(job: Job, model: pycolmap.Reconstruction) -> None:
     """Write a model's cameras into the job's database: the mapper can only extend a model with the same lenses."""
-    with closing(pycolmap.Database.open(str(job.database))) as database:
+    with pycolmap.Database.open(job.database) as database:
         for camera in model.cameras.values():
             database.update_camera(camera)
 

@@ -5,28 +5,24 @@ some. So a request for a smaller component gets the one that the report lists un
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
 from nerfcli.poses.engine.mapped import COMPONENTS, FIRST, MappedModels, mapping_key, read_mapped, write_mapped
-from nerfcli.poses.engine.second_chance import AlternativeMapping, grow, is_contradicted, second_chance
+from nerfcli.poses.engine.mapping import photo_numbers
+from nerfcli.poses.engine.second_chance import ChosenModel, grow, is_contradicted, second_chance
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.stages import read_stage, write_stage
 from nerfcli.poses.judge.checks import Checks
-from nerfcli.poses.judge.examine import ExaminedModel, examine
+from nerfcli.poses.judge.examine import examine
+from nerfcli.poses.model.reasons import FEW_MATCHES
+from nerfcli.poses.model.two_views import count_matches
 
 # A component has at least this many photos of its own.
 _LEAST_PHOTOS = 3
-
-
-@dataclass(frozen=True)
-class ChosenModel:
-    """The examined component, and all models in the order of their numbers, including the examined one."""
-
-    mapped: MappedModels
-    examined: ExaminedModel
 
 
 def choose_component(
@@ -69,11 +65,11 @@ def _largest(mapped: MappedModels, report: Report, tell: Tell, *, checks: Callab
     elif examined.verdict.accepted and largest_first is mapped:
         chance = grow(mapped, examined, report, tell, checks=checks)
     else:
-        chance = AlternativeMapping(largest_first, examined)
+        chance = ChosenModel(largest_first, examined)
     if chance.examined is examined or not chance.examined.verdict.accepted:
         if largest_first is mapped or chance.mapped is not largest_first:
             _keep_numbers(mapped.job, FIRST)
-        return ChosenModel(chance.mapped, chance.examined)
+        return chance
     first, *found = chance.mapped.models
     numbered = replace(chance.mapped, models=[first, *_with_photos_of_their_own(first, [*found, *mapped.models[1:]])])
     write_mapped(numbered, mapping_key(mapped.job), name=COMPONENTS)
@@ -109,3 +105,35 @@ def _keep_numbers(job: Job, name: str) -> None:
 
 def _stage(job: Job) -> Path:
     return Path(job.folder) / "numbering.json"
+
+
+def describe_components(models: Sequence[pycolmap.Reconstruction], job: Job) -> list[dict[str, Any]]:
+    """Describe each model of a job, the largest first, by the matches in the job's database.
+
+    Returns:
+        Per model {"size", "photos": numbers, "apart": why it is not part of the largest, None for that one}.
+    """
+    members = [photo_numbers(model, job) for model in models]
+    pairs = [(count, job.numbers[one], job.numbers[other]) for one, other, count in count_matches(job.database)]
+    return [
+        {
+            "size": len(photos),
+            "photos": photos,
+            "apart": _apart(set(photos), set(members[0]), pairs, job.names) if index else None,
+        }
+        for index, photos in enumerate(members)
+    ]
+
+
+def _apart(photos: set[int], largest: set[int], pairs: Sequence[tuple[int, int, int]], names: Sequence[str]) -> str:
+    own = photos - largest
+    between = [pair for pair in pairs if own.intersection(pair[1:]) and largest.intersection(pair[1:])]
+    if not between:
+        return "none of its photos matches a photo of the largest"
+    count, one, other = max(between)
+    best = f"{names[one]} and {names[other]}, {count} matches"
+    strong = sum(pair[0] >= FEW_MATCHES for pair in between)
+    if not strong:
+        return f"no pair connects it well enough to the largest (best: {best})"
+    pairs_connect = "1 pair connects" if strong == 1 else f"{strong} pairs connect"
+    return f"{pairs_connect} it to the largest (strongest: {best}), but no consistent alignment was found"

@@ -6,7 +6,6 @@ Nothing else changes, not by a bit: results measured on these photos depend on t
 """
 
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -103,7 +102,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     after = fingerprint(model, without=frozenset(found.name for found in placed.values()))
     if after != before:
         raise AssertionError("locating held-out photos changed the model of the training photos")
-    model.write_binary(str(folder))
+    model.write_binary(folder)
     whole["models"][0] = sorted([*whole["models"][0], *placed])
     whole["left_out"] |= reasons
     whole["evidence"] = evidence(job)
@@ -197,7 +196,7 @@ def _seen_points(
     """Return pixels (N, 2) of a photo and their points (N, 3), from its verified matches with placed photos."""
     image_id = job.image_ids[number]
     seen: set[tuple[int, int]] = set()  # feature of the photo, point
-    with closing(pycolmap.Database.open(str(job.database))) as database:
+    with pycolmap.Database.open(job.database) as database:
         features = database.read_keypoints(image_id)[:, :2].astype(np.float64)
         for i, j in pairs:
             if number not in (i, j):

@@ -9,7 +9,6 @@ Existing masks of an earlier call are used unchanged, since they may have been e
 
 import time
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -158,7 +157,7 @@ class _Features:
     def of(self, number: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
         """Return pixels (N, 2), descriptors (N, 128), and the photo's (width, height)."""
         if number not in self._read:
-            with closing(pycolmap.Database.open(str(self.job.database))) as database:
+            with pycolmap.Database.open(self.job.database) as database:
                 image_id = self.job.image_ids[number]
                 keypoints = np.asarray(database.read_keypoints(image_id))
                 descriptors = np.asarray(database.read_descriptors(image_id).data)

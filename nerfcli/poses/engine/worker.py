@@ -29,8 +29,7 @@ from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import MappedModels, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
 from nerfcli.poses.engine.retrieval import with_neighbours
-from nerfcli.poses.engine.selected_component import choose_component
-from nerfcli.poses.engine.separate_models import describe_components
+from nerfcli.poses.engine.selected_component import choose_component, describe_components
 from nerfcli.poses.engine.strict import place_held_out, training_part
 from nerfcli.poses.engine.turntable import recalled, with_object_masks
 from nerfcli.poses.input.job import Job, Report, Tell, read_job

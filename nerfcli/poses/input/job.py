@@ -121,6 +121,16 @@ class Job:
         """The photos' ids in the database, by number; pycolmap's ids start at 1."""
         return tuple(int(Path(file).stem) + 1 for file in self.files)
 
+    @cached_property
+    def numbers(self) -> dict[int, int]:
+        """The photos' numbers, by id in the database."""
+        return {image_id: number for number, image_id in enumerate(self.image_ids)}
+
+    @property
+    def sizes(self) -> dict[int, tuple[int, int]]:
+        """Width and height of each upright photo, by id in the database."""
+        return {self.image_ids[photo]: (group.width, group.height) for group in self.groups for photo in group.photos}
+
 
 def database_path(work: Path, rung: str = "") -> Path:
     """Return the path of a work folder's database: in the scene folder above it, or inside it for a named rung."""

@@ -1,8 +1,7 @@
 """Examine a model after mapping: lens model, contradictions, acceptance, uncertainty."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -60,16 +59,13 @@ def examine(
         checks: runs the checks.
     """
     checks = Checks() if checks is None else checks
-    with closing(pycolmap.Database.open(str(job.database))) as database:
-        pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
-    sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}
+    pairs = read_verified_pairs(job.database, min_matches=MIN_MATCHES)
     strong = [pair for pair in pairs if pair.matches >= FEW_MATCHES]
-    turn = checks.run("parallax", lambda: _rotation_fit(strong, job, sizes), otherwise=None)
+    turn = checks.run("parallax", lambda: _rotation_fit(strong, job), otherwise=None)
     joined = connected_groups(job.image_ids, [(pair.one, pair.other) for pair in strong])
     details: dict[str, Any] = {"parts": [len(part) for part in joined if len(part) > 1]}
     if not models:
         return ExaminedModel(None, nothing_placed(turn), {}, {}, details | {"not_computed": checks.not_computed})
-    numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
     report("check", 0, 4)
     mapped = with_pose_only(models[0])
     nothing: list[VerifiedPair] = []
@@ -107,20 +103,20 @@ def examine(
             otherwise=blur,
         )
     report("check", 4, 4)
-    reasons = {numbers[image_id]: _with_names(reason, job) for image_id, reason in left_out.items()}
+    reasons = {job.numbers[image_id]: _with_names(reason, job) for image_id, reason in left_out.items()}
     details["not_computed"] = checks.not_computed
     uncertainty = {str(camera_id): certain for camera_id, certain in lenses.uncertainty.items()}
     return ExaminedModel(
-        model, verdict, reasons, {numbers[image_id]: px for image_id, px in blur.items()}, details, uncertainty
+        model, verdict, reasons, {job.numbers[image_id]: px for image_id, px in blur.items()}, details, uncertainty
     )
 
 
-def _rotation_fit(pairs: Sequence[VerifiedPair], job: Job, sizes: Mapping[int, tuple[int, int]]) -> RotationFit | None:
+def _rotation_fit(pairs: Sequence[VerifiedPair], job: Job) -> RotationFit | None:
     """Return how well rotations explain the matches: of panoramas if all photos are, else of the other photos."""
     panoramas = {job.image_ids[photo] for group in job.groups if group.is_panorama for photo in group.photos}
     if len(panoramas) == len(job.files):
-        return panorama_rotation_fit(pairs, sizes)
-    return best_rotation_fit([pair for pair in pairs if not {pair.one, pair.other} & panoramas], sizes)
+        return panorama_rotation_fit(pairs, job.sizes)
+    return best_rotation_fit([pair for pair in pairs if not {pair.one, pair.other} & panoramas], job.sizes)
 
 
 def with_pose_only(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:

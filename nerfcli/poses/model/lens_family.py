@@ -7,7 +7,6 @@ known lens; so a perspective photo never gains by a fisheye.
 """
 
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -35,7 +34,7 @@ def as_fisheye(job: Job) -> Job | None:
     Only cameras without a model from a file or the user are tested.
     """
     groups = []
-    with closing(pycolmap.Database.open(str(job.database))) as database:
+    with pycolmap.Database.open(job.database) as database:
         for group in job.groups:
             is_open = group.choose and group.model == START_MODEL and group.params is None
             focal_px = _fisheye_focal_px(group, job, database) if is_open else None

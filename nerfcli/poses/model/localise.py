@@ -9,7 +9,6 @@ Source: 2D-3D matching as in Sattler et al. 2011 (ICCV), with the ratio test bet
 """
 
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,7 +106,7 @@ def localise(
     attempts: dict[int, Attempt] = {}
     left = sorted(image_ids)
     files = dict(zip(job.image_ids, job.files, strict=True))
-    with closing(pycolmap.Database.open(str(job.database))) as database:
+    with pycolmap.Database.open(job.database) as database:
         total = _ROUNDS * len(left)
         placed_before: list[int] = []
         for turn in range(_ROUNDS):
@@ -131,7 +130,7 @@ def localise(
                 break
             placed_before = placed_now
         report("locate", total, total)
-        pairs = read_verified_pairs(database, min_matches=FEW_MATCHES)
+    pairs = read_verified_pairs(job.database, min_matches=FEW_MATCHES)
     if any(not attempt.refused for attempt in attempts.values()):
         settle(grown, threads=job.threads, fixed=job.fixed_cameras)
     for image_id in (image_id for image_id, attempt in attempts.items() if not attempt.refused):
@@ -144,7 +143,7 @@ def localise(
 def left_out(model: pycolmap.Reconstruction, job: Job) -> list[int]:
     """Return the ids of images that a model does not place although they have enough features."""
     placed = set(model.reg_image_ids())
-    with closing(pycolmap.Database.open(str(job.database))) as database:
+    with pycolmap.Database.open(job.database) as database:
         return [
             image_id
             for image_id in job.image_ids

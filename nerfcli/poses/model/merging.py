@@ -20,7 +20,7 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.poses.input.plan import duration
 from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.projection import is_ahead, offsets_px
-from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs
+from nerfcli.poses.model.two_views import VerifiedPair, agreements, count_matches, read_verified_pairs
 
 Array = NDArray[np.float64]
 
@@ -69,9 +69,8 @@ def merge_models(
         report: called with ("merge", models done, models in all).
         tell: called with what was cut short, if anything was.
     """
-    with pycolmap.Database.open(str(database)) as opened:
-        pairs = read_verified_pairs(opened, min_matches=1)
-        tracks = _matched_keypoints(opened)
+    pairs = read_verified_pairs(database, min_matches=1)
+    tracks = _matched_keypoints(database)
     merged: list[pycolmap.Reconstruction] = []
     start = time.perf_counter()
     for number, model in enumerate(models):
@@ -197,9 +196,9 @@ def _joined(
     options.extract_colors = False
     joined = pycolmap.triangulate_points(
         joined,
-        str(database),
-        str(output),
-        str(output),
+        database,
+        output,
+        output,
         clear_points=True,
         options=options,
         refine_intrinsics=not fixed,
@@ -217,12 +216,11 @@ def _holds(joined: pycolmap.Reconstruction, first: pycolmap.Reconstruction, pair
     return matches > 0 and sum(a.matches * a.fraction for a in found) > _LEAST_AGREEMENT * matches
 
 
-def _matched_keypoints(database: pycolmap.Database) -> dict[tuple[int, int], NDArray[np.int64]]:
+def _matched_keypoints(database: Path) -> dict[tuple[int, int], NDArray[np.int64]]:
     """Return, by pair of image ids, the (matches, 2) feature numbers of the verified matches."""
-    pair_ids, counts = database.read_two_view_geometry_num_inliers()
-    tracks = {}
-    for pair_id, count in zip(pair_ids, counts, strict=True):
-        if count:
-            one, other = pycolmap.pair_id_to_image_pair(pair_id)
-            tracks[one, other] = np.asarray(database.read_two_view_geometry(one, other).inlier_matches, dtype=np.int64)
-    return tracks
+    with pycolmap.Database.open(database) as opened:
+        return {
+            (one, other): np.asarray(opened.read_two_view_geometry(one, other).inlier_matches, dtype=np.int64)
+            for one, other, count in count_matches(database)
+            if count
+        }

@@ -8,6 +8,7 @@ Letters: p, q are unit rays of a match in the two cameras; R, t the pose of the 
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -61,23 +62,27 @@ class Agreement:
         return self.fraction < 0.5
 
 
-def read_verified_pairs(database: pycolmap.Database, *, min_matches: int) -> list[VerifiedPair]:
+def count_matches(database: Path) -> list[tuple[int, int, int]]:
+    """Return (image id, image id, verified matches) of all pairs in a database, in ascending order."""
+    with pycolmap.Database.open(database) as opened:
+        pair_ids, counts = opened.read_two_view_geometry_num_inliers()
+    return sorted(
+        (*pycolmap.pair_id_to_image_pair(pair_id), count) for pair_id, count in zip(pair_ids, counts, strict=True)
+    )
+
+
+def read_verified_pairs(database: Path, *, min_matches: int) -> list[VerifiedPair]:
     """Read the pairs with at least `min_matches` verified matches, by image ids."""
-    pair_ids, counts = database.read_two_view_geometry_num_inliers()
-    keypoints: dict[int, Array] = {}
-
-    def pixels(image_id: int) -> Array:
-        if image_id not in keypoints:
-            keypoints[image_id] = np.asarray(database.read_keypoints(image_id), dtype=np.float64)[:, :2]
-        return keypoints[image_id]
-
-    pairs = []
-    for pair_id, count in sorted(zip(pair_ids, counts, strict=True)):
-        if count < min_matches:
-            continue
-        one, other = pycolmap.pair_id_to_image_pair(pair_id)
-        matches = np.asarray(database.read_two_view_geometry(one, other).inlier_matches, dtype=np.int64)
-        pairs.append(VerifiedPair(one, other, pixels(one)[matches[:, 0]], pixels(other)[matches[:, 1]]))
+    strong = [(one, other) for one, other, count in count_matches(database) if count >= min_matches]
+    with pycolmap.Database.open(database) as opened:
+        pixels = {
+            image_id: np.asarray(opened.read_keypoints(image_id), dtype=np.float64)[:, :2]
+            for image_id in {image_id for pair in strong for image_id in pair}
+        }
+        pairs = []
+        for one, other in strong:
+            matches = np.asarray(opened.read_two_view_geometry(one, other).inlier_matches, dtype=np.int64)
+            pairs.append(VerifiedPair(one, other, pixels[one][matches[:, 0]], pixels[other][matches[:, 1]]))
     return pairs
 
 
