@@ -90,10 +90,10 @@ POSES: tuple[Group, ...] = (
         "",
         (),
         (
-            Mutant("if name != stage]\n        at", "]\n        at"),
-            Mutant("at = 1 + next(", "at = next("),
-            Mutant('"merge" if "merge" in self._seconds else "map"', '"map"'),
-            Mutant("_SETTLE_FACTOR * self._plan", "self._plan"),
+            Mutant("self._planned | searches", "searches | self._planned"),
+            Mutant('"merge", "locate", "check"', '"check", "merge", "locate"'),
+            Mutant("_SECONDS_PER_LOCATED * total", "_SECONDS_PER_LOCATED * done"),
+            Mutant("_SETTLE_FACTOR * self._planned", "self._planned"),
         ),
     ),
     Group(

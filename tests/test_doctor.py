@@ -19,7 +19,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.calibration import Calibration
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.doctor import camera_motion, connectivity, consensus, coverage, inventory, quality
+from nerfcli.doctor import camera_motion, connectivity, coverage, inventory, quality
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.examination import Diagnosis, compare_all, content, estimated_seconds, examine, judged
 from nerfcli.doctor.page import page_html, refuse_foreign
@@ -344,7 +344,7 @@ def test_heights_come_back_from_differences_of_which_some_are_wrong():
     differences = np.array([truth[j] - truth[i] for i, j in pairs])
     differences[::9] += 5
     differences[4] = np.nan
-    values, backing = consensus.potentials(12, pairs, differences, trust=np.ones(len(pairs)))
+    values, backing = quality.potentials(12, pairs, differences, trust=np.ones(len(pairs)))
     np.testing.assert_allclose(values[:11], truth[:11] - np.median(truth[:11]), atol=0.1)  # squares below 0.1
     assert np.isnan(values[11])
     assert backing[11] == 0

@@ -10,8 +10,14 @@ from test_photos import NO_EXIF
 
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses.engine.retrieval import alike, likeness, promising
-from nerfcli.poses.input.pairs import EXHAUSTIVE_UP_TO, Pairing, capture_order, choose_pairs, sequential_pairs
-from nerfcli.poses.input.pairs_file import read_pairs
+from nerfcli.poses.input.pairs import (
+    EXHAUSTIVE_UP_TO,
+    Pairing,
+    capture_order,
+    choose_pairs,
+    read_pairs,
+    sequential_pairs,
+)
 from nerfcli.poses.input.photos import Photo, Photos
 from nerfcli.poses.input.plan import Plan, TimeEstimate, make_plan
 from nerfcli.poses.input.settings import PoseSettings

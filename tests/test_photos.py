@@ -11,7 +11,7 @@ from nerfcli.doctor.photo_list import find_subject
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
 from nerfcli.media.exif import Exif
 from nerfcli.poses.input.photos import Photo, camera_groups, find_photos
-from nerfcli.poses.model.reasons import NO_TRAINING_PHOTO, Evidence, dominant, reason
+from nerfcli.poses.model.reasons import NO_TRAINING_PHOTO, dominant, reason
 
 NO_EXIF = Exif(
     make=None,
@@ -156,21 +156,22 @@ def test_photos_share_a_camera_when_all_optics_and_the_size_agree():
 
 
 @pytest.mark.parametrize(
-    ("evidence", "words"),
+    ("found", "other_model_size", "words"),
     [
-        (Evidence(83, 0, None, 0, (40, 30)), "too few features (83 in 40x30 pixels)"),
-        (Evidence(4000, 12, "a.jpg", 0, (40, 30)), "matches no other photo well (best 12 verified matches)"),
-        (Evidence(4000, 41, "a.jpg", 0, (40, 30)), "rejected by the mapper (41 verified matches with a.jpg)"),
-        (Evidence(4000, 41, "a.jpg", 7, (40, 30)), "in another model of 7 photos"),
+        ((83, 0, None), 0, "too few features (83 in 40x30 pixels)"),
+        ((4000, 12, "a.jpg"), 0, "matches no other photo well (best 12 verified matches)"),
+        ((4000, 41, "a.jpg"), 0, "rejected by the mapper (41 verified matches with a.jpg)"),
+        ((4000, 41, "a.jpg"), 7, "in another model of 7 photos"),
     ],
 )
-def test_reasons(evidence: Evidence, words: str):
-    assert reason(evidence) == words
+def test_reasons(found: tuple[int, int, str | None], other_model_size: int, words: str):
+    assert reason(*found, other_model_size=other_model_size, size_px=(40, 30)) == words
 
 
 def test_the_dominant_reason_brings_its_advice():
-    few, alone = Evidence(10, 0, None, 0, (40, 30)), Evidence(4000, 3, "a", 0, (40, 30))
-    kind, advice = dominant([reason(few), reason(alone), reason(alone), "unreadable: damaged"])
+    few = reason(10, 0, None, other_model_size=0, size_px=(40, 30))
+    alone = reason(4000, 3, "a", other_model_size=0, size_px=(40, 30))
+    kind, advice = dominant([few, alone, alone, "unreadable: damaged"])
     assert kind == "matches no other photo well"
     assert "overlap" in advice
     assert "--holdout" in dominant([NO_TRAINING_PHOTO])[1]

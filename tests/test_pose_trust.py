@@ -17,7 +17,7 @@ import synthetic_captures as synthetic
 from scipy.spatial.transform import Rotation
 from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 
-from nerfcli.multiview.graph import connected_groups
+from nerfcli.multiview.graph import Bottlenecks, connected_groups, consistent_groups
 from nerfcli.poses.engine import ladder, mapping
 from nerfcli.poses.engine import second_chance as chances
 from nerfcli.poses.engine.database import register_photos
@@ -38,7 +38,6 @@ from nerfcli.poses.model import merging
 from nerfcli.poses.model.intrinsics import converted
 from nerfcli.poses.model.lens_family import as_fisheye
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs, rotation_errors
-from nerfcli.poses.model.view_graph import Bottlenecks, consistent_groups
 
 pytestmark = pytest.mark.usefixtures("_quiet")
 PLAUSIBLE = {

@@ -20,9 +20,8 @@ from nerfcli.fit.losses import distance_losses, opacity_entropy
 from nerfcli.fit.point_depth import PointRays, fading, point_depths
 from nerfcli.kernels import reference
 from nerfcli.multiview.camera_check import CameraCheck
-from nerfcli.multiview.correspondences import SharedFeatures
+from nerfcli.multiview.correspondences import SharedFeatures, chosen_pairs
 from nerfcli.multiview.tracks import Tracks, tracks_of_model
-from nerfcli.multiview.training_matches import chosen_pairs
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.loading import load_photos
 from nerfcli.photos.pool import PixelPool

@@ -15,9 +15,9 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
+from nerfcli.multiview.correspondences import MOST_PHOTOS, chosen_pairs, match
 from nerfcli.multiview.features import Matches
 from nerfcli.multiview.tracks import Tracks, indices_by_value, tracks_of_matches
-from nerfcli.multiview.training_matches import MOST_PHOTOS, chosen_pairs, match
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.runs.settings import TrainSettings

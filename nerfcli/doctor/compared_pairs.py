@@ -82,7 +82,6 @@ def compare(
     """Match two photos and analyse their matches.
 
     Args:
-        numbers: indices of the photos.
         focals_px: best known focal lengths, at the size at which features were detected.
         most_features: number of features of each photo to use, strongest first.
     """

@@ -8,7 +8,7 @@ import numpy as np
 
 from nerfcli.cameras.calibration import Calibration, Picture, calibrated
 from nerfcli.cameras.frame import Frame
-from nerfcli.doctor import connectivity, coverage, geometry, inventory, pose_agreement, quality, turntable
+from nerfcli.doctor import connectivity, coverage, geometry, inventory, pose_agreement, quality
 from nerfcli.doctor.compared_pairs import Pair, compare, focal_px
 from nerfcli.doctor.misplaced_groups import misplaced_groups, nearest_pairs
 from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, read_all
@@ -91,7 +91,7 @@ def examine(
     def on_pair(done: int) -> None:
         progress(fraction + (1 - fraction) * done / max(len(places), 1), f"pair {done} of {len(places)}")
 
-    focals = _focals(subject, facts) if calibration is None else _known_focals(subject, facts, calibration)
+    focals = _focals_px(subject, facts, calibration)
     pairs = compare_all(facts, places, focals, threads=threads, progress=on_pair)
     pairs = _second_look(facts, pairs, focals)
     return judged(subject, facts, pairs, unreadable=unreadable)
@@ -160,10 +160,15 @@ def judged(
         ("clipping", lambda: quality.clipping(photos)),
     ]
     not_checked: list[tuple[str, str]] = []
-    few = "too few pairs have enough matches"
     turning = None
+
+    def found_or_noted(name: str, finding: Finding | None) -> Finding | None:
+        if finding is None:
+            not_checked.append((name, "too few pairs have enough matches"))
+        return finding
+
     if len(photos) > 1:
-        turning = checks.run("turning object", lambda: turntable.turning_object(pairs), otherwise=None)
+        turning = checks.run("turning object", lambda: geometry.turning_object(pairs), otherwise=None)
         planned.append(("connectivity", lambda: connectivity.connectivity(photos, pairs)))
         if all(photo.is_panorama for photo in photos):
             reason = "not supported for panoramas; nerfcli poses checks that the camera moved"
@@ -171,8 +176,8 @@ def judged(
         elif turning is None:
             planned += [
                 ("moving content", lambda: geometry.moving_content(photos, pairs)),
-                ("movement", lambda: _or_not_checked("movement", geometry.movement(photos, pairs), few, not_checked)),
-                ("depth relief", lambda: _or_not_checked("depth relief", geometry.flatness(pairs), few, not_checked)),
+                ("movement", lambda: found_or_noted("movement", geometry.movement(photos, pairs))),
+                ("depth relief", lambda: found_or_noted("depth relief", geometry.flatness(pairs))),
             ]
         else:
             planned.append(("turning object", lambda: turning))
@@ -190,18 +195,15 @@ def judged(
         # The background does not turn with the object, so its matches say nothing about the poses.
         compared = pairs if turning is None else []
         errors = checks.run("epipolar errors", lambda: pair_errors(frames, photos, compared), otherwise=[])
-        found += [
-            checks.run("spread of cameras", lambda: coverage.spread(of_scene), otherwise=None),
-            checks.run("directions", lambda: coverage.directions(of_scene), otherwise=None),
-            checks.run("points", lambda: coverage.points(of_scene), otherwise=None),
-            checks.run("intrinsics", lambda: coverage.intrinsics(of_scene), otherwise=None),
-            checks.run(
-                "poses",
-                lambda: _or_not_checked("poses", pose_agreement.agreement(photos, errors), few, not_checked),
-                otherwise=None,
-            ),
-            checks.run("places", lambda: misplaced_groups(frames, photos, errors, pairs), otherwise=None),
+        planned = [
+            ("spread of cameras", lambda: coverage.spread(of_scene)),
+            ("directions", lambda: coverage.directions(of_scene)),
+            ("points", lambda: coverage.points(of_scene)),
+            ("intrinsics", lambda: coverage.intrinsics(of_scene)),
+            ("poses", lambda: found_or_noted("poses", pose_agreement.agreement(photos, errors))),
+            ("places", lambda: misplaced_groups(frames, photos, errors, pairs)),
         ]
+        found += [checks.run(name, compute, otherwise=None) for name, compute in planned]
         found += checks.run("files of the scene", lambda: coverage.belongings(of_scene), otherwise=[])
     not_checked += [(name, f"could not be computed: {why}") for name, why in checks.not_computed.items()]
     findings = tuple(finding for finding in found if finding is not None)
@@ -212,40 +214,25 @@ def _focal_length(subject: ExaminedCapture, photos: Sequence[PhotoFacts]) -> Fin
     return inventory.focal_length(photos) if subject.scene is None else coverage.focal_lengths(subject.scene)
 
 
-def _or_not_checked(
-    name: str, finding: Finding | None, reason: str, not_checked: list[tuple[str, str]]
-) -> Finding | None:
-    if finding is None:
-        not_checked.append((name, reason))
-    return finding
-
-
 def _frames(scene: Scene, photos: Sequence[PhotoFacts]) -> list[Frame]:
     """Return the frames of the readable photos, in their order."""
     by_name = {frame.name: frame for frame in scene.frames}
     return [by_name[photo.name] for photo in photos]
 
 
-def _focals(subject: ExaminedCapture, photos: Sequence[PhotoFacts]) -> list[float]:
-    """Return focal lengths at the feature-detection size, from the scene's cameras, EXIF, or a typical value."""
-    cameras = {} if subject.scene is None else {frame.name: frame.camera for frame in subject.scene.frames}
-    focals = []
-    for photo in photos:
-        camera = cameras.get(photo.name)
-        if camera is None:
-            focals.append(focal_px(photo.features, photo.exif))
-        else:
-            focals.append(camera.focal_px * max(photo.features.size) / max(camera.width, camera.height))
-    return focals
-
-
-def _known_focals(subject: ExaminedCapture, photos: Sequence[PhotoFacts], calibration: Calibration) -> list[float]:
-    """Return focal lengths at the feature-detection size, from an intrinsics file."""
-    paths = {source.name: source.path for source in subject.sources}
-    pictures = [
-        Picture(paths[photo.name], photo.exif.width, photo.exif.height, photo.exif.orientation or 1) for photo in photos
-    ]
-    cameras = [found.camera for found in calibrated(calibration, pictures)]
+def _focals_px(subject: ExaminedCapture, photos: Sequence[PhotoFacts], calibration: Calibration | None) -> list[float]:
+    """Return focal lengths at the feature-detection size, of the given or the scene's cameras, else by `focal_px`."""
+    if calibration is not None:
+        paths = {source.name: source.path for source in subject.sources}
+        pictures = [
+            Picture(paths[photo.name], photo.exif.width, photo.exif.height, photo.exif.orientation or 1)
+            for photo in photos
+        ]
+        cameras = [found.camera for found in calibrated(calibration, pictures)]
+    elif subject.scene is not None:
+        cameras = [frame.camera for frame in _frames(subject.scene, photos)]
+    else:
+        return [focal_px(photo.features, photo.exif) for photo in photos]
     return [
         camera.focal_px * max(photo.features.size) / max(camera.width, camera.height)
         for photo, camera in zip(photos, cameras, strict=True)

@@ -1,6 +1,7 @@
 """Check from pairs, without poses: does the camera move enough for depth, is the scene flat, does anything move?"""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.moving import Patch
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, worst
+from nerfcli.multiview.stationary import LEAST_FRACTION, together
 
 # Baseline over depth: 0.1 is an angle of 6 degrees between two rays to the same point.
 BASELINE_LOOK, BASELINE_BAD = 0.08, 0.03
@@ -114,6 +116,28 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
         "look from 1 photo, bad from half of them",
         advice if moving_photos else "",
         tuple((name, what) for _, name, what in sorted(moving_photos, reverse=True)),
+    )
+
+
+def turning_object(pairs: Sequence[Pair]) -> Finding | None:
+    """Return a finding if an object turns in front of a static background, else None.
+
+    In such a capture the camera stood still, so the other checks of movement between pairs do not apply.
+    """
+    motions = together([(pair.first, pair.second, pair.motions) for pair in pairs if pair.motions is not None])
+    others = sum(pair.linked and pair.motions is None for pair in pairs)
+    motions = replace(motions, moved=motions.moved + others)
+    if not motions.found:
+        return None
+    return Finding(
+        "turning object",
+        LOOK,
+        f"an object moves in front of a static background, as on a turntable: {motions.two} of "
+        f"{motions.two + motions.still + motions.moved} pairs show both motions",
+        motions.fraction,
+        f"look if {100 * LEAST_FRACTION:g} % of the pairs with a moving object also show a static background",
+        "nerfcli poses creates masks of the object and uses only its motion; if it finds none, give --masks that are "
+        "white on the object, or use a plain cloth as background",
     )
 
 

@@ -48,12 +48,7 @@ def misplaced_groups(
     """Check whether groups of photos match each other, but none of their neighbours; None where this tells nothing.
 
     It tells nothing if neighbours in the rest of the capture often do not match, either, or if all cameras are wrong.
-
-    Args:
-        frames: the camera and pose of each photo.
-        photos: in the same order.
-        errors: of the linked pairs.
-        pairs: all pairs that were compared.
+    `errors` are those of the linked pairs, `pairs` all pairs that were compared.
     """
     usual_px, measured = usual(errors, len(photos))
     if not measured or usual_px >= USUAL_BAD_PX:

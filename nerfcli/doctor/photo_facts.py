@@ -87,11 +87,9 @@ class Source:
 def read_all(
     sources: Sequence[Source], *, threads: int, progress: Callable[[int], None]
 ) -> tuple[list[PhotoFacts], dict[str, str]]:
-    """Measure all photos, in order; also return the reasons for unreadable ones, by name.
+    """Measure all photos, in order, each thread with one at full size in memory; also return why others are unreadable.
 
-    Args:
-        threads: photos read at a time, each at full size in memory.
-        progress: called with the number of photos read.
+    The reasons are by name; `progress` receives the number of photos read.
     """
     facts: list[PhotoFacts] = []
     unreadable: dict[str, str] = {}

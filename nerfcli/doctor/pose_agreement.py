@@ -66,12 +66,7 @@ def pair_errors(frames: Sequence[Frame], photos: Sequence[PhotoFacts], pairs: Se
     """Measure how well the matches of each linked pair fit the poses.
 
     An error is at most the distance by which the pose moves the point in the picture, so pairs with little parallax
-    have small errors, however uncertain the direction of their baseline is.
-
-    Args:
-        frames: the camera and pose of each photo.
-        photos: in the same order.
-        pairs: their compared pairs.
+    have small errors, however uncertain the direction of their baseline is. `frames` are in the order of `photos`.
     """
     found = []
     for pair in pairs:
@@ -112,11 +107,6 @@ def contradicting(errors: Sequence[PairError], count: int, *, limit_px: float) -
 
     The photo with the largest fraction of such pairs is removed first, so that a wrong pose does not accuse its
     neighbours.
-
-    Args:
-        errors: of the pairs.
-        count: number of photos.
-        limit_px: errors above it contradict the poses.
     """
     left, named = list(errors), []
     while True:

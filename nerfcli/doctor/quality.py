@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerfcli.doctor.compared_pairs import Pair
-from nerfcli.doctor.consensus import potentials
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_above, verdict_below, worst
+from nerfcli.multiview.graph import connected_groups
 
 # log2 of the detail that a photo lacks relative to the others: a Gaussian blur of about 0.8 px takes 0.3 from a sharp
 # photo of 1600 px, one of 1.5 px takes 0.7.
@@ -26,6 +26,10 @@ STOPS_LOOK, STOPS_BAD = 1.0, 2.5
 _BALANCE_LOOK, _BALANCE_BAD = 0.5, 1.5
 CLIPPED_LOOK, CLIPPED_BAD = 0.1, 0.5
 _DARK, _VERY_DARK = 0.15, 0.05
+# Of `potentials`.
+_ROUNDS = 10
+# Differences between photos are off by about this much; larger residuals weigh less.
+_TYPICAL_ERROR = 0.1
 
 
 def lacking_detail(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> np.ndarray:
@@ -210,3 +214,46 @@ def clipping(photos: Sequence[PhotoFacts]) -> Finding:
         else "",
         tuple((name, what) for _, name, what in sorted(flagged, key=lambda item: -item[0])),
     )
+
+
+def potentials(
+    count: int, pairs: Sequence[tuple[int, int]], differences: np.ndarray, *, trust: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate a number v per photo such that v_j - v_i fits the differences (weighted least absolute deviations), as
+    heights are found in a levelling survey.
+
+    In each connected group of photos v is determined up to a constant, which makes its median 0.
+
+    Args:
+        count: number of photos.
+        pairs: (i, j) of each difference.
+        differences: (len(pairs),) second minus first; NaN where unknown.
+        trust: (len(pairs),) positive weights.
+
+    Returns:
+        v (count,), NaN for photos without a known difference; and the number of known differences of each photo.
+    """
+    measured = ~np.isnan(differences)
+    i, j = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)[measured].T
+    differences, trust = differences[measured], trust[measured]
+    backing = np.bincount(np.concatenate([i, j]), minlength=count)
+    values = np.zeros(count)
+    weights = trust / max(trust.mean(), 1e-9) if len(trust) else trust
+    for _ in range(_ROUNDS):
+        laplacian = np.zeros((count, count))
+        np.add.at(laplacian, (i, i), weights)
+        np.add.at(laplacian, (j, j), weights)
+        np.add.at(laplacian, (i, j), -weights)
+        np.add.at(laplacian, (j, i), -weights)
+        right = np.bincount(j, weights * differences, minlength=count)
+        right -= np.bincount(i, weights * differences, minlength=count)
+        # A slight pull to 0 fixes the constant of each connected group.
+        values = np.linalg.solve(laplacian + 1e-6 * np.eye(count), right)
+        residuals = np.abs(values[j] - values[i] - differences)
+        weights = trust / trust.mean() / np.maximum(residuals, _TYPICAL_ERROR) if len(trust) else trust
+    values[backing == 0] = np.nan
+    for members in connected_groups(range(count), zip(i.tolist(), j.tolist(), strict=True)):
+        backed = [member for member in members if backing[member]]
+        if backed:
+            values[backed] -= np.median(values[backed])
+    return values, backing

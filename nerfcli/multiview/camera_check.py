@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.cameras.lens_change import FOCAL, changeable, changed
+from nerfcli.multiview.correspondences import radians_per_pixel
 from nerfcli.multiview.features import Matches
-from nerfcli.multiview.training_matches import radians_per_pixel
 from nerfcli.photos.loading import LoadedPhoto
 
 # Logarithms of factors of the focal length: the limit and the two step sizes of the search. A wrong unit or crop is off
@@ -51,11 +51,7 @@ def check_cameras(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> 
     """Check cameras against matches; None where there are too few.
 
     The factor minimises the sum of log(1 + (miss / MISS_PX)^2) over all matches. Its error comes from a jackknife over
-    photos, because a wrong pose moves all matches of a photo alike.
-
-    Args:
-        photos: the training photos.
-        matched: their matches, of which some may be wrong.
+    photos, because a wrong pose moves all matches of a photo alike. Some of the matches may be wrong.
     """
     usable = [
         matches

@@ -1,27 +1,37 @@
-"""Correspondences between training photos, computed on first use."""
+"""Features that training photos have in common, and points that they see, computed on first use.
+
+They show the geometry of a capture before any training: where surfaces are, and whether the focal lengths are right.
+"""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 
-from nerfcli.multiview.features import Matches
+import cv2
+import numpy as np
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.layout import centres_of, views_of
+from nerfcli.multiview.features import Features, Matches, find_features, mutual_matches
 from nerfcli.multiview.tracks import Tracks, tracks_of_matches, tracks_of_model
-from nerfcli.multiview.training_matches import LONGER_SIDE_PX, chosen_pairs, match
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.scene import Scene
 
 # Time on one thread to find and match features, per pixel of the photos that are searched: 0.5 to 0.8 us were measured.
 # It only serves to decide whether there is enough time.
 SECONDS_PER_PIXEL = 0.7e-6
+# Photos are reduced to this longer side to find features, so that it takes seconds.
+LONGER_SIDE_PX = 600
+MOST_FEATURES = 1500
+# Number of evenly chosen photos that are compared with others, and the ranks of these others by distance among the
+# photos that look about the same way. Near ones have the most in common, far ones constrain the geometry the most.
+MOST_PHOTOS = 16
+PARTNERS = (1, 3, 9)
+SAME_WAY_COS = np.cos(np.radians(40.0))
 
 
 class SharedFeatures:
-    """Features and 3D points shared by training photos.
-
-    Args:
-        scene: may have a COLMAP model.
-        photos: the training photos.
-        threads: number of threads that find and match features.
-    """
+    """Features and 3D points shared by training photos; the scene may have a COLMAP model."""
 
     def __init__(self, scene: Scene, photos: Sequence[LoadedPhoto], *, threads: int):
         self._scene, self._photos, self._threads = scene, photos, threads
@@ -55,3 +65,50 @@ class SharedFeatures:
     def tracks(self) -> Tracks:
         """Tracks from structure from motion, or from matched features where there are none."""
         return self.of_model if self.of_model.count else self.of_matches
+
+
+def match(photos: Sequence[LoadedPhoto], *, threads: int) -> tuple[Matches, ...]:
+    """Match the features of `chosen_pairs`; return the pairs that have matches."""
+    pairs = chosen_pairs(photos)
+    wanted = sorted({index for pair in pairs for index in pair})
+    own_threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # each thread processes a photo: no more threads than requested
+    try:
+        with ThreadPoolExecutor(max(1, threads)) as pool:
+            features = dict(zip(wanted, pool.map(lambda index: _features(photos[index]), wanted), strict=True))
+            found = pool.map(lambda pair: _in_common(pair, (features[pair[0]], features[pair[1]])), pairs)
+            return tuple(matches for matches in found if len(matches.pixels[0]))
+    finally:
+        cv2.setNumThreads(own_threads)
+
+
+def chosen_pairs(photos: Sequence[LoadedPhoto]) -> list[tuple[int, int]]:
+    """Return pairs of photos that look about the same way from different places."""
+    frames = [photo.frame for photo in photos]
+    centres, views = centres_of(frames), views_of(frames)
+    pairs: set[tuple[int, int]] = set()
+    for index in np.unique(np.linspace(0, len(frames) - 1, MOST_PHOTOS).round().astype(int)):
+        baselines = np.linalg.norm(centres - centres[index], axis=1)
+        candidates = np.flatnonzero((views @ views[index] > SAME_WAY_COS) & (baselines > 0))
+        candidates = candidates[np.argsort(baselines[candidates], kind="stable")]
+        for place in PARTNERS:
+            if place <= len(candidates):
+                other = int(candidates[place - 1])
+                pairs.add((min(int(index), other), max(int(index), other)))
+    return sorted(pairs)
+
+
+def _features(photo: LoadedPhoto) -> Features:
+    grey = cv2.cvtColor(np.ascontiguousarray(photo.pixels[..., :3]), cv2.COLOR_RGB2GRAY)
+    return find_features(grey, longer_side_px=LONGER_SIDE_PX, most=MOST_FEATURES, used=photo.used)
+
+
+def _in_common(pair: tuple[int, int], features: tuple[Features, Features]) -> Matches:
+    one, other = features
+    a, b = mutual_matches(one.descriptors, other.descriptors)
+    return Matches(pair, (one.pixels[a], other.pixels[b]))
+
+
+def radians_per_pixel(camera: Camera) -> float:
+    """Return the angle of a pixel at the size used for feature extraction."""
+    return float(np.radians(max(camera.fov_deg))) / min(LONGER_SIDE_PX, max(camera.width, camera.height))

@@ -29,14 +29,7 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
     """Estimate the logarithms (P, 3) of the gains of photos in linear light, per channel, with mean 0.
 
     The log ratio of a pair is the median over its common pixels. Differences between log gains fit these log ratios by
-    least absolute errors.
-
-    Args:
-        photos: photos with pixels in sRGB.
-        dense: the dense depths of each photo.
-
-    Returns:
-        The log gains; NaN for photos that share too little with the others to be compared.
+    least absolute errors. NaN for photos that share too little with the others to be compared.
     """
     levels = [np.ascontiguousarray(photo.pixels[..., :3]) for photo in photos]
     around = [cv2.blur(pixels, (WINDOW_PX, WINDOW_PX)).astype(np.float64) / 255.0 for pixels in levels]

@@ -1,10 +1,17 @@
-"""Photos as a graph: groups that are connected by joins."""
+"""Photos as a graph: groups that are connected by joins, and the strength of their connections.
+
+The strength of the join of two photos is the number of their matches. A chain of joins is as strong as its weakest
+join; the bottleneck of two photos is the strongest chain between them.
+"""
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+
+Join = tuple[int, int, float]
 
 
 def connected_groups(photos: Sequence[int], joins: Iterable[tuple[int, int]]) -> list[list[int]]:
@@ -21,3 +28,68 @@ def connected_groups(photos: Sequence[int], joins: Iterable[tuple[int, int]]) ->
     for photo, label in zip(photos, connected_components(graph, directed=False)[1].tolist(), strict=True):
         groups.setdefault(label, []).append(photo)
     return sorted(groups.values(), key=lambda group: (-len(group), index[group[0]]))
+
+
+class Bottlenecks:
+    """Strengths of the strongest chains between photos, along given joins (photo, photo, strength)."""
+
+    def __init__(self, photos: Sequence[int], joins: Iterable[Join]) -> None:
+        self._index = {photo: index for index, photo in enumerate(photos)}
+        self._strengths: NDArray[np.float64] = np.zeros((len(photos), len(photos)))
+        groups = [[index] for index in range(len(photos))]
+        # Kruskal's maximum spanning tree: the join that first brings two groups together is their bottleneck.
+        for one, other, strength in sorted(joins, key=lambda join: -join[2]):
+            first, second = groups[self._index[one]], groups[self._index[other]]
+            if first is second:
+                continue
+            self._strengths[np.ix_(first, second)] = strength
+            self._strengths[np.ix_(second, first)] = strength
+            first.extend(second)
+            for index in second:
+                groups[index] = first
+
+    def between(self, one: int, other: int) -> float:
+        """Return the strength of the strongest chain between two photos, 0 without any."""
+        return float(self._strengths[self._index[one], self._index[other]])
+
+
+def consistent_groups(photos: Sequence[int], joins: Iterable[Join]) -> list[list[int]]:
+    """Divide photos into groups that are consistent with the strongest evidence.
+
+    Joins with a strength above 0 put photos in one group, those below 0 keep them apart. The stronger join wins: in the
+    order of absolute strength, a positive join merges two groups unless a stronger negative one keeps them apart.
+
+    Args:
+        photos: any numbers.
+        joins: (photo, photo, strength), of these photos.
+
+    Returns:
+        The groups, the largest first, each in the order of `photos`.
+
+    Example:
+        >>> consistent_groups([1, 2, 3, 4], [(1, 2, 9.0), (3, 4, 9.0), (2, 3, 5.0), (1, 4, -6.0)])
+        [[1, 2], [3, 4]]
+
+    Source: mutex watershed, Wolf et al. 2019, The Mutex Watershed and its Objective, arXiv:1904.12654, algorithm 1.
+    """
+    group_of = {photo: photo for photo in photos}
+    members = {photo: [photo] for photo in photos}
+    apart: dict[int, set[int]] = {photo: set() for photo in photos}
+    for one, other, strength in sorted(joins, key=lambda join: -abs(join[2])):
+        first, second = group_of[one], group_of[other]
+        if first == second or strength == 0:
+            continue
+        if strength < 0:
+            apart[first].add(second)
+            apart[second].add(first)
+        elif second not in apart[first]:
+            for photo in members[second]:
+                group_of[photo] = first
+            members[first].extend(members.pop(second))
+            for third in apart.pop(second):
+                apart[third].remove(second)
+                apart[third].add(first)
+                apart[first].add(third)
+    order = {photo: index for index, photo in enumerate(photos)}
+    groups = [sorted(group, key=order.__getitem__) for group in members.values()]
+    return sorted(groups, key=lambda group: (-len(group), order[group[0]]))

@@ -108,7 +108,6 @@ def dense_depths(
     the faces of a cube, each like a photo.
 
     Args:
-        photos: the training photos.
         tracks: sparse points, which determine the neighbours and the range of depths.
         longer_side_px: longer side of the pictures that are matched.
         threads: number of photos processed at a time.

@@ -42,10 +42,6 @@ def triangulate(frames: Sequence[Frame], tracks: Tracks) -> Surface:
 
     For two rays at an angle a, the least eigenvalue of the matrix is 1 - cos a; below that of `LEAST_ANGLE_RAD`, the
     distance is not known. Accuracy: a few per cent of the distance at worst, except for a few points that are wrong.
-
-    Args:
-        frames: frames of the photos.
-        tracks: their sightings.
     """
     centres = np.array([frame.centre for frame in frames])
     middle = centres.mean(axis=0)  # far from the origin of GPS coordinates, rounding would cost digits

@@ -10,7 +10,7 @@ import nerfcli
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.poses.input.photos import MIN_PHOTOS, Photos
 from nerfcli.poses.input.settings import PoseSettings
-from nerfcli.poses.model.reasons import Evidence, dominant, reason
+from nerfcli.poses.model.reasons import dominant, reason
 
 # Fraction of all photos outside the largest part, above which the refusal blames the disconnected parts.
 _MUCH_APART = 0.3
@@ -98,8 +98,9 @@ def make_report(
         else:
             elsewhere = max((len(model) for model in models[1:] if number in model), default=0)
             size_px = photo.exif.width, photo.exif.height
-            evidence = Evidence(**result["evidence"][number], other_model_size=elsewhere, size_px=size_px)
-            why = result["left_out"].get(str(number)) or reason(evidence)
+            why = result["left_out"].get(str(number)) or reason(
+                **result["evidence"][number], other_model_size=elsewhere, size_px=size_px
+            )
             images[name] = ImageReport(name, False, why, orientation)
     return PosesReport(
         registered=len(models[0]) if models else 0,
@@ -120,7 +121,10 @@ def make_report(
         parts=tuple(result["parts"]),
         intrinsics=intrinsics,
         strict=result.get("strict"),
-        components=tuple(_with_names(component, photos) for component in result["components"]),
+        components=tuple(
+            {**component, "photos": [photos.names[number] for number in component["photos"]]}
+            for component in result["components"]
+        ),
         not_computed=result["not_computed"],
         not_finite=result["not_finite"],
         moving_foreground=result.get("moving_foreground"),
@@ -167,10 +171,6 @@ def closing_notes(report: PosesReport) -> list[str]:
     for check, why in report.not_computed.items():
         notes.append(f"could not compute a check ({check}): {why}")
     return notes
-
-
-def _with_names(component: Mapping[str, Any], photos: Photos) -> dict[str, Any]:
-    return {**component, "photos": [photos.names[number] for number in component["photos"]]}
 
 
 def _blur_summary(images: Iterable[ImageReport]) -> dict[str, Any] | None:

@@ -23,8 +23,7 @@ from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
 from nerfcli.poses.engine.turntable import MASKS, advised
 from nerfcli.poses.input.job import Job, write_job
 from nerfcli.poses.input.masks import lay_out_masks
-from nerfcli.poses.input.pairs import Pairing, choose_pairs
-from nerfcli.poses.input.pairs_file import read_pairs
+from nerfcli.poses.input.pairs import Pairing, choose_pairs, read_pairs
 from nerfcli.poses.input.photos import Photos, find_photos
 from nerfcli.poses.input.plan import Plan, make_plan
 from nerfcli.poses.input.settings import Limits, PoseSettings, check_settings, for_panoramas
@@ -54,16 +53,12 @@ def estimate_poses(
     complete or not, is reused: only steps that depend on changed photos or settings are repeated.
 
     Args:
-        photos_dir: the folder with the photos.
-        scene_dir: the folder to write.
-        settings: see `PoseSettings`.
         notify: receives messages for the user, one sentence at a time.
         progress: receives (stage, done, total); the stages are "read", "extract", "enlarge" where photos have few
             features, "faint" and "faint-enlarged" where these still have very few, "features" (per photo, of those
             requested), "pair" where look-alikes are searched for, "match", "map", "merge" where the mapper leaves
             several models, "locate" where single photos are left, "check", "stabilise" where the poses are accepted,
             and "settle" where each photo gets a principal point of its own, in this order.
-        limits: see `Limits`.
         planned: receives the plan before the long work starts.
         given: known intrinsics, if any.
 

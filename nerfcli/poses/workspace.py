@@ -56,12 +56,8 @@ def is_under_construction(scene_dir: Path) -> bool:
 def publish(scene_dir: Path, describe: Callable[[], None], *, keep_models: bool) -> None:
     """Copy the worker's model into the scene; then `describe` writes the report and, last, scene.json.
 
-    Until then the folder is not a scene, and another call continues from the complete model.
-
-    Args:
-        scene_dir: the scene's folder.
-        describe: writes the report and scene.json.
-        keep_models: whether the mapped models stay in the work folder, for another --component later.
+    Until then the folder is not a scene, and another call continues from the complete model. With `keep_models`, the
+    mapped models stay in the work folder, for another --component later.
     """
     work = scene_dir / "work"
     (scene_dir / SCENE_FILE).unlink(missing_ok=True)

@@ -25,6 +25,7 @@ from nerfcli.poses.input.plan import duration, extraction_seconds, mapping_secon
 from nerfcli.poses.input.settings import FULL_SIZE
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model.intrinsics import field_of_view_deg
+from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.lens_family import as_fisheye
 from nerfcli.poses.model.localise import left_out, localise
 from nerfcli.poses.model.merging import merge_models
@@ -64,8 +65,8 @@ class _Ladder:
     def __init__(self, job: Job, report: Report, tell: Tell) -> None:
         self.best = MappedModels([], job, [])
         self.rungs: list[dict[str, Any]] = []
-        self._report = report
-        self._tell = tell
+        self.report = report
+        self.tell = tell
         self._photos = len(job.files)
         self._results_reported = 0
         self._announced = ""
@@ -86,7 +87,7 @@ class _Ladder:
         self.tell_results()
         if what != self._announced:
             longer = f" (takes about {takes:.1f} times as long as the first features and matches)" if takes else ""
-            self._tell(f"next: {what}{longer}")
+            self.tell(f"next: {what}{longer}")
         self._announced = what
 
     def tell_results(self) -> None:
@@ -94,14 +95,14 @@ class _Ladder:
         for rung in self.rungs[self._results_reported :]:
             largest, *others = rung["models"] or ["none"]
             also = f" (and {len(others)} smaller models)" if len(others) > 1 else f" + {others[0]}" if others else ""
-            self._tell(f"{rung['what']}: {largest}{also} of {self._photos} photos registered")
+            self.tell(f"{rung['what']}: {largest}{also} of {self._photos} photos registered")
         self._results_reported = len(self.rungs)
 
     def attempt(self, what: str, job: Job, start: MapperOptions) -> None:
         """Map once; the result counts if it places more photos than the best so far."""
-        if self.rungs and not self.has_time():
-            return
         if self.rungs:
+            if not self.has_time():
+                return
             self.announce(what)
         number = len(self.rungs)
         models = self._map(what, job, start)
@@ -116,7 +117,7 @@ class _Ladder:
                 threads=job.threads,
                 fixed=job.fixed_cameras,
                 seconds=mapper_limit_seconds(self._photos),
-                report=self._report,
+                report=self.report,
                 tell=self._cut,
             )
             if _placed(merged) > _placed(models):
@@ -132,11 +133,11 @@ class _Ladder:
 
     def is_wide(self) -> bool:
         """Return whether a camera of the best model has such a wide field of view that it may be a fisheye."""
-        if not self.best.models:
-            return False
-        model = self.best.models[0]
-        cameras = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
-        return any(field_of_view_deg(model.camera(camera_id)) > _WIDE_DEG for camera_id in cameras)
+        return any(
+            field_of_view_deg(model.camera(camera_id)) > _WIDE_DEG
+            for model in self.best.models[:1]
+            for camera_id in set(lenses_of(model).values())
+        )
 
     def go_on(self, what: str, start: MapperOptions) -> None:
         """Try to extend the best model to the remaining photos."""
@@ -148,8 +149,9 @@ class _Ladder:
         if grown:
             self._take(what, [grown[0], *models[1:]], job)
 
-    def find_left_out(self, what: str) -> None:
+    def find_left_out(self) -> None:
         """Locate remaining photos one by one from the 3D points they see."""
+        what = "remaining photos one by one, from the 3D points they see"
         models, job = self.best.models, self.best.job
         if not models:
             return
@@ -157,7 +159,7 @@ class _Ladder:
         if not 0 < len(left) <= _MOST_SINGLE_PHOTOS:
             return
         self.announce(what)
-        grown, attempts = localise(models[0], job, image_ids=left, report=self._report)
+        grown, attempts = localise(models[0], job, image_ids=left, report=self.report)
         placed = tuple(attempt.image_id for attempt in attempts if not attempt.refused)
         names = dict(zip(job.image_ids, job.names, strict=True))
         found = [{"name": names[one.image_id], **asdict(one)} for one in attempts]
@@ -169,9 +171,14 @@ class _Ladder:
 
     def match(self, job: Job, pairs: Sequence[tuple[int, int]]) -> None:
         """Match pairs of photos, and remember if that was cut short."""
-        unmatched = match(job, pairs, self._report)
+        unmatched = match(job, pairs, self.report)
         if unmatched is not None:
             self._cut(unmatched)
+
+    def verify(self, job: Job) -> None:
+        """Verify the matches of a job again, as far as they were verified with other lenses."""
+        register_photos(job)
+        self.match(job, job.pairs)
 
     def result(self) -> MappedModels:
         """Return the best models with the record of all attempts."""
@@ -181,13 +188,13 @@ class _Ladder:
         self, what: str, job: Job, start: MapperOptions, *, base: pycolmap.Reconstruction | None = None
     ) -> list[pycolmap.Reconstruction]:
         most, began = mapper_limit_seconds(self._photos), time.perf_counter()
-        models = map_photos(job, self._report, attempt=len(self.rungs), start=start, base=base)
+        models = map_photos(job, self.report, attempt=len(self.rungs), start=start, base=base)
         if time.perf_counter() - began > most:
             self._cut(f"{what}: stopped after {duration(most)}, longer than most captures take")
         return models
 
     def _cut(self, what: str) -> None:
-        self._tell(f"cut short: {what}")
+        self.tell(f"cut short: {what}")
         self._cut_short.append(what)
 
     def _take(self, what: str, models: list[pycolmap.Reconstruction], job: Job) -> None:
@@ -221,9 +228,9 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> MappedMod
         ladder.tell_results()
         tell("not trying anything else: the camera turned on the spot")
         return ladder.result()
-    job = _without_exif(ladder, job, report, tell, fraction=ladder.fraction(featured))
-    job = _with_fisheye(ladder, job, report, fraction=ladder.fraction(featured))
-    _other_starts(ladder, job, tell)
+    job = _without_exif(ladder, job, fraction=ladder.fraction(featured))
+    job = _with_fisheye(ladder, job, fraction=ladder.fraction(featured))
+    _other_starts(ladder, job)
     compared = set(job.pairs)
     few_more = 0 < math.comb(len(job.files), 2) - len(compared) <= _MOST_PAIRS
     if few_more and ladder.fraction(featured) < _GOOD_FRACTION and ladder.has_time():
@@ -232,8 +239,8 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> MappedMod
         ladder.match(job, rest)
         ladder.attempt("match all pairs", job, SMALLER_BASELINE)
     if _can_have_more_features(job) and ladder.fraction(featured) < _FEW_FRACTION and ladder.has_time():
-        _with_more_features(ladder, job, report, tell, missing=1 - ladder.fraction(featured))
-    ladder.find_left_out("remaining photos one by one, from the 3D points they see")
+        _with_more_features(ladder, job, missing=1 - ladder.fraction(featured))
+    ladder.find_left_out()
     if len(ladder.rungs) > 1:
         ladder.tell_results()
     _tell_of_exif(given, ladder.best, tell)
@@ -262,7 +269,7 @@ def _only_turns(job: Job) -> bool:
     return turn is not None and turn.explains_all
 
 
-def _with_more_features(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, missing: float) -> None:
+def _with_more_features(ladder: _Ladder, job: Job, *, missing: float) -> None:
     """Search larger pictures for more features, within a time that grows with the fraction of missing photos."""
     longest = max(max(group.width, group.height) for group in job.groups)
     more = replace(job, rung="full-size", max_features=_MORE_FEATURES, pairs=all_pairs(len(job.files)))
@@ -275,11 +282,11 @@ def _with_more_features(ladder: _Ladder, job: Job, report: Report, tell: Tell, *
     what = "more features from full-size photos" if fraction == 1 else f"more features from photos of {size} pixels"
     more = replace(more, max_image_size=FULL_SIZE if fraction == 1 else size)
     ladder.announce(what, takes=_search_seconds(more) / so_far)
-    extract(more, report)
+    extract(more, ladder.report)
     start_matching(more, more.pairs)
     ladder.match(more, more.pairs)
     ladder.attempt(what, more, MapperOptions())
-    _other_starts(ladder, more, tell)
+    _other_starts(ladder, more)
 
 
 def _search_seconds(job: Job) -> float:
@@ -289,13 +296,13 @@ def _search_seconds(job: Job) -> float:
     return features + matching_seconds(len(job.pairs), max_features=job.max_features)
 
 
-def _other_starts(ladder: _Ladder, job: Job, tell: Tell) -> None:
+def _other_starts(ladder: _Ladder, job: Job) -> None:
     """Try other ways to start, until nearly all photos that are connected by matches are placed."""
     candidates = len(connected_groups(job.image_ids, [pair[:2] for pair in _strong_pairs(job)])[0])
     if len(job.files) >= _MANY_PHOTOS and _FEW_FRACTION <= ladder.fraction(candidates) < _GOOD_FRACTION:
         ladder.tell_results()
         takes = duration(mapping_seconds(len(job.files)))
-        tell(f"not trying other starts, which take about {takes} each: most photos are registered")
+        ladder.tell(f"not trying other starts, which take about {takes} each: most photos are registered")
         ladder.go_on("lower angles", LOW_ANGLES)
         return
     steps: list[Callable[[], None]] = [
@@ -310,25 +317,23 @@ def _other_starts(ladder: _Ladder, job: Job, tell: Tell) -> None:
         step()
 
 
-def _without_exif(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, fraction: float) -> Job:
+def _without_exif(ladder: _Ladder, job: Job, *, fraction: float) -> Job:
     """Map without EXIF's focal lengths if few photos are placed with them; return the job of the better result."""
     bare = replace(job, groups=tuple(group.without_exif() for group in job.groups))
     if fraction >= _LITTLE_FRACTION or bare.groups == job.groups or not ladder.has_time():
         return job
     what = "without EXIF's focal length"
     ladder.announce(what)
-    register_photos(bare)  # removes what was verified with the other focal length
-    ladder.match(bare, bare.pairs)
-    bare = with_focal_lengths(bare, tell)
+    ladder.verify(bare)
+    bare = with_focal_lengths(bare, ladder.tell)
     ladder.attempt(what, bare, MapperOptions())
-    if ladder.best.job is bare:
-        return bare
-    register_photos(job)
-    ladder.match(job, job.pairs)
-    return job
+    if ladder.best.job is not bare:
+        ladder.verify(job)
+        return job
+    return bare
 
 
-def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, fraction: float) -> Job:
+def _with_fisheye(ladder: _Ladder, job: Job, *, fraction: float) -> Job:
     """Map from a fisheye if the result suggests it and pairs of photos confirm it; return the better result's job."""
     if fraction >= _GOOD_FRACTION and not ladder.is_wide():
         return job
@@ -336,14 +341,12 @@ def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, fraction: float)
     if fisheye is None or not ladder.has_time():
         return job
     ladder.announce("start from a fisheye lens")
-    register_photos(fisheye)  # removes what was verified with another lens
-    ladder.match(fisheye, fisheye.pairs)
+    ladder.verify(fisheye)
     ladder.attempt_instead("start from a fisheye lens", fisheye, MapperOptions())
-    if ladder.best.job is fisheye:
-        return fisheye
-    register_photos(job)
-    ladder.match(job, job.pairs)
-    return job
+    if ladder.best.job is not fisheye:
+        ladder.verify(job)
+        return job
+    return fisheye
 
 
 def _from_left_out(ladder: _Ladder, job: Job) -> None:

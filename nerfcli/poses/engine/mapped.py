@@ -44,26 +44,18 @@ class MappedModels:
 
 def write_mapped(mapped: MappedModels, key: str, *, name: str = FIRST) -> None:
     """Write models and stage into the work folder, replacing earlier ones of this name."""
-    content = {"job": asdict(mapped.job), "attempts": mapped.attempts, "localised": list(mapped.localised)}
-    content |= {"seconds": mapped.seconds, "cut_short": list(mapped.cut_short)}
-    write_models(Path(mapped.job.folder) / name, mapped.models, key, also=content)
+    also = {field: getattr(mapped, field) for field in ("attempts", "localised", "seconds", "cut_short")}
+    write_models(Path(mapped.job.folder) / name, mapped.models, key, also={"job": asdict(mapped.job), **also})
 
 
 def read_mapped(job: Job, key: str, *, name: str = FIRST) -> MappedModels | None:
-    """Read what `write_mapped` wrote for this key; None if it is damaged or missing, or its database is missing.
-
-    Args:
-        job: gives the current work folder, photos and threads.
-        key: hash of everything that the models depend on.
-        name: of the stage.
-    """
+    """Read what `write_mapped` wrote for this key; None if it is damaged or missing, or its database is missing."""
     found = read_models(Path(job.folder) / name, key)
     if found is None:
         return None
     models, content = found
-    there = job_from_json(content["job"])
     there = replace(
-        there,
+        job_from_json(content["job"]),
         folder=job.folder,
         originals=job.originals,
         threads=job.threads,
@@ -72,14 +64,8 @@ def read_mapped(job: Job, key: str, *, name: str = FIRST) -> MappedModels | None
     )
     if not there.database.exists():
         return None
-    return MappedModels(
-        models,
-        there,
-        content["attempts"],
-        tuple(content["localised"]),
-        content["seconds"],
-        tuple(content.get("cut_short", ())),
-    )
+    localised, cut_short = tuple(content["localised"]), tuple(content["cut_short"])
+    return MappedModels(models, there, content["attempts"], localised, content["seconds"], cut_short)
 
 
 def write_models(

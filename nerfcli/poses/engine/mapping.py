@@ -13,7 +13,7 @@ import pycolmap
 from nerfcli.poses.engine.mapped import file_keys, mapping_key, read_models, write_models
 from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.input.plan import limit_seconds, mapping_seconds
-from nerfcli.poses.input.stages import file_key, stage_key
+from nerfcli.poses.input.stages import stage_key
 from nerfcli.poses.model.principal_points import camera_of_lens
 from nerfcli.poses.model.reasons import FEW_MATCHES
 
@@ -40,7 +40,7 @@ def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
 def describe_cameras(
     model: pycolmap.Reconstruction,
     job: Job,
-    uncertainty: Mapping[str, dict[str, Any]],
+    uncertainty: Mapping[int, dict[str, Any]],
     *,
     lens_of: Mapping[int, int],
 ) -> list[dict[str, Any]]:
@@ -61,7 +61,7 @@ def describe_cameras(
             "params": [float(value) for value in camera.params],
             "focal_from_exif": camera.has_prior_focal_length and lens not in job.given_cameras,
             "images": count,
-            "uncertainty": uncertainty.get(str(lens)),
+            "uncertainty": uncertainty.get(lens),
         }
         for lens, camera, count in cameras
     ]
@@ -94,8 +94,7 @@ def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
 
 def model_keys(job: Job) -> dict[str, str]:
     """Return a hash of each file of the model in the job's folder, by the file's name; none if there is no model."""
-    folder = _model_folder(job)
-    return {path.name: file_key(path) for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+    return file_keys(_model_folder(job))
 
 
 def _model_folder(job: Job) -> Path:
@@ -144,9 +143,7 @@ def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
     options.mapper.bundle_adjustment.ceres.use_gpu = False
     with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
         models = pycolmap.global_mapping(job.database, job.photos, output, options)
-    for model in models.values():
-        model.update_point_3d_errors()
-    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+    return _largest_first(models)
 
 
 def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.IncrementalPipelineOptions:
@@ -204,6 +201,10 @@ def _run_mapper(
             initial_image_pair_callback=started,
             next_image_callback=placed_one,
         )
+    return _largest_first(models)
+
+
+def _largest_first(models: Mapping[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
     for model in models.values():
         model.update_point_3d_errors()
     return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)

@@ -54,7 +54,6 @@ def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
 
     Args:
         descriptors: per photo (features, 128) integers up to 255.
-        report: receives ("pair", photos done, photos in all).
 
     Returns:
         (photos, photos) counts, symmetric, 0 on the diagonal.

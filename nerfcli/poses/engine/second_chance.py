@@ -13,6 +13,7 @@ from typing import Any
 
 import pycolmap
 
+from nerfcli.multiview.graph import consistent_groups
 from nerfcli.poses.engine.database import keep_geometries
 from nerfcli.poses.engine.ladder import SMALLER_BASELINE
 from nerfcli.poses.engine.mapped import MappedModels, mapping_key, read_mapped, write_mapped
@@ -33,7 +34,6 @@ from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import NO_PARALLAX_PX
 from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.two_views import agreements, count_matches, read_verified_pairs
-from nerfcli.poses.model.view_graph import consistent_groups
 
 # First number of the mapper's runs here, after those of the ladder; the numbers are added to the seed.
 _FIRST_ATTEMPT = 100
@@ -72,7 +72,7 @@ def second_chance(
     Args:
         mapped: the model that the checks refused, and the smaller ones.
         first: the result of these checks.
-        report, tell, checks: see `selected_component.choose_component`.
+        checks: makes a check runner for one more model.
         component: the number of this model for the user. From 2 on, its photos are mapped again by themselves.
 
     Returns:
@@ -105,11 +105,7 @@ def second_chance(
         ("from the largest consistent part", rest * scratch, lambda: _regrown(mapped, core, report)),
         (_ALL_AT_ONCE, all_at_once, lambda: _all_at_once(mapped, core)),
         ("from the largest consistent part of that", rest * scratch, grown_from_all),
-        (
-            "from scratch, with other initial pairs",
-            scratch,
-            lambda: _mapped_without(mapped, core.suspects, report, base=None),
-        ),
+        ("from scratch, with other initial pairs", scratch, lambda: _from_nothing(mapped, core, report)),
         (
             "only the largest consistent part of the first model",
             0.0,
@@ -143,14 +139,7 @@ def grow(
     """Extend an accepted model to the photos of smaller models, if these are many and match its photos.
 
     Where a few photos fail in a row, the mapper gives up and begins another model; starting from the adjusted model,
-    with its lens, these photos often fit.
-
-    Args:
-        mapped, report, tell, checks: see `second_chance`.
-        first: the examined model, which was accepted; there may be none.
-
-    Returns:
-        A larger accepted model, or the given one.
+    with its lens, these photos often fit. Returns a larger accepted model, or the given one.
     """
     given = ChosenModel(mapped, first)
     model = first.model
@@ -287,6 +276,10 @@ def _regrown(mapped: MappedModels, core: _Core, report: Report) -> MappedModels 
     base = pycolmap.Reconstruction(core.model)
     settle(base, threads=mapped.job.threads, fixed=mapped.job.fixed_cameras)
     return _mapped_without(mapped, core.suspects, report, base=base)
+
+
+def _from_nothing(mapped: MappedModels, core: _Core, report: Report) -> MappedModels:
+    return _mapped_without(mapped, core.suspects, report, base=None)
 
 
 def _mapped_without(

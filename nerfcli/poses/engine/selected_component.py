@@ -32,8 +32,6 @@ def choose_component(
 
     Args:
         mapped: the models of the first mapping.
-        report: called with (stage, done, total).
-        tell: called with messages for the user.
         component: its number, from 1; there may be no component with this number.
         checks: makes a check runner for one model.
     """

@@ -6,7 +6,7 @@ Nothing else changes, not by a bit: results measured on these photos depend on t
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +18,13 @@ from nerfcli.poses.engine.features import extract, match, start_matching
 from nerfcli.poses.engine.retrieval import with_neighbours
 from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.input.stages import stage_key
+from nerfcli.poses.model.localise import place
 from nerfcli.poses.model.principal_points import LEAST_OBSERVATIONS, camera_of_lens, refine_with_principal_point
 from nerfcli.poses.model.reasons import FEW_MATCHES, NO_TRAINING_PHOTO
 
 # As in pycolmap's mapper (abs_pose_max_error, abs_pose_min_inlier_ratio).
 _MOST_ERROR_PX = 12.0
 _LEAST_INLIERS = 0.25
-
-
-@dataclass(frozen=True)
-class Placed:
-    """A located held-out photo: name, inliers of its pose, points that it matches, and mean error of the inliers."""
-
-    name: str
-    inliers: int
-    points: int
-    error_px: float
 
 
 def held_out_last(job: Job) -> Job:
@@ -66,11 +57,7 @@ def training_part(job: Job) -> Job:
 def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Report) -> dict[str, Any]:
     """Place the held-out photos of a job in the model of its training photos, and add them to the model on disk.
 
-    Args:
-        job: all photos.
-        training: its `training_part`.
-        result: the worker's result for `training`.
-        report: receives ("extract", ...), ("match", ...) and ("map", photos done, photos in all).
+    `result` is the worker's for `training`, the `training_part` of the job.
 
     Returns:
         The result for all photos of the job, with "strict": how each held-out photo was placed, and the fingerprints of
@@ -88,18 +75,18 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     unmatched = match(job, across, report)
     model = pycolmap.Reconstruction(folder)
     before = fingerprint(model)
-    placed: dict[int, Placed] = {}
+    placed: dict[int, dict[str, Any]] = {}
     reasons: dict[str, str] = {}
     own = (result.get("principal_points") or {"kept": False})["kept"]
     for done, number in enumerate(job.held_out):
         found = _place(model, job, number, across, own_principal_point=own)
-        if isinstance(found, Placed):
-            placed[number] = found
-        else:
+        if isinstance(found, str):
             reasons[str(number)] = found
+        else:
+            placed[number] = found
         report("map", done + 1, len(job.held_out))
     # Held-out photos only add poses, so they are excluded from the fingerprint.
-    after = fingerprint(model, without=frozenset(found.name for found in placed.values()))
+    after = fingerprint(model, without=frozenset(job.names[number] for number in placed))
     if after != before:
         raise AssertionError("locating held-out photos changed the model of the training photos")
     model.write_binary(folder)
@@ -111,7 +98,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
         whole["cut_short"] = [*whole["cut_short"], unmatched]
     whole["strict"] = {
         "held_out": [job.names[number] for number in job.held_out],
-        "placed": {found.name: {"inliers": found.inliers, "error_px": found.error_px} for found in placed.values()},
+        "placed": {job.names[number]: found for number, found in placed.items()},
         "fingerprint_before": before,
         "fingerprint_after": after,
     }
@@ -149,8 +136,8 @@ def _place(
     pairs: tuple[tuple[int, int], ...],
     *,
     own_principal_point: bool,
-) -> Placed | str:
-    """Add one photo with its pose to the model, or return the reason why it has none."""
+) -> dict[str, Any] | str:
+    """Add one photo with its pose to the model; return its inliers and their mean error, or why it has no pose."""
     group = next(group for group in job.groups if number in group.photos)
     training = [job.image_ids[photo] for photo in group.photos if photo not in job.held_out]
     placed = [image_id for image_id in training if model.exists_image(image_id)]
@@ -174,20 +161,18 @@ def _place(
     inside = np.asarray(found["inlier_mask"], dtype=bool)
     pose: pycolmap.Rigid3d = found["cam_from_world"]
     if own_principal_point:
-        camera.camera_id = job.image_ids[number]
+        camera.camera_id = job.image_ids[number]  # a new one
         if found["num_inliers"] >= LEAST_OBSERVATIONS:
             refined, shift = refine_with_principal_point(camera, pose.matrix(), pixels[inside], points[inside])
             pose = pycolmap.Rigid3d(refined)
             camera.principal_point_x += shift[0]
             camera.principal_point_y += shift[1]
-        model.add_camera_with_trivial_rig(camera)
-    image = pycolmap.Image(name=job.names[number], camera_id=camera.camera_id, image_id=job.image_ids[number])
-    image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels[inside]])
-    model.add_image_with_trivial_frame(image, pose)
-    there = model.image(job.image_ids[number])
+    image_id = job.image_ids[number]
+    place(model, camera, pose, image_id=image_id, name=job.names[number], pixels=pixels[inside])
+    there = model.image(image_id)
     projected = [there.project_point(point) for point in points[inside]]
     errors = [np.linalg.norm(p - xy) for p, xy in zip(projected, pixels[inside], strict=True) if p is not None]
-    return Placed(job.names[number], int(inside.sum()), len(points), float(np.mean(errors)))
+    return {"inliers": int(inside.sum()), "error_px": float(np.mean(errors))}
 
 
 def _seen_points(

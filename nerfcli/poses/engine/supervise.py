@@ -66,11 +66,9 @@ def run_worker(
     Args:
         job_path: the job's JSON file; the worker's log is written beside it.
         threads: for OpenMP inside pycolmap, -1 for all.
-        progress: receives (stage, done, total).
         limits: the worker is stopped when it exceeds one of them.
         since: the start of the time limit, by `time.monotonic`; None for now.
         lock: a descriptor that the worker inherits.
-        notify: receives messages for the user, one sentence at a time.
 
     Raises:
         WorkerDiedError: the worker died; the message has the stage, and the last lines of its log. Or it was stopped

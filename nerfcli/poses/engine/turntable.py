@@ -22,6 +22,7 @@ from nerfcli.errors import UserError
 from nerfcli.media.images import image_size, read_image
 from nerfcli.media.masks import read_mask
 from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
+from nerfcli.multiview.graph import connected_groups
 from nerfcli.multiview.stationary import Motions, Stationary, motions, together
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.input import still_background as still
@@ -96,7 +97,6 @@ def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[st
     Args:
         job: its photos get masks.
         featured: the job whose features are in the database, with the same photos or some of them.
-        tell: receives one sentence on the object and its masks.
 
     Returns:
         The job, unchanged if no masks can be accepted; and the facts, None if there is nothing to report.
@@ -108,12 +108,20 @@ def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[st
     if not motions.two_motions:
         write_stage(Path(job.folder) / _STAGE, _key(job), {})
         return job, None
-    facts = _facts(motions)
+    facts: dict[str, Any] = {
+        "pairs": motions.two + motions.still + motions.moved,
+        "pairs_two_motions": motions.two,
+        "pairs_still": motions.still,
+        "pairs_one_motion": motions.moved,
+        "still_share": round(motions.cells, 4),
+        "wide": motions.wide,
+    }
     masks: list[np.ndarray | None] = [None] * len(job.files)
     if motions.found:
-        places = {number: job.files.index(file) for number, file in enumerate(featured.files)}
-        masks = _masks(job, compared, groups=_same_place(compared, places), places=places)
-        facts |= _judged(masks, compared, places)
+        number = [job.files.index(file) for file in featured.files]
+        compared = [replace(pair, first=number[pair.first], second=number[pair.second]) for pair in compared]
+        masks = _masks(job, compared)
+        facts |= _judged(masks, compared)
     facts["masked"] = facts.get("why_not") is None and motions.found
     facts["unmasked"] = [name for name, mask in zip(job.names, masks, strict=True) if mask is None]
     if facts["masked"]:
@@ -219,30 +227,17 @@ def _pairs(count: int, most: int) -> list[tuple[int, int]]:
     return sorted(pair for pair in near | far if pair[0] < pair[1])
 
 
-def _same_place(pairs: Sequence[ComparedPair], places: dict[int, int]) -> list[list[int]]:
-    """Group photos (numbers in the whole job) connected by static matches: each group has one camera position."""
-    groups: list[set[int]] = []
-    for pair in pairs:
-        if pair.motions.two or pair.motions.only_still:
-            both = {places[pair.first], places[pair.second]}
-            touching = [group for group in groups if group & both]
-            groups = [group for group in groups if not group & both]
-            groups.append(both.union(*touching))
-    return sorted((sorted(group) for group in groups), key=lambda group: (-len(group), group))
-
-
-def _masks(
-    job: Job, pairs: Sequence[ComparedPair], *, groups: Sequence[Sequence[int]], places: dict[int, int]
-) -> list[np.ndarray | None]:
+def _masks(job: Job, pairs: Sequence[ComparedPair]) -> list[np.ndarray | None]:
     """Return a small mask of the object for each photo, None for photos without a matching background."""
+    # Photos connected by static matches have one camera position.
+    static = [(pair.first, pair.second) for pair in pairs if pair.motions.two or pair.motions.only_still]
+    groups = [group for group in connected_groups(range(len(job.files)), static) if len(group) > 1]
     pictures = [still.small(read_image(job.photos / file)[..., :3]) for file in job.files]
     behinds = []
     for group in groups:
         members = [number for number in group if pictures[number].shape == pictures[group[0]].shape]
         inside = set(members)
-        stay = [
-            pair.places[pair.motions.stays] for pair in pairs if {places[pair.first], places[pair.second]} <= inside
-        ]
+        stay = [pair.places[pair.motions.stays] for pair in pairs if {pair.first, pair.second} <= inside]
         if len(members) >= still.LEAST_PHOTOS and stay:
             behinds.append(still.background([pictures[number] for number in members], np.concatenate(stay)))
     masks: list[np.ndarray | None] = []
@@ -254,17 +249,14 @@ def _masks(
     return masks
 
 
-def _judged(
-    masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPair], places: dict[int, int]
-) -> dict[str, Any]:
+def _judged(masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPair]) -> dict[str, Any]:
     """Return the fraction of the photos that the masks keep, and of either motion's matches on the right side of them.
 
     "why_not" is there if the masks cannot be accepted.
     """
-    found = [mask for mask in masks if mask is not None]
     moving, staying = [], []
     for pair in pairs:
-        mask = masks[places[pair.first]]
+        mask = masks[pair.first]
         if mask is None or not pair.motions.two:
             continue
         height, width = mask.shape
@@ -274,7 +266,7 @@ def _judged(
         staying.append(1 - inside[pair.motions.stays].mean())
     if not moving:
         return {"why_not": "too few photos show the same background"}
-    white = np.quantile([mask.mean() for mask in found], [0, 0.5, 1])
+    white = np.quantile([mask.mean() for mask in masks if mask is not None], [0, 0.5, 1])
     right = float(np.median(moving)), float(np.median(staying))
     facts: dict[str, Any] = {
         "white_share": [round(float(fraction), 4) for fraction in white],
@@ -305,17 +297,6 @@ def _written(job: Job, masks: Sequence[np.ndarray | None]) -> tuple[WorkMask, ..
         laid_out.append(write_mask(target, used))
         Image.fromarray(used).save(scene_masks(job) / f"{name}.png")
     return tuple(laid_out)
-
-
-def _facts(motions: Stationary) -> dict[str, Any]:
-    return {
-        "pairs": motions.two + motions.still + motions.moved,
-        "pairs_two_motions": motions.two,
-        "pairs_still": motions.still,
-        "pairs_one_motion": motions.moved,
-        "still_share": round(motions.cells, 4),
-        "wide": motions.wide,
-    }
 
 
 def _key(job: Job) -> str:

@@ -64,8 +64,10 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
     """Extract, match, map and check, each continuing from the results of earlier calls."""
     stored = recalled(job)
     result, key = Path(job.folder) / RESULT, result_key(job if stored is None else stored[0])
-    if _is_complete(job, key):
-        _name_images(job)
+    there = read_stage(result, key)
+    if there is not None and there["model_files"].items() <= model_keys(job).items():
+        if job.database.exists():
+            name_images(job)
         return
     result.unlink(missing_ok=True)
     seconds: dict[str, float] = {}
@@ -78,7 +80,7 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
     found, replaced = finite(found)
     found["not_finite"] = replaced
     write_stage(result, key, found)
-    _name_images(job)
+    name_images(job)
 
 
 def result_key(job: Job) -> str:
@@ -151,11 +153,22 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
         uncertainty = examined.uncertainty
         if examined.verdict.accepted:
             with _timed(seconds, "stabilisation"):
-                found = _stabilised(model, job, finishing, report)
+                found = finishing.run(
+                    "principal points",
+                    partial(
+                        choose_principal_points,
+                        model,
+                        seed=job.seed,
+                        threads=job.threads,
+                        fixed=job.fixed_cameras,
+                        report=report,
+                    ),
+                    otherwise=StabilisedModel(model, None, {}),
+                )
             model, result["principal_points"] = found.model, found.evidence and asdict(found.evidence)
-            uncertainty = uncertainty | {str(lens): certain for lens, certain in found.uncertainty.items()}
+            uncertainty = uncertainty | found.uncertainty
         result["cameras"] = describe_cameras(model, job, uncertainty, lens_of=lens_of)
-        model = _coloured(model, job, finishing)
+        model = finishing.run("colours of points", partial(with_colours, model, job), otherwise=model)
         result["not_computed"] |= finishing.not_computed
         result["mean_reprojection_error_px"] = model.compute_mean_reprojection_error()
         result["points"] = model.num_points3D()
@@ -198,32 +211,6 @@ def _checks(job: Job) -> Checks:
     """Make a check runner for one model."""
     most = limit_seconds(checking_seconds(len(job.files)), least=_LEAST_LIMIT_SECONDS)
     return Checks(Path(job.folder), skip=dict(job.skipped_checks), seconds=most)
-
-
-def _stabilised(model: pycolmap.Reconstruction, job: Job, checks: Checks, report: Report) -> StabilisedModel:
-    return checks.run(
-        "principal points",
-        lambda: choose_principal_points(
-            model, seed=job.seed, threads=job.threads, fixed=job.fixed_cameras, report=report
-        ),
-        otherwise=StabilisedModel(model, None, {}),
-    )
-
-
-def _coloured(model: pycolmap.Reconstruction, job: Job, checks: Checks) -> pycolmap.Reconstruction:
-    return checks.run("colours of points", lambda: with_colours(model, job), otherwise=model)
-
-
-def _is_complete(job: Job, key: str) -> bool:
-    """Return whether there is a result with this key, and the model on disk is the one written with it."""
-    there = read_stage(Path(job.folder) / RESULT, key)
-    return there is not None and there["model_files"].items() <= model_keys(job).items()
-
-
-def _name_images(job: Job) -> None:
-    """Give the images in the database the photos' own names, if there is a database."""
-    if job.database.exists():
-        name_images(job)
 
 
 @contextmanager

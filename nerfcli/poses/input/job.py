@@ -149,17 +149,13 @@ def read_job(path: Path) -> Job:
 
 def job_from_json(content: dict[str, Any]) -> Job:
     """Rebuild a job from the result of `dataclasses.asdict`, after a round trip through JSON."""
-    content = dict(content)
-    content["groups"] = tuple(_group(group) for group in content["groups"])
-    content["pairs"] = tuple((i, j) for i, j in content["pairs"])
-    content["skipped_checks"] = tuple((check, why) for check, why in content["skipped_checks"])
-    for name in ("files", "names", "keys", "held_out"):
-        content[name] = tuple(content[name])
-    content["masks"] = tuple(WorkMask(**mask) for mask in content["masks"])
-    return Job(**content)
+    content = _with_tuples(content)
+    groups = tuple(CameraGroup(**group) for group in content["groups"])
+    masks = tuple(WorkMask(**mask) for mask in content["masks"])
+    return Job(**content | {"groups": groups, "masks": masks})
 
 
-def _group(content: dict[str, Any]) -> CameraGroup:
-    params = content["params"]
-    lists: dict[str, Any] = {"photos": tuple(content["photos"]), "params": None if params is None else tuple(params)}
-    return CameraGroup(**content | lists)
+def _with_tuples(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _with_tuples(item) for key, item in value.items()}
+    return tuple(_with_tuples(item) for item in value) if isinstance(value, list) else value

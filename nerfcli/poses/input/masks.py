@@ -23,10 +23,9 @@ def lay_out_masks(
     """Write a mask for each photo, upright, for pycolmap: 00000.jpg.png for the photo 00000.jpg, black where not used.
 
     Args:
-        photos: the photos, and files: their names below the worker's folder of photos.
+        files: the photos' names below the worker's folder of photos.
         masks: the user's folder of masks.
         folder: where to write; created if missing.
-        notify: receives notes on photos without a mask, and on photos with a completely black one.
 
     Raises:
         UserError: no such folder, no mask in it for any photo, or masks that cannot be read or do not fit.

@@ -54,10 +54,7 @@ def find_photos(
 ) -> Photos:
     """Read every photo of `folder` once, so that a damaged one is found here and not by a solver an hour later.
 
-    Args:
-        folder: a folder with photos.
-        progress: receives (photos read, photos in all) after each photo.
-        subfolders: whether the photos in its subfolders are included.
+    `progress` receives (photos read, photos in all) after each photo.
 
     Raises:
         UserError: no such folder, a file instead of a folder, no photos in it, or fewer than `MIN_PHOTOS` readable.

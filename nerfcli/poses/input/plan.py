@@ -12,6 +12,8 @@ from nerfcli.poses.input.settings import PoseSettings
 
 # Time of the further searches for features, relative to the first, see `engine.features`.
 _SEARCH_FACTORS = {"enlarge": 3.0, "faint": 1.0, "faint-enlarged": 3.0}
+# All stages that take time, in the order of the work.
+_ORDER = ("extract", *_SEARCH_FACTORS, "pair", "match", "map", "merge", "locate", "check", "stabilise", "settle")
 # CPU seconds, measured on one core of a 2-core server; within a factor of two on others.
 _SECONDS_PER_MEGAPIXEL = 0.4
 _SECONDS_PER_PAIR = 0.045
@@ -167,21 +169,20 @@ class TimeEstimate:
     and whether principal points differ only after a trial; if that adds work, the fraction done stays constant until it
     is correct again.
 
-    Args:
-        plan: for the stages that have not begun.
-        clock: returns seconds.
+    `clock` returns seconds.
     """
 
     def __init__(self, plan: Plan, clock: Callable[[], float] = time.monotonic):
         self._plan = plan
         self._clock = clock
         self._start = clock()
-        self._stage = ""
+        self._stage, self._place = "", -1
         self._began = (0.0, 0.0)
         self._ratio = 0.0
         self._stretches: list[float] = []  # of earlier stages: their seconds over the planned ones for that work
         self._latest = (0.0, 0.0)  # of the current stage: its seconds, and the planned ones for that work
-        self._seconds = dict(plan.seconds)
+        self._planned = dict.fromkeys(_ORDER, 0.0) | plan.seconds
+        self._seconds = dict(self._planned)
         self._fraction = 0.0
         self._at = ("", 0, 0)
 
@@ -189,26 +190,29 @@ class TimeEstimate:
         """Return (fraction of all work that is done, remaining seconds)."""
         now = self._clock()
         if stage == "features":
-            self._plan_matching(done)
+            self._seconds["match"] *= done / max(self._plan.features, 1)
             stage, done, total = self._at
         self._at = (stage, done, total)
         if stage in _SEARCH_FACTORS:
-            self._plan_search(stage, total)
-        if stage == "merge":
-            self._plan_after("map", stage, _MERGE_FRACTION * self._plan.seconds.get("map", 0.0))
-        if stage == "locate":
-            self._plan_after("merge" if "merge" in self._seconds else "map", stage, _SECONDS_PER_LOCATED * total)
-        if stage == "settle":
-            self._plan_after("stabilise", stage, _SETTLE_FACTOR * self._plan.seconds.get("stabilise", 0.0))
+            searches = {name: self._seconds[name] for name in _SEARCH_FACTORS}
+            searches[stage] = _SEARCH_FACTORS[stage] * self._planned["extract"] * total / max(self._plan.photos, 1)
+            self._seconds = self._planned | searches
+        elif stage == "merge":
+            self._seconds[stage] = _MERGE_FRACTION * self._planned["map"]
+        elif stage == "locate":
+            self._seconds[stage] = _SECONDS_PER_LOCATED * total
+        elif stage == "settle":
+            self._seconds[stage] = _SETTLE_FACTOR * self._planned["stabilise"]
         ratio = _fraction_done(stage, done, total)
-        if self._begins_again(stage, ratio):
+        place = _ORDER.index(stage) if stage in _ORDER else len(_ORDER)
+        if (place, ratio) < (self._place, self._ratio):  # the work has gone back for another attempt
             self._fraction = 0.0
         if stage != self._stage or ratio < self._ratio:
             took, of_plan = self._latest
             if of_plan > _telling(self._stage) * self._seconds.get(self._stage, 0.0):
                 self._stretches.append(took / of_plan)
             self._stage, self._began, self._latest = stage, (now, ratio), (0.0, 0.0)
-        self._ratio = ratio
+        self._place, self._ratio = place, ratio
         planned = self._seconds.get(stage, 0.0)
         began, ratio_before = self._began
         took, of_plan = now - began, planned * (ratio - ratio_before)
@@ -222,37 +226,10 @@ class TimeEstimate:
             stretch = min(own, *self._stretches) if self._stretches else own
         else:
             left = took * (1 - ratio) / (ratio - ratio_before) if ratio > ratio_before else 0.0
-        stages = list(self._seconds)
-        later = stages[stages.index(stage) + 1 :] if stage in stages else []
-        left += stretch * sum(self._seconds[name] for name in later)
+        left += stretch * sum(self._seconds[name] for name in _ORDER[place + 1 :])
         spent = now - self._start
         self._fraction = max(self._fraction, spent / (spent + left) if left > 0 else 1.0)
         return self._fraction, left
-
-    def _begins_again(self, stage: str, ratio: float) -> bool:
-        """Return whether the work has gone back for another attempt. Stages without a plan are taken to be last."""
-        order = list(self._seconds)
-        new, old = (order.index(name) if name in order else len(order) for name in (stage, self._stage))
-        return bool(self._stage) and (new < old or (new == old and ratio < self._ratio))
-
-    def _plan_matching(self, features: int) -> None:
-        """Rescale the planned matching time to the actual number of features per photo."""
-        fraction = features / max(self._plan.features, 1)
-        self._seconds = {name: s * (fraction if name == "match" else 1.0) for name, s in self._seconds.items()}
-
-    def _plan_search(self, stage: str, photos: int) -> None:
-        """Insert another search for features after the earlier ones."""
-        first = self._plan.seconds.get("extract", 0.0)
-        searches = {name: self._seconds[name] for name in _SEARCH_FACTORS if name in self._seconds and name != stage}
-        searches[stage] = _SEARCH_FACTORS[stage] * first * photos / max(self._plan.photos, 1)
-        later = {name: seconds for name, seconds in self._plan.seconds.items() if name != "extract"}
-        self._seconds = {"extract": first, **searches, **later}
-
-    def _plan_after(self, earlier: str, stage: str, seconds: float) -> None:
-        """Insert a stage that was not planned after an earlier one."""
-        planned = [(name, value) for name, value in self._seconds.items() if name != stage]
-        at = 1 + next((index for index, (name, _) in enumerate(planned) if name == earlier), len(planned) - 1)
-        self._seconds = dict([*planned[:at], (stage, seconds), *planned[at:]])
 
 
 def _fraction_done(stage: str, done: int, total: int) -> float:

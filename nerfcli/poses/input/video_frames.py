@@ -69,11 +69,9 @@ def extract_frames(
     same frames.
 
     Args:
-        path: the video.
         folder: gets frame_000123.jpg... and frames.json, all or nothing.
         count: how many; None for 120. A video with fewer frames gives all of them.
         overwrite: replace frames that were made from another video or with another count.
-        notify: receives messages for the user, one sentence at a time.
         progress: receives (fraction done in 0...1, current step).
 
     Raises:

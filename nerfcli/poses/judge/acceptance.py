@@ -16,6 +16,7 @@ from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import Contradiction, strong_contradictions
 from nerfcli.poses.judge.parallax import RotationFit
 from nerfcli.poses.model import held_out
+from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.lens_observability import is_centred
 from nerfcli.poses.model.two_views import Agreement, RotationError, VerifiedPair, agreements, rotation_errors
 
@@ -99,24 +100,18 @@ def judge(
 
     Args:
         model: a converged model.
-        pairs: the verified pairs of the capture.
         turn: how well rotations of the camera alone explain the matches.
         names: the user's name for each photo of the model.
-        seed: of random draws.
-        threads: of the adjustment, -1 for all.
         held: pairs that support photos located from points of the model, see `localise.shared_pairs`.
         given: ids of cameras with given intrinsics, whose focal lengths are not checked.
-        fixed: ids of cameras whose intrinsics are kept fixed.
-        checks: runs the checks.
     """
     run = (Checks() if checks is None else checks).run
-    nothing: list[Any] = []
-    found: list[Agreement] = run("agreement of pairs", lambda: agreements(model, pairs), otherwise=nothing)
+    found: list[Agreement] = run("agreement of pairs", lambda: agreements(model, pairs), otherwise=[])
     rotations: list[RotationError] = run(
-        "rotations of pairs", lambda: rotation_errors(model, pairs, seed=seed), otherwise=nothing
+        "rotations of pairs", lambda: rotation_errors(model, pairs, seed=seed), otherwise=[]
     )
     contradictions: list[Contradiction] = run(
-        "contradictions", lambda: strong_contradictions(model, [*found, *agreements(model, held)]), otherwise=nothing
+        "contradictions", lambda: strong_contradictions(model, [*found, *agreements(model, held)]), otherwise=[]
     )
     total = sum(a.matches for a in found)
     fraction = sum(c.matches for c in contradictions) / total if total else 0.0
@@ -127,8 +122,13 @@ def judge(
         lambda: _held_out_measure(model, seed=seed, threads=threads, fixed=fixed),
         otherwise=_UNKNOWN_HELD_OUT,
     )
+    counts = [model.image(photo).num_points3D for photo in model.reg_image_ids()] or [0]
     measures: dict[str, Any] = {
-        "pairs": _pair_measure(found),
+        "pairs": {
+            "judged": len(found),
+            "contradicting": sum(a.contradicts for a in found),
+            "share_of_matches_that_agree": sum(a.matches * a.fraction for a in found) / total if total else None,
+        },
         "strong_contradictions": [asdict(c) for c in contradictions[:_MOST_LISTED]],
         "strong_contradictions_share": fraction,
         "rotations": _rotation_measure(rotations),
@@ -136,7 +136,7 @@ def judge(
         **geometry,
         "focal_over_longer_side": focal,
         "held_out": unused,
-        "observations_per_photo": _observation_measure(model),
+        "observations_per_photo": {"median": float(np.median(counts)), "least": int(min(counts))},
     }
     failures = [
         *_no_baseline(turn, geometry),
@@ -191,8 +191,7 @@ def _parts(items: list[Any], length: int) -> list[list[Any]]:
 
 
 def _cameras_in_use(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
-    ids = sorted({model.image(photo).camera_id for photo in model.reg_image_ids()})
-    return [model.cameras[camera_id] for camera_id in ids]
+    return [model.cameras[camera_id] for camera_id in sorted(set(lenses_of(model).values()))]
 
 
 def _sees_behind(camera: pycolmap.Camera) -> bool:
@@ -207,27 +206,14 @@ def _held_out_measure(
     model: pycolmap.Reconstruction, *, seed: int, threads: int, fixed: Sequence[int]
 ) -> dict[str, Any]:
     training, held = held_out.split(model, seed=seed)
-    cameras = _cameras_in_use(model)
     # The lens was chosen before; a principal point that was freed is not moved again.
     held_out.adjust(training, threads=threads, fixed=fixed)
     errors = held_out.errors_px(training, held)
-    centred = all(camera.is_spherical() or is_centred(camera) for camera in cameras)
-    if not len(errors):
-        return {"observations": 0, "median_px": None, "share_above_8_px": None, "principal_points_central": centred}
     return {
         "observations": len(errors),
-        "median_px": float(np.median(errors)),
-        "share_above_8_px": float((errors > 8).mean()),
-        "principal_points_central": centred,
-    }
-
-
-def _pair_measure(found: Sequence[Agreement]) -> dict[str, Any]:
-    matches = sum(a.matches for a in found)
-    return {
-        "judged": len(found),
-        "contradicting": sum(a.contradicts for a in found),
-        "share_of_matches_that_agree": sum(a.matches * a.fraction for a in found) / matches if matches else None,
+        "median_px": float(np.median(errors)) if len(errors) else None,
+        "share_above_8_px": float((errors > 8).mean()) if len(errors) else None,
+        "principal_points_central": all(c.is_spherical() or is_centred(c) for c in _cameras_in_use(model)),
     }
 
 
@@ -241,21 +227,16 @@ def _rotation_measure(errors: Sequence[RotationError]) -> dict[str, Any]:
     }
 
 
-def _observation_measure(model: pycolmap.Reconstruction) -> dict[str, Any]:
-    counts = [model.image(photo).num_points3D for photo in model.reg_image_ids()]
-    return {"median": float(np.median(counts)), "least": int(min(counts))} if counts else {"median": 0.0, "least": 0}
-
-
 def _no_baseline(turn: RotationFit | None, geometry: Mapping[str, Any]) -> list[Failure]:
-    advice = "take the photos while walking around the scene or sideways; turning on the spot gives no depth"
+    spread = geometry["camera_spread_over_distance"]
     if turn is not None and turn.explains_all:
         evidence = f"a rotation of the camera without translation explains all matches to {turn.parallax_px:.1f} px"
-        return [Failure("no baseline (pure rotation)", evidence, advice)]
-    spread = geometry["camera_spread_over_distance"]
-    if spread is not None and spread < _LEAST_SPREAD:
+    elif spread is not None and spread < _LEAST_SPREAD:
         evidence = f"the cameras are spread over only {100 * spread:.2f} % of their distance from the scene"
-        return [Failure("no baseline (pure rotation)", evidence, advice)]
-    return []
+    else:
+        return []
+    advice = "take the photos while walking around the scene or sideways; turning on the spot gives no depth"
+    return [Failure("no baseline (pure rotation)", evidence, advice)]
 
 
 def _contradicted(
@@ -330,18 +311,15 @@ def _implausible(
         if camera.camera_id not in given and not _sees_behind(camera)
     }
     low, high = _FOCAL_RANGE
-    photos = Counter(model.image(photo).camera_id for photo in model.reg_image_ids())
+    photos = Counter(lenses_of(model).values())
     unusual = sum(photos[camera_id] for camera_id, focal in focals.items() if not low < focal < high)
     if unusual < _FEW * photos.total():
         low, high = _FOCAL_RANGE_OF_FEW
-    for focal in focals.values():
-        if not low < focal < high:
-            evidence = f"the estimated focal length is {focal:.2f} times the longer side"
-            failures.append(
-                Failure(
-                    "the intrinsics are implausible",
-                    evidence,
-                    "give the intrinsics with --intrinsics, or use photos with EXIF data",
-                )
-            )
-    return failures
+    advice = "give the intrinsics with --intrinsics, or use photos with EXIF data"
+    return failures + [
+        Failure(
+            "the intrinsics are implausible", f"the estimated focal length is {focal:.2f} times the longer side", advice
+        )
+        for focal in focals.values()
+        if not low < focal < high
+    ]

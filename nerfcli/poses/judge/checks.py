@@ -36,13 +36,7 @@ class Checks:
         self._seconds = seconds
 
     def run(self, name: str, compute: Callable[[], T], *, otherwise: T, seconds: float | None = None) -> T:
-        """Return what `compute` returns, or `otherwise` if it raises or is to be skipped.
-
-        Args:
-            name: of the check.
-            compute: computes the result.
-            otherwise: the result if it cannot be computed.
-            seconds: time limit of this check, if it differs from that of the others.
+        """Return what `compute` returns within `seconds`, or `otherwise` if it raises or is to be skipped.
 
         Example:
             >>> Checks().run("pose uncertainty", lambda: 1 / 0, otherwise=None)

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from nerfcli.multiview.graph import connected_groups
+from nerfcli.multiview.graph import Bottlenecks, connected_groups
 from nerfcli.poses.model.two_views import Agreement, VerifiedPair, agreements
-from nerfcli.poses.model.view_graph import Bottlenecks
 
 # A pair with fewer may be wrong even if no other pair joins its photos: measured, up to 81 between different walls.
 _CERTAIN_MATCHES = 100

@@ -28,7 +28,7 @@ class ExaminedModel:
     """A model after examination, with the results for the report.
 
     left_out: why photos were left out, by number. blur_px: of each photo's pose, by number. details: for the report.
-    uncertainty: of the lenses, by camera id, see `determined.uncertainty`.
+    uncertainty: of the lenses, by camera id, see `lens_observability.uncertainty`.
     """
 
     model: pycolmap.Reconstruction | None
@@ -36,7 +36,7 @@ class ExaminedModel:
     left_out: dict[int, str]
     blur_px: dict[int, float]
     details: dict[str, Any]
-    uncertainty: dict[str, dict[str, Any]] = field(default_factory=dict)
+    uncertainty: dict[int, dict[str, Any]] = field(default_factory=dict)
 
 
 def examine(
@@ -51,12 +51,8 @@ def examine(
 
     A check that cannot be computed is left out and listed in `details["not_computed"]`; the others go on.
 
-    Args:
-        models: from the mapper; the first one is examined.
-        job: the job of the models.
-        report: called with ("check", done, total).
-        localised: ids of images that are supported by points of the model instead of a pair.
-        checks: runs the checks.
+    `report` is called with ("check", done, total); `localised` are ids of images that are supported by points of the
+    model instead of a pair.
     """
     checks = Checks() if checks is None else checks
     pairs = read_verified_pairs(job.database, min_matches=MIN_MATCHES)
@@ -66,13 +62,11 @@ def examine(
     details: dict[str, Any] = {"parts": [len(part) for part in joined if len(part) > 1]}
     if not models:
         return ExaminedModel(None, nothing_placed(turn), {}, {}, details | {"not_computed": checks.not_computed})
+    names = dict(zip(job.files, job.names, strict=True))
     report("check", 0, 4)
     mapped = with_pose_only(models[0])
-    nothing: list[VerifiedPair] = []
-    held = checks.run(
-        "points of single photos",
-        lambda: shared_pairs(mapped, localised, min_matches=MIN_MATCHES),
-        otherwise=nothing,
+    held: list[VerifiedPair] = checks.run(
+        "points of single photos", lambda: shared_pairs(mapped, localised, min_matches=MIN_MATCHES), otherwise=[]
     )
     model, left_out = checks.run(
         "contradicting photos", lambda: leave_out_contradicting(mapped, [*pairs, *held]), otherwise=(mapped, {})
@@ -87,7 +81,7 @@ def examine(
         pairs,
         held=held,
         turn=turn,
-        names=dict(zip(job.files, job.names, strict=True)),
+        names=names,
         seed=job.seed,
         threads=job.threads,
         given=job.given_cameras,
@@ -103,11 +97,19 @@ def examine(
             otherwise=blur,
         )
     report("check", 4, 4)
-    reasons = {job.numbers[image_id]: _with_names(reason, job) for image_id, reason in left_out.items()}
+    # In one pass, since a photo's own name may contain the numbered name of another one.
+    reasons = {
+        job.numbers[image_id]: re.sub(r"\d+\.\w+", lambda file: names.get(file[0], file[0]), reason)
+        for image_id, reason in left_out.items()
+    }
     details["not_computed"] = checks.not_computed
-    uncertainty = {str(camera_id): certain for camera_id, certain in lenses.uncertainty.items()}
     return ExaminedModel(
-        model, verdict, reasons, {job.numbers[image_id]: px for image_id, px in blur.items()}, details, uncertainty
+        model,
+        verdict,
+        reasons,
+        {job.numbers[image_id]: px for image_id, px in blur.items()},
+        details,
+        lenses.uncertainty,
     )
 
 
@@ -142,9 +144,3 @@ def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> ModelLenses:
         named=named,
         exif_focal_px=exif_focal_px,
     )
-
-
-def _with_names(reason: str, job: Job) -> str:
-    """Replace numbered files in a reason by the photos' names, in one pass: a name may contain another's number."""
-    names = dict(zip(job.files, job.names, strict=True))
-    return re.sub(r"\d+\.\w+", lambda found: names.get(found[0], found[0]), reason)

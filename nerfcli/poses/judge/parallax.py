@@ -78,12 +78,7 @@ def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[i
 
 
 def panorama_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]]) -> RotationFit | None:
-    """Find how well rotations explain the matches between panoramas, whose rays are known; None without a pair.
-
-    Args:
-        pairs: verified pairs of panoramas; if there are many, an even selection is used.
-        sizes: width and height of every panorama, pixels, by image id.
-    """
+    """Find how well rotations explain the matches between panoramas, whose rays are known, as `best_rotation_fit`."""
     if not pairs:
         return None
     chosen = pairs[:: -(-len(pairs) // _MOST_PAIRS)]

@@ -32,10 +32,7 @@ def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int, fixed: Sequenc
     uncertain too; the lens model is taken as chosen. Errors common to all photos, and errors that no lens model
     describes, are not included.
 
-    Args:
-        model: a converged model; it is not changed.
-        threads: of the adjustment, -1 for all.
-        fixed: ids of cameras whose intrinsics are taken to be exact.
+    The model has converged and is not changed; the intrinsics of the cameras `fixed` are taken to be exact.
 
     Returns:
         By image id; empty if there is no covariance, since the model is not constrained in all directions.

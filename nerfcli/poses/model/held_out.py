@@ -106,11 +106,7 @@ def adjust(
     """Run bundle adjustment of a whole model in place until it converges; return the adjuster, for the covariance.
 
     Args:
-        model: the model to adjust.
-        threads: -1 for all.
-        principal_points: whether they are adjusted too.
-        focal_lengths, distortion: whether they are adjusted too.
-        fixed: camera ids whose intrinsics are kept fixed.
+        fixed: ids of cameras whose intrinsics are kept fixed.
         robust_px: error from which observations are downweighted (Cauchy loss); None for squared errors.
         tolerance: the relative change of the cost per iteration at which it ends. The default is full convergence: of
             two models that are compared, neither must look better because it was adjusted longer.

@@ -6,6 +6,7 @@ of the observations: a richer model is kept if it predicts these better by more 
 are larger than their uncertainty; the principal point is freed by the same criteria.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,14 +18,16 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from nerfcli.poses.model import held_out
-from nerfcli.poses.model.lens_evidence import UndeterminedError, parameters_of
+from nerfcli.poses.model.lens_evidence import UndeterminedError, lenses_of, parameters_of
 from nerfcli.poses.model.lens_observability import (
+    Candidate,
     DeterminedLens,
     determine,
     has_open_distortion,
     is_centred,
     uncertainty,
 )
+from nerfcli.poses.model.projection import projected
 
 Array = NDArray[np.float64]
 
@@ -50,24 +53,6 @@ MOST_DESCRIBED = 8
 # iterations instead of 328, with cameras within 4e-5 of the radius from where these take them; with 1e-4 it is 1.3e-4.
 _TOLERANCE, _ROBUST_TOLERANCE = 1e-6, 1e-5
 _FIT_GRID = 15
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A lens model that was tried for a camera, or a decision by which parameters the observations determine.
-
-    held_out_px: for a wide lens, mean error of this camera's held-out observations, each clipped to 4 px. gain: how
-    many standard errors that is below the model kept before it. significance: for a wide lens, the largest ratio of an
-    added parameter to its standard deviation; else the distance of `determined.Step`. kept: whether it was chosen.
-    """
-
-    camera: int
-    model: str
-    principal_point: bool
-    held_out_px: float | None
-    gain: float | None
-    significance: float | None
-    kept: bool
 
 
 @dataclass(frozen=True)
@@ -100,13 +85,10 @@ def choose_lenses(
 
     Args:
         model: a converged model; it is not changed.
-        seed: of the choice of observations to use or to hold out.
-        threads: of the adjustments, -1 for all.
-        fixed: ids of cameras whose intrinsics are kept fixed.
         named: ids of cameras that keep their model; their principal points may still become free.
         exif_focal_px: by camera id, the focal length to keep if the observations do not determine it.
     """
-    photos = _photos_by_camera(model)
+    photos = Counter(lenses_of(model).values())
     cameras = sorted((c for c in photos if c not in fixed and photos[c] >= _LEAST_PHOTOS), key=lambda c: -photos[c])
     candidates: list[Candidate] = []
     freed: list[int] = []
@@ -136,13 +118,16 @@ def choose_lenses(
             held[camera_id] = found
             continue
         if found is None or wide:
-            free, tried = _by_trials(result, camera_id, seed=seed, threads=threads, fixed=fixed, named=named)
-            candidates.extend(tried)
+            training, left_out = held_out.split(result, seed=seed)
+            choice = _Choice(left_out, camera_id, threads=threads, fixed=fixed)
+            best = choice.make(training, named=camera_id in named)
+            _set_lens(camera, best.model.cameras[camera_id])
+            free = best.principal_point
+            candidates.extend(choice.tried)
         else:
             free = found.principal_point
-            candidates.extend(_decisions(camera_id, found))
-            camera.model = found.camera.model
-            camera.params = found.camera.params.tolist()
+            candidates.extend(found.steps)
+            _set_lens(camera, found.camera)
         freed += [camera_id] if free else []
     if held:
         return _with_held(
@@ -184,8 +169,7 @@ def _with_held(
     """
     start = pycolmap.Reconstruction(model)
     for camera_id, found in held.items():
-        start.cameras[camera_id].model = found.camera.model
-        start.cameras[camera_id].params = found.camera.params.tolist()
+        _set_lens(start.cameras[camera_id], found.camera)
     held_out.adjust(start, threads=threads, focal_lengths=False, fixed=[c for c in start.cameras if c not in held])
     for camera_id in held:
         if has_open_distortion(start, camera_id, seed=seed, fixed=[*fixed, *(c for c in held if c != camera_id)]):
@@ -196,7 +180,7 @@ def _with_held(
     chosen = choose_lenses(
         start, seed=seed, threads=threads, fixed=[*fixed, *held], named=named, exif_focal_px=exif_focal_px
     )
-    decided = [decision for camera_id, found in held.items() for decision in _decisions(camera_id, found)]
+    decided = [decision for found in held.values() for decision in found.steps]
     certain = {
         camera_id: uncertainty(chosen.model, camera_id, principal_point=False, seed=seed, fixed=fixed)
         for camera_id in held
@@ -205,38 +189,9 @@ def _with_held(
     return ModelLenses(chosen.model, [*decided, *chosen.candidates], chosen.uncertainty | certain)
 
 
-def _decisions(camera_id: int, found: DeterminedLens) -> list[Candidate]:
-    return [
-        Candidate(
-            camera_id,
-            step.model,
-            step.principal_point,
-            held_out_px=None,
-            gain=None,
-            significance=step.distance,
-            kept=step.taken,
-        )
-        for step in found.steps
-    ]
-
-
-def _by_trials(
-    result: pycolmap.Reconstruction,
-    camera_id: int,
-    *,
-    seed: int,
-    threads: int,
-    fixed: Sequence[int],
-    named: Sequence[int],
-) -> tuple[bool, list[Candidate]]:
-    """Set a camera by trials with held-out observations; return whether its principal point is free, and the trials."""
-    training, held = held_out.split(result, seed=seed)
-    choice = _Choice(held, camera_id, threads=threads, fixed=fixed)
-    best = choice.make(training, named=camera_id in named)
-    found = best.model.cameras[camera_id]
-    result.cameras[camera_id].model = found.model
-    result.cameras[camera_id].params = found.params.tolist()
-    return best.principal_point, choice.tried
+def _set_lens(camera: pycolmap.Camera, lens: pycolmap.Camera) -> None:
+    camera.model = lens.model
+    camera.params = lens.params.tolist()
 
 
 def settle(
@@ -272,7 +227,7 @@ def converted(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
     def misses(values: Array) -> Array:
         params[free] = values
         start.params = params.tolist()
-        found = np.asarray(start.img_from_cam(rays[good]), dtype=np.float64).reshape(-1, 2) - pixels[good]
+        found = projected(start, rays[good]) - pixels[good]
         return np.nan_to_num(found, nan=1e3).ravel()  # a ray that the trial cannot project counts as far off
 
     scale = np.array([camera.mean_focal_length() if i in start.focal_length_idxs() else 0.1 for i in free])
@@ -349,9 +304,7 @@ class _Choice:
         model = pycolmap.Reconstruction(training)
         camera = model.cameras[self.camera_id]
         if camera.model.name != name:
-            new = converted(camera, name)
-            camera.model = new.model
-            camera.params = new.params.tolist()
+            _set_lens(camera, converted(camera, name))
         others = [c for c in model.cameras if c != self.camera_id] if principal_point else self.fixed
         adjuster = held_out.adjust(model, threads=self.threads, principal_points=principal_point, fixed=others)
         mine = np.array([model.image(int(i)).camera_id == self.camera_id for i in self.held.images], dtype=bool)
@@ -377,11 +330,3 @@ def _significance(before: _Trial, after: _Trial, camera_id: int) -> float:
         added += [(index, new.params[index] - start) for index, start in zip(indices, before_it, strict=True)]
     ratios = [abs(value) / after.deviations[index] for index, value in added if after.deviations[index] > 0]
     return max(ratios, default=0.0)
-
-
-def _photos_by_camera(model: pycolmap.Reconstruction) -> dict[int, int]:
-    counts: dict[int, int] = {}
-    for image_id in model.reg_image_ids():
-        camera_id = model.image(image_id).camera_id
-        counts[camera_id] = counts.get(camera_id, 0) + 1
-    return counts

@@ -24,6 +24,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
 from nerfcli.poses.model import held_out
+from nerfcli.poses.model.projection import projected
 
 Array = NDArray[np.float64]
 
@@ -173,8 +174,7 @@ def lens_evidence(
     scores = np.einsum("nij,ni->nj", own, residuals)
     products = np.einsum("nij,nik->njk", own, own)
     clusters = (seen.photos, _scene_clusters(seen, seed=seed))
-    photo = next(image_id for image_id, lens_id in lens_of.items() if lens_id == camera_id)
-    camera = model.camera(model.image(photo).camera_id)
+    camera = camera_of(model, camera_id, lens_of)
     return LensEvidence(
         current=_current(camera),
         information=products.sum(axis=0),
@@ -189,6 +189,13 @@ def lens_evidence(
 def lenses_of(model: pycolmap.Reconstruction) -> dict[int, int]:
     """Return the camera id of each photo of a model whose photos share cameras, by image id."""
     return {image_id: model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+
+
+def camera_of(model: pycolmap.Reconstruction, lens: int, lens_of: Mapping[int, int] | None = None) -> pycolmap.Camera:
+    """Return the camera of a lens's first photo; `lens_of` as for `lens_evidence`."""
+    if lens_of is None:
+        return model.camera(lens)
+    return model.camera(model.image(next(photo for photo, number in lens_of.items() if number == lens)).camera_id)
 
 
 def parameters_of(camera: pycolmap.Camera) -> tuple[str, ...]:
@@ -270,7 +277,7 @@ def _jacobians(
         turned -= turned.transpose(0, 2, 1)
         poses[rows] = np.concatenate([jacobian @ turned, jacobian], axis=2)
         points[rows] = jacobian @ rotation
-        residuals[rows] = seen.pixels[rows] - np.asarray(camera.img_from_cam(local), dtype=np.float64).reshape(-1, 2)
+        residuals[rows] = seen.pixels[rows] - projected(camera, local)
         terms, of = _lens_terms(camera, local), seen.lenses[position]
         if of == camera_id:
             lens[rows, :, : len(NAMES)] = terms
@@ -290,12 +297,10 @@ def projection_jacobians(camera: pycolmap.Camera, local: Array) -> Array:
     """Return pixels per unit of points (n, 3) in the camera's axes, (n, 2, 3), by central differences."""
     step = 1e-5 * np.linalg.norm(local, axis=1, keepdims=True)
     columns = []
-    for axis in range(3):
-        offset = np.zeros((1, 3))
-        offset[0, axis] = 1.0
-        ahead = np.asarray(camera.img_from_cam(local + step * offset), dtype=np.float64).reshape(-1, 2)
-        behind = np.asarray(camera.img_from_cam(local - step * offset), dtype=np.float64).reshape(-1, 2)
-        columns.append((ahead - behind) / (2 * step))
+    for offset in np.eye(3):
+        columns.append(
+            (projected(camera, local + step * offset) - projected(camera, local - step * offset)) / (2 * step)
+        )
     return np.stack(columns, axis=-1)
 
 
@@ -329,7 +334,7 @@ def _freed(poses: Array, points: Array, lens: Array, seen: _Seen) -> Array:
     blocks = np.zeros((len(seen.xyz), 3, 3))
     np.add.at(blocks, seen.points, np.einsum("nij,nik->njk", points, points))
     blocks += _DAMPING * (np.trace(blocks, axis1=1, axis2=2) + 1e-300)[:, None, None] * np.eye(3)
-    inverse = _block_diagonal(np.linalg.inv(blocks))
+    inverse = _sparse(np.linalg.inv(blocks), np.arange(len(blocks)), width=3 * len(blocks))
     cross = csr_array(by_point.T @ by_pose)
     cross_lens = by_point.T @ flat
     normal = (by_pose.T @ by_pose - cross.T @ (inverse @ cross)).toarray()
@@ -342,18 +347,11 @@ def _freed(poses: Array, points: Array, lens: Array, seen: _Seen) -> Array:
 
 
 def _sparse(blocks: Array, columns: NDArray[np.int64], *, width: int) -> csr_array:
-    """Return a sparse matrix of blocks (n, 2, size), with block i in row block i and column block `columns[i]`."""
-    count, _, size = blocks.shape
-    places = np.repeat((columns[:, None] * size + np.arange(size))[:, None, :], 2, axis=1)
-    pointers = np.arange(0, 2 * count * size + 1, size)
-    return csr_array((blocks.ravel(), places.ravel(), pointers), shape=(2 * count, width))
-
-
-def _block_diagonal(blocks: Array) -> csr_array:
-    count = len(blocks)
-    places = np.repeat((3 * np.arange(count)[:, None] + np.arange(3))[:, None, :], 3, axis=1)
-    pointers = np.arange(0, 9 * count + 1, 3)
-    return csr_array((blocks.ravel(), places.ravel(), pointers), shape=(3 * count, 3 * count))
+    """Return a sparse matrix of blocks (n, rows, size), with block i in row block i and column block `columns[i]`."""
+    count, rows, size = blocks.shape
+    places = np.repeat((columns[:, None] * size + np.arange(size))[:, None, :], rows, axis=1)
+    pointers = np.arange(0, blocks.size + 1, size)
+    return csr_array((blocks.ravel(), places.ravel(), pointers), shape=(rows * count, width))
 
 
 def _scene_clusters(seen: _Seen, *, seed: int) -> NDArray[np.int64]:

@@ -94,11 +94,7 @@ def localise(
     Photos that resemble the points of a newly placed one are tried again, so that chains of photos are followed. A
     photo is not kept if its verified matches with another photo, if there are enough of them, contradict its pose.
 
-    Args:
-        model: with points; it is not changed.
-        job: provides features and matches.
-        image_ids: of the photos to place.
-        report: called with ("locate", done, total), in trials, of which each photo may have several.
+    `report` is called with ("locate", done, total), in trials, of which each photo may have several.
     """
     grown = pycolmap.Reconstruction(model)
     if model.num_points3D() < _LEAST_FOUND:
@@ -123,7 +119,11 @@ def localise(
                     continue
                 placed, attempts[image_id] = _place(photo, model_points, seed=job.seed)
                 if placed is not None:
-                    _add(grown, photo, placed, model_points=model_points, name=files[image_id])
+                    place(
+                        grown, photo.camera, placed.pose, image_id=image_id, name=files[image_id], pixels=photo.pixels
+                    )
+                    for feature, point in zip(placed.features, model_points.ids[placed.points], strict=True):
+                        grown.add_observation(int(point), pycolmap.TrackElement(image_id, int(feature)))
                     placed_now.append(image_id)
             left = [image_id for image_id in left if image_id not in placed_now]
             if not left or not placed_now:
@@ -320,19 +320,27 @@ def _deviations(photo: PhotoFeatures, model_points: KnownPoints, placed: _Placed
     return float(np.degrees(spread[:3].max())), float(spread[3:].max() / distance)
 
 
-def _add(
-    model: pycolmap.Reconstruction, photo: PhotoFeatures, placed: _Placed, *, model_points: KnownPoints, name: str
+def place(
+    model: pycolmap.Reconstruction,
+    camera: pycolmap.Camera,
+    cam_from_world: pycolmap.Rigid3d,
+    *,
+    image_id: int,
+    name: str,
+    pixels: Array,
 ) -> None:
-    """Add a photo and its observations to a model."""
-    if not model.exists_camera(photo.camera.camera_id):
-        model.add_camera_with_trivial_rig(photo.camera)
-    if model.exists_image(photo.image_id):
-        frame = model.frame(model.image(photo.image_id).frame_id)
-        frame.rig_from_world = placed.pose
+    """Give a photo a pose in a model, and add it, with its camera and its features at `pixels` (n, 2), if it is new."""
+    if not model.exists_camera(camera.camera_id):
+        model.add_camera_with_trivial_rig(camera)
+    if model.exists_image(image_id):
+        frame = model.frame(model.image(image_id).frame_id)
+        frame.rig_from_world = cam_from_world
         model.register_frame(frame.frame_id)
     else:
-        image = pycolmap.Image(name=name, camera_id=photo.camera.camera_id, image_id=photo.image_id)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in photo.pixels])
-        model.add_image_with_trivial_frame(image, placed.pose)
-    for feature, point in zip(placed.features, placed.points, strict=True):
-        model.add_observation(int(model_points.ids[point]), pycolmap.TrackElement(photo.image_id, int(feature)))
+        image = pycolmap.Image(name=name, keypoints=pixels, camera_id=camera.camera_id, image_id=image_id)
+        model.add_image_with_trivial_frame(image, cam_from_world)
+
+
+def pixels_of(image: pycolmap.Image) -> Array:
+    """Return the pixels of all features of a photo in a model, (n, 2)."""
+    return np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)

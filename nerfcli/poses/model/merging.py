@@ -19,6 +19,7 @@ from nerfcli.cameras.alignment import align as similarity
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.poses.input.plan import duration
 from nerfcli.poses.model.intrinsics import settle
+from nerfcli.poses.model.localise import pixels_of, place
 from nerfcli.poses.model.projection import is_ahead, offsets_px
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, count_matches, read_verified_pairs
 
@@ -60,11 +61,7 @@ def merge_models(
 
     Args:
         models: of one database, largest first; they are not changed.
-        database: with the matches.
         output: a folder for temporary files of pycolmap.
-        seed: of the search for the similarity.
-        threads: -1 for all.
-        fixed: ids of cameras whose intrinsics are kept fixed.
         seconds: time after which the remaining models are not merged.
         report: called with ("merge", models done, models in all).
         tell: called with what was cut short, if anything was.
@@ -180,16 +177,8 @@ def _joined(
     joined = pycolmap.Reconstruction(first)
     for photo in sorted(set(second.reg_image_ids()) - set(first.reg_image_ids())):
         image = moved.image(photo)
-        if not joined.exists_camera(image.camera_id):
-            joined.add_camera_with_trivial_rig(second.camera(image.camera_id))
-        if joined.exists_image(photo):
-            frame = joined.frame(joined.image(photo).frame_id)
-            frame.rig_from_world = image.cam_from_world()
-            joined.register_frame(frame.frame_id)
-        else:
-            fresh = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=photo)
-            fresh.points2D = pycolmap.Point2DList([pycolmap.Point2D(point.xy) for point in image.points2D])
-            joined.add_image_with_trivial_frame(fresh, image.cam_from_world())
+        camera = second.camera(image.camera_id)
+        place(joined, camera, image.cam_from_world(), image_id=photo, name=image.name, pixels=pixels_of(image))
     output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = threads

@@ -21,6 +21,8 @@ from nerfcli.poses.model import held_out
 from nerfcli.poses.model.intrinsics import MOST_DESCRIBED
 from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.lens_observability import uncertainty, with_own_principal_points
+from nerfcli.poses.model.localise import pixels_of, place
+from nerfcli.poses.model.projection import projected
 
 Array = NDArray[np.float64]
 
@@ -78,14 +80,9 @@ def choose_principal_points(
 ) -> StabilisedModel:
     """Return the model with a camera for each photo if their principal points differ, else the model as it is.
 
-    Photos of one lens keep a common focal length and distortion, which are adjusted too.
-
-    Args:
-        model: a converged model; it is not changed.
-        seed: of the choice of observations to hold out.
-        threads: of the adjustments, -1 for all.
-        fixed: ids of cameras whose intrinsics are kept fixed.
-        report: called with ("stabilise", done, total), then with ("settle", done, total) if principal points differ.
+    Photos of one lens keep a common focal length and distortion, which are adjusted too. The model has converged and is
+    not changed. `report` is called with ("stabilise", done, total), then with ("settle", done, total) if principal
+    points differ.
     """
     report("stabilise", 0, 2)
     shared, held = held_out.split(model, seed=seed)
@@ -117,10 +114,7 @@ def with_own_cameras(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         image = model.image(image_id)
         camera = pycolmap.Camera(model.camera(image.camera_id).todict())
         camera.camera_id = image_id
-        own.add_camera_with_trivial_rig(camera)
-        fresh = pycolmap.Image(name=image.name, camera_id=image_id, image_id=image_id)
-        fresh.points2D = pycolmap.Point2DList([pycolmap.Point2D(point.xy) for point in image.points2D])
-        own.add_image_with_trivial_frame(fresh, image.cam_from_world())
+        place(own, camera, image.cam_from_world(), image_id=image_id, name=image.name, pixels=pixels_of(image))
     for point_id in sorted(model.point3D_ids()):
         own.add_point3D_with_id(point_id, model.point3D(point_id))
     return own
@@ -156,8 +150,8 @@ def refine_with_principal_point(
 
     def misses(values: Array) -> Array:
         pose = moved(values)
-        projected = np.asarray(camera.img_from_cam(points @ pose[:, :3].T + pose[:, 3]), dtype=np.float64)
-        return np.nan_to_num(projected.reshape(-1, 2) + values[6:] - pixels, nan=1e3).ravel()
+        seen = projected(camera, points @ pose[:, :3].T + pose[:, 3])
+        return np.nan_to_num(seen + values[6:] - pixels, nan=1e3).ravel()
 
     found = np.zeros(8)
     for _ in range(_ROUNDS):

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 # Below this a photo is blank for our purposes: pycolmap's mapper needs 100 common points to begin.
 FEW_FEATURES = 100
@@ -12,32 +11,24 @@ FEW_MATCHES = 30
 NO_TRAINING_PHOTO = "its camera took no training photo"
 
 
-@dataclass(frozen=True)
-class Evidence:
-    """Evidence about one photo that did not register.
+def reason(
+    features: int, best_matches: int, best_partner: str | None, *, other_model_size: int, size_px: tuple[int, int]
+) -> str:
+    """Return a phrase for the first condition that by itself explains why a photo was left out.
 
-    features: keypoints found in it. best_matches: the most geometrically verified matches with any one photo,
-    best_partner: that photo's name. other_model_size: number of photos in another model with this photo, 0 without one.
-    size_px: width and height.
+    Args:
+        features: keypoints found in it.
+        best_matches: the most geometrically verified matches with any one photo; best_partner: that photo's name.
+        other_model_size: number of photos in another model with this photo, 0 without one.
+        size_px: width and height.
     """
-
-    features: int
-    best_matches: int
-    best_partner: str | None
-    other_model_size: int
-    size_px: tuple[int, int]
-
-
-def reason(evidence: Evidence) -> str:
-    """Return a phrase for the first condition that by itself explains why the photo was left out."""
-    if evidence.other_model_size:
-        return f"in another model of {evidence.other_model_size} photos"
-    if evidence.features < FEW_FEATURES:
-        width, height = evidence.size_px
-        return f"too few features ({evidence.features} in {width}x{height} pixels)"
-    if evidence.best_matches < FEW_MATCHES:
-        return f"matches no other photo well (best {evidence.best_matches} verified matches)"
-    return f"rejected by the mapper ({evidence.best_matches} verified matches with {evidence.best_partner})"
+    if other_model_size:
+        return f"in another model of {other_model_size} photos"
+    if features < FEW_FEATURES:
+        return f"too few features ({features} in {size_px[0]}x{size_px[1]} pixels)"
+    if best_matches < FEW_MATCHES:
+        return f"matches no other photo well (best {best_matches} verified matches)"
+    return f"rejected by the mapper ({best_matches} verified matches with {best_partner})"
 
 
 _ADVICE = {
