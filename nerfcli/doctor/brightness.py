@@ -23,12 +23,7 @@ _PALE = 0.3
 
 @dataclass(frozen=True)
 class Brightness:
-    """Brightness of one photo.
-
-    Args:
-        mean: of all channels, sRGB in [0, 1].
-        white, black: fraction of the pixels with all channels clipped at that end.
-    """
+    """Mean of all channels of a photo, sRGB in [0, 1], and the fractions of its pixels clipped at either end."""
 
     mean: float
     white: float
@@ -49,10 +44,7 @@ def local_light(rgb: np.ndarray) -> np.ndarray:
 
     First log2 of the linear luminance, to which a stop of exposure adds 1; NaN where it is clipped or too dark.
     Second log2 of red over blue, which white balance shifts; NaN also where the colour is saturated, since a small
-    highlight on it shifts the ratio by more than the white balance does.
-
-    Args:
-        rgb: (H, W, 3) uint8 sRGB.
+    highlight on it shifts the ratio by more than the white balance does. The picture is (H, W, 3) uint8 sRGB.
     """
     light = np.maximum(cv2.GaussianBlur(cv2.LUT(rgb, _LINEAR), (0, 0), _WINDOW_PX), 1e-6)
     clipped = 255 * np.any((rgb >= WHITE_LEVEL) | (rgb <= BLACK_LEVEL), axis=2).astype(np.uint8)

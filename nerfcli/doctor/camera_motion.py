@@ -21,9 +21,8 @@ class TwoViews:
     """Camera motion between two photos.
 
     Args:
-        homography_share: fraction of the matches that one homography fits within `WITHIN_PX`: near 1 if the camera only
+        homography_fraction: of the matches that one homography fits within `WITHIN_PX`: near 1 if the camera only
             turned, or if everything it saw is flat.
-        rotation_deg: angle of the camera's rotation.
         baseline_over_depth: distance between the camera positions, relative to the distance of the scene.
     """
 

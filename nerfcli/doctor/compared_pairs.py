@@ -4,6 +4,7 @@ All of this works without poses, at the picture size `photo_facts.LONGER_SIDE_PX
 match in the first and the second photo.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,13 +57,13 @@ class Pair:
     second: int
     matches: int
     inliers: int
-    shift: float
-    detail: float
-    stops: float
-    stops_spread: float
-    redder: float
-    views: camera_motion.TwoViews | None
-    patches: tuple[Patch, ...]
+    shift: float = math.nan
+    detail: float = math.nan
+    stops: float = math.nan
+    stops_spread: float = math.nan
+    redder: float = math.nan
+    views: camera_motion.TwoViews | None = None
+    patches: tuple[Patch, ...] = ()
     motions: Motions | None = None
     agreeing: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -96,10 +97,8 @@ def compare(
         _, agree = fundamental_matrix(x, y, within_px=EPIPOLAR_PX)
     count = int(agree.sum())
     if count < LEAST_MATCHES:
-        unknown = float("nan")
-        return Pair(*numbers, len(a), count, unknown, unknown, unknown, unknown, unknown, None, ())
-    same_size = np.abs(np.log2(other.scales[b] / one.scales[a])) < _SAME_SIZE_OCTAVES
-    chosen = agree & same_size
+        return Pair(*numbers, len(a), count)
+    same_size = agree & (np.abs(np.log2(other.scales[b] / one.scales[a])) < _SAME_SIZE_OCTAVES)
     lighter, redder = (other.light[b[agree]] - one.light[a[agree]]).T
     stops = _median(lighter)
     views, patches, still = None, (), None
@@ -114,7 +113,7 @@ def compare(
         matches=len(a),
         inliers=count,
         shift=float(np.median(np.linalg.norm(y[agree] - x[agree], axis=1)) / np.hypot(*one.size)),
-        detail=_median(other.detail[b[chosen]] - one.detail[a[chosen]]),
+        detail=_median(other.detail[b[same_size]] - one.detail[a[same_size]]),
         stops=stops,
         stops_spread=_median(np.abs(lighter - stops)),
         redder=_median(redder),

@@ -30,13 +30,11 @@ class Diagnosis:
     """Result of an examination.
 
     Args:
-        subject: what was examined.
         findings: results of the checks that were made, in order.
         not_checked: (name, reason) of the checks that were not made.
         photos: the readable photos.
         lack: (photos,) log2 of the detail that each photo lacks relative to the others; NaN without texture.
         lighter: (photos,) stops by which each shows the same points brighter than the median photo; NaN where unknown.
-        pairs: the pairs that were compared.
     """
 
     subject: ExaminedCapture

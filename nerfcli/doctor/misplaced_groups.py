@@ -53,7 +53,7 @@ def misplaced_groups(
     usual_px, measured = usual(errors, len(photos))
     if not measured or usual_px >= USUAL_BAD_PX:
         return None
-    limit_px = contradicts_from_px(errors, len(photos))
+    limit_px = contradicts_from_px(usual_px)
     agreeing = {(pair.first, pair.second) for pair in errors if pair.error_px < limit_px}
     groups = connected_groups(range(len(frames)), agreeing)
     neighbours = _neighbours(frames, [(pair.first, pair.second) for pair in pairs])

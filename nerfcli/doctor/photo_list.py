@@ -11,13 +11,7 @@ from nerfcli.media.images import list_photos, list_unsupported, name_in, where_p
 
 @dataclass(frozen=True)
 class ExaminedCapture:
-    """A capture to examine.
-
-    Args:
-        path: as given by the user.
-        sources: its photos.
-        scene: the scene with their poses; None for a folder of photos.
-    """
+    """A capture to examine: its path as the user gave it, and the scene with the poses, None for a folder of photos."""
 
     path: Path
     sources: tuple[Source, ...]

@@ -49,7 +49,6 @@ class PairError:
     """How well the matches of two photos fit their poses.
 
     Args:
-        first, second: indices of the photos.
         matches: number of verified matches.
         error_px: their median distance from the epipolar geometry of the poses, at `photo_facts.LONGER_SIDE_PX`.
         behind: whether the poses put most of their points behind a camera.
@@ -82,7 +81,7 @@ def agreement(photos: Sequence[PhotoFacts], errors: Sequence[PairError]) -> Find
     usual_px, measured = usual(errors, len(photos))
     if not measured:
         return None
-    limit_px = contradicts_from_px(errors, len(photos))
+    limit_px = contradicts_from_px(usual_px)
     named = contradicting(errors, len(photos), limit_px=limit_px)
     behind = float(np.mean([pair.behind for pair in errors if pair.matches >= _LEAST_MATCHES]))
     summary = f"median epipolar error {usual_px:.2g} px"
@@ -121,10 +120,9 @@ def contradicting(errors: Sequence[PairError], count: int, *, limit_px: float) -
         left = [pair for pair in left if index not in (pair.first, pair.second)]
 
 
-def contradicts_from_px(errors: Sequence[PairError], count: int) -> float:
-    """Return the error in pixels from which on a pair contradicts its poses."""
-    usual_px, measured = usual(errors, count)
-    return max(_CONTRADICTS_PX, _TIMES_USUAL * usual_px) if measured else _CONTRADICTS_PX
+def contradicts_from_px(usual_px: float) -> float:
+    """Return the error in pixels from which on a pair contradicts its poses, by the usual error of the capture."""
+    return max(_CONTRADICTS_PX, _TIMES_USUAL * usual_px)
 
 
 def usual(errors: Sequence[PairError], count: int) -> tuple[float, int]:

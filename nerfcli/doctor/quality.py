@@ -113,10 +113,9 @@ def texture(photos: Sequence[PhotoFacts]) -> Finding:
 
 
 def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
-    """Compute by how many stops each photo is brighter, and redder, than the median photo at the same points.
+    """Compute by how many stops each photo is brighter, and redder (red over blue), than the median photo.
 
-    Returns:
-        stops (photos,) and stops of red over blue (photos,); NaN for photos without usable matches.
+    At the same points, (photos,) each; NaN for photos without usable matches.
     """
     linked = [pair for pair in pairs if pair.linked]
     places = [(pair.first, pair.second) for pair in linked]
@@ -129,32 +128,28 @@ def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarr
 
 def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
     """Check whether the same points are about equally bright in all photos; reports the exposures in EXIF."""
-    measured = ~np.isnan(lighter)
-    spread = float(np.ptp(lighter[measured])) if measured.any() else float("nan")
+    spread, verdict, off = _differences(lighter, look=STOPS_LOOK, bad=STOPS_BAD)
     settings = [
         float(np.log2(photo.exif.exposure_seconds * photo.exif.iso))
         for photo in photos
         if photo.exif.exposure_seconds and photo.exif.iso
     ]
     text = f"; EXIF: {np.ptp(settings):.1f} stops in time and ISO" if len(settings) > 1 else ""
-    off = [i for i in np.argsort(-np.abs(np.nan_to_num(lighter))) if measured[i] and abs(lighter[i]) > STOPS_LOOK / 2]
-    verdict = verdict_above(spread, look=STOPS_LOOK, bad=STOPS_BAD) if measured.any() else GOOD
-    if not measured.any() and len(settings) > 1:
+    seen = f"brightness differs by up to {spread:.1f} stops at the same points"
+    if np.isnan(spread):
+        seen = "no matches to compare brightness"
+    if np.isnan(spread) and len(settings) > 1:
         verdict = verdict_above(float(np.ptp(settings)), look=STOPS_LOOK, bad=STOPS_BAD)
     fixed = len(settings) == len(photos) and np.ptp(settings) < 0.1
-    seen = (
-        f"brightness differs by up to {spread:.1f} stops at the same points"
-        if measured.any()
-        else "no matches to compare brightness"
-    )
     advice = (
-        "the camera settings are constant, so the lighting changes or surfaces are shiny: avoid lamps and your shadow"
-        if fixed
-        else (
-            "fix the exposure in the camera and take all photos in one session; highlights and moving shadows have "
-            "the same effect"
-        )
+        "fix the exposure in the camera and take all photos in one session; highlights and moving shadows have the "
+        "same effect"
     )
+    if fixed:
+        advice = (
+            "the camera settings are constant, so the lighting changes or surfaces are shiny: avoid lamps and your "
+            "shadow"
+        )
     return Finding(
         "exposure",
         verdict,
@@ -168,20 +163,26 @@ def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
 
 def white_balance(photos: Sequence[PhotoFacts], redder: np.ndarray) -> Finding:
     """Check whether the same points have the same colour in all photos."""
-    measured = ~np.isnan(redder)
-    spread = float(np.ptp(redder[measured])) if measured.any() else float("nan")
-    verdict = verdict_above(spread, look=_BALANCE_LOOK, bad=_BALANCE_BAD) if measured.any() else GOOD
-    off = [i for i in np.argsort(-np.abs(np.nan_to_num(redder))) if measured[i] and abs(redder[i]) > _BALANCE_LOOK / 2]
+    spread, verdict, off = _differences(redder, look=_BALANCE_LOOK, bad=_BALANCE_BAD)
     seen = f"the red/blue ratio differs by up to {spread:.2f} stops at the same points"
     return Finding(
         "white balance",
         verdict,
-        seen if measured.any() else "no matches to compare colours",
+        "no matches to compare colours" if np.isnan(spread) else seen,
         spread,
         f"look from {_BALANCE_LOOK:g} stops, bad from {_BALANCE_BAD:g}",
         "" if verdict == GOOD else "fix the white balance in the camera; avoid coloured light",
         tuple((photos[i].name, f"{redder[i]:+.2f} stops redder") for i in off) if verdict != GOOD else (),
     )
+
+
+def _differences(values: np.ndarray, *, look: float, bad: float) -> tuple[float, str, list[int]]:
+    """Return the range of photos' values, NaN without any, its verdict, and the photos more than look / 2 from 0."""
+    if np.isnan(values).all():
+        return float("nan"), GOOD, []
+    spread = float(np.nanmax(values) - np.nanmin(values))
+    far = [int(i) for i in np.argsort(-np.abs(np.nan_to_num(values))) if abs(values[i]) > look / 2]
+    return spread, verdict_above(spread, look=look, bad=bad), far
 
 
 def clipping(photos: Sequence[PhotoFacts]) -> Finding:
@@ -225,7 +226,6 @@ def potentials(
     In each connected group of photos v is determined up to a constant, which makes its median 0.
 
     Args:
-        count: number of photos.
         pairs: (i, j) of each difference.
         differences: (len(pairs),) second minus first; NaN where unknown.
         trust: (len(pairs),) positive weights.

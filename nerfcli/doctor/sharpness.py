@@ -49,13 +49,9 @@ def octaves(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measure(grey: np.ndarray) -> tuple[Sharpness, np.ndarray]:
-    """Measure the sharpness of a photo, and the detail around each of its pixels.
+    """Measure the sharpness of a photo, and `detail` around each pixel, (H, W) float32, NaN where there is no texture.
 
-    Args:
-        grey: (H, W) float32 in levels of 255, at most `LONGER_SIDE_PX` long.
-
-    Returns:
-        The photo's sharpness, and `detail` around each pixel, (H, W) float32, NaN where there is no texture.
+    The photo is (H, W) float32 in levels of 255, at most `LONGER_SIDE_PX` long.
     """
     fine, coarse = octaves(grey)
     fine_power, coarse_power = (cv2.GaussianBlur(band * band, (0, 0), _WINDOW_PX) for band in (fine, coarse))

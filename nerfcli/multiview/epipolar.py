@@ -12,12 +12,8 @@ def fundamental_matrix(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the fundamental matrix (3, 3) of matches (N, 2); return it and the mask of its inliers, (N,) bool.
 
-    The matrix is NaN, without inliers, where none is found. Deterministic.
-
-    Args:
-        within_px: inlier threshold, the distance of a match from its epipolar lines.
-        trials: maximum number of random samples of matches.
-        least: minimum number of matches.
+    The matrix is NaN, without inliers, where none is found, as with fewer matches than `least`. Inliers are within
+    `within_px` of their epipolar lines. Deterministic.
     """
     nothing = np.full((3, 3), np.nan), np.zeros(len(x), dtype=bool)
     if len(x) < least:

@@ -33,12 +33,7 @@ class Features:
 
 @dataclass(frozen=True)
 class Matches:
-    """Features that two photos have in common; some matches are wrong.
-
-    Args:
-        photos: the indices of the two photos.
-        pixels: (N, 2) in each photo, pixel centres at 0.5.
-    """
+    """Features that two photos (indices) have in common, (N, 2) in each, pixel centres at 0.5; some are wrong."""
 
     photos: tuple[int, int]
     pixels: tuple[np.ndarray, np.ndarray]
@@ -76,8 +71,7 @@ def find_features(grey: np.ndarray, *, longer_side_px: int, most: int, used: np.
 def mutual_matches(one: np.ndarray, other: np.ndarray, *, ratio: float = RATIO) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of features that are each other's nearest, and nearer than `ratio` times the second nearest.
 
-    Args:
-        one, other: descriptors (N, 128) and (M, 128); squared distances between SIFT descriptors are exact in float32.
+    Squared distances between SIFT descriptors, (N, 128) and (M, 128), are exact in float32.
     """
     if min(len(one), len(other)) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)

@@ -57,14 +57,8 @@ def consistent_groups(photos: Sequence[int], joins: Iterable[Join]) -> list[list
     """Divide photos into groups that are consistent with the strongest evidence.
 
     Joins with a strength above 0 put photos in one group, those below 0 keep them apart. The stronger join wins: in the
-    order of absolute strength, a positive join merges two groups unless a stronger negative one keeps them apart.
-
-    Args:
-        photos: any numbers.
-        joins: (photo, photo, strength), of these photos.
-
-    Returns:
-        The groups, the largest first, each in the order of `photos`.
+    order of absolute strength, a positive join merges two groups unless a stronger negative one keeps them apart. The
+    largest group is the first, and each is in the order of `photos`.
 
     Example:
         >>> consistent_groups([1, 2, 3, 4], [(1, 2, 9.0), (3, 4, 9.0), (2, 3, 5.0), (1, 4, -6.0)])

@@ -26,13 +26,7 @@ FACES = len(_TURNS)
 
 @dataclass(frozen=True)
 class Faces:
-    """Photos with faces in place of panoramas.
-
-    Args:
-        photos: the faces of each panorama in turn, and the other photos as they are.
-        first: for each of the original photos, the index of its first one in `photos`.
-        originals: the original photos.
-    """
+    """Photos with the faces of each panorama in turn in its place, and for each original the index of its first one."""
 
     photos: list[LoadedPhoto]
     first: np.ndarray

@@ -134,11 +134,9 @@ def _up_to_its_border(own: _Small, mask: np.ndarray) -> np.ndarray:
 
 
 def _uppermost(valid: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return the mask (h, w) of the pixels at the upper border of a photo, or of the part of it that has rays.
+    """Return the mask (h, w) of the pixels at the upper border of a photo, or of the part of it that has rays, `valid`.
 
-    Args:
-        valid: (h, w) the pixels that have a ray.
-        up: (3,) the upward direction in the camera's axes.
+    `up` is in the camera's axes.
     """
     axis = int(abs(up[1]) >= abs(up[0]))  # the side of the photo that is up, also if the camera was turned
     beyond = np.pad(valid, WINDOW_PX // 2)

@@ -139,14 +139,13 @@ def _depths_of(photos: Sequence[LoadedPhoto], tracks: Tracks, *, longer_side_px:
         with ThreadPoolExecutor(max(1, threads)) as pool:
             views = list(pool.map(lambda photo: _view(photo, longer_side_px), photos))
 
-            def map_of(index: int) -> _Map:
-                own = points[shown[index]]
-                return _map(views[index], [views[other] for other in near[index]], own)
+            def map_of(index: int) -> tuple[np.ndarray, np.ndarray]:
+                return _map(views[index], [views[other] for other in near[index]], points[shown[index]])
 
             maps = list(pool.map(map_of, range(len(photos))))
 
             def depth_of(index: int) -> DenseDepth:
-                others = [(views[other], maps[other]) for other in near[index]]
+                others = [(views[other], maps[other][0]) for other in near[index]]
                 return _depth(photos[index], views[index], maps[index], others)
 
             return list(pool.map(depth_of, range(len(photos))))
@@ -213,37 +212,37 @@ def _view(photo: LoadedPhoto, longer_side_px: int) -> _View:
     return _View(np.ascontiguousarray(both[..., 0]), shown, matrix, turn, photo.frame.centre, pinhole)
 
 
-@dataclass(frozen=True)
-class _Map:
-    """Inverse depths (h, w) float32 along the optical axis, NaN where unknown, and their errors."""
+def _map(view: _View, others: Sequence[_View], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Match a view with its neighbours; `points` (P, 3) are the ones that the view shows.
 
-    rho: np.ndarray
-    errors: np.ndarray
-
-
-def _map(view: _View, others: Sequence[_View], points: np.ndarray) -> _Map:
-    """Match a view with its neighbours; `points` (P, 3) are the ones that the view shows."""
+    Returns inverse depths (h, w) float32 along the optical axis, NaN where unknown, and their errors.
+    """
     matched = [found for other in others if (found := _matched(view, other, points)) is not None]
     rho, errors, agreeing = _agreed(matched, view.grey.shape)
     rho[(agreeing < max(1, min(LEAST_AGREEING, len(matched)))) | ~view.shown | ~_has_texture(view.grey)] = np.nan
-    return _Map(rho, errors)
+    return rho, errors
 
 
-def _depth(photo: LoadedPhoto, view: _View, own: _Map, others: Sequence[tuple[_View, _Map]]) -> DenseDepth:
-    """Return the pixels of a photo whose depth a neighbour's map confirms."""
-    rows, columns = np.nonzero(np.isfinite(own.rho))
-    rho, errors = own.rho[rows, columns], own.errors[rows, columns]
+def _depth(
+    photo: LoadedPhoto,
+    view: _View,
+    own: tuple[np.ndarray, np.ndarray],
+    others: Sequence[tuple[_View, np.ndarray]],
+) -> DenseDepth:
+    """Return the pixels of a photo whose depth the inverse depths of a neighbour confirm."""
+    rows, columns = np.nonzero(np.isfinite(own[0]))
+    rho, errors = (values[rows, columns] for values in own)
     confirmed = np.zeros(len(rho), dtype=bool)
-    for other, other_depth in others:
+    for other, other_rho in others:
         turn = (other.matrix @ other.turn @ view.turn.T @ np.linalg.inv(view.matrix)).astype(np.float32)
         move = (other.matrix @ other.turn @ (view.centre - other.centre)).astype(np.float32)
         x, y, z = (a * columns + b * rows + (c + move * rho) for (a, b, c), move in zip(turn, move, strict=True))
-        height, width = other_depth.rho.shape
+        height, width = other_rho.shape
         with np.errstate(divide="ignore", invalid="ignore"):
             column, row = np.rint(x / z), np.rint(y / z)
             inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
             place = np.where(inside, row * width + column, 0).astype(np.int64)
-            confirmed |= inside & (np.abs(other_depth.rho.ravel()[place] * z / rho - 1.0) < CONSISTENT)
+            confirmed |= inside & (np.abs(other_rho.ravel()[place] * z / rho - 1.0) < CONSISTENT)
     rows, columns, rho, errors = rows[confirmed], columns[confirmed], rho[confirmed], errors[confirmed]
     bearings, _ = view.pinhole.bearings(np.stack([columns, rows], axis=-1) + 0.5)
     camera = photo.frame.camera

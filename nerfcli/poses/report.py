@@ -1,7 +1,7 @@
 """Content of poses_report.json: the result for each photo."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -31,7 +31,7 @@ class ImageReport:
     pose_blur_px: float | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PosesReport:
     """Content of poses_report.json, with the same names.
 
@@ -53,9 +53,9 @@ class PosesReport:
     total: int
     seconds: dict[str, float]
     images: tuple[ImageReport, ...]
-    mean_reprojection_error_px: float
-    points: int
-    cameras: tuple[dict[str, Any], ...]
+    mean_reprojection_error_px: float = 0.0
+    points: int = 0
+    cameras: tuple[dict[str, Any], ...] = ()
     models: tuple[int, ...]
     attempts: tuple[dict[str, Any], ...]
     matching: dict[str, Any]
@@ -63,7 +63,7 @@ class PosesReport:
     versions: dict[str, str]
     verdict: dict[str, Any]
     pose_blur_px: dict[str, Any] | None
-    lenses: tuple[dict[str, Any], ...]
+    lenses: tuple[dict[str, Any], ...] = ()
     parts: tuple[int, ...]
     intrinsics: dict[str, Any] | None = None
     strict: dict[str, Any] | None = None
@@ -102,35 +102,26 @@ def make_report(
                 **result["evidence"][number], other_model_size=elsewhere, size_px=size_px
             )
             images[name] = ImageReport(name, False, why, orientation)
-    return PosesReport(
-        registered=len(models[0]) if models else 0,
-        total=len(images),
-        seconds=result["seconds"],
-        images=tuple(images[name] for name in sorted(images)),
-        mean_reprojection_error_px=result.get("mean_reprojection_error_px", 0.0),
-        points=result.get("points", 0),
-        cameras=tuple(result.get("cameras", ())),
-        models=tuple(len(model) for model in models),
-        attempts=tuple(result["attempts"]),
-        matching=matching,
-        settings=settings,
-        versions={"nerfcli": nerfcli.__version__, **result["versions"]},
-        verdict=result["verdict"],
-        pose_blur_px=_blur_summary(images.values()),
-        lenses=tuple(result.get("lenses", ())),
-        parts=tuple(result["parts"]),
-        intrinsics=intrinsics,
-        strict=result.get("strict"),
-        components=tuple(
+    named_alike = {field.name: result[field.name] for field in fields(PosesReport) if field.name in result}
+    content: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in named_alike.items()
+    }
+    content |= {
+        "registered": len(models[0]) if models else 0,
+        "total": len(images),
+        "images": tuple(images[name] for name in sorted(images)),
+        "models": tuple(len(model) for model in models),
+        "matching": matching,
+        "settings": settings,
+        "versions": {"nerfcli": nerfcli.__version__, **result["versions"]},
+        "pose_blur_px": _blur_summary(images.values()),
+        "intrinsics": intrinsics,
+        "components": tuple(
             {**component, "photos": [photos.names[number] for number in component["photos"]]}
             for component in result["components"]
         ),
-        not_computed=result["not_computed"],
-        not_finite=result["not_finite"],
-        moving_foreground=result.get("moving_foreground"),
-        principal_points=result.get("principal_points"),
-        cut_short=tuple(result.get("cut_short", ())),
-    )
+    }
+    return PosesReport(**content)
 
 
 def closing_notes(report: PosesReport) -> list[str]:

@@ -80,11 +80,7 @@ def estimate_poses(
         _work(job, work, limits=limits, lock=space.lock, progress=progress, notify=notify)
         result = _read_json(work / "result.json")["content"]  # written by the worker, or complete from before
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
-        matching = {"rule": pairing.rule, "pairs": result["pairs"]}
-        if settings.pairs_file is not None:
-            matching["pairs_file_key"] = file_key(Path(settings.pairs_file))
-        if Path(settings.holdout).is_file():
-            matching["holdout_key"] = file_key(Path(settings.holdout))
+        matching = {"rule": pairing.rule, "pairs": result["pairs"], **_file_keys(settings)}
         report = make_report(photos, settings, result=result, matching=matching, intrinsics=grouped.given)
         if settings.component > max(len(report.components), 1):
             raise _no_such_component(report, photos_dir)
@@ -163,8 +159,6 @@ def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given
     report = _read_json(scene_dir / "poses_report.json")
     made = scene_dir.resolve() / _read_json(scene_dir / scene.SCENE_FILE)["image_folder"]
     names = [name_in(photos_dir, path) for path in list_photos(photos_dir, subfolders=settings.subfolders)]
-    pairs_key = None if settings.pairs_file is None else file_key(Path(settings.pairs_file))
-    holdout_key = file_key(Path(settings.holdout)) if Path(settings.holdout).is_file() else None
     earlier = report.get("intrinsics")
     wanted_settings: dict[str, Any] = asdict(settings)
     for name in ("threads", "accept_refused"):
@@ -175,10 +169,15 @@ def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given
     return (
         made.resolve() == photos_dir.resolve()
         and sorted(image["name"] for image in report["images"]) == sorted(names)
-        and report["matching"].get("pairs_file_key") == pairs_key
-        and report["matching"].get("holdout_key") == holdout_key
+        and {key: value for key, value in report["matching"].items() if key.endswith("_key")} == _file_keys(settings)
         and all(made_with[key] == value for key, value in wanted_settings.items())
     )
+
+
+def _file_keys(settings: PoseSettings) -> dict[str, str]:
+    """Return hashes of the files that the settings name."""
+    files = {"pairs_file_key": settings.pairs_file, "holdout_key": settings.holdout}
+    return {key: file_key(Path(file)) for key, file in files.items() if file is not None and Path(file).is_file()}
 
 
 def _work(

@@ -72,12 +72,12 @@ def extract(job: Job, report: Report) -> None:
     All photos are searched once, those with few features again as `_SEARCHES` says.
     """
     register_photos(job)
-    keys, stage_path = feature_keys(job), _stage_file(job, "features")
+    keys, stage_path = feature_keys(job), job.stage_file("features")
     there = read_stage(stage_path, _FEATURES_VERSION) or {}
     forget_features(job, [int(image_id) for image_id, key in keys.items() if there.get(image_id) != key])
     # From here on, all features in the database are those of `keys`.
     write_stage(stage_path, _FEATURES_VERSION, keys)
-    last_file = _stage_file(job, "searches")
+    last_file = job.stage_file("searches")
     kept = read_stage(last_file, _FEATURES_VERSION) or {}
     # The index of the last search of each photo, by number.
     last = [kept[i][1] if kept.get(i, [""])[0] == keys[i] else 0 for i in map(str, job.image_ids)]
@@ -98,7 +98,7 @@ def extract(job: Job, report: Report) -> None:
 
 def start_matching(job: Job, pairs: Sequence[tuple[int, int]]) -> None:
     """Remove the matches of other settings, and the verified matches of other pairs, which the mapper would use."""
-    matched, verified = _stage_file(job, "matches"), _stage_file(job, "geometries")
+    matched, verified = job.stage_file("matches"), job.stage_file("geometries")
     matches_key = stage_key(_MATCHES_VERSION, pycolmap.__version__)
     verified_key = stage_key(matches_key, job.seed)
     if read_stage(matched, matches_key) is None:
@@ -113,10 +113,8 @@ def start_matching(job: Job, pairs: Sequence[tuple[int, int]]) -> None:
 def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | None:
     """Match the descriptors of the pairs that have no matches yet, and verify them by two-view geometry.
 
-    Each pair's random numbers start from the seed, so its result does not depend on earlier work.
-
-    Returns:
-        A note if matching was cut short after ten times the planned time, so that the last pairs have no matches.
+    Each pair's random numbers start from the seed, so its result does not depend on earlier work. Returns a note if
+    matching was cut short after ten times the planned time, so that the last pairs have no matches.
     """
     planned = matching_seconds(len(pairs), max_features=job.max_features) / max(job.threads, 1)
     most, start = limit_seconds(planned, least=_LEAST_LIMIT_SECONDS), time.perf_counter()
@@ -204,10 +202,6 @@ def _by_limit(job: Job, numbers: Iterable[int]) -> dict[int, list[str]]:
         factor = min(_MOST_FEATURES_FOR_MASK, 2 ** int(math.log2(1 / fraction))) if fraction > 0 else 1
         limits.setdefault(job.max_features * factor, []).append(job.files[number])
     return limits
-
-
-def _stage_file(job: Job, stage: str) -> Path:
-    return Path(job.folder) / f"{job.rung}{'-' if job.rung else ''}{stage}.json"
 
 
 @contextmanager

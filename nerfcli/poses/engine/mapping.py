@@ -106,8 +106,7 @@ def map_photos(
 ) -> list[pycolmap.Reconstruction]:
     """Run the incremental mapper once, from scratch or from a model, unless an earlier call has done so.
 
-    Returns:
-        Its models as read back from disk, largest first, with point errors.
+    Its models are read back from disk, largest first, with point errors.
     """
     output = Path(job.folder) / f"{job.rung}models_{attempt}"
     base_folder = output.with_name(f"{output.name}_base")

@@ -10,7 +10,6 @@ Descriptors are integers, so their squared distances are exact: the result does 
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -39,7 +38,7 @@ def with_neighbours(job: Job, report: Report) -> Job:
     """
     if job.neighbours == 0:
         return job
-    path = Path(job.folder) / f"{job.rung}{'-' if job.rung else ''}pairs.json"
+    path = job.stage_file("pairs")
     key = stage_key(_VERSION, feature_keys(job), job.pairs, job.neighbours)
     found = read_stage(path, key)
     if found is None:
@@ -50,13 +49,9 @@ def with_neighbours(job: Job, report: Report) -> Job:
 
 
 def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
-    """Count the common features of all pairs of photos.
+    """Count the common features of all pairs of photos, (photos, photos), symmetric, 0 on the diagonal.
 
-    Args:
-        descriptors: per photo (features, 128) integers up to 255.
-
-    Returns:
-        (photos, photos) counts, symmetric, 0 on the diagonal.
+    `descriptors` are, per photo, (features, 128) integers up to 255.
     """
     count = len(descriptors)
     most = max((len(rows) for rows in descriptors), default=0)

@@ -30,10 +30,7 @@ def choose_component(
 ) -> ChosenModel:
     """Examine one component, and give it a second chance if pairs of photos contradict it.
 
-    Args:
-        mapped: the models of the first mapping.
-        component: its number, from 1; there may be no component with this number.
-        checks: makes a check runner for one model.
+    Components are numbered from 1; there may be none with this number. `checks` makes a check runner for one model.
     """
     if component == 1:
         return _largest(mapped, report, tell, checks=checks)
@@ -108,8 +105,7 @@ def _stage(job: Job) -> Path:
 def describe_components(models: Sequence[pycolmap.Reconstruction], job: Job) -> list[dict[str, Any]]:
     """Describe each model of a job, the largest first, by the matches in the job's database.
 
-    Returns:
-        Per model {"size", "photos": numbers, "apart": why it is not part of the largest, None for that one}.
+    Per model {"size", "photos": numbers, "apart": why it is not part of the largest, None for that one}.
     """
     members = [photo_numbers(model, job) for model in models]
     pairs = [(count, job.numbers[one], job.numbers[other]) for one, other, count in count_matches(job.database)]

@@ -57,11 +57,8 @@ def training_part(job: Job) -> Job:
 def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Report) -> dict[str, Any]:
     """Place the held-out photos of a job in the model of its training photos, and add them to the model on disk.
 
-    `result` is the worker's for `training`, the `training_part` of the job.
-
-    Returns:
-        The result for all photos of the job, with "strict": how each held-out photo was placed, and the fingerprints of
-        the training model before and after, which are equal.
+    Returns the worker's result for `training`, the `training_part` of the job, as one for all photos, with "strict":
+    how each held-out photo was placed, and the fingerprints of the training model before and after, which are equal.
     """
     folder = Path(job.folder) / "sparse" / "0"
     whole = _renumbered(job, training, result)

@@ -116,8 +116,7 @@ def run_worker(
 def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> UserError:
     """Return the error for a worker that ended with `returncode` during `stage`, with the last lines of its log.
 
-    Args:
-        free_bytes: free space on the disk that it wrote to. If that is full, the log may be empty.
+    If the disk that it wrote to is full, by its `free_bytes`, the log may be empty.
     """
     if free_bytes < _FULL_DISK_BYTES or "disk is full" in log or os.strerror(ENOSPC) in log:
         return UserError(
@@ -153,7 +152,7 @@ class _Guard:
         self._underway = underway
         self._check_written, self._check_seen = 0, 0.0
         self._worker = worker
-        self._limits = limits
+        self._most_bytes = limits.memory_bytes
         self._end = None if limits.seconds is None else since + limits.seconds
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -168,7 +167,7 @@ class _Guard:
         while not self._stopped.wait(_LOOK_EVERY_SECONDS):
             if self._end is not None and time.monotonic() > self._end:
                 self.reached = "time"
-            elif self._limits.memory_bytes is not None and self._resident() > self._limits.memory_bytes:
+            elif self._most_bytes is not None and resident_bytes(self._worker.pid) > self._most_bytes:
                 self.reached = "memory"
             elif self._is_overdue():
                 self.reached = "check"
@@ -187,9 +186,6 @@ class _Guard:
             return False
         most = self.check["seconds"]
         return most is not None and time.monotonic() - self._check_seen > most
-
-    def _resident(self) -> int:
-        return resident_bytes(self._worker.pid)
 
 
 def _limit_reached(which: str, limits: Limits, stage: str) -> UserError:

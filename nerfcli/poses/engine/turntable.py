@@ -94,12 +94,8 @@ def recalled(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
 def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[str, Any] | None]:
     """Return the job with masks of the object, if one turns in front of a static background, and the facts to report.
 
-    Args:
-        job: its photos get masks.
-        featured: the job whose features are in the database, with the same photos or some of them.
-
-    Returns:
-        The job, unchanged if no masks can be accepted; and the facts, None if there is nothing to report.
+    The database has the features of the job `featured`, with the same photos or some of them. The job is unchanged if
+    no masks can be accepted; the facts are None if there is nothing to report.
     """
     start = time.perf_counter()
     features = _Features(featured)

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from nerfcli.media.images import downscale
+
 # Longer sides, in pixels, of the pictures for measuring sharpness (about the size for extracting features) and motion.
 SHARPNESS_SIZE_PX = 960
 _MOTION_SIZE_PX = 320
@@ -58,9 +60,7 @@ class MotionPicture:
     def __init__(self, picture: np.ndarray):
         """picture: uint8, grey or RGB."""
         grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-        factor = max(1.0, max(grey.shape) / _MOTION_SIZE_PX)
-        size = (max(1, round(grey.shape[1] / factor)), max(1, round(grey.shape[0] / factor)))
-        self._grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        self._grey = downscale(grey, max(1.0, max(grey.shape) / _MOTION_SIZE_PX))
         self._corners: np.ndarray | None = None
 
     def moved_to(self, other: "MotionPicture") -> float:
@@ -91,10 +91,7 @@ def sharpness(grey: np.ndarray) -> float:
 def choose_frames(seconds: np.ndarray, measures: Sequence[FrameMeasure], *, count: int) -> list[int]:
     """Return the ascending numbers of `count` frames: the sharpest (the first of equals) of each of `count` stretches.
 
-    Args:
-        seconds: (frames,) increasing.
-        measures: of each frame.
-        count: 1...frames.
+    `seconds` (frames,) increase; `count` is 1...frames.
     """
     if not 1 <= count <= len(measures):
         raise ValueError(f"count must be within 1...{len(measures)}, got {count}")

@@ -101,6 +101,10 @@ class Job:
         """Folder of the masks, named after the photos' files with .png appended."""
         return Path(self.folder) / "masks"
 
+    def stage_file(self, name: str) -> Path:
+        """Return the path of a stage on the way to the database, see `stages`."""
+        return Path(self.folder) / f"{self.rung}{'-' if self.rung else ''}{name}.json"
+
     @property
     def fixed_cameras(self) -> list[int]:
         """Ids of the cameras whose intrinsics are kept fixed; a camera's id is the position of its group, from 1."""

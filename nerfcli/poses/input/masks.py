@@ -22,10 +22,7 @@ def lay_out_masks(
 ) -> tuple[WorkMask, ...]:
     """Write a mask for each photo, upright, for pycolmap: 00000.jpg.png for the photo 00000.jpg, black where not used.
 
-    Args:
-        files: the photos' names below the worker's folder of photos.
-        masks: the user's folder of masks.
-        folder: where to write; created if missing.
+    `files` are the photos' names below the worker's folder of photos, `masks` is the user's folder.
 
     Raises:
         UserError: no such folder, no mask in it for any photo, or masks that cannot be read or do not fit.

@@ -42,17 +42,12 @@ _COSINES = 2**20
 # Contradictions listed in the report; the fraction counts all.
 _MOST_LISTED = 20
 # Reported if the measurement failed.
-_UNKNOWN_GEOMETRY: dict[str, Any] = {
-    "triangulation_angle_deg": None,
-    "share_in_front": None,
-    "camera_spread_over_distance": None,
-}
-_UNKNOWN_HELD_OUT: dict[str, Any] = {
-    "observations": None,
-    "median_px": None,
-    "share_above_8_px": None,
-    "principal_points_central": None,
-}
+_UNKNOWN_GEOMETRY: dict[str, Any] = dict.fromkeys(
+    ("triangulation_angle_deg", "share_in_front", "camera_spread_over_distance")
+)
+_UNKNOWN_HELD_OUT: dict[str, Any] = dict.fromkeys(
+    ("observations", "median_px", "share_above_8_px", "principal_points_central")
+)
 
 
 @dataclass(frozen=True)

@@ -50,9 +50,7 @@ class RotationFit:
 def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]]) -> RotationFit | None:
     """Find how well rotations of one camera explain the matches; None without a pair.
 
-    Args:
-        pairs: verified pairs; if there are many, an even selection is used.
-        sizes: width and height of every photo, pixels, by image id.
+    If there are many pairs, an even selection is used. `sizes` are width and height, pixels, by image id.
     """
     if not pairs:
         return None

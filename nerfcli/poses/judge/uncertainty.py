@@ -30,12 +30,9 @@ def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int, fixed: Sequenc
 
     The noise of an observation is estimated from the residuals of the adjustment. Points and intrinsics are treated as
     uncertain too; the lens model is taken as chosen. Errors common to all photos, and errors that no lens model
-    describes, are not included.
-
-    The model has converged and is not changed; the intrinsics of the cameras `fixed` are taken to be exact.
-
-    Returns:
-        By image id; empty if there is no covariance, since the model is not constrained in all directions.
+    describes, are not included. The model has converged and is not changed; the intrinsics of the cameras `fixed` are
+    taken to be exact. The result is by image id; empty if there is no covariance, since the model is not constrained in
+    all directions.
     """
     copy = pycolmap.Reconstruction(model)
     adjuster = held_out.adjust(copy, threads=threads, fixed=fixed)

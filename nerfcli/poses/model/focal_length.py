@@ -52,15 +52,9 @@ def focal_length(pairs: Sequence[VerifiedPair], size: tuple[int, int], *, seed: 
     With a wrong focal length, a fundamental matrix corresponds to no rotation and direction (Kruppa's equations). For
     each focal length of a grid, each pair gets the essential matrix that fits its matches best; its cost above that of
     the pair's own best focal length, up to a limit, is summed over the pairs. Flat scenes, pure rotations, and cameras
-    that look at one point from one distance fit any focal length; then there is no rise, or a large spread.
-
-    Args:
-        pairs: of photos of one camera, with negligible distortion and the principal point at the centre.
-        size: (width, height) of its pictures.
-        seed: of the choice of pairs and matches, and of the spread.
-
-    Returns:
-        None if fewer than 20 pairs have enough matches.
+    that look at one point from one distance fit any focal length; then there is no rise, or a large spread. The pairs
+    are of one camera, with negligible distortion and the principal point at the centre. None if fewer than 20 of them
+    have enough matches.
     """
     rng = np.random.default_rng(seed)
     usable = [pair for pair in pairs if pair.matches >= _MATCHES]

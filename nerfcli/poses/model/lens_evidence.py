@@ -138,7 +138,6 @@ def lens_evidence(
 
     Args:
         camera_id: of the camera; of its lens with `lens_of`.
-        seed: of the selection of points of a large model, and of the clusters.
         fixed: cameras whose intrinsics are exact.
         lens_of: by image id, the lens of each photo, if photos have cameras of their own that differ in the principal
             point.

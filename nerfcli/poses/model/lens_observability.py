@@ -153,11 +153,9 @@ def with_own_principal_points(
 ) -> pycolmap.Camera | None:
     """Return a lens as the observations determine it if photos have principal points of their own: one Newton step.
 
-    The arguments are those of `lens_evidence`; each photo of the model has a camera of its own.
-
-    Returns:
-        The camera of the lens's first photo with these parameters, with its principal point; None if the observations
-        do not determine them, or the lens cannot be examined in this way.
+    The arguments are those of `lens_evidence`; each photo of the model has a camera of its own. Returns the camera of
+    the lens's first photo with these parameters, with its principal point; None if the observations do not determine
+    them, or the lens cannot be examined in this way.
     """
     camera = camera_of(model, lens, lens_of)
     free = parameters_of(camera)

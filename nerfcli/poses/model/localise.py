@@ -41,8 +41,9 @@ _LEAST_VOTES = 10
 _LEAST_FOUND = 25
 # Search radii for features, in tolerances: larger at first, since the first pose is rough.
 _WITHIN = (2.0, 1.0)
-# At these offsets from the predicted positions, in tolerances, at least `_CLEARLY` times fewer features must match.
-_BESIDE = (6.0, 9.0)
+# At offsets in eight directions from the predicted positions, in tolerances, at least `_CLEARLY` times fewer features
+# must match.
+_BESIDE = [(6.0, 9.0)[i % 2] * np.array([np.cos(i * np.pi / 4), np.sin(i * np.pi / 4)]) for i in range(8)]
 _HERE = np.zeros(2)
 _CLEARLY = 2.5
 # A second pose with this fraction of the votes makes the first one ambiguous.
@@ -206,9 +207,7 @@ def _place(photo: PhotoFeatures, model_points: KnownPoints, *, seed: int) -> tup
         if found is None:
             break
         placed = found
-    count, *beside = (
-        len(_expected(photo, model_points, placed.pose, beside=step)[0]) for step in (np.zeros(2), *_steps())
-    )
+    count, *beside = (len(_expected(photo, model_points, placed.pose, beside=step)[0]) for step in (_HERE, *_BESIDE))
     attempt = replace(attempt, found=count, beside=max(beside))
     if count < _LEAST_FOUND or count < _CLEARLY * max(beside):
         reason = f"{count} features match the expected positions, but {max(beside)} match wrong ones by chance"
@@ -278,12 +277,6 @@ def _expected(
         _, first = np.unique(ids[order], return_index=True)
         order = order[np.sort(first)]
     return features[order], points[order]
-
-
-def _steps() -> list[Array]:
-    """Return offsets in eight directions to positions where no feature is expected, in tolerances."""
-    angles = np.arange(8) * np.pi / 4
-    return [_BESIDE[i % 2] * np.array([np.cos(angle), np.sin(angle)]) for i, angle in enumerate(angles)]
 
 
 def _area(photo: PhotoFeatures, features: Indices) -> float:

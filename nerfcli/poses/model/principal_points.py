@@ -136,13 +136,8 @@ def refine_with_principal_point(
 ) -> tuple[Array, Array]:
     """Refine the pose and the principal point of one photo on fixed points; errors beyond the usual ones count less.
 
-    Args:
-        camera: of the photo, with a principal point near its own.
-        cam_from_world: (3, 4) its pose, near the best one.
-        pixels, points: (N, 2) where the photo shows the points (N, 3). N >= 4, for 8 unknowns.
-
-    Returns:
-        The pose (3, 4), and the shift (2,) of the principal point in pixels.
+    The photo shows the points (N, 3) at the pixels (N, 2); N >= 4, for 8 unknowns. The camera's principal point and the
+    pose (3, 4) are near the best ones. Returns the pose (3, 4), and the shift (2,) of the principal point in pixels.
     """
 
     def moved(values: Array) -> Array:

@@ -30,11 +30,9 @@ def offsets_px(camera: pycolmap.Camera, local: Array, pixels: Array) -> Array:
 
 
 def across_edge(camera: pycolmap.Camera, offsets: Array) -> Array:
-    """Return the shorter of two ways between pixels: across the left and right edge of a panorama, or as it is.
+    """Return the shorter of two ways between pixels (n, 2): across the left and right edge of a panorama, or as it is.
 
-    Args:
-        camera: of the photo.
-        offsets: (n, 2) differences of pixels; they are changed.
+    The offsets are changed.
     """
     if camera.is_spherical():
         offsets[:, 0] -= camera.width * np.round(offsets[:, 0] / camera.width)

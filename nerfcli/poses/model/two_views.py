@@ -138,8 +138,6 @@ def epipolar_angles(p: Array, q: Array, t: Array) -> Array:
 class RotationError:
     """The angle between a pair's own relative rotation and the model's, degrees; weight: the number of its inliers."""
 
-    one: int
-    other: int
     degrees: float
     weight: int
 
@@ -172,7 +170,7 @@ def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair
             continue
         pose = second.cam_from_world() * first.cam_from_world().inverse()
         degrees = float(np.degrees((own.rotation * pose.rotation.inverse()).angle()))
-        errors.append(RotationError(pair.one, pair.other, degrees, int(inliers.sum())))
+        errors.append(RotationError(degrees, int(inliers.sum())))
     return errors
 
 
