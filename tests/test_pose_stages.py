@@ -287,9 +287,9 @@ def test_two_calls_on_one_scene_do_not_meet(photos: Path, tmp_path: Path):
 
 
 def test_the_worker_keeps_the_lock_as_long_as_it_lives(tmp_path: Path):
-    with workspace(tmp_path / "scene") as space:
+    with workspace(tmp_path / "scene") as lock:
         code = "import sys; sys.stdin.read()"
-        child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, pass_fds=(space.lock,))
+        child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, pass_fds=(lock,))
     with pytest.raises(UserError, match="another"), workspace(tmp_path / "scene"):
         pass
     child.communicate()

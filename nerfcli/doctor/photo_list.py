@@ -42,14 +42,10 @@ def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
     if path.is_file() or scenes.is_scene(path):
         if subfolders:
             raise UserError(f"{path}: --subfolders is for photos, and this is a scene", "leave --subfolders out")
-        return _of_scene(path)
+        scene = scenes.load(path)
+        sources = tuple(Source(f.name, f.image, f.mask) for f in scene.frames if f.image is not None)
+        return ExaminedCapture(path, sources, scene)
     photos = [*list_photos(path, subfolders=subfolders), *list_unsupported(path, subfolders=subfolders)]
     if not photos:
         raise UserError(f"no photos and no scene in {path}", where_photos_may_be(path))
     return ExaminedCapture(path, tuple(Source(name_in(path, photo), photo) for photo in photos), None)
-
-
-def _of_scene(path: Path) -> ExaminedCapture:
-    scene = scenes.load(path)
-    sources = tuple(Source(f.name, f.image, f.mask) for f in scene.frames if f.image is not None)
-    return ExaminedCapture(path, sources, scene)

@@ -1,6 +1,6 @@
 """Content of poses_report.json: the result for each photo."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from statistics import median
@@ -102,6 +102,7 @@ def make_report(
                 **result["evidence"][number], other_model_size=elsewhere, size_px=size_px
             )
             images[name] = ImageReport(name, False, why, orientation)
+    blurs = sorted((image.pose_blur_px, image.name) for image in images.values() if image.pose_blur_px is not None)
     named_alike = {field.name: result[field.name] for field in fields(PosesReport) if field.name in result}
     content: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value for name, value in named_alike.items()
@@ -114,7 +115,9 @@ def make_report(
         "matching": matching,
         "settings": settings,
         "versions": {"nerfcli": nerfcli.__version__, **result["versions"]},
-        "pose_blur_px": _blur_summary(images.values()),
+        "pose_blur_px": {"median": median(px for px, _ in blurs), "largest": blurs[-1][0], "photo": blurs[-1][1]}
+        if blurs
+        else None,
         "intrinsics": intrinsics,
         "components": tuple(
             {**component, "photos": [photos.names[number] for number in component["photos"]]}
@@ -162,13 +165,6 @@ def closing_notes(report: PosesReport) -> list[str]:
     for check, why in report.not_computed.items():
         notes.append(f"could not compute a check ({check}): {why}")
     return notes
-
-
-def _blur_summary(images: Iterable[ImageReport]) -> dict[str, Any] | None:
-    blurs = sorted((image.pose_blur_px, image.name) for image in images if image.pose_blur_px is not None)
-    if not blurs:
-        return None
-    return {"median": median(px for px, _ in blurs), "largest": blurs[-1][0], "photo": blurs[-1][1]}
 
 
 def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:

@@ -74,10 +74,10 @@ def estimate_poses(
     for note in photo_notes(photos, grouped):
         notify(note)
     planned(plan)
-    with workspace(scene_dir) as space:
-        work = space.folder
+    work = scene_dir / "work"
+    with workspace(scene_dir) as lock:
         job = _prepare(photos, _searched(settings, grouped), grouped=grouped, pairing=pairing, work=work, notify=notify)
-        _work(job, work, limits=limits, lock=space.lock, progress=progress, notify=notify)
+        _work(job, work, limits=limits, lock=lock, progress=progress, notify=notify)
         result = _read_json(work / "result.json")["content"]  # written by the worker, or complete from before
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
         matching = {"rule": pairing.rule, "pairs": result["pairs"], **_file_keys(settings)}

@@ -11,7 +11,6 @@ The process that works in the folder holds its lock. If it is killed, the lock i
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from nerfcli.atomic import atomic_folder, clear_leftovers
@@ -26,17 +25,11 @@ REFUSED = "refused-model"
 POINTS_FILE = "points.ply"
 
 
-@dataclass(frozen=True)
-class Workspace:
-    """folder: SCENE/work. lock: a descriptor that the worker inherits, so that the lock lasts until both have ended."""
-
-    folder: Path
-    lock: int
-
-
 @contextmanager
-def workspace(scene_dir: Path) -> Iterator[Workspace]:
+def workspace(scene_dir: Path) -> Iterator[int]:
     """Open the work folder of a scene, for one process at a time.
+
+    Yields a descriptor of the lock that the worker inherits, so that the lock lasts until both have ended.
 
     Raises:
         UserError: another process is working there, or the folder cannot be written.
@@ -45,7 +38,7 @@ def workspace(scene_dir: Path) -> Iterator[Workspace]:
     with exclusive(folder / _LOCK, f"nerfcli poses is working on {scene_dir}") as lock:
         for place in (scene_dir, folder):
             clear_leftovers(place)
-        yield Workspace(folder, lock)
+        yield lock
 
 
 def is_under_construction(scene_dir: Path) -> bool:

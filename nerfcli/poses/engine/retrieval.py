@@ -42,7 +42,10 @@ def with_neighbours(job: Job, report: Report) -> Job:
     key = stage_key(_VERSION, feature_keys(job), job.pairs, job.neighbours)
     found = read_stage(path, key)
     if found is None:
-        common = likeness(_coarsest(job), report)
+        most = retrieval_feature_count(len(job.files))
+        with pycolmap.Database.open(job.database) as database:
+            descriptors = [coarsest(database, image_id, most)[1] for image_id in job.image_ids]
+        common = likeness(descriptors, report)
         found = [*promising(common, job.pairs), *alike(common, job.neighbours, paired=job.pairs)]
         write_stage(path, key, found)
     return replace(job, pairs=in_blocks((i, j) for i, j in found), neighbours=0)
@@ -106,17 +109,11 @@ def _clear_matches(distances: np.ndarray) -> np.ndarray:
     return (mutual & (first < _RATIO * distances.min(axis=2, keepdims=True))).sum(axis=(0, 2))
 
 
-def _coarsest(job: Job) -> list[np.ndarray]:
-    """Return, per photo, the descriptors of its largest-scale features."""
-    most = retrieval_feature_count(len(job.files))
-    found: list[np.ndarray] = []
-    with pycolmap.Database.open(job.database) as database:
-        for image_id in job.image_ids:
-            if not database.exists_descriptors(image_id):
-                found.append(np.zeros((0, 128), np.uint8))
-                continue
-            shapes = database.read_keypoints(image_id)[:, 2:6]  # the affine shape, row by row
-            areas = np.abs(shapes[:, 0] * shapes[:, 3] - shapes[:, 1] * shapes[:, 2])
-            order = np.argsort(-areas, kind="stable")[:most]
-            found.append(database.read_descriptors(image_id).data[order])
-    return found
+def coarsest(database: pycolmap.Database, image_id: int, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels (N, 2) and descriptors (N, 128) of the largest-scale features of a photo, the largest first."""
+    if not database.num_keypoints_for_image(image_id):
+        return np.zeros((0, 2)), np.zeros((0, 128), np.uint8)
+    keypoints = database.read_keypoints(image_id)
+    a, b, c, d = keypoints[:, 2:6].T  # the affine shape, row by row
+    order = np.argsort(-np.abs(a * d - b * c), kind="stable")[:most]
+    return keypoints[order, :2].astype(np.float64), database.read_descriptors(image_id).data[order]

@@ -8,7 +8,6 @@ import shutil
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import pycolmap
@@ -30,6 +29,7 @@ from nerfcli.poses.input.plan import at_once_seconds, duration, mapping_seconds
 from nerfcli.poses.input.stages import stage_key
 from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict
 from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.judge.contradictions import without_photos
 from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import NO_PARALLAX_PX
 from nerfcli.poses.model.intrinsics import settle
@@ -181,7 +181,16 @@ def _tried(
     seconds: float,
 ) -> MappedModels | None:
     """Return the models of a hypothesis, which are stored under `name`; None, and tell the user why, without any."""
-    found = runner.run(what, partial(_kept, job, name, make), otherwise=None, seconds=seconds)
+    key = stage_key(mapping_key(job), name)
+
+    def stored() -> MappedModels | None:
+        there = read_mapped(job, key, name=name)
+        if there is None and (made := make()) is not None:
+            write_mapped(made, key, name=name)
+            there = read_mapped(job, key, name=name)
+        return there
+
+    found = runner.run(what, stored, otherwise=None, seconds=seconds)
     if found is None or not found.models:
         tell(f"{what}: {runner.not_computed.get(what, 'nothing to map')}")
         return None
@@ -248,10 +257,7 @@ def _core(model: pycolmap.Reconstruction, job: Job) -> _Core:
     joins = [(a.one, a.other, -a.matches if a.contradicts else a.matches * a.fraction) for a in found]
     groups = consistent_groups(sorted(model.reg_image_ids()), joins)
     group_of = {photo: number for number, group in enumerate(groups) for photo in group}
-    rest = pycolmap.Reconstruction(model)
-    for photo in sorted(set(model.reg_image_ids()) - set(groups[0])):
-        rest.deregister_frame(rest.image(photo).frame_id)
-    rest.tear_down()
+    rest = without_photos(model, sorted(set(model.reg_image_ids()) - set(groups[0])))
     suspects = {
         (job.numbers[a.one], job.numbers[a.other])
         for a in found
@@ -298,7 +304,7 @@ def _mapped_without(
 
 def _all_at_once(mapped: MappedModels, core: _Core) -> MappedModels | None:
     """Estimate the rotations, then the positions, of all photos together, with the intrinsics of the core."""
-    job = _with_own_database(mapped.job, without=frozenset())
+    job = _with_own_database(mapped.job)
     for camera in core.model.cameras.values():
         camera.has_prior_focal_length = True
     _set_cameras(job, core.model)
@@ -314,22 +320,10 @@ def _set_cameras(job: Job, model: pycolmap.Reconstruction) -> None:
             database.update_camera(camera)
 
 
-def _with_own_database(job: Job, *, without: frozenset[tuple[int, int]]) -> Job:
+def _with_own_database(job: Job, *, without: Iterable[tuple[int, int]] = ()) -> Job:
     """Copy the job's database, without some pairs of photo numbers, and return the job of the copy."""
     copy = replace(job, rung="second-chance")
     shutil.copyfile(job.database, copy.database)
     left_out = {(min(pair), max(pair)) for pair in without}
     keep_geometries(copy, [pair for pair in job.pairs if (min(pair), max(pair)) not in left_out])
     return copy
-
-
-def _kept(job: Job, name: str, make: Callable[[], MappedModels | None]) -> MappedModels | None:
-    """Return the models that an earlier call wrote under this name, or make and write them."""
-    key = stage_key(mapping_key(job), name)
-    if (there := read_mapped(job, key, name=name)) is not None:
-        return there
-    made = make()
-    if made is None:
-        return None
-    write_mapped(made, key, name=name)
-    return read_mapped(job, key, name=name)

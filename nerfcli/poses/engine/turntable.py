@@ -25,6 +25,7 @@ from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.multiview.stationary import Motions, Stationary, motions, together
 from nerfcli.poses.engine.features import feature_keys
+from nerfcli.poses.engine.retrieval import coarsest
 from nerfcli.poses.input import still_background as still
 from nerfcli.poses.input.job import Job, Tell, WorkMask
 from nerfcli.poses.input.masks import write_mask, write_no_mask
@@ -161,20 +162,9 @@ class _Features:
     def of(self, number: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
         """Return pixels (N, 2), descriptors (N, 128), and the photo's (width, height)."""
         if number not in self._read:
+            image_id = self.job.image_ids[number]
             with pycolmap.Database.open(self.job.database) as database:
-                image_id = self.job.image_ids[number]
-                keypoints = np.asarray(database.read_keypoints(image_id))
-                descriptors = np.asarray(database.read_descriptors(image_id).data)
-                camera = database.read_camera(database.read_image(image_id).camera_id)
-            if not len(keypoints):
-                keypoints, descriptors = np.zeros((0, 6)), np.zeros((0, 128), np.uint8)
-            if keypoints.shape[1] >= 6:  # x, y and a 2 x 2 matrix
-                scales = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
-            else:
-                scales = keypoints[:, 2]
-            order = np.argsort(-scales, kind="stable")[:_FEATURES]
-            pixels = keypoints[order, :2].astype(np.float64)
-            self._read[number] = pixels, descriptors[order], (camera.width, camera.height)
+                self._read[number] = *coarsest(database, image_id, _FEATURES), self.job.sizes[image_id]
         return self._read[number]
 
     def compare(self, first: int, second: int) -> ComparedPair | None:

@@ -6,7 +6,6 @@ The frames are named by their number in the video, so that pairs are chosen as f
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,16 +34,6 @@ _JPEG_QUALITY = 97
 _END_BYTES = 1 << 20
 # Approximate fraction of the time for measuring, which decodes and examines every frame; extracting only decodes.
 _MEASURING_FRACTION = 0.7
-
-
-@dataclass(frozen=True)
-class VideoFrame:
-    """A frame that was written: its file's name, its number in the video from 0, its time, and its sharpness."""
-
-    name: str
-    number: int
-    seconds: float
-    sharpness: float
 
 
 def frames_folder(scene_dir: Path) -> Path:
@@ -125,14 +114,17 @@ def _write(
     numbers: Sequence[int],
     measured: MeasuredFrames[FrameMeasure],
     progress: Callable[[float], None],
-) -> list[VideoFrame]:
-    """Write the chosen frames that differ from the one written before; of similar frames, the sharpest one."""
-    written: list[VideoFrame] = []
+) -> list[dict[str, Any]]:
+    """Write the chosen frames that differ from the one written before; of similar frames, the sharpest one.
+
+    Returns the file's name, the number in the video from 0, the time, and the sharpness of each.
+    """
+    written: list[dict[str, Any]] = []
     for number, picture in _different(zip(numbers, read_frames(video, numbers), strict=True), measured.values):
         name = f"frame_{number:06d}.jpg"
         Image.fromarray(picture).save(folder / name, quality=_JPEG_QUALITY, subsampling=0)
-        sharp = measured.values[number].sharpness
-        written.append(VideoFrame(name, number, round(float(measured.seconds[number]), 6), round(sharp, 3)))
+        seconds, sharp = float(measured.seconds[number]), measured.values[number].sharpness
+        written.append({"name": name, "number": number, "seconds": round(seconds, 6), "sharpness": round(sharp, 3)})
         progress(number / len(measured.values))
     return written
 
@@ -195,14 +187,14 @@ def _identity(path: Path) -> dict[str, Any]:
     return {"name": path.name, "bytes": size, "sha256_of_ends": digest.hexdigest()}
 
 
-def _description(video: Video, request: dict[str, Any], *, total: int, frames: Sequence[VideoFrame]) -> dict[str, Any]:
+def _description(video: Video, request: dict[str, Any], *, total: int, frames: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the content of frames.json."""
     return {
         "request": request,
         "width": video.width,
         "height": video.height,
         "frames_in_video": total,
-        "frames": [vars(frame) for frame in frames],
+        "frames": frames,
         "settings": {
             "moved_share": MOVED_FRACTION,
             "sharpness_size_px": SHARPNESS_SIZE_PX,

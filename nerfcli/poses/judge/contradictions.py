@@ -1,6 +1,6 @@
 """Find the verified pairs of photos that contradict a model, and leave out the photos on the weaker side."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,11 +73,16 @@ def leave_out_contradicting(
             )
     if len(reasons) > _MOST_LEFT_OUT * len(placed):
         return model, {}
+    return without_photos(model, reasons), reasons
+
+
+def without_photos(model: pycolmap.Reconstruction, photos: Iterable[int] = ()) -> pycolmap.Reconstruction:
+    """Copy a model without some photos and those that have no pose: pycolmap's covariance raises on them."""
     rest = pycolmap.Reconstruction(model)
-    for photo in reasons:
+    for photo in photos:
         rest.deregister_frame(rest.image(photo).frame_id)
-    rest.tear_down()  # an image without a pose would make the covariance fail
-    return rest, reasons
+    rest.tear_down()
+    return rest
 
 
 def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[Agreement]) -> list[Contradiction]:

@@ -11,7 +11,7 @@ from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict, judge, nothing_placed
 from nerfcli.poses.judge.checks import Checks
-from nerfcli.poses.judge.contradictions import leave_out_contradicting
+from nerfcli.poses.judge.contradictions import leave_out_contradicting, without_photos
 from nerfcli.poses.judge.parallax import RotationFit, best_rotation_fit, panorama_rotation_fit
 from nerfcli.poses.judge.uncertainty import pose_blur_px
 from nerfcli.poses.model.intrinsics import ModelLenses, choose_lenses
@@ -64,7 +64,7 @@ def examine(
         return ExaminedModel(None, nothing_placed(turn), {}, {}, details | {"not_computed": checks.not_computed})
     names = dict(zip(job.files, job.names, strict=True))
     report("check", 0, 4)
-    mapped = with_pose_only(models[0])
+    mapped = without_photos(models[0])
     held: list[VerifiedPair] = checks.run(
         "points of single photos", lambda: shared_pairs(mapped, localised, min_matches=MIN_MATCHES), otherwise=[]
     )
@@ -119,13 +119,6 @@ def _rotation_fit(pairs: Sequence[VerifiedPair], job: Job) -> RotationFit | None
     if len(panoramas) == len(job.files):
         return panorama_rotation_fit(pairs, job.sizes)
     return best_rotation_fit([pair for pair in pairs if not {pair.one, pair.other} & panoramas], job.sizes)
-
-
-def with_pose_only(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """Copy a model without the images that have no pose: pycolmap's covariance raises on them."""
-    copy = pycolmap.Reconstruction(model)
-    copy.tear_down()
-    return copy
 
 
 def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> ModelLenses:

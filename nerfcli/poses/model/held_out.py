@@ -163,9 +163,13 @@ def observation_errors_px(model: pycolmap.Reconstruction) -> Array:
 
 
 def intrinsic_deviations(
-    model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster, *, principal_points: bool
-) -> dict[int, Array]:
-    """Return the standard deviation of each intrinsic parameter after an adjustment, by camera id; NaN if it was fixed.
+    model: pycolmap.Reconstruction,
+    adjuster: pycolmap.CeresBundleAdjuster,
+    camera_id: int,
+    *,
+    principal_points: bool,
+) -> Array:
+    """Return the standard deviation of each intrinsic parameter of a camera after an adjustment; NaN if it was fixed.
 
     The noise of the observations is estimated from the residuals.
     """
@@ -175,16 +179,13 @@ def intrinsic_deviations(
         covariance = pycolmap.estimate_ba_covariance(options, model, adjuster)
     except (RuntimeError, ValueError):  # an image without a pose
         covariance = None
-    deviations: dict[int, Array] = {}
-    for camera_id, camera in model.cameras.items():
-        deviations[camera_id] = np.full(len(camera.params), np.nan)
-        found = None if covariance is None else covariance.get_other_params_cov(camera.params)
-        if found is None:
-            continue
+    camera = model.cameras[camera_id]
+    deviations = np.full(len(camera.params), np.nan)
+    found = None if covariance is None else covariance.get_other_params_cov(camera.params)
+    if found is not None:
         free = [*camera.focal_length_idxs(), *camera.extra_params_idxs()]
         free += camera.principal_point_idxs() if principal_points else []
-        spread = np.sqrt(np.maximum(np.diag(found), 0)) * residual_deviation_px(model)
-        deviations[camera_id][sorted(free)] = spread
+        deviations[sorted(free)] = np.sqrt(np.maximum(np.diag(found), 0)) * residual_deviation_px(model)
     return deviations
 
 

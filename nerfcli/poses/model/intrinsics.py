@@ -309,8 +309,8 @@ class _Choice:
         adjuster = held_out.adjust(model, threads=self.threads, principal_points=principal_point, fixed=others)
         mine = np.array([model.image(int(i)).camera_id == self.camera_id for i in self.held.images], dtype=bool)
         errors = np.minimum(held_out.errors_px(model, self.held)[mine], held_out.MOST_ERROR_PX)
-        deviations = held_out.intrinsic_deviations(model, adjuster, principal_points=principal_point)
-        return _Trial(model, principal_point, errors, deviations[self.camera_id])
+        deviations = held_out.intrinsic_deviations(model, adjuster, self.camera_id, principal_points=principal_point)
+        return _Trial(model, principal_point, errors, deviations)
 
     def _note(self, trial: _Trial, *, gain: float | None, significance: float | None, kept: bool) -> None:
         error = float(trial.errors.mean()) if len(trial.errors) else None
