@@ -58,31 +58,26 @@ def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
     smeared = (ratios > _SMEARED * usual) & (lack > _SMEARED_LACK)
     blurred = ~blank & ((lack > BLURRED) | smeared)
     very = ~blank & (lack > VERY_BLURRED)
-    order = [int(i) for i in np.argsort(-np.nan_to_num(lack, nan=-9)) if blurred[i]]
     flagged = [
         (photos[i].name, f"{100 * 2 ** -lack[i]:.0f} % of the usual detail{', smeared' if smeared[i] else ''}")
-        for i in order
+        for i in np.argsort(-np.nan_to_num(lack, nan=-9))
+        if blurred[i]
     ]
     middle = float(np.median(own[~blank])) if (~blank).any() else float("nan")
     whole = GOOD if np.isnan(middle) else verdict_below(middle, look=SOFT, bad=VERY_SOFT)
     fraction = float(blurred.mean())
     verdict = worst([whole, BAD if fraction > 0.3 or very.mean() > 0.1 else LOOK if blurred.any() else GOOD])
-    parts = []
+    parts, advice = [], []
     if blurred.any():
         parts.append(f"{blurred.sum()} of {several(len(photos), 'photo')} blurred")
-    if whole != GOOD:
-        parts.append("all photos are soft, as if upscaled or out of focus")
-    if not parts:
-        parts.append("no photo is blurred compared with the others")
-    advice = []
-    if blurred.any():
         advice.append("remove them if others show the same, or take them again with a shorter exposure time")
     if whole != GOOD:
+        parts.append("all photos are soft, as if upscaled or out of focus")
         advice.append("train with --downscale 2 or use sharper originals")
     return Finding(
         "sharpness",
         verdict,
-        "; ".join(parts),
+        "; ".join(parts) or "no photo is blurred compared with the others",
         fraction,
         f"detail: look below {100 * 2 ** (-BLURRED):.0f} % of the usual detail, bad from 30 % of the photos",
         "; ".join(advice),

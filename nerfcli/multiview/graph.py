@@ -4,7 +4,7 @@ The strength of the join of two photos is the number of their matches. A chain o
 join; the bottleneck of two photos is the strongest chain between them.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,23 +30,31 @@ def connected_groups(photos: Sequence[int], joins: Iterable[tuple[int, int]]) ->
     return sorted(groups.values(), key=lambda group: (-len(group), index[group[0]]))
 
 
+def spanning_tree(photos: Sequence[int], joins: Iterable[Join]) -> Iterator[tuple[Join, list[int], list[int]]]:
+    """Yield the joins of the maximum spanning tree, the strongest first, each with the two groups that it connects.
+
+    Source: Kruskal 1956, On the shortest spanning subtree of a graph.
+    """
+    groups = {photo: [photo] for photo in photos}
+    for join in sorted(joins, key=lambda join: -join[2]):
+        first, second = groups[join[0]], groups[join[1]]
+        if first is not second:
+            yield join, first, second
+            first.extend(second)
+            groups.update(dict.fromkeys(second, first))
+
+
 class Bottlenecks:
     """Strengths of the strongest chains between photos, along given joins (photo, photo, strength)."""
 
     def __init__(self, photos: Sequence[int], joins: Iterable[Join]) -> None:
         self._index = {photo: index for index, photo in enumerate(photos)}
         self._strengths: NDArray[np.float64] = np.zeros((len(photos), len(photos)))
-        groups = [[index] for index in range(len(photos))]
-        # Kruskal's maximum spanning tree: the join that first brings two groups together is their bottleneck.
-        for one, other, strength in sorted(joins, key=lambda join: -join[2]):
-            first, second = groups[self._index[one]], groups[self._index[other]]
-            if first is second:
-                continue
+        # The join that first brings two groups together is their bottleneck.
+        for (_, _, strength), *groups in spanning_tree(photos, joins):
+            first, second = ([self._index[photo] for photo in group] for group in groups)
             self._strengths[np.ix_(first, second)] = strength
             self._strengths[np.ix_(second, first)] = strength
-            first.extend(second)
-            for index in second:
-                groups[index] = first
 
     def between(self, one: int, other: int) -> float:
         """Return the strength of the strongest chain between two photos, 0 without any."""

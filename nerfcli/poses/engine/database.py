@@ -87,18 +87,12 @@ def camera_of_group(group: CameraGroup) -> pycolmap.Camera:
 
 def forget_features(job: Job, image_ids: Iterable[int]) -> None:
     """Remove the features of some photos and all their matches; pycolmap itself can only remove those of all photos."""
-    with _edited(job) as database:
-        for image_id in image_ids:
-            for table in ("keypoints", "descriptors"):
-                database.execute(f"DELETE FROM {table} WHERE image_id = ?", (image_id,))
-            _forget_pairs(database, image_id, ("matches", "two_view_geometries"))
+    _forget(job, image_ids, "keypoints", "descriptors", "matches", "two_view_geometries")
 
 
 def forget_geometries(job: Job, image_ids: Iterable[int]) -> None:
     """Remove the verified matches of some photos; the matches themselves are kept, and are verified again later."""
-    with _edited(job) as database:
-        for image_id in image_ids:
-            _forget_pairs(database, image_id, ("two_view_geometries",))
+    _forget(job, image_ids, "two_view_geometries")
 
 
 def keep_geometries(job: Job, pairs: Iterable[tuple[int, int]]) -> None:
@@ -172,10 +166,13 @@ def _verified_with(camera: pycolmap.Camera) -> tuple[Any, ...]:
     return (camera.model.name, camera.width, camera.height)
 
 
-def _forget_pairs(database: sqlite3.Connection, image_id: int, tables: Iterable[str]) -> None:
-    for table in tables:
-        condition = f"pair_id / {_PAIR_FACTOR} = ? OR pair_id % {_PAIR_FACTOR} = ?"
-        database.execute(f"DELETE FROM {table} WHERE {condition}", (image_id, image_id))
+def _forget(job: Job, image_ids: Iterable[int], *tables: str) -> None:
+    of_pairs = f"pair_id / {_PAIR_FACTOR} = :photo OR pair_id % {_PAIR_FACTOR} = :photo"
+    with _edited(job) as database:
+        for image_id in image_ids:
+            for table in tables:
+                condition = "image_id = :photo" if table in ("keypoints", "descriptors") else of_pairs
+                database.execute(f"DELETE FROM {table} WHERE {condition}", {"photo": image_id})
 
 
 @contextmanager

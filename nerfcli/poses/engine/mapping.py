@@ -174,20 +174,10 @@ def _run_mapper(
     beginnings = iter([placed] if placed else [])  # a given model; every other one begins with two photos
     most = 0
 
-    def started() -> None:
-        nonlocal placed
-        placed = next(beginnings, 2)
-        tell()
-
-    def placed_one() -> None:
-        nonlocal placed
-        placed += 1
-        tell()
-
-    def tell() -> None:
-        nonlocal most
+    def tell(count: int) -> None:
+        nonlocal placed, most
         # Report the largest model so far: each further one begins again with two of the few photos left.
-        most = max(most, min(placed, len(job.files)))
+        placed, most = count, max(most, min(count, len(job.files)))
         report("map", most, len(job.files))
 
     with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
@@ -197,8 +187,8 @@ def _run_mapper(
             output,
             options=options,
             input_path="" if base_folder is None else base_folder,
-            initial_image_pair_callback=started,
-            next_image_callback=placed_one,
+            initial_image_pair_callback=lambda: tell(next(beginnings, 2)),
+            next_image_callback=lambda: tell(placed + 1),
         )
     return _largest_first(models)
 

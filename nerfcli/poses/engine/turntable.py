@@ -8,8 +8,9 @@ Existing masks of an earlier call are used unchanged, since they may have been e
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -99,8 +100,7 @@ def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[st
     no masks can be accepted; the facts are None if there is nothing to report.
     """
     start = time.perf_counter()
-    features = _Features(featured)
-    compared = _compared(features)
+    compared = _compared(featured)
     motions = _together(compared)
     if not motions.two_motions:
         write_stage(Path(job.folder) / _STAGE, _key(job), {})
@@ -152,44 +152,33 @@ def advised(error: UserError, facts: dict[str, Any] | None) -> UserError:
     return UserError(error.message, hint, error.exit_code)
 
 
-class _Features:
-    """Positions and descriptors of features in the database, the largest first, read when they are needed."""
-
-    def __init__(self, job: Job) -> None:
-        self.job = job
-        self._read: dict[int, tuple[np.ndarray, np.ndarray, tuple[int, int]]] = {}
-
-    def of(self, number: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-        """Return pixels (N, 2), descriptors (N, 128), and the photo's (width, height)."""
-        if number not in self._read:
-            image_id = self.job.image_ids[number]
-            with pycolmap.Database.open(self.job.database) as database:
-                self._read[number] = *coarsest(database, image_id, _FEATURES), self.job.sizes[image_id]
-        return self._read[number]
-
-    def compare(self, first: int, second: int) -> ComparedPair | None:
-        """Compare two photos; return None if their sizes differ."""
-        (x, one, size), (y, other, other_size) = self.of(first), self.of(second)
-        if size != other_size:
-            return None
-        a, b = mutual_matches(one, other, ratio=LOOSE_RATIO)
-        return ComparedPair(first, second, x[a] / size, motions(x[a], y[b], size))
-
-
-def _compared(features: _Features) -> list[ComparedPair]:
+def _compared(job: Job) -> list[ComparedPair]:
     """Compare photos near and far in the order of names; all pairs of a selection if names seem to have no order."""
-    count = len(features.job.files)
-    first = _pairs(count, _FIRST_ANCHORS)
-    pairs = _all_compared(features, first)
+
+    @cache
+    def features(number: int) -> tuple[np.ndarray, np.ndarray]:
+        with pycolmap.Database.open(job.database) as database:
+            return coarsest(database, job.image_ids[number], _FEATURES)
+
+    def compare(chosen: Iterable[tuple[int, int]]) -> list[ComparedPair]:
+        found = []
+        for first, second in sorted(chosen):
+            if sizes[first] == sizes[second]:
+                (x, one), (y, other) = features(first), features(second)
+                a, b = mutual_matches(one, other, ratio=LOOSE_RATIO)
+                moves = motions(x[a], y[b], sizes[first])
+                found.append(ComparedPair(first, second, x[a] / sizes[first], moves))
+        return found
+
+    sizes = [job.sizes[image_id] for image_id in job.image_ids]
+    few, more = _pairs(len(sizes), _FIRST_ANCHORS), _pairs(len(sizes), _ANCHORS)
+    pairs = compare(few)
     if sum(pair.motions.still > 0 for pair in pairs) < _FEW_STILL * len(pairs):
         return pairs
-    pairs += _all_compared(features, [pair for pair in _pairs(count, _ANCHORS) if pair not in set(first)])
-    motions = _together(pairs)
-    if motions.still > motions.moved and not motions.two_motions:
-        done = {(pair.first, pair.second) for pair in pairs}
-        pairs += _all_compared(
-            features, [pair for pair in combinations(_anchors(count, _ANCHORS), 2) if pair not in done]
-        )
+    pairs += compare(more - few)
+    found = _together(pairs)
+    if found.still > found.moved and not found.two_motions:
+        pairs += compare(set(combinations(_anchors(len(sizes), _ANCHORS), 2)) - more - few)
     return pairs
 
 
@@ -197,20 +186,15 @@ def _together(pairs: Sequence[ComparedPair]) -> Stationary:
     return together([(pair.first, pair.second, pair.motions) for pair in pairs])
 
 
-def _all_compared(features: _Features, pairs: Sequence[tuple[int, int]]) -> list[ComparedPair]:
-    found = (features.compare(first, second) for first, second in pairs)
-    return [pair for pair in found if pair is not None]
-
-
 def _anchors(count: int, most: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()
 
 
-def _pairs(count: int, most: int) -> list[tuple[int, int]]:
+def _pairs(count: int, most: int) -> set[tuple[int, int]]:
     anchors = _anchors(count, most)
     near = {(i, i + step) for i in anchors for step in _STEPS if i + step < count}
     far = {(anchors[k], anchors[k + len(anchors) // 2]) for k in range(len(anchors) - len(anchors) // 2)}
-    return sorted(pair for pair in near | far if pair[0] < pair[1])
+    return {pair for pair in near | far if pair[0] < pair[1]}
 
 
 def _masks(job: Job, pairs: Sequence[ComparedPair]) -> list[np.ndarray | None]:

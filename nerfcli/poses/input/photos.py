@@ -80,7 +80,7 @@ def find_photos(
             if progress:
                 progress(index + 1, len(paths))
     if len(photos) < MIN_PHOTOS:
-        raise UserError(_too_few(folder, photos, unreadable), _more_photos_hint(unreadable), TOO_FEW_PHOTOS)
+        raise _too_few(folder, photos, unreadable)
     exifs = with_digital_zoom([photo.exif for photo in photos])
     zoomed = tuple(replace(photo, exif=exif) for photo, exif in zip(photos, exifs, strict=True))
     return Photos(folder=folder, photos=zoomed, unreadable=unreadable)
@@ -125,18 +125,18 @@ def _examine(path: Path, name: str) -> Photo | str:
         return error.message.replace(str(path), "").removeprefix(" is ").strip(" :")
 
 
-def _too_few(folder: Path, photos: list[Photo], unreadable: dict[str, str]) -> str:
-    total = len(photos) + len(unreadable)
+def _too_few(folder: Path, photos: list[Photo], unreadable: dict[str, str]) -> UserError:
+    add = "20 or more that overlap by two thirds work well"
     if not unreadable:
-        return f"{folder} has only {total} photo{'s' if total > 1 else ''}; at least {MIN_PHOTOS} are needed"
+        text = (
+            f"{folder} has only {len(photos)} photo{'s' if len(photos) > 1 else ''}; at least {MIN_PHOTOS} are needed"
+        )
+        return UserError(text, f"add photos from other viewpoints; {add}", TOO_FEW_PHOTOS)
     name, reason = next(iter(unreadable.items()))
     few = f"only {len(photos)}" if photos else "none"
-    readable = f"{few} of {total} photos in {folder} can be read; at least {MIN_PHOTOS} are needed"
-    return f"{readable} ({name}: {reason})"
-
-
-def _more_photos_hint(unreadable: dict[str, str]) -> str:
-    add = "20 or more that overlap by two thirds work well"
-    if unreadable:
-        return f"convert these files to JPEG or copy them again, or add photos; {add}"
-    return f"add photos from other viewpoints; {add}"
+    readable = f"{few} of {len(photos) + len(unreadable)} photos in {folder} can be read"
+    return UserError(
+        f"{readable}; at least {MIN_PHOTOS} are needed ({name}: {reason})",
+        f"convert these files to JPEG or copy them again, or add photos; {add}",
+        TOO_FEW_PHOTOS,
+    )

@@ -100,7 +100,20 @@ def extract_frames(
                 "film while walking around the scene; a still camera gives no depth",
                 TOO_FEW_PHOTOS,
             )
-        write_json(partial / FRAMES_FILE, _description(video, request, total=total, frames=frames))
+        content = {
+            "request": request,
+            "width": video.width,
+            "height": video.height,
+            "frames_in_video": total,
+            "frames": frames,
+            "settings": {
+                "moved_share": MOVED_FRACTION,
+                "sharpness_size_px": SHARPNESS_SIZE_PX,
+                "jpeg_quality": _JPEG_QUALITY,
+            },
+            "versions": {"nerfcli": nerfcli.__version__},
+        }
+        write_json(partial / FRAMES_FILE, content)
     same = len(numbers) - len(frames)
     notify(
         f"{folder}: {len(frames)} of {total} frames of {path.name}"
@@ -185,20 +198,3 @@ def _identity(path: Path) -> dict[str, Any]:
         file.seek(max(0, size - _END_BYTES))
         digest.update(file.read(_END_BYTES))
     return {"name": path.name, "bytes": size, "sha256_of_ends": digest.hexdigest()}
-
-
-def _description(video: Video, request: dict[str, Any], *, total: int, frames: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the content of frames.json."""
-    return {
-        "request": request,
-        "width": video.width,
-        "height": video.height,
-        "frames_in_video": total,
-        "frames": frames,
-        "settings": {
-            "moved_share": MOVED_FRACTION,
-            "sharpness_size_px": SHARPNESS_SIZE_PX,
-            "jpeg_quality": _JPEG_QUALITY,
-        },
-        "versions": {"nerfcli": nerfcli.__version__},
-    }

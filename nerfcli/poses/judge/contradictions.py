@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from nerfcli.multiview.graph import Bottlenecks, connected_groups
+from nerfcli.multiview.graph import Bottlenecks, connected_groups, spanning_tree
 from nerfcli.poses.model.two_views import Agreement, VerifiedPair, agreements
 
 # A pair with fewer may be wrong even if no other pair joins its photos: measured, up to 81 between different walls.
@@ -57,10 +57,9 @@ def leave_out_contradicting(
     far = {photo: reason for photo, reason in _far_away(model).items() if not _is_held(photo, found)}
     if not contradicting and not far:
         return model, {}
-    sound = _spanning_tree(placed, found)
-    _, *sides = (
-        connected_groups(placed, [(a.one, a.other) for a in sound if not a.contradicts]) if contradicting else [placed]
-    )
+    agreeing = {(a.one, a.other) for a in found if not a.contradicts}
+    tree = [join[:2] for join, *_ in spanning_tree(placed, [(a.one, a.other, a.matches) for a in found])]
+    _, *sides = connected_groups(placed, [pair for pair in tree if pair in agreeing]) if contradicting else [placed]
     reasons = dict(far)
     for photo in (photo for side in sides for photo in side if photo not in far):
         pair = next((c for c in contradicting if model.image(photo).name in (c.one, c.other)), None)
@@ -96,19 +95,6 @@ def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[Agreem
         if a.matches > _RIVAL_STRENGTH * chain:
             pairs.append(Contradiction(model.image(a.one).name, model.image(a.other).name, a.matches, chain))
     return pairs
-
-
-def _spanning_tree(placed: Sequence[int], found: Sequence[Agreement]) -> list[Agreement]:
-    """Return the strongest pairs that connect all photos, as few as possible."""
-    taken: list[Agreement] = []
-    chains = {photo: {photo} for photo in placed}
-    for a in sorted(found, key=lambda a: -a.matches):
-        if chains[a.one] is not chains[a.other]:
-            taken.append(a)
-            joined = chains[a.one] | chains[a.other]
-            for photo in joined:
-                chains[photo] = joined
-    return taken
 
 
 def _is_held(photo: int, found: Sequence[Agreement]) -> bool:

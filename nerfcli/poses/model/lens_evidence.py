@@ -81,7 +81,7 @@ class LensEvidence:
             count = len(left)
             meat = left.T @ left * (count / max(count - 1, 1))
             covariances.append(inverse @ meat @ inverse)
-        return Estimate(tuple(names), self.current[index] + change, change, tuple(covariances))
+        return Estimate(tuple(names), self.current[index] + change, tuple(covariances))
 
     def without(self, name: str) -> "LensEvidence":
         """Return the evidence with a parameter set to zero, so that what it explained is added to the residuals."""
@@ -98,11 +98,10 @@ class LensEvidence:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Values of lens parameters, their change from the model's, and their covariance by each way to estimate noise."""
+    """Values of lens parameters, and their covariance by each way to estimate noise."""
 
     names: tuple[str, ...]
     values: Array
-    change: Array
     covariances: tuple[Array, ...]
 
     def deviation(self, name: str) -> float:

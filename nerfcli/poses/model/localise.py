@@ -189,18 +189,17 @@ def _place(photo: PhotoFeatures, model_points: KnownPoints, *, seed: int) -> tup
     first = _pose(photo, model_points, features, points, seed=seed)
     agreeing = 0 if first is None else len(first.features)
     attempt = Attempt(photo.image_id, len(features), agreeing)
+
+    def refused(why: str) -> tuple[None, Attempt]:
+        return None, replace(attempt, refused=why)
+
     if first is None or agreeing < _LEAST_VOTES:
-        return None, replace(attempt, refused=f"only {agreeing} of {len(features)} features agree on a pose")
+        return refused(f"only {agreeing} of {len(features)} features agree on a pose")
     others = ~np.isin(features, first.features)
     second = _pose(photo, model_points, features[others], points[others], seed=seed)
-    if (
-        second is not None
-        and len(second.features) >= _RIVAL_FRACTION * agreeing
-        and not _alike(first, second, model_points)
-    ):
-        return None, replace(
-            attempt, refused=f"{len(second.features)} features agree on a different pose than the {agreeing} others"
-        )
+    rivals = 0 if second is None or _alike(first, second, model_points) else len(second.features)
+    if rivals >= _RIVAL_FRACTION * agreeing:
+        return refused(f"{rivals} features agree on a different pose than the {agreeing} others")
     placed = first
     for within in _WITHIN:
         found = _pose(photo, model_points, *_expected(photo, model_points, placed.pose, within=within), seed=seed)
@@ -210,14 +209,13 @@ def _place(photo: PhotoFeatures, model_points: KnownPoints, *, seed: int) -> tup
     count, *beside = (len(_expected(photo, model_points, placed.pose, beside=step)[0]) for step in (_HERE, *_BESIDE))
     attempt = replace(attempt, found=count, beside=max(beside))
     if count < _LEAST_FOUND or count < _CLEARLY * max(beside):
-        reason = f"{count} features match the expected positions, but {max(beside)} match wrong ones by chance"
-        return None, replace(attempt, refused=reason)
+        return refused(f"{count} features match the expected positions, but {max(beside)} match wrong ones by chance")
     area = _area(photo, placed.features)
     if area < _LEAST_AREA:
-        return None, replace(attempt, refused=f"only {100 * area:.0f} % of the picture agrees with the model")
+        return refused(f"only {100 * area:.0f} % of the picture agrees with the model")
     turn_deg, shift = _deviations(photo, model_points, placed)
     if turn_deg > _MOST_TURN_DEG or shift > _MOST_SHIFT:
-        return None, replace(attempt, refused=f"its position is uncertain by {100 * shift:.1f} % of the distance")
+        return refused(f"its position is uncertain by {100 * shift:.1f} % of the distance")
     return placed, attempt
 
 

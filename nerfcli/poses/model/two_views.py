@@ -6,6 +6,7 @@ the observations that contradict it; they are still in the database, and are tes
 Letters: p, q are unit rays of a match in the two cameras; R, t the pose of the second camera from the first.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -190,13 +191,12 @@ def panorama_inliers(
 
 def strongest(pairs: Sequence[VerifiedPair], *, per_photo: int) -> list[VerifiedPair]:
     """Return the pairs that are, for one of their photos, among the `per_photo` with the most matches."""
-    taken: dict[int, int] = {}
+    taken: Counter[int] = Counter()
     kept = []
     for pair in sorted(pairs, key=lambda pair: (-pair.matches, pair.one, pair.other)):
-        if min(taken.get(pair.one, 0), taken.get(pair.other, 0)) < per_photo:
+        if min(taken[pair.one], taken[pair.other]) < per_photo:
             kept.append(pair)
-            for photo in (pair.one, pair.other):
-                taken[photo] = taken.get(photo, 0) + 1
+            taken.update((pair.one, pair.other))
     return kept
 
 
