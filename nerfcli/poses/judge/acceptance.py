@@ -244,28 +244,24 @@ def _contradicted(
     rivals = sum(c.matches for c in contradictions if c.is_rival)
     outweighing = [c for c in contradictions if c.outweighs]
     if fraction > _MOST_RIVALS and rivals > sum(c.matches for c in contradictions) / 2:
+        kind = "parts of the scene look alike (repeated structure)"
         count = sum(a.contradicts for a in found)
-        return [
-            Failure(
-                "parts of the scene look alike (repeated structure)",
-                f"{count} of {len(found)} pairs contradict the poses, with as many matches as those that agree",
-                "include distinctive surroundings in photos of the parts that look alike, or photograph each part "
-                "separately",
-            )
-        ]
-    if outweighing:
+        evidence = f"{count} of {len(found)} pairs contradict the poses, with as many matches as those that agree"
+        advice = (
+            "include distinctive surroundings in photos of the parts that look alike, or photograph each part "
+            "separately"
+        )
+    elif outweighing:
+        kind = "the poses contradict the strongest matches"
         first = outweighing[0]
-        one, other = names.get(first.one, first.one), names.get(first.other, first.other)
+        between = " and ".join(names.get(name, name) for name in (first.one, first.other))
         also = f" and {len(outweighing) - 1} more pairs" if len(outweighing) > 1 else ""
-        return [
-            Failure(
-                "the poses contradict the strongest matches",
-                f"the {first.matches} verified matches between {one} and {other} are inconsistent with the estimated "
-                f"poses{also}",
-                "take more photos between these two, with more overlap",
-            )
-        ]
-    return []
+        matches = f"the {first.matches} verified matches between {between}"
+        evidence = f"{matches} are inconsistent with the estimated poses{also}"
+        advice = "take more photos between these two, with more overlap"
+    else:
+        return []
+    return [Failure(kind, evidence, advice)]
 
 
 def _turned(rotations: Mapping[str, Any]) -> list[Failure]:

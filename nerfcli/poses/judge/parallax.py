@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from nerfcli.poses.model.projection import panorama_camera, px_per_radian
+from nerfcli.poses.model.projection import Array, panorama_camera, px_per_radian
 from nerfcli.poses.model.two_views import VerifiedPair, rays
-
-Array = NDArray[np.float64]
 
 # Matches are verified to 4 px; real baselines leave 20 px and more in most pairs, rotations leave feature noise only.
 NO_PARALLAX_PX = 3.0

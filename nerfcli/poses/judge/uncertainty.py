@@ -12,12 +12,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.lens_evidence import projection_jacobians
-
-Array = NDArray[np.float64]
+from nerfcli.poses.model.projection import Array
 
 # Points per photo used to measure how a picture moves.
 _POINTS_PER_PHOTO = 60

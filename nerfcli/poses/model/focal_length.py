@@ -9,12 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from nerfcli.poses.model.projection import Array
 from nerfcli.poses.model.two_views import VerifiedPair
-
-Array = NDArray[np.float64]
 
 # Focal lengths that are compared, over the longer side: fields of view from 103 to 14 degrees.
 _GRID = np.geomspace(0.4, 4.0, 48)

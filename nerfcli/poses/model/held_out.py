@@ -11,9 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from nerfcli.poses.model.projection import across_edge, offsets_px
-
-Array = NDArray[np.float64]
+from nerfcli.poses.model.projection import Array, across_edge, offsets_px
 
 _FRACTION = 0.1
 # Beyond this, more observations cost time and change nothing; a part of the points is adjusted instead.

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from nerfcli.poses.model import held_out
@@ -27,9 +26,7 @@ from nerfcli.poses.model.lens_observability import (
     is_centred,
     uncertainty,
 )
-from nerfcli.poses.model.projection import projected
-
-Array = NDArray[np.float64]
+from nerfcli.poses.model.projection import Array, projected
 
 # From simple to rich. A fisheye model is a candidate if the field of view is wide enough to distinguish it.
 PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")

@@ -24,9 +24,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
 from nerfcli.poses.model import held_out
-from nerfcli.poses.model.projection import projected
-
-Array = NDArray[np.float64]
+from nerfcli.poses.model.projection import Array, projected
 
 NAMES = ("f", "fa", "cx", "cy", "k1", "k2", "p1", "p2")
 # Beyond this, more observations cost time and change little: clusters, not their members, determine the uncertainty.

@@ -11,12 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL
-
-Array = NDArray[np.float64]
+from nerfcli.poses.model.projection import Array
 
 # Focal lengths to try, as a fraction of the longer side: an equidistant lens shows 1 / fraction radians along it.
 _FOCAL_FRACTIONS = np.geomspace(0.25, 0.85, 8)

@@ -28,11 +28,10 @@ from nerfcli.poses.model.point_descriptors import (
     resembling,
     votes,
 )
-from nerfcli.poses.model.projection import is_ahead, offsets_px, projected
+from nerfcli.poses.model.projection import Array, is_ahead, offsets_px, projected
 from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _TRIALS = 40_000

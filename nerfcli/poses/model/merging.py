@@ -20,10 +20,8 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.poses.input.plan import duration
 from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.localise import pixels_of, place
-from nerfcli.poses.model.projection import is_ahead, offsets_px
+from nerfcli.poses.model.projection import Array, is_ahead, offsets_px
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, count_matches, read_verified_pairs
-
-Array = NDArray[np.float64]
 
 # A similarity has seven unknowns; this many points agreeing within the tolerance is no accident.
 _LEAST_COMMON = 15

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from nerfcli.cameras.rigid import transform_from_twist
@@ -22,9 +21,7 @@ from nerfcli.poses.model.intrinsics import MOST_DESCRIBED
 from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.lens_observability import uncertainty, with_own_principal_points
 from nerfcli.poses.model.localise import pixels_of, place
-from nerfcli.poses.model.projection import projected
-
-Array = NDArray[np.float64]
+from nerfcli.poses.model.projection import Array, projected
 
 # The principal points stay shared unless their own ones reduce the error of held-out observations by this fraction, and
 # by this many standard errors. Measured: 16 and 20 % with two stabilised phones, at most 5 % on nine other captures.

@@ -15,9 +15,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from nerfcli.poses.model.projection import panorama_camera, px_per_radian
-
-Array = NDArray[np.float64]
+from nerfcli.poses.model.projection import Array, panorama_camera, px_per_radian
 
 # COLMAP verifies matches within 4 px of the epipolar line; a model that fits more than the pair may leave twice that.
 TOLERANCE_PX = 8.0
