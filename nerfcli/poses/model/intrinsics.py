@@ -1,9 +1,9 @@
 """Choose the lens model that a capture supports, and adjust with it.
 
 Mapping starts from one distortion term. For a perspective camera, the observations then show which parameters are
-determined (see `determined`). Fisheyes and very wide lenses are adjusted with richer models, each time without a tenth
-of the observations: a richer model is kept if it predicts these better by more than chance, and if its added parameters
-are larger than their uncertainty; the principal point is freed by the same criteria.
+determined (see `lens_observability`). Fisheyes and very wide lenses are adjusted with richer models, each time without
+a tenth of the observations: a richer model is kept if it predicts these better by more than chance, and if its added
+parameters are larger than their uncertainty; the principal point is freed by the same criteria.
 """
 
 from collections import Counter
