@@ -118,15 +118,11 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
     """
     planned = matching_seconds(len(pairs), max_features=job.max_features) / max(job.threads, 1)
     most, start = limit_seconds(planned, least=_LEAST_LIMIT_SECONDS), time.perf_counter()
-    options = pycolmap.FeatureMatchingOptions()
-    options.num_threads = job.threads
-    options.use_gpu = False
+    options = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.seed
     pair_list = Path(job.folder) / "pairs.txt"
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = pair_list
-    pairing.block_size = _PAIRS_PER_BLOCK
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list, block_size=_PAIRS_PER_BLOCK)
     ids = job.image_ids
     cut_short = None
     with pycolmap.Database.open(job.database) as database:
@@ -162,14 +158,12 @@ def feature_counts(job: Job) -> list[int]:
 
 def _extract(job: Job, numbers: Iterable[int], search: _Search, *, watched: Sequence[int], report: Report) -> None:
     """Extract features of photos that have none, and report how many of the photos `watched` have some."""
-    options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = job.max_image_size
-    options.num_threads = job.threads
-    options.use_gpu = False
+    options = pycolmap.FeatureExtractionOptions(
+        max_image_size=job.max_image_size, num_threads=job.threads, use_gpu=False
+    )
     options.sift.first_octave = search.first_octave
     options.sift.peak_threshold = search.contrast
-    reader = pycolmap.ImageReaderOptions()
-    reader.mask_path = job.mask_folder if job.masks else ""
+    reader = pycolmap.ImageReaderOptions(mask_path=job.mask_folder if job.masks else "")
     with pycolmap.Database.open(job.database) as database:
         pending = {job.image_ids[number] for number in watched}
 

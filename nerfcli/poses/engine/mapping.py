@@ -146,22 +146,21 @@ def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
 
 
 def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.IncrementalPipelineOptions:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = job.threads
-    seed = job.seed + attempt
-    options.random_seed = seed
-    options.mapper.random_seed = seed
-    options.triangulation.random_seed = seed
-    # Models of small captures count too; the largest is chosen below.
-    options.min_model_size = 3
-    options.constant_cameras = set(job.fixed_cameras)
-    options.mapper.constant_cameras = options.constant_cameras
+    seed, fixed = job.seed + attempt, set(job.fixed_cameras)
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=job.threads,
+        random_seed=seed,
+        min_model_size=3,  # models of small captures count too; the largest is chosen below
+        constant_cameras=fixed,
+        max_runtime_seconds=mapper_limit_seconds(len(job.files)),
+    )
+    options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.mapper.constant_cameras = fixed
     options.mapper.init_min_tri_angle = start.init_min_tri_angle
     options.mapper.init_min_num_inliers = start.init_min_num_inliers
     options.mapper.init_max_forward_motion = start.init_max_forward_motion
     options.mapper.filter_min_tri_angle = start.filter_min_tri_angle
     options.mapper.abs_pose_min_num_inliers = FEW_MATCHES
-    options.max_runtime_seconds = mapper_limit_seconds(len(job.files))
     if start.init_pair:
         options.init_image_id1, options.init_image_id2 = start.init_pair
         options.init_num_trials = 1  # every trial would begin with this pair

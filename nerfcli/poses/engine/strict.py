@@ -146,9 +146,7 @@ def _place(
     options.ransac.max_error = _MOST_ERROR_PX
     options.ransac.min_inlier_ratio = _LEAST_INLIERS
     options.ransac.random_seed = job.seed
-    refinement = pycolmap.AbsolutePoseRefinementOptions()
-    refinement.refine_focal_length = False
-    refinement.refine_extra_params = False
+    refinement = pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=False, refine_extra_params=False)
     found = None
     if len(points) >= FEW_MATCHES:
         found = pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, options, refinement)

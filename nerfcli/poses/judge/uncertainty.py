@@ -34,8 +34,7 @@ def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int, fixed: Sequenc
     """
     copy = pycolmap.Reconstruction(model)
     adjuster = held_out.adjust(copy, threads=threads, fixed=fixed)
-    options = pycolmap.BACovarianceOptions()
-    options.params = pycolmap.BACovarianceOptionsParams.ALL
+    options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
     found = pycolmap.estimate_ba_covariance(options, copy, adjuster)
     photos = sorted(copy.reg_image_ids())
     if found is None:

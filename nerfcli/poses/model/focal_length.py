@@ -76,10 +76,8 @@ def _two_views(
     pair: VerifiedPair, size: tuple[int, int], rng: np.random.Generator
 ) -> tuple[Array, Array, Array] | None:
     """Return the fundamental matrix of a pair, and some of its inliers in each photo, pixels from the centre."""
-    options = pycolmap.RANSACOptions()
-    options.max_error = _VERIFIED_PX
+    options = pycolmap.RANSACOptions(max_error=_VERIFIED_PX, random_seed=int(rng.integers(2**31)))
     options.min_num_trials, options.max_num_trials = 50, 1000  # the matches are verified
-    options.random_seed = int(rng.integers(2**31))
     one, other = (pixels - np.array(size) / 2 for pixels in (pair.pixels_one, pair.pixels_other))
     found = pycolmap.estimate_fundamental_matrix(one, other, options)
     inliers = np.flatnonzero([] if found is None else found["inlier_mask"])

@@ -109,11 +109,12 @@ def adjust(
         tolerance: the relative change of the cost per iteration at which it ends. The default is full convergence: of
             two models that are compared, neither must look better because it was adjusted longer.
     """
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_principal_point = principal_points
-    options.refine_focal_length = focal_lengths
-    options.refine_extra_params = distortion
+    options = pycolmap.BundleAdjustmentOptions(
+        print_summary=False,
+        refine_principal_point=principal_points,
+        refine_focal_length=focal_lengths,
+        refine_extra_params=distortion,
+    )
     options.ceres.solver_options.num_threads = threads
     options.ceres.solver_options.max_num_iterations = 200
     options.ceres.solver_options.function_tolerance = tolerance
@@ -171,8 +172,7 @@ def intrinsic_deviations(
 
     The noise of the observations is estimated from the residuals.
     """
-    options = pycolmap.BACovarianceOptions()
-    options.params = pycolmap.BACovarianceOptionsParams.ALL
+    options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
     try:
         covariance = pycolmap.estimate_ba_covariance(options, model, adjuster)
     except (RuntimeError, ValueError):  # an image without a pose

@@ -178,9 +178,7 @@ def _joined(
         camera = second.camera(image.camera_id)
         place(joined, camera, image.cam_from_world(), image_id=photo, name=image.name, pixels=pixels_of(image))
     output.mkdir(parents=True, exist_ok=True)
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = threads
-    options.extract_colors = False
+    options = pycolmap.IncrementalPipelineOptions(num_threads=threads, extract_colors=False)
     joined = pycolmap.triangulate_points(
         joined,
         database,

@@ -147,11 +147,8 @@ def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair
     Only the pairs with the most matches of each photo are used, and only if they have parallax: without it, the
     five-point algorithm may turn a camera around.
     """
-    options = pycolmap.RANSACOptions()
-    options.max_error = 4.0
     # The matches are verified; few trials are enough, and pycolmap's own number takes ten times as long.
-    options.min_num_trials, options.max_num_trials = 50, 500
-    options.random_seed = seed
+    options = pycolmap.RANSACOptions(max_error=4.0, min_num_trials=50, max_num_trials=500, random_seed=seed)
     errors = []
     for pair in strongest(placed_pairs(model, pairs), per_photo=_ROTATIONS_PER_PHOTO):
         first, second = model.image(pair.one), model.image(pair.other)
@@ -179,8 +176,7 @@ def panorama_inliers(
     """Return which matches (n, 2) of two panoramas of these (width, height) agree on one motion of the camera."""
     if not len(pixels_one):
         return np.zeros(0, dtype=bool)
-    options = pycolmap.RANSACOptions()
-    options.max_error, options.random_seed = within_px, 0
+    options = pycolmap.RANSACOptions(max_error=within_px, random_seed=0)
     found = pycolmap.estimate_relative_pose(
         panorama_camera(sizes[0]), pixels_one, panorama_camera(sizes[1]), pixels_other, options=options
     )
