@@ -64,7 +64,7 @@ def read_mapped(job: Job, key: str, *, name: str = FIRST) -> MappedModels | None
     )
     if not there.database.exists():
         return None
-    localised, cut_short = tuple(content["localised"]), tuple(content["cut_short"])
+    localised, cut_short = tuple(content["localised"]), tuple(content.get("cut_short", ()))
     return MappedModels(models, there, content["attempts"], localised, content["seconds"], cut_short)
 
 
