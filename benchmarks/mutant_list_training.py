@@ -15,7 +15,7 @@ TRAINING: tuple[Group, ...] = (
                 "before[:, :3, :3] @ np.swapaxes(after[:, :3, :3], -1, -2)",
             ),
             Mutant("moves = after[:, :3, 3] - centres", "moves = centres - after[:, :3, 3]"),
-            Mutant("= -_cross_matrices(arms)", "= _cross_matrices(arms)"),
+            Mutant("np.cross(arms[:, None], np.eye(3))", "np.cross(np.eye(3), arms[:, None])"),
             Mutant("rows[:, 3:, 6] = arms", "rows[:, 3:, 6] = -arms"),
             Mutant("float(np.exp(found[6]))", "float(np.exp(-found[6]))"),
             Mutant("middle + found[3:6] - scale * rotation @ middle", "found[3:6]"),
@@ -173,7 +173,7 @@ TRAINING: tuple[Group, ...] = (
         "",
         (),
         (
-            Mutant("    ).among(pool)\n\n\ndef stereo", "    )\n\n\ndef stereo"),
+            Mutant("*known).among(pool)", "*known)"),
             Mutant("row * width + column", "column * width + row"),
             Mutant("axis=1) * training_from_scene.scale", "axis=1)"),
             Mutant("(surface.misses_px[kept] / HALF_ERROR_PX) ** 2", "surface.misses_px[kept] / HALF_ERROR_PX"),

@@ -1,7 +1,5 @@
 """Parts that are learned besides the field: the background, the exposures of the photos, and their cameras."""
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
@@ -9,7 +7,6 @@ from nerfcli.errors import UserError
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.exposure import Exposure
 from nerfcli.fit.losses import over_background
-from nerfcli.fit.ranks import SingleProcess
 from nerfcli.fit.refinement import Refinement, rate_at
 from nerfcli.photos.pool import PixelBatch, Pool
 from nerfcli.runs.components import LEARNED_BACKGROUNDS, Components
@@ -77,11 +74,11 @@ class Appearance(nn.Module):
         self.background.logits.add_(torch.logit(median)[:, None, None, None])
         self.sky = sky
 
-    def groups(self) -> list[dict[str, Any]]:
+    def groups(self) -> list[tuple[list[nn.Parameter], float]]:
         """Return the parameters to optimise, with their learning rates as multiples of the field's."""
         rates = ((self.background, BACKGROUND_RATE), (self.exposure, EXPOSURE_RATE))
         learned = [(list(part.parameters()), rate) for part, rate in rates if part is not None]
-        return [{"params": tensors, "multiple": rate} for tensors, rate in learned if tensors[0].requires_grad]
+        return [(tensors, rate) for tensors, rate in learned if tensors[0].requires_grad]
 
     def fraction_of_detail(self, fraction: float) -> float:
         """Return the fraction of the budget whose detail the field may have.
@@ -106,26 +103,6 @@ class Appearance(nn.Module):
         return refined._replace(
             origins=refined.origins.clone().requires_grad_(), directions=refined.directions.clone().requires_grad_()
         )
-
-    def step_cameras(
-        self, drawn: PixelBatch, losses: Tensor, fraction: float, *, factor: float, ranks: SingleProcess
-    ) -> None:
-        """Take one step of the cameras against the gradients of rays of `with_learning_rays`.
-
-        Args:
-            drawn: those rays.
-            losses: (R,) the loss of each ray.
-            fraction: of the budget.
-            factor: of the learning rate.
-            ranks: the processes that share the step, each with its own rays.
-        """
-        if self.cameras is not None:
-            self.cameras.step(drawn, losses, fraction, factor=factor, ranks=ranks)
-
-    def forget_gradients(self) -> None:
-        """Drop the gradients that a GPU has sent for the next step of the cameras."""
-        if self.cameras is not None:
-            self.cameras.sent.forget()
 
     def behind(self, count: int, generator: torch.Generator) -> Tensor:
         """Return the colours (count, 3) that rays are composited on: black or random.

@@ -173,7 +173,8 @@ class Fitting:
         self.step += 1
         self.optimiser.step(self.step, rate, decay=self.row_decay(rays))
         self.parts_optimiser.step(rate)
-        self.parts.step_cameras(drawn, losses, of_cameras, factor=self.rate_factor, ranks=ranks)
+        if self.parts.cameras is not None:
+            self.parts.cameras.step(drawn, losses, of_cameras, factor=self.rate_factor, ranks=ranks)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         watch.state(self.state)
         self.in_step = False
@@ -378,7 +379,8 @@ class Fitting:
     def restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
         """Restore what `state` returned."""
         self._losses.forget()
-        self.parts.forget_gradients()
+        if self.parts.cameras is not None:
+            self.parts.cameras.sent.forget()
         self.field.load_state_dict(
             {name.removeprefix("field."): value for name, value in tensors.items() if name.startswith("field.")}
         )

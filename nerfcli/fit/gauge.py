@@ -6,7 +6,7 @@ refined, would be left behind. The mean similarity of all corrections is therefo
 
 import numpy as np
 
-from nerfcli.cameras.rigid import Similarity, inverse, rotation_from_vector, vector_from_rotation
+from nerfcli.cameras.rigid import Similarity, rotation_from_vector, vector_from_rotation
 
 # Cameras whose spread is below this distance are in one place: they have only a rotation and a translation in common.
 LEAST_REACH = 1e-9
@@ -41,7 +41,7 @@ def mean_similarity(before: np.ndarray, after: np.ndarray) -> Similarity:
     moves = after[:, :3, 3] - centres
     rows = np.zeros((len(before), 6, 7))
     rows[:, :3, :3] = reach * np.eye(3)
-    rows[:, 3:, :3] = -_cross_matrices(arms)  # w x arm = -arm x w
+    rows[:, 3:, :3] = np.cross(arms[:, None], np.eye(3))  # (w x arm)_i = (arm x e_i) . w
     rows[:, 3:, 3:6] = np.eye(3)
     rows[:, 3:, 6] = arms
     wanted = np.concatenate([turns, moves], axis=1)
@@ -62,19 +62,6 @@ def without_mean(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return mean_similarity(before, after).inverse().apply_pose(after)
 
 
-def relative_motions(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return `cam_before_from_cam_after`, (P, 4, 4)."""
-    return inverse(before) @ after
-
-
 def _least_squares(rows: np.ndarray, wanted: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return x (7,) that minimises the difference of rows (P, 6, 7) @ x and wanted (P, 6), weighted by (6,)."""
     return np.linalg.lstsq((weights[:, None] * rows).reshape(-1, 7), (weights * wanted).ravel(), rcond=1e-9)[0]
-
-
-def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
-    """Return the matrices (N, 3, 3) with matrix @ x = vector x x."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

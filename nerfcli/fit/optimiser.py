@@ -1,7 +1,6 @@
 """Adam for a field: on the weights, which every sample uses, and on the rows that a step has touched."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -46,16 +45,9 @@ class FieldOptimiser:
         self._adam.step(rate)
         rows = self._field.rows()
         if rows is not None and self.sink is not None and self._first is not None and self._second is not None:
+            moments = (self._first, self._second)
             self._field.backend.adam_rows(
-                rows,
-                self.sink,
-                self._first,
-                self._second,
-                step=number,
-                rate=rate,
-                betas=BETAS,
-                eps=EPS,
-                decay=decay,
+                rows, self.sink, *moments, step=number, rate=rate, betas=BETAS, eps=EPS, decay=decay
             )
 
     def state(self) -> dict[str, Tensor]:
@@ -75,14 +67,10 @@ class FieldOptimiser:
 
 
 class PartsOptimiser:
-    """Adam for parameters learned besides the field.
+    """Adam for groups of parameters learned besides the field, each with a multiple of the field's learning rate."""
 
-    Args:
-        groups: each has "params" and "multiple", their learning rate as a multiple of the field's.
-    """
-
-    def __init__(self, groups: Sequence[dict[str, Any]]):
-        self._groups = [(Adam(group["params"]), group["multiple"]) for group in groups]
+    def __init__(self, groups: Sequence[tuple[Sequence[Tensor], float]]):
+        self._groups = [(Adam(parameters), multiple) for parameters, multiple in groups]
 
     def zero_grad(self) -> None:
         """Forget the gradients."""

@@ -38,8 +38,7 @@ class PointDepths:
 
     def among(self, pool: PixelPool) -> "PointDepths":
         """Select the pixels that are usable in a pool."""
-        usable = pool.is_usable(self.numbers)
-        return PointDepths(self.numbers[usable], self.distances[usable], self.trust[usable])
+        return self._chosen(pool.is_usable(self.numbers))
 
     def joined(self, other: "PointDepths") -> "PointDepths":
         """Return the pixels of both."""
@@ -48,8 +47,11 @@ class PointDepths:
 
     def draw(self, count: int, generator: torch.Generator) -> "PointDepths":
         """Draw `count` of these pixels at random, with replacement."""
-        chosen = torch.randint(len(self.numbers), (count,), generator=generator, device=self.numbers.device)
-        return PointDepths(self.numbers[chosen], self.distances[chosen], self.trust[chosen])
+        device = self.numbers.device
+        return self._chosen(torch.randint(len(self.numbers), (count,), generator=generator, device=device))
+
+    def _chosen(self, which: Tensor) -> "PointDepths":
+        return PointDepths(self.numbers[which], self.distances[which], self.trust[which])
 
 
 class PointRays:
@@ -101,12 +103,7 @@ def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarit
     centres = np.array([frame.centre for frame in pool.frames])[tracks.photos[kept]]
     distances = np.linalg.norm(surface.points[tracks.points[kept]] - centres, axis=1) * training_from_scene.scale
     trust = 1.0 / (1.0 + (surface.misses_px[kept] / HALF_ERROR_PX) ** 2)
-    device = pool.colours.device
-    return PointDepths(
-        torch.from_numpy(numbers[inside]).to(device),
-        torch.from_numpy(distances).to(device, torch.float32),
-        torch.from_numpy(trust).to(device, torch.float32),
-    ).among(pool)
+    return _usable(numbers[inside], distances, trust, pool=pool)
 
 
 def stereo_depths(dense: Sequence[DenseDepth], pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
@@ -124,12 +121,13 @@ def stereo_depths(dense: Sequence[DenseDepth], pool: PixelPool, training_from_sc
     numbers = [first + depth.pixels @ (1, width) for first, width, depth in zip(firsts, widths, dense, strict=True)]
     distances = np.concatenate([depth.distances for depth in dense]) * training_from_scene.scale
     trust = 1.0 / (1.0 + np.square(np.concatenate([depth.errors for depth in dense]) / HALF_ERROR))
+    return _usable(np.concatenate(numbers), distances, trust, pool=pool)
+
+
+def _usable(numbers: np.ndarray, distances: np.ndarray, trust: np.ndarray, *, pool: PixelPool) -> PointDepths:
     device = pool.colours.device
-    return PointDepths(
-        torch.from_numpy(np.concatenate(numbers)).to(device),
-        torch.from_numpy(distances).to(device, torch.float32),
-        torch.from_numpy(trust).to(device, torch.float32),
-    ).among(pool)
+    known = (torch.from_numpy(values).to(device, torch.float32) for values in (distances, trust))
+    return PointDepths(torch.from_numpy(numbers).to(device), *known).among(pool)
 
 
 def fading(fraction: float) -> float:

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from nerfcli.cameras.camera import Camera, by_lens
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.lens_change import FOCAL, bearings_by_change, changeable, changed, pixels_by_change
-from nerfcli.cameras.rigid import from_parts, transform_from_twist, vector_from_rotation
+from nerfcli.cameras.rigid import from_parts, inverse, transform_from_twist, vector_from_rotation
 from nerfcli.fit.delayed import Delayed, on_device_of
-from nerfcli.fit.gauge import relative_motions, without_mean
+from nerfcli.fit.gauge import without_mean
 from nerfcli.fit.newton import NewtonSteps
 from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.fit.whitening import WhitenedAdam, whitening
@@ -138,7 +138,7 @@ class PoseRefinement(nn.Module):
         seen = (twists[:, None] @ self.picture @ twists[..., None])[..., 0].sqrt()  # (P, 1) radians
         twists = (twists * (_FARTHEST_STEP / seen.clamp_min(_FARTHEST_STEP))).numpy()
         moved = without_mean(self._given, self.poses() @ transform_from_twist(twists))
-        self.motions.copy_(torch.from_numpy(relative_motions(self._given, moved)))
+        self.motions.copy_(torch.from_numpy(inverse(self._given) @ moved))
 
 
 class LensRefinement(nn.Module):

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,8 +28,8 @@ class NonFiniteError(Exception):
     """A step met a number that is not finite. `Sentinel` handles it; the user never sees it."""
 
 
-class Watch(Protocol):
-    """Observer that receives the tensors of a step in the order of computation."""
+class Watch:
+    """Observer that receives the tensors of a step in the order of computation; this one ignores them."""
 
     def state(self, give: Callable[[], tuple[dict[str, Tensor], Any]]) -> None:
         """Look at the state between two steps, which `give` collects."""
@@ -41,30 +41,16 @@ class Watch(Protocol):
         """Look at a tensor whose rows belong to rays (N,), and at the gradient that will come to it."""
 
 
-class Unwatched:
-    """Null object: records nothing and costs nothing."""
-
-    def state(self, give: Callable[[], tuple[dict[str, Tensor], Any]]) -> None:
-        pass
-
-    def values(self, name: str, tensor: Tensor) -> None:
-        pass
-
-    def rows(self, name: str, tensor: Tensor, rays: Tensor) -> None:
-        pass
+UNWATCHED = Watch()
 
 
-UNWATCHED = Unwatched()
-
-
-class FirstBad:
+class FirstBad(Watch):
     """Looks at every number of every tensor, and remembers the first tensor that is not finite."""
 
     def __init__(self) -> None:
         self.found: BadTensor | None = None
 
     def state(self, give: Callable[[], tuple[dict[str, Tensor], Any]]) -> None:
-        """Look at the state between two steps, which `give` collects."""
         for name, tensor in that_must_be_finite(give()[0]).items():
             self.values(name.removeprefix("field."), tensor)
 
@@ -79,7 +65,6 @@ class FirstBad:
         self.found = BadTensor(name, int(bad.sum()), bad.numel(), tuple(which.long().tolist()))
 
     def rows(self, name: str, tensor: Tensor, rays: Tensor) -> None:
-        """Look at a tensor whose rows belong to rays (N,), and at the gradient that will come to it."""
         self.values(name, tensor, rays)
         if tensor.requires_grad:
             tensor.register_hook(lambda gradient: self.values(f"gradient of {name}", gradient, rays))

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from nerfcli.fit.adam import BETAS, EPS
+
 # Relative damping of the sums of squares, so that poorly determined parameters do not move far: CamP's value.
 DAMPING = 0.1
 _FLOOR = 1e-8
-BETAS = (0.9, 0.99)
-EPS = 1e-15
 
 
 def whitening(jacobian: np.ndarray) -> np.ndarray:
