@@ -518,7 +518,7 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "field/encodings.py",
+        "field/fourier_field.py",
         ("tests/test_field.py",),
         "",
         (),

@@ -18,7 +18,7 @@ from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.contraction import training_points, uncontract, uncontract_from_cube
 from nerfcli.field.cost import field_bytes
-from nerfcli.field.encodings import fourier_features
+from nerfcli.field.fourier_field import fourier_features
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.kernels import spherical_harmonics
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT, density_from_log

@@ -14,8 +14,7 @@ from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
-from nerfcli.field.encodings import fourier_features
-from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
+from nerfcli.field.fourier_field import FourierField, FourierFieldSettings, fourier_features
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import KINDS, fresh_field, settings_from_json

@@ -8,7 +8,7 @@ import torch
 from kernel_parts import parts_for
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.field.encodings import fourier_features
+from nerfcli.field.fourier_field import fourier_features
 from nerfcli.kernels import LightEnds
 from nerfcli.kernels.reference import depth
 from nerfcli.render.depth import DepthRequest, requested

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from nerfcli.field.contraction import training_points
 from nerfcli.field.interface import Field, FieldSettings
-from nerfcli.kernels import Medium, grid_coordinates
+from nerfcli.kernels import grid_coordinates
 
 
 @dataclass(frozen=True)
@@ -78,23 +78,13 @@ class BlocksField(Field):
         occupancy: (B, G, G, G) bool, each block's over its own cube; space is empty where it is False.
     """
 
+    settings: BlocksFieldSettings
     occupancy: Tensor
 
     def __init__(self, settings: BlocksFieldSettings, fields: Sequence[Field], occupancy: Tensor):
-        super().__init__()
-        self._settings = settings
+        super().__init__(settings)
         self.fields = nn.ModuleList(fields)
         self.register_buffer("occupancy", occupancy)
-
-    @property
-    def settings(self) -> BlocksFieldSettings:
-        return self._settings
-
-    def rows(self) -> None:
-        return None
-
-    def medium(self, detail: float = 1.0) -> Medium:
-        return self
 
     def density(self, coordinates: Tensor) -> Tensor:
         """See `kernels.Medium`."""

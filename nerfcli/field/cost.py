@@ -19,9 +19,9 @@ CORNERS = 8
 TRAINING = 3
 
 
-def parameter_bytes(count: int, *, bytes_per_value: int = FLOAT_BYTES) -> int:
+def parameter_bytes(count: int) -> int:
     """Return the bytes of `count` parameters, without activations and optimiser state."""
-    return count * bytes_per_value
+    return count * FLOAT_BYTES
 
 
 def optimiser_bytes(count: int) -> int:
@@ -36,7 +36,7 @@ def occupancy_bytes(side: int) -> int:
 
 def field_bytes(field: nn.Module) -> int:
     """Return the bytes of a field's parameters."""
-    return sum(parameter_bytes(p.numel(), bytes_per_value=p.element_size()) for p in field.parameters())
+    return sum(parameter.nbytes for parameter in field.parameters())
 
 
 @dataclass(frozen=True)

@@ -73,20 +73,16 @@ class HashField(Field):
     Source: Barron et al. 2023, Zip-NeRF, arXiv:2304.06706, section 4, where it is normalised by level.
     """
 
+    settings: HashFieldSettings
     row_decay = ROW_DECAY
 
     def __init__(self, settings: HashFieldSettings):
-        super().__init__()
-        self._settings = settings
+        super().__init__(settings)
         width, encoded = settings.width, settings.levels * settings.features
         shape = (settings.levels, 2**settings.log2_rows, settings.features)
         self.table = nn.Parameter(torch.empty(shape).uniform_(-1e-4, 1e-4))
         sizes = ((width, encoded), (GEOMETRY, width), (width, GEOMETRY + HARMONICS), (width, width), (3, width))
         self.weights = nn.ParameterList([_uniform_weights(*size) for size in sizes])
-
-    @property
-    def settings(self) -> HashFieldSettings:
-        return self._settings
 
     def rows(self) -> nn.Parameter:
         return self.table

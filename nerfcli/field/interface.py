@@ -51,8 +51,9 @@ class Field(nn.Module, abc.ABC):
     row_decay: float = 0.0
     closing_steps: ClassVar[int] = 150
 
-    def __init__(self) -> None:
+    def __init__(self, settings: FieldSettings) -> None:
         super().__init__()
+        self._settings = settings
         self._backend: kernels.Backend | None = None
 
     @property
@@ -72,19 +73,18 @@ class Field(nn.Module, abc.ABC):
         return super()._apply(fn, recurse)
 
     @property
-    @abc.abstractmethod
     def settings(self) -> FieldSettings:
-        """Kind and size."""
+        """Kind and size; each kind of field narrows the type."""
+        return self._settings
 
-    @abc.abstractmethod
     def rows(self) -> nn.Parameter | None:
         """Return the parameter (..., F) of which a sample touches only some rows; None if there is none.
 
         Training changes rows that were touched and leaves the rest alone, see `reference.adam_rows`. All other
         parameters take part in every sample.
         """
+        return None
 
-    @abc.abstractmethod
     def medium(self, detail: float = 1.0) -> kernels.HashGrid | kernels.Medium:
         """Return the medium that backends render.
 
@@ -92,6 +92,7 @@ class Field(nn.Module, abc.ABC):
             detail: fraction of the training budget at which a field has the details to include; 1 for all, below 0 for
                 fewer than at the start. Details left out are as in an untrained field: nothing visible.
         """
+        return self
 
     @abc.abstractmethod
     def density(self, coordinates: Tensor) -> Tensor:

@@ -13,24 +13,21 @@ from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
 
 # The kinds that can be trained.
-KINDS = (HashFieldSettings.kind, VoxelFieldSettings.kind, FourierFieldSettings.kind)
+_TRAINED: dict[type[FieldSettings], type[Field]] = {
+    HashFieldSettings: HashField,
+    VoxelFieldSettings: VoxelField,
+    FourierFieldSettings: FourierField,
+}
+KINDS = tuple(settings.kind for settings in _TRAINED)
 
 
 def fresh_field(settings: FieldSettings) -> Field:
     """Return an untrained field, initialised from torch's random numbers."""
-    match settings:
-        case HashFieldSettings():
-            return HashField(settings)
-        case VoxelFieldSettings():
-            return VoxelField(settings)
-        case FourierFieldSettings():
-            return FourierField(settings)
-        case BlocksFieldSettings():
-            fields = [fresh_field(block.field) for block in settings.blocks]
-            shape = (len(fields), *[settings.occupancy_side] * 3)
-            return BlocksField(settings, fields, torch.zeros(shape, dtype=torch.bool))
-        case _:
-            raise ValueError(f"no field has settings of type {type(settings).__name__}")
+    if not isinstance(settings, BlocksFieldSettings):
+        return _TRAINED[type(settings)](settings)
+    fields = [fresh_field(block.field) for block in settings.blocks]
+    shape = (len(fields), *[settings.occupancy_side] * 3)
+    return BlocksField(settings, fields, torch.zeros(shape, dtype=torch.bool))
 
 
 def settings_from_json(content: dict[str, Any]) -> FieldSettings:
@@ -40,18 +37,14 @@ def settings_from_json(content: dict[str, Any]) -> FieldSettings:
         UserError: the kind is not known here.
     """
     sizes = {name: value for name, value in content.items() if name != "kind"}
-    match content.get("kind", HashFieldSettings.kind):
-        case HashFieldSettings.kind:
-            return HashFieldSettings(**sizes)
-        case VoxelFieldSettings.kind:
-            return VoxelFieldSettings(**sizes)
-        case FourierFieldSettings.kind:
-            return FourierFieldSettings(**sizes)
-        case BlocksFieldSettings.kind:
-            sizes["ground"], sizes["blocks"] = tuple(map(tuple, sizes["ground"])), tuple(map(_block, sizes["blocks"]))
-            return BlocksFieldSettings(**sizes)
-        case kind:
-            raise UserError(f"unknown type of field: {kind!r}", "use the version of nerfcli that trained it")
+    kind = content.get("kind", HashFieldSettings.kind)
+    if kind == BlocksFieldSettings.kind:
+        sizes["ground"], sizes["blocks"] = tuple(map(tuple, sizes["ground"])), tuple(map(_block, sizes["blocks"]))
+        return BlocksFieldSettings(**sizes)
+    for settings in _TRAINED:
+        if settings.kind == kind:
+            return settings(**sizes)
+    raise UserError(f"unknown type of field: {kind!r}", "use the version of nerfcli that trained it")
 
 
 def _block(content: dict[str, Any]) -> Block:

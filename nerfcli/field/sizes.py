@@ -47,7 +47,7 @@ def chosen_size(
         ValueError: an unknown kind.
     """
     contraction, view_degree = hash_grid.contraction, hash_grid.view_degree
-    cells = cells_of_footprint(footprint, contraction)
+    cells = cube_side(contraction) / footprint  # as wide as a pixel, along the side of the cube
 
     def tables(log2_rows: int) -> HashFieldSettings:
         size = replace(hash_grid, log2_rows=log2_rows)
@@ -65,27 +65,22 @@ def chosen_size(
         case HashFieldSettings.kind:
             if memory_bytes is None:
                 return tables(hash_grid.log2_rows)
-            return largest_within(LOG2_ROWS, tables, memory_bytes)
+            return _largest_within(LOG2_ROWS, tables, memory_bytes)
         case VoxelFieldSettings.kind:
             sizes = [size for size in LOG2_VERTICES if voxels(size).resolution <= cells] or LOG2_VERTICES[:1]
-            return largest_within(sizes, voxels, memory_bytes or VOXEL_BYTES)
+            return _largest_within(sizes, voxels, memory_bytes or VOXEL_BYTES)
         case FourierFieldSettings.kind:
-            return largest_within(WIDTHS, network, memory_bytes or NETWORK_BYTES)
+            return _largest_within(WIDTHS, network, memory_bytes or NETWORK_BYTES)
         case _:
             raise ValueError(f"unknown type of field: {kind!r}")
 
 
-def cells_of_footprint(footprint: float, contraction: str) -> float:
-    """Return how many cells as wide as a pixel's footprint fit along the cube's side, see `grid_coordinates`."""
-    return cube_side(contraction) / footprint
-
-
 def cube_side(contraction: str) -> float:
-    """Return the side of the field's cube in units of the training frame, those at its centre if it is contracted."""
+    """Return the side of the cube of `grid_coordinates` in training units, those at its centre if it is contracted."""
     return 2.0 if contraction == "none" else 4.0
 
 
-def largest_within(sizes: Sequence[int], settings: Callable[[int], FieldSettings], memory_bytes: int) -> FieldSettings:
+def _largest_within(sizes: Sequence[int], settings: Callable[[int], FieldSettings], memory_bytes: int) -> FieldSettings:
     """Return the settings of the last of increasing sizes whose parameters fit into the memory, enlarged by `SLACK`.
 
     Raises:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from nerfcli.field.interface import Field, FieldSettings
-from nerfcli.kernels import Medium, spherical_harmonics
+from nerfcli.kernels import spherical_harmonics
 from nerfcli.kernels.activations import density_from_log
 
 # Row width of the compiled interpolation.
@@ -59,23 +59,16 @@ class VoxelField(Field):
     section 4.1 on activations after interpolation.
     """
 
+    settings: VoxelFieldSettings
     rate_factor = 30.0
 
     def __init__(self, settings: VoxelFieldSettings):
-        super().__init__()
-        self._settings = settings
+        super().__init__(settings)
         shape = (settings.layers, 2**settings.log2_vertices, FEATURES)
         self.table = nn.Parameter(torch.empty(shape).uniform_(-1e-4, 1e-4))
 
-    @property
-    def settings(self) -> VoxelFieldSettings:
-        return self._settings
-
     def rows(self) -> nn.Parameter:
         return self.table
-
-    def medium(self, detail: float = 1.0) -> Medium:
-        return self
 
     def density(self, coordinates: Tensor) -> Tensor:
         """See `kernels.Medium`."""
