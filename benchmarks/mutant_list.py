@@ -498,7 +498,7 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "render/sampling.py",
+        "render/model.py",
         ("tests/test_sampling.py",),
         "",
         (),

@@ -12,7 +12,7 @@ from nerfcli.evaluate.protocol import PROTOCOL, HeldOutPhoto, as_exposed, backgr
 from nerfcli.field.background import colours_behind
 from nerfcli.render.model import Model
 from nerfcli.render.rays import CENTRES, pixel_rays
-from nerfcli.render.tracing import TOLERANCE, render_cut_rays, uniform_cuts
+from nerfcli.render.tracing import TOLERANCE, render_rays, uniform_cuts
 
 SAMPLED_PIXELS = 2**14
 _RAYS_AT_A_TIME = 4096
@@ -78,13 +78,12 @@ def render_sampled(
     directions, origin = rays.directions.to(dtype), rays.origin.to(dtype)
     behind = colours_behind(background_of(model, photo), directions)
     colours = [
-        render_cut_rays(
+        render_rays(
             model,
             origin.expand_as(some),
             some,
             cuts=cuts.to(some),
             background=behind[begin : begin + len(some)],
-            fractions=(),
             tolerance=tolerance,
             cones=rays.cones[begin : begin + len(some)].to(dtype),
         ).rgb

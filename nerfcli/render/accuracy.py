@@ -19,7 +19,7 @@ from nerfcli.render.depth import DepthRequest, fractions, requested
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import RenderedPicture
 from nerfcli.render.rays import CENTRES, pixel_rays
-from nerfcli.render.tracing import render_cut_rays, uniform_cuts
+from nerfcli.render.tracing import render_rays, uniform_cuts
 
 IN_WORDS = (
     "these numbers concern the rendering, not how close the field is to the scene: truncation_of_colour bounds what "
@@ -38,7 +38,6 @@ class Spread:
     values: int
     median: float
     percentile_95: float
-    largest: float
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,7 @@ def _renderings(
     background = colours_behind(model.background, directions)
     cuts = uniform_cuts(model.marching)
     seen = [
-        render_cut_rays(
+        render_rays(
             model,
             rays.origin.expand_as(directions),
             directions,
@@ -158,6 +157,6 @@ def _spread(differences: np.ndarray) -> Spread:
     """Return the spread of the values that are defined; zeros where there are none."""
     finite = differences[np.isfinite(differences)]
     if finite.size == 0:
-        return Spread(0, 0.0, 0.0, 0.0)
+        return Spread(0, 0.0, 0.0)
     median, high = np.percentile(finite, (50, 95))
-    return Spread(finite.size, float(median), float(high), float(finite.max()))
+    return Spread(finite.size, float(median), float(high))

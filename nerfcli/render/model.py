@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,6 @@ from nerfcli.field.background import Background, SphereBackground
 from nerfcli.field.checkpoint import read_checkpoint, refuse_non_finite, save_tensors, tensors_of
 from nerfcli.field.interface import Field
 from nerfcli.field.kinds import fresh_field, settings_from_json
-from nerfcli.render.sampling import step_edges
 
 FORMAT = "nerfcli field 2"
 # Format without a choice of contractions; still read.
@@ -27,7 +27,16 @@ BACKGROUND = "background.logits"
 
 @dataclass(frozen=True)
 class Marching:
-    """Sampling of rays, in units of the training frame; see `sampling.step_edges`."""
+    """Sampling of rays in steps that grow with distance, in units of the training frame.
+
+    step(t) = max(shortest_step, growth * t * max(1, t)): a pixel covers more the farther away it is, and beyond the
+    unit ball equal steps in 1 / t are about equal steps in contracted space.
+
+    Args:
+        near, far: 0 <= near < far.
+        shortest_step: > 0.
+        growth: step per distance at distance 1, >= 0; 0 gives equal steps.
+    """
 
     near: float
     far: float
@@ -35,8 +44,23 @@ class Marching:
     growth: float
 
     def edges(self) -> Tensor:
-        """Return the edges (S + 2,) of the steps."""
-        return step_edges(self.near, self.far, shortest_step=self.shortest_step, growth=self.growth)
+        """Return the distances that cut every ray.
+
+        Returns:
+            (S + 2,) float64, increasing, the first at `near`, the last but one at or beyond `far`; one more edge than
+            the intervals need, so that a jittered cut always has a right neighbour.
+
+        Raises:
+            ValueError: the distances are not in order or the step is not positive.
+        """
+        near, far, shortest_step, growth = self.near, self.far, self.shortest_step, self.growth
+        if not 0 <= near < far < math.inf or shortest_step <= 0 or growth < 0:
+            raise ValueError(f"need 0 <= near < far and a positive step, got {near}, {far}, {shortest_step}, {growth}")
+        edges = [near]
+        while len(edges) < 2 or edges[-2] < far:
+            distance = edges[-1]
+            edges.append(distance + max(shortest_step, growth * distance * max(1.0, distance)))
+        return torch.tensor(edges, dtype=torch.float64)
 
     def stretched(self, factor: float) -> "Marching":
         """Return the same span with steps `factor` (> 0) times as long."""

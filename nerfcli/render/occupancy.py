@@ -53,7 +53,7 @@ class Occupancy:
             detail: level of detail of the field, see `Field.medium`.
             cells: slice of the cells, numbered (z * side + y) * side + x; in this order their features are close in
                 memory.
-            shortest_step, growth: the step schedule of `sampling.step_edges`; distances are from the origin of the
+            shortest_step, growth: the step schedule of `Marching`; distances are from the origin of the
                 training frame, near which the cameras are.
             generator: source of the random points, on the grid's device.
         """
@@ -65,7 +65,7 @@ class Occupancy:
         medium = field.medium(detail)
         density = torch.cat([field.backend.density(chunk, medium) for chunk in coordinates.split(2**16)])
         radius = training_points(coordinates, field.settings.contraction).norm(dim=-1)
-        step = (growth * radius * radius.clamp_min(1.0)).clamp_min(shortest_step)  # as `sampling.step_length`
+        step = (growth * radius * radius.clamp_min(1.0)).clamp_min(shortest_step)  # as in `Marching.edges`
         chosen = self.optical_depth.view(-1)[cells]
         chosen.copy_(torch.maximum(torch.where(chosen.isinf(), 0.0, chosen * DECAY), density * step))
 

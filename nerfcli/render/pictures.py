@@ -130,17 +130,8 @@ def render_picture(
         for column in zip(*columns, strict=True)
     )
     _refuse_non_finite(frame, {"rgb": rgb, "opacity": opacity, "truncation error": error})
-    depth_map, spread_map, disagreement_map, median_map = distances if depth is not None else (None,) * 4
-    return RenderedPicture(
-        rgb=rgb,
-        opacity=opacity,
-        depth=depth_map,
-        spread=spread_map,
-        disagreement=disagreement_map,
-        median=median_map,
-        truncation_error=error,
-        valid=valid,
-    )
+    depth_map, spread_map, disagreement_map, median_map = distances or (None,) * 4
+    return RenderedPicture(rgb, opacity, depth_map, spread_map, disagreement_map, median_map, error, valid)
 
 
 def default_rays_per_tile(model: Model) -> int:

@@ -35,6 +35,7 @@ def render_rays(
     directions: Tensor,
     *,
     background: Tensor,
+    cuts: Tensor | None = None,
     fractions: tuple[float, ...] = (),
     tolerance: float = TOLERANCE,
     cones: Tensor | None = None,
@@ -46,46 +47,13 @@ def render_rays(
         model: the trained model.
         origins, directions: (R, 3) in the training frame, unit directions.
         background: (3,) or (R, 3) sRGB.
+        cuts: (S + 1,) distances at which all rays are cut; by default those of pictures, see `uniform_cuts`.
         fractions: of light for the quantiles to compute.
         tolerance: bound on the truncation error of a colour, > 0.
         cones: (R,) footprint of each ray per distance, see `kernels.Rays`; None for lines.
         keep_intervals: whether to return the samples.
     """
-    cuts = uniform_cuts(model.marching).to(directions)
-    return render_cut_rays(
-        model,
-        origins,
-        directions,
-        cuts=cuts,
-        background=background,
-        fractions=fractions,
-        tolerance=tolerance,
-        cones=cones,
-        keep_intervals=keep_intervals,
-    )
-
-
-@lru_cache(maxsize=4)
-def uniform_cuts(marching: Marching) -> Tensor:
-    """Return the distances (S + 1,) float64 at which pictures cut all rays: the midpoints of the training's steps."""
-    edges = marching.edges()
-    return edges[:-1] + 0.5 * edges.diff()
-
-
-def render_cut_rays(
-    model: Model,
-    origins: Tensor,
-    directions: Tensor,
-    *,
-    cuts: Tensor,
-    background: Tensor,
-    fractions: tuple[float, ...],
-    tolerance: float,
-    cones: Tensor | None = None,
-    keep_intervals: bool = True,
-) -> RaysSeen:
-    """March rays as `render_rays` does, all cut at the same distances `cuts` (S + 1,)."""
-    field = model.field
+    field, cuts = model.field, uniform_cuts(model.marching).to(directions) if cuts is None else cuts
     edges = torch.cat([cuts, cuts[-1:]])  # the last edge is not used, because there is no jitter
     rays = Rays(origins, directions, torch.zeros_like(directions[:, 0]), cones)
     march = March(edges, model.occupied, model.contraction, deepest(tolerance))
@@ -102,3 +70,10 @@ def render_cut_rays(
         negligible=negligible,
         keep_intervals=keep_intervals,
     )
+
+
+@lru_cache(maxsize=4)
+def uniform_cuts(marching: Marching) -> Tensor:
+    """Return the distances (S + 1,) float64 at which pictures cut all rays: the midpoints of the training's steps."""
+    edges = marching.edges()
+    return edges[:-1] + 0.5 * edges.diff()

@@ -11,7 +11,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction, views_of
 from nerfcli.errors import UserError
 from nerfcli.render.model import Model
-from nerfcli.render.tracing import TOLERANCE, render_cut_rays
+from nerfcli.render.tracing import TOLERANCE, render_rays
 from nerfcli.render.visibility import DepthMap, sees
 from nerfcli.surface.views import DepthView
 
@@ -145,7 +145,7 @@ def _from_above(model: Model, places: np.ndarray, *, reach: float, height: float
     towards = torch.from_numpy(similarity.rotation @ down).float().to(model.device).expand_as(origins).contiguous()
     length = similarity.scale * reach
     step = max(marching.shortest_step, marching.growth * similarity.scale * height)
-    seen = render_cut_rays(
+    seen = render_rays(
         model,
         origins,
         towards,

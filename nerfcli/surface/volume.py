@@ -7,7 +7,7 @@ import torch
 
 from nerfcli.kernels import grid_coordinates
 from nerfcli.render.model import Model
-from nerfcli.render.tracing import render_cut_rays
+from nerfcli.render.tracing import render_rays
 from nerfcli.surface.extent import Grid
 
 _BLOCK = 2**15
@@ -69,13 +69,12 @@ def _looked_at(
             torch.from_numpy(np.array(values[part], dtype=np.float32)).to(model.device)
             for values in (starts, directions)
         )
-        seen = render_cut_rays(
+        seen = render_rays(
             model,
             origins,
             towards,
             cuts=cuts.to(origins),
             background=torch.zeros(3, device=model.device),
-            fractions=(),
             tolerance=_TOLERANCE,
         )
         opacity = seen.ends.opacity
