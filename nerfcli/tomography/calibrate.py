@@ -4,7 +4,6 @@ The tilt is judged by prediction: a volume fitted to every second view has to ex
 centre of rotation.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,7 +57,18 @@ def detector_tilt(scan: Scan) -> Correction:
     def misfit(angle: float) -> np.ndarray:
         return _prediction(scan, scan.geometry.tilted(angle), binning=binning)
 
-    return _search(misfit, bound=TILT_RANGE, steps=5, precise=float(np.deg2rad(0.02)))
+    def mean(angle: float) -> float:
+        return float(np.nanmean(misfit(float(angle))))
+
+    # On a grid over the whole range, then between the neighbours of the best value.
+    grid = np.linspace(-TILT_RANGE, TILT_RANGE, 5)
+    best = int(np.argmin([mean(value) for value in grid]))
+    between = (float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)]))
+    precise = float(np.deg2rad(0.02))
+    value = float(minimize_scalar(mean, bounds=between, method="bounded", options={"xatol": precise}).x)
+    better = misfit(0.0) - misfit(value)
+    error = float(np.nanstd(better) / np.sqrt(max(np.isfinite(better).sum(), 1)))
+    return Correction(value, float(np.nanmean(better)), error)
 
 
 def air_factors(likelihood: Poisson, integrals: torch.Tensor, *, margin: float = 0.01) -> torch.Tensor:
@@ -76,24 +86,6 @@ def air_factors(likelihood: Poisson, integrals: torch.Tensor, *, margin: float =
     expected = torch.where(air, likelihood.open_beam * torch.exp(-integrals) + likelihood.background, 0).double().sum(1)
     counted = torch.where(air, likelihood.counts, 0).double().sum(1)
     return ((counted + PRIOR_PHOTONS) / (expected + PRIOR_PHOTONS)).float()
-
-
-def _search(misfit: Callable[[float], np.ndarray], *, bound: float, steps: int, precise: float) -> Correction:
-    """Minimise the misfit: on a grid over the whole range, then between the neighbours of the best value."""
-    grid = np.linspace(-bound, bound, steps)
-    means = [float(np.nanmean(misfit(float(value)))) for value in grid]
-    best = int(np.argmin(means))
-    low, high = grid[max(best - 1, 0)], grid[min(best + 1, steps - 1)]
-    found = minimize_scalar(
-        lambda value: float(np.nanmean(misfit(float(value)))),
-        bounds=(float(low), float(high)),
-        method="bounded",
-        options={"xatol": precise},
-    )
-    value = float(found.x)
-    better = misfit(0.0) - misfit(value)
-    error = float(np.nanstd(better) / np.sqrt(max(np.isfinite(better).sum(), 1)))
-    return Correction(value, float(np.nanmean(better)), error)
 
 
 def _prediction(scan: Scan, geometry: ScanGeometry, *, binning: int) -> np.ndarray:

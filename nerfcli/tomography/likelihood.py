@@ -1,10 +1,16 @@
 """Likelihoods of measurements given line integrals: Poisson for counts, least squares for line integrals.
 
-The likelihood of counts takes no logarithm of the data: it is biased for few photons and undefined for none.
+The likelihood of counts takes no logarithm of the data: it is biased for few photons and undefined for none. Both
+likelihoods are negative logarithms, view by view; tensors are (views, pixels), with pixels row by row:
+
+    slope        derivative by each line integral; 0 for unusable pixels
+    curvature    second derivative, >= 0, at the line integrals that the data themselves suggest
+    deviance     squared misfit over the noise variance, 1 on average for a correct model; NaN if unusable
+    suggested    line integrals estimated directly from the data, to start a fit; NaN for unusable pixels
+    by_ray       the same likelihood with each pixel as a separate view
 """
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -15,30 +21,6 @@ from nerfcli.tomography.scan import Scan
 
 # Median of |x| of a normal variable of variance 1.
 _MEDIAN_DEVIATION = 0.6745
-
-
-class Likelihood(Protocol):
-    """Negative log likelihood of line integrals, view by view; tensors are (views, pixels), with pixels row by row."""
-
-    def slope(self, integrals: Tensor, views: Tensor) -> Tensor:
-        """Return the derivative of the negative log likelihood by each line integral; 0 for unusable pixels."""
-        ...
-
-    def curvature(self, views: Tensor) -> Tensor:
-        """Return the second derivative, >= 0, at the line integrals that the data themselves suggest."""
-        ...
-
-    def deviance(self, integrals: Tensor, views: Tensor) -> Tensor:
-        """Return the squared misfit over the noise variance, 1 on average for a correct model; NaN if unusable."""
-        ...
-
-    def suggested(self, views: Tensor) -> Tensor:
-        """Return line integrals estimated directly from the data, to start a fit; NaN for unusable pixels."""
-        ...
-
-    def by_ray(self) -> "Likelihood":
-        """Return the same likelihood with each pixel as a separate view."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -87,7 +69,6 @@ class Poisson:
         return torch.where(self.open_beam[views] > 0, torch.log(self.open_beam[views] / signal), torch.nan)
 
     def by_ray(self) -> "Poisson":
-        """Return the same likelihood with each pixel as a separate view."""
         counts, open_beam, background = (x.reshape(-1, 1) for x in (self.counts, self.open_beam, self.background))
         return replace(self, counts=counts, open_beam=open_beam, background=background)
 
@@ -137,11 +118,13 @@ class Gaussian:
         return torch.where(self.weight[views] > 0, self.measured[views], torch.nan)
 
     def by_ray(self) -> "Gaussian":
-        """Return the same likelihood with each pixel as a separate view."""
         return Gaussian(self.measured.reshape(-1, 1), self.weight.reshape(-1, 1))
 
 
-def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Poisson | Gaussian:
+Likelihood = Poisson | Gaussian
+
+
+def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Likelihood:
     """Build the likelihood of some views of a scan.
 
     Transmissions are treated as counts with an open beam of 1, scaled to photons. If the number of photons per value

@@ -28,24 +28,23 @@ class Row:
     Args:
         geometry: with one row, everything at z = 0.
         integrals: (V, columns) float32.
-        number: index of the row in the detector.
     """
 
     geometry: ScanGeometry
     integrals: np.ndarray
-    number: int
 
     def binned(self, columns: int) -> "Row":
         """Return the row with at most `columns` columns, each a mean of neighbours."""
         factor = -(-self.geometry.columns // columns)
         kept = self.geometry.columns // factor
         means = self.integrals[:, : kept * factor].reshape(len(self.integrals), kept, factor).mean(2)
-        return Row(self.geometry.binned(factor), means, self.number)
+        return Row(self.geometry.binned(factor), means)
 
-    def thinned(self, views: int = MOST_VIEWS) -> "Row":
-        """Return the row with at most `views` views, at equal steps."""
-        index = np.unique(np.linspace(0, len(self.integrals) - 1, min(views, len(self.integrals))).round().astype(int))
-        return Row(self.geometry.select(index), self.integrals[index], self.number)
+    def thinned(self) -> "Row":
+        """Return the row with at most `MOST_VIEWS` views, at equal steps."""
+        views = len(self.integrals)
+        index = np.unique(np.linspace(0, views - 1, min(MOST_VIEWS, views)).round().astype(int))
+        return Row(self.geometry.select(index), self.integrals[index])
 
 
 def highest_contrast_row(scan: Scan, views: np.ndarray | None = None) -> Row:
@@ -71,13 +70,13 @@ def highest_contrast_row(scan: Scan, views: np.ndarray | None = None) -> Row:
         emitter = emitter / np.linalg.norm(emitter, axis=1, keepdims=True)
     centre = geometry.centre + (row - (geometry.rows - 1) / 2) * geometry.row_step
     plane = replace(geometry, emitter=emitter, centre=centre * flat, column_step=geometry.column_step * flat, rows=1)
-    return Row(plane, filled(scan, views, row)[:, 0], row)
+    return Row(plane, filled(scan, views, row)[:, 0])
 
 
 def filled(scan: Scan, views: np.ndarray, row: int | None = None) -> np.ndarray:
     """Return line integrals (views, rows or 1, columns) with unusable pixels interpolated along their row."""
     if row is not None:
-        scan = _only_row(scan, row)
+        scan = scan.only_rows(row, row + 1)
     integrals = scan.line_integrals(views)
     usable = scan.of_views("usable", views)
     if usable is None:
@@ -175,19 +174,3 @@ def _row_of_source(geometry: ScanGeometry) -> float:
     lift = geometry.emitter[:, 2] - geometry.centre[:, 2]
     down = np.where(geometry.row_step[:, 2] == 0, -1.0, geometry.row_step[:, 2])
     return (geometry.rows - 1) / 2 + float(np.median(lift / down))
-
-
-def _only_row(scan: Scan, row: int) -> Scan:
-    def cut(array: np.ndarray | None) -> np.ndarray | None:
-        return array if array is None or array.shape[1] == 1 else array[:, row : row + 1]
-
-    values = cut(scan.values)
-    assert values is not None
-    return replace(
-        scan,
-        geometry=replace(scan.geometry, rows=1),
-        values=values,
-        open_beam=cut(scan.open_beam),
-        dark=cut(scan.dark),
-        usable=cut(scan.usable),
-    )

@@ -21,7 +21,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from nerfcli import kernels
-from nerfcli.kernels import Backend
 from nerfcli.kernels.reference import total_variation
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid
@@ -85,27 +84,20 @@ class Projector:
         grid: grid of the volumes.
     """
 
-    def __init__(self, geometry: ScanGeometry, grid: VoxelGrid, backend: Backend | None = None):
+    def __init__(self, geometry: ScanGeometry, grid: VoxelGrid):
         self._geometry, self._grid = geometry, grid
-        self._backend = backend or kernels.backend_for(torch.device("cpu"), torch.float32)
+        self._backend = kernels.backend_for(torch.device("cpu"), torch.float32)
 
     def forward(self, volume: Tensor, views: np.ndarray) -> Tensor:
         """Return line integrals (len(views), pixels) of a volume."""
-        origins, directions = self._rays(views)
-        integrals = self._backend.project(volume, origins, directions, first=self._grid.first, size=self._grid.size)
+        grid = self._grid
+        integrals = self._backend.project(volume, *self._rays(views), first=grid.first, size=grid.size)
         return integrals.view(len(views), -1)
 
     def backward(self, values: Tensor, views: np.ndarray) -> Tensor:
         """Apply the transpose of `forward`: return a volume from values (len(views), pixels)."""
-        origins, directions = self._rays(views)
-        return self._backend.back_project(
-            values.reshape(-1),
-            origins,
-            directions,
-            shape=self._grid.shape,
-            first=self._grid.first,
-            size=self._grid.size,
-        )
+        grid, rays = self._grid, self._rays(views)
+        return self._backend.back_project(values.reshape(-1), *rays, shape=grid.shape, first=grid.first, size=grid.size)
 
     def _rays(self, views: np.ndarray) -> tuple[Tensor, Tensor]:
         origins, directions = self._geometry.rays(views)

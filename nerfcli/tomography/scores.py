@@ -9,7 +9,7 @@ from skimage.metrics import structural_similarity
 
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid
-from nerfcli.tomography.likelihood import likelihood_of
+from nerfcli.tomography.likelihood import Poisson, likelihood_of
 from nerfcli.tomography.reconstruct import Projector
 from nerfcli.tomography.scan import Scan
 
@@ -71,8 +71,6 @@ def score_projections(
     likelihood = likelihood_of(scan, views)
     measured = scan.line_integrals(views).reshape(len(views), -1)
     if air is not None:
-        from nerfcli.tomography.likelihood import Poisson
-
         assert isinstance(likelihood, Poisson)
         likelihood = likelihood.scaled(torch.from_numpy(air.astype(np.float32)))
         measured = measured + np.log(air)[:, None].astype(np.float32)

@@ -21,7 +21,6 @@ class Sample:
 
     Args:
         scan: the scan.
-        views: indices of the examined views.
         rows: indices of the examined rows.
         integrals: (V, rows, columns) float32, unusable pixels interpolated.
         noise: standard deviation of a line integral where there is little object.
@@ -29,7 +28,6 @@ class Sample:
     """
 
     scan: Scan
-    views: np.ndarray
     rows: np.ndarray
     integrals: np.ndarray
     noise: float
@@ -57,4 +55,4 @@ def sample_of(scan: Scan) -> Sample:
     inner = integrals[..., 1:-1] if integrals.shape[2] > 4 else integrals[..., :1]
     thin = inner <= np.quantile(inner, 0.25)
     noise = float(np.median(second[thin])) / _MAD / np.sqrt(_SECOND) if thin.any() else 0.0
-    return Sample(scan, views, rows, integrals, noise, float(np.quantile(integrals, 0.995)))
+    return Sample(scan, rows, integrals, noise, float(np.quantile(integrals, 0.995)))
