@@ -51,21 +51,12 @@ class Circle:
         Raises:
             ValueError: see `circular_cone`.
         """
-        pixels = {
-            "pixel_width": self.pixel_width,
-            "pixel_height": self.pixel_height,
-            "rows": self.rows,
-            "columns": self.columns,
-        }
+        pixels = {name: getattr(self, name) for name in ("pixel_width", "pixel_height", "rows", "columns")}
         if self.beam == "parallel":
             geometry = circular_parallel(self.angles, **pixels)
         else:
-            geometry = circular_cone(
-                self.angles,
-                source_origin=self.source_origin,
-                source_detector=self.source_detector,
-                **pixels,
-            )
+            distances = {name: getattr(self, name) for name in ("source_origin", "source_detector")}
+            geometry = circular_cone(self.angles, **distances, **pixels)
         right = geometry.column_step / self.pixel_width
         moved = geometry.centre + self.lateral * right
         emitter = geometry.emitter if self.beam == "parallel" else geometry.emitter + self.lateral * right

@@ -57,13 +57,8 @@ class ScanGeometry:
     def select(self, views: ArrayLike) -> "ScanGeometry":
         """Return the same scan with some of its views, given by their indices."""
         index = np.asarray(views)
-        return replace(
-            self,
-            emitter=self.emitter[index],
-            centre=self.centre[index],
-            column_step=self.column_step[index],
-            row_step=self.row_step[index],
-        )
+        vectors = ("emitter", "centre", "column_step", "row_step")
+        return replace(self, **{name: getattr(self, name)[index] for name in vectors})
 
     def binned(self, factor: int) -> "ScanGeometry":
         """Return the scan with detector pixels `factor` times as large.
@@ -97,6 +92,12 @@ class ScanGeometry:
         return replace(
             self, column_step=width * (cos * along + sin * down), row_step=height * (cos * down - sin * along)
         )
+
+    def scaled(self, factor: float) -> "ScanGeometry":
+        """Return the same scan in a unit that is `factor` times smaller."""
+        emitter = self.emitter if self.beam == "parallel" else factor * self.emitter
+        lengths = {name: factor * getattr(self, name) for name in ("centre", "column_step", "row_step")}
+        return replace(self, emitter=emitter, **lengths)
 
     def mirrored(self) -> "ScanGeometry":
         """Return the scan with the detector's columns numbered from the other side."""

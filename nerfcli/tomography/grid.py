@@ -1,5 +1,6 @@
 """The voxel grid of a volume: number, position and size of its voxels."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,11 @@ class VoxelGrid:
         if min(self.shape) < 1 or not self.size > 0 or not np.isfinite([*self.first, self.size]).all():
             raise ValueError(f"no grid: shape {self.shape}, first voxel {self.first}, size {self.size}")
 
+    @staticmethod
+    def of(shape: Sequence[int], first: Sequence[float], size: float) -> "VoxelGrid":
+        """Return the grid of three counts (z, y, x) and the three coordinates (x, y, z) of the first centre."""
+        return VoxelGrid((shape[0], shape[1], shape[2]), (first[0], first[1], first[2]), size)
+
     @property
     def voxels(self) -> int:
         """Number of voxels."""
@@ -39,15 +45,13 @@ class VoxelGrid:
         """Return a grid over the same box with voxels `factor` times as large, their number rounded up."""
         shape = tuple(-(-count // factor) for count in self.shape)
         half = self.size * (factor - 1) / 2
-        first = (self.first[0] + half, self.first[1] + half, self.first[2] + half)
-        return VoxelGrid((shape[0], shape[1], shape[2]), first, self.size * factor)
+        return VoxelGrid.of(shape, [centre + half for centre in self.first], self.size * factor)
 
 
 def centred_grid(extent: tuple[float, float, float], size: float) -> VoxelGrid:
     """Return a grid around the frame's origin that covers a box of these lengths (x, y, z) with whole voxels."""
     counts = [max(1, int(np.ceil(length / size - 1e-9))) for length in extent]
-    first = tuple(-(count - 1) / 2 * size for count in counts)
-    return VoxelGrid((counts[2], counts[1], counts[0]), (first[0], first[1], first[2]), size)
+    return VoxelGrid.of(counts[::-1], [-(count - 1) / 2 * size for count in counts], size)
 
 
 def grid_of_scan(geometry: ScanGeometry, size: float | None = None) -> VoxelGrid:

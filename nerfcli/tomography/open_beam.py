@@ -1,6 +1,7 @@
 """The open beam from flats and darks: averages, dead pixels, photons per detector value."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -31,6 +32,23 @@ class OpenBeam:
     dark: np.ndarray | None
     usable: np.ndarray
     photons_per_value: float | None
+
+
+def check_sizes(
+    projections: tuple[int, ...], *, flats: np.ndarray | None, darks: np.ndarray | None, path: Path
+) -> None:
+    """Raise unless flats and darks of a scan at a path have the size of its projections, given by their shape.
+
+    Raises:
+        UserError: another size.
+    """
+    for name, frames in (("flats", flats), ("darks", darks)):
+        if frames is not None and frames.shape[1:] != projections[1:]:
+            raise UserError(
+                f"{path}: {name} of {frames.shape[2]} x {frames.shape[1]} pixels, projections of "
+                f"{projections[2]} x {projections[1]}",
+                "flats and darks come from the detector of the projections: crop them the same way",
+            )
 
 
 def open_beam_of(flats: np.ndarray, darks: np.ndarray | None) -> OpenBeam:

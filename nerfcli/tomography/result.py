@@ -15,7 +15,7 @@ from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 from nerfcli.sealed import read_sealed, write_sealed
 from nerfcli.tomography.grid import VoxelGrid
-from nerfcli.tomography.scan import MEASUREMENT
+from nerfcli.tomography.scan import MEASUREMENT, array_digest, read_array
 
 DESCRIPTION = "reconstruction.json"
 VOLUME = "volume.npy"
@@ -124,8 +124,6 @@ def save_reconstruction(run: Path, result: Reconstruction) -> None:
     Raises:
         UserError: it cannot be written.
     """
-    from nerfcli.tomography.scan import array_digest
-
     digests = {}
     for name, array in {VOLUME: result.volume, MARKS: result.marks, **result.learned}.items():
         with atomic_path(run / name) as partial:
@@ -159,17 +157,14 @@ def load_reconstruction(run: Path) -> Reconstruction:
     Raises:
         UserError: there is none, or its files are damaged.
     """
-    from nerfcli.tomography.scan import read_array
-
     try:
         content = read_sealed(run / DESCRIPTION)
         arrays = {name: read_array(run / name, digest) for name, digest in content["arrays"].items()}
         grid = content["grid"]
-        shape, first = grid["shape"], grid["first"]
         return Reconstruction(
             arrays.pop(VOLUME),
             arrays.pop(MARKS),
-            VoxelGrid((shape[0], shape[1], shape[2]), (first[0], first[1], first[2]), grid["size"]),
+            VoxelGrid.of(grid["shape"], grid["first"], grid["size"]),
             content["unit"],
             Path(content["scan"]),
             content["scan_digest"],

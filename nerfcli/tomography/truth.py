@@ -1,6 +1,6 @@
 """The true volume of a simulated scan."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +8,39 @@ import numpy as np
 
 from nerfcli.errors import UserError
 from nerfcli.tomography.grid import VoxelGrid
+
+
+def described_truth(
+    path: Path,
+    layout: str,
+    shape: Sequence[int],
+    *,
+    size: float,
+    attenuation_per_value: float,
+    first: Sequence[float] | None = None,
+    dtype: str | None = None,
+) -> dict[str, Any]:
+    """Return the entry of a scan's history from which `load_truth` loads the true volume.
+
+    Args:
+        path: the file: a .npy, a pickle of NAF, or plain numbers of type `dtype`.
+        layout: order of the axes in the file, "zyx" or "xyz".
+        shape: number of voxels (z, y, x).
+        size: side of a voxel, in the scan's unit.
+        attenuation_per_value: in the inverse of the scan's unit.
+        first: (x, y, z) centre of the first voxel; by default, the volume is centred on the origin.
+    """
+    return {
+        "truth": {
+            "path": str(path.absolute()),
+            "layout": layout,
+            **({} if dtype is None else {"dtype": dtype}),
+            "shape": list(shape),
+            "first": [-(count - 1) / 2 * size for count in reversed(shape)] if first is None else list(first),
+            "size": size,
+            "attenuation_per_value": attenuation_per_value,
+        }
+    }
 
 
 def load_truth(history: Mapping[str, Any]) -> tuple[VoxelGrid, np.ndarray] | None:
@@ -45,5 +78,4 @@ def load_truth(history: Mapping[str, Any]) -> tuple[VoxelGrid, np.ndarray] | Non
     if stated["layout"] == "xyz":
         volume = volume.reshape(shape[::-1]).transpose(2, 1, 0)
     volume = volume.reshape(shape).astype(np.float32) * np.float32(stated["attenuation_per_value"])
-    first = tuple(float(value) for value in stated["first"])
-    return VoxelGrid((shape[0], shape[1], shape[2]), (first[0], first[1], first[2]), float(stated["size"])), volume
+    return VoxelGrid.of(shape, [float(value) for value in stated["first"]], float(stated["size"])), volume

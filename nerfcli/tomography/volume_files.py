@@ -57,9 +57,10 @@ def write_volume(path: Path, volume: VolumeFile) -> None:
     """
     if volume.values.dtype not in _WORDS:
         raise ValueError(f"volumes are float32 or uint8, not {volume.values.dtype}")
-    writer = _writer(path)
+    if path.suffix.lower() not in _FORMATS:
+        raise UserError(f"{path.name}: unknown volume format", f"choose one of {', '.join(SUFFIXES)}")
     with atomic_path(path) as partial:
-        writer(partial, volume)
+        _FORMATS[path.suffix.lower()][0](partial, volume)
 
 
 def read_volume(path: Path) -> VolumeFile:
@@ -68,34 +69,14 @@ def read_volume(path: Path) -> VolumeFile:
     Raises:
         UserError: it is missing, damaged, or was not written by nerfcli.
     """
-    readers: dict[str, Callable[[Path], VolumeFile]] = {
-        ".nrrd": _read_nrrd,
-        ".mha": _read_mha,
-        ".nii": _read_nifti,
-        ".tif": _read_tiff,
-        ".tiff": _read_tiff,
-    }
     try:
-        return readers[path.suffix.lower()](path)
+        return _FORMATS[path.suffix.lower()][1](path)
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}", "give a volume file") from error
     except (KeyError, ValueError, IndexError, struct.error) as error:
         raise UserError(
             f"{path} is damaged or not a volume written by nerfcli: {error}", "export the volume again"
         ) from error
-
-
-def _writer(path: Path) -> Callable[[Path, VolumeFile], None]:
-    writers = {
-        ".nrrd": _write_nrrd,
-        ".mha": _write_mha,
-        ".nii": _write_nifti,
-        ".tif": _write_tiff,
-        ".tiff": _write_tiff,
-    }
-    if path.suffix.lower() not in writers:
-        raise UserError(f"{path.name}: unknown volume format", f"choose one of {', '.join(SUFFIXES)}")
-    return writers[path.suffix.lower()]
 
 
 def is_volume_file(path: Path) -> bool:
@@ -128,9 +109,7 @@ def _read_nrrd(path: Path) -> VolumeFile:
     first = [float(v) for v in fields["space origin"].strip("()").split(",")]
     size = float(fields["space directions"].split(",")[0].strip("("))
     values = values.transpose(2, 1, 0)
-    z, y, x = values.shape
-    grid = VoxelGrid((z, y, x), (first[0], first[1], first[2]), size)
-    return VolumeFile(values, grid, description["unit"], description["quantity"])
+    return VolumeFile(values, VoxelGrid.of(values.shape, first, size), description["unit"], description["quantity"])
 
 
 def _write_mha(path: Path, volume: VolumeFile) -> None:
@@ -139,7 +118,7 @@ def _write_mha(path: Path, volume: VolumeFile) -> None:
     lines = [
         "ObjectType = Image",
         "NDims = 3",
-        f"Comment = unit {volume.unit or '-'} quantity {volume.quantity or '-'}",
+        f"Comment = {_units(volume)}",
         "BinaryData = True",
         "BinaryDataByteOrderMSB = False",
         "CompressedData = False",
@@ -150,9 +129,7 @@ def _write_mha(path: Path, volume: VolumeFile) -> None:
         f"ElementType = {_WORDS[volume.values.dtype]}",
         "ElementDataFile = LOCAL",
     ]
-    with path.open("wb") as file:
-        file.write(("\n".join(lines) + "\n").encode("ascii"))
-        file.write(np.ascontiguousarray(volume.values).tobytes())
+    path.write_bytes(("\n".join(lines) + "\n").encode("ascii") + volume.values.tobytes())
 
 
 def _read_mha(path: Path) -> VolumeFile:
@@ -163,10 +140,9 @@ def _read_mha(path: Path) -> VolumeFile:
     kind = {"MET_UCHAR": np.dtype(np.uint8), "MET_FLOAT": np.dtype("<f4")}[fields["ElementType"]]
     x, y, z = (int(n) for n in fields["DimSize"].split())
     first = [float(v) for v in fields["Offset"].split()]
-    _, unit, _, quantity = fields["Comment"].split(" ", 3)
     values = np.frombuffer(content[at:], kind).reshape(z, y, x)
-    grid = VoxelGrid((z, y, x), (first[0], first[1], first[2]), float(fields["ElementSpacing"].split()[0]))
-    return VolumeFile(values, grid, unit.strip("-"), quantity.strip("-"))
+    grid = VoxelGrid.of(values.shape, first, float(fields["ElementSpacing"].split()[0]))
+    return VolumeFile(values, grid, *_stated_units(fields["Comment"]))
 
 
 def _write_nifti(path: Path, volume: VolumeFile) -> None:
@@ -180,18 +156,14 @@ def _write_nifti(path: Path, volume: VolumeFile) -> None:
     struct.pack_into("<8f", header, 76, 1, size, size, size, 0, 0, 0, 0)
     struct.pack_into("<3f", header, 108, _NIFTI_HEADER, 1, 0)
     struct.pack_into("<b", header, 123, _NIFTI_UNITS.get(volume.unit, 0))
-    struct.pack_into(
-        "<80s", header, 148, f"unit {volume.unit or '-'} quantity {volume.quantity or '-'}".encode("ascii")
-    )
+    struct.pack_into("<80s", header, 148, _units(volume).encode("ascii"))
     struct.pack_into("<2h", header, 252, 0, 1)  # no qform; sform: the scanner's frame, in the rows below
     for row in range(3):
         axis = [0.0] * 4
         axis[row], axis[3] = size, first[row]
         struct.pack_into("<4f", header, 280 + 16 * row, *axis)
     struct.pack_into("<4s", header, 344, b"n+1\0")
-    with path.open("wb") as file:
-        file.write(bytes(header))
-        file.write(np.ascontiguousarray(volume.values).tobytes())
+    path.write_bytes(header + volume.values.tobytes())
 
 
 def _read_nifti(path: Path) -> VolumeFile:
@@ -201,10 +173,9 @@ def _read_nifti(path: Path) -> VolumeFile:
     x, y, z = struct.unpack_from("<3h", content, 42)
     kind = {2: np.dtype(np.uint8), 16: np.dtype("<f4")}[struct.unpack_from("<h", content, 70)[0]]
     rows = [struct.unpack_from("<4f", content, 280 + 16 * row) for row in range(3)]
-    words = content[148:228].rstrip(b"\0").decode("ascii").split(" ", 3)
     values = np.frombuffer(content[_NIFTI_HEADER:], kind).reshape(z, y, x)
-    grid = VoxelGrid((z, y, x), (rows[0][3], rows[1][3], rows[2][3]), rows[0][0])
-    return VolumeFile(values, grid, words[1].strip("-"), words[3].strip("-"))
+    grid = VoxelGrid.of(values.shape, [row[3] for row in rows], rows[0][0])
+    return VolumeFile(values, grid, *_stated_units(content[148:228].rstrip(b"\0").decode("ascii")))
 
 
 def _write_tiff(path: Path, volume: VolumeFile) -> None:
@@ -232,6 +203,25 @@ def _read_tiff(path: Path) -> VolumeFile:
         values = tiff.asarray()
     values = values.reshape(-1, *values.shape[-2:])
     first = [float(v) for v in str(found["first"]).split()]
-    z, y, x = values.shape
-    grid = VoxelGrid((z, y, x), (first[0], first[1], first[2]), float(found["spacing"]))
+    grid = VoxelGrid.of(values.shape, first, float(found["spacing"]))
     return VolumeFile(values, grid, str(found.get("unit", "")), str(found.get("quantity", "")))
+
+
+def _units(volume: VolumeFile) -> str:
+    """Return the comment that states both units."""
+    return f"unit {volume.unit or '-'} quantity {volume.quantity or '-'}"
+
+
+def _stated_units(comment: str) -> tuple[str, str]:
+    _, unit, _, quantity = comment.split(" ", 3)
+    return unit.strip("-"), quantity.strip("-")
+
+
+# Writer and reader of each suffix.
+_FORMATS: dict[str, tuple[Callable[[Path, VolumeFile], None], Callable[[Path], VolumeFile]]] = {
+    ".nrrd": (_write_nrrd, _read_nrrd),
+    ".mha": (_write_mha, _read_mha),
+    ".nii": (_write_nifti, _read_nifti),
+    ".tif": (_write_tiff, _read_tiff),
+    ".tiff": (_write_tiff, _read_tiff),
+}

@@ -148,19 +148,7 @@ def _in_millimetres(found: ReaderOutput, given: ScanOptions) -> tuple[str, Circl
         raise UserError(
             f"--unit {given.unit} is not a unit of length", f"choose one of {', '.join(sorted(MILLIMETRES))}"
         )
-    factor /= found.stated_mm
-    if isinstance(found.geometry, Circle):
-        return "mm", found.geometry.scaled(factor)
-    g = found.geometry
-    emitter = g.emitter if g.beam == "parallel" else g.emitter * factor
-    scaled = replace(
-        g,
-        emitter=emitter,
-        centre=g.centre * factor,
-        column_step=g.column_step * factor,
-        row_step=g.row_step * factor,
-    )
-    return "mm", scaled
+    return "mm", found.geometry.scaled(factor / found.stated_mm)
 
 
 def _with_centre(placed: Circle | ScanGeometry, geometry: ScanGeometry, column: float) -> Circle | ScanGeometry:

@@ -14,7 +14,7 @@ from nerfcli.errors import UserError
 from nerfcli.tomography.circle import Circle
 from nerfcli.tomography.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
 from nerfcli.tomography.formats.scan_options import ScanOptions, angles_in_radians, millimetres
-from nerfcli.tomography.open_beam import open_beam_of
+from nerfcli.tomography.open_beam import check_sizes, open_beam_of
 from nerfcli.tomography.scan import Scan
 
 SUFFIXES = (".h5", ".hdf5", ".hdf", ".nxs", ".nx")
@@ -106,13 +106,7 @@ def _parallel(
     sides: tuple[float, float, float] | None,
     given: ScanOptions,
 ) -> Scan:
-    for name, frames in (("flats", flats), ("darks", darks)):
-        if frames is not None and frames.shape[1:] != data.shape[1:]:
-            raise UserError(
-                f"{path}: {name} of {frames.shape[2]} x {frames.shape[1]} pixels, projections of "
-                f"{data.shape[2]} x {data.shape[1]}",
-                "flats and darks come from the detector of the projections: crop them the same way",
-            )
+    check_sizes(data.shape, flats=flats, darks=darks, path=path)
     notes = ["the file does not say which way the source moved: counter-clockwise around the object is assumed"]
     width, height, stated = (1.0, 1.0, 1.0) if sides is None else sides
     circle = Circle("parallel", tuple(angles.tolist()), width, height, data.shape[1], data.shape[2])

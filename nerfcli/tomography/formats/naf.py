@@ -17,6 +17,7 @@ from nerfcli.tomography.circle import Circle
 from nerfcli.tomography.formats.assemble import ReaderOutput, scan_of
 from nerfcli.tomography.formats.scan_options import ScanOptions, angles_in_radians
 from nerfcli.tomography.scan import Scan
+from nerfcli.tomography.truth import described_truth
 
 SUFFIXES = (".pickle", ".pkl")
 ATTENUATION_PER_VALUE = 1e-3
@@ -154,17 +155,8 @@ def _truth(data: Mapping[str, Any], path: Path) -> dict[str, Any]:
     side = np.asarray(data.get("dVoxel", ()), dtype=np.float64).reshape(-1)
     if not isinstance(image, np.ndarray) or image.ndim != 3 or len(side) != 3 or np.ptp(side) > 1e-9 * side[0]:
         return {}
-    shape = [int(n) for n in image.shape]
-    return {
-        "truth": {
-            "path": str(path.absolute()),
-            "layout": "xyz",
-            "shape": shape[::-1],
-            "first": [-(n - 1) / 2 * float(side[0]) for n in shape],
-            "size": float(side[0]),
-            "attenuation_per_value": ATTENUATION_PER_VALUE,
-        }
-    }
+    shape = [int(n) for n in reversed(image.shape)]
+    return described_truth(path, "xyz", shape, size=float(side[0]), attenuation_per_value=ATTENUATION_PER_VALUE)
 
 
 def _entry(data: Any, name: str, path: Path) -> Any:

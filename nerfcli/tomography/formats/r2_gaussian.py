@@ -15,6 +15,7 @@ from nerfcli.tomography.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan
 from nerfcli.tomography.formats.scan_options import ScanOptions, angles_in_radians
 from nerfcli.tomography.formats.statement import Statement, read_object
 from nerfcli.tomography.scan import Scan
+from nerfcli.tomography.truth import described_truth
 
 NAME = "meta_data.json"
 _HINT = "expected R2-Gaussian's meta_data.json: scanner, proj_train and proj_test"
@@ -108,16 +109,10 @@ def _truth(meta: Statement, scanner: Statement, file: Path) -> dict[str, Any]:
     side = size / count
     if np.ptp(side) > 1e-9 * side[0]:
         return {}
-    return {
-        "truth": {
-            "path": str((file.parent / name).absolute()),
-            "layout": "xyz",
-            "shape": [round(n) for n in count[::-1].tolist()],
-            "first": (middle - (count - 1) / 2 * side).tolist(),
-            "size": float(side[0]),
-            "attenuation_per_value": 1.0,
-        }
-    }
+    shape, first = [round(n) for n in count[::-1].tolist()], (middle - (count - 1) / 2 * side).tolist()
+    return described_truth(
+        file.parent / name, "xyz", shape, first=first, size=float(side[0]), attenuation_per_value=1.0
+    )
 
 
 def _angle(frame: dict[str, Any]) -> float:

@@ -38,8 +38,9 @@ from nerfcli.tomography.formats.pictures import SUFFIXES, numbered, read_stack
 from nerfcli.tomography.formats.scan_options import ScanOptions, angles_in_radians, millimetres
 from nerfcli.tomography.formats.statement import Statement, read_object
 from nerfcli.tomography.geometry import Beam, ScanGeometry, from_vectors
-from nerfcli.tomography.open_beam import OpenBeam, open_beam_of
+from nerfcli.tomography.open_beam import OpenBeam, check_sizes, open_beam_of
 from nerfcli.tomography.scan import KINDS, Kind, Scan
+from nerfcli.tomography.truth import described_truth
 
 NAME = "scan.json"
 _HINT = "a scan.json states projections, kind, beam, pixel_size, unit and angles_deg; see nerfcli's guide of tomography"
@@ -141,13 +142,7 @@ def _open_beam(file: Path, fields: Statement, shape: tuple[int, ...]) -> OpenBea
         flats = np.full((1, *shape[1:]), fields.positive("white_level"), dtype=np.float32)
     else:
         raise UserError(f"{file}: counts without flats", "name the flats, or a white_level, or say kind transmission")
-    for name, frames in (("flats", flats), ("darks", darks)):
-        if frames is not None and frames.shape[1:] != tuple(shape[1:]):
-            raise UserError(
-                f"{file}: {name} of {frames.shape[2]} x {frames.shape[1]} pixels, projections of "
-                f"{shape[2]} x {shape[1]}",
-                "flats and darks come from the detector of the projections: crop them the same way",
-            )
+    check_sizes(shape, flats=flats, darks=darks, path=file)
     return open_beam_of(flats, darks)
 
 
@@ -200,16 +195,8 @@ def _truth(fields: Statement, factor: float) -> dict[str, Any]:
     if len(shape) != 3:
         raise UserError(f"{path} has shape {shape}", "a volume is z x y x x")
     size = stated.positive("voxel_size") * factor
-    return {
-        "truth": {
-            "path": str(path.absolute()),
-            "layout": "zyx",
-            "shape": list(shape),
-            "first": [-(count - 1) / 2 * size for count in reversed(shape)],
-            "size": size,
-            "attenuation_per_value": stated.positive("attenuation_per_value") / factor,
-        }
-    }
+    value = stated.positive("attenuation_per_value") / factor
+    return described_truth(path, "zyx", shape, size=size, attenuation_per_value=value)
 
 
 def _one_of(fields: Statement, name: str, choices: tuple[str, ...]) -> str:

@@ -19,6 +19,7 @@ from nerfcli.tomography.formats.scan_options import ScanOptions
 from nerfcli.tomography.formats.statement import Statement, read_object
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.scan import Scan
+from nerfcli.tomography.truth import described_truth
 
 NAME = "geometry.json"
 TRANSFORMS = ("transforms_train.json", "transforms_test.json")
@@ -114,15 +115,5 @@ def _truth(folder: Path, stated: Statement) -> dict[str, Any]:
     if not isinstance(name, str) or not found or not (folder / name).is_file() or "mu_per_unit_value" not in stated:
         return {}
     counts = [int(number) for number in found.groups()]
-    size = stated.number("voxel_size", 1.0)
-    return {
-        "truth": {
-            "path": str((folder / name).absolute()),
-            "layout": "zyx",
-            "dtype": "uint8",
-            "shape": counts[::-1],
-            "first": [-(count - 1) / 2 * size for count in counts],
-            "size": size,
-            "attenuation_per_value": stated.number("mu_per_unit_value") / 255,
-        }
-    }
+    size, value = stated.number("voxel_size", 1.0), stated.number("mu_per_unit_value") / 255
+    return described_truth(folder / name, "zyx", counts[::-1], size=size, attenuation_per_value=value, dtype="uint8")
