@@ -15,7 +15,7 @@ from nerfcli import cli, kernels
 from nerfcli.errors import GATE_NOT_MET
 from nerfcli.kernels import numba_cpu, reference
 from nerfcli.kernels.reference import compositing, depth
-from nerfcli.selftest import suite, textbook
+from nerfcli.selftest import table, textbook
 from nerfcli.selftest.cases import Ray, Segments
 from nerfcli.selftest.measure import MET, NOT_MET, Errors, Precision, Row, by_formula, largest_error
 from nerfcli.selftest.table import checks, row_of
@@ -37,7 +37,7 @@ def all_rows() -> list[Row]:
 @pytest.fixture(scope="module")
 def own_rows() -> list[Row]:
     """The rows that the command measures: the kernels against the definitions in float64."""
-    return list(suite.rows("cpu", lambda text: None))
+    return list(table.rows("cpu", lambda text: None))
 
 
 def test_every_bound_is_met_and_has_a_reason(all_rows, own_rows):
@@ -216,11 +216,11 @@ def test_errors_are_relative_and_nan_counts_only_where_one_of_the_two_is():
 def test_the_command_prints_a_line_per_row_and_ends_with_7_where_a_bound_is_not_met(monkeypatch):
     good = Row("thin", "composite", "float32", Errors(1e-8), Errors(1e-6), "u", "1 - exp", Errors(1.0), 0.001)
     bad = Row("thick", "composite", "float32", Errors(1e-2), Errors(1e-6), "u", "1 - exp", Errors(1.0), 0.001)
-    monkeypatch.setattr(suite, "rows", lambda device, notify: iter([good]))
+    monkeypatch.setattr(table, "rows", lambda device, notify: iter([good]))
     result = CliRunner().invoke(cli.app, ["selftest", "--json", "--device", "cpu"])
     assert result.exit_code == 0
     assert json.loads(result.stdout)["verdict"] == MET
-    monkeypatch.setattr(suite, "rows", lambda device, notify: iter([good, bad]))
+    monkeypatch.setattr(table, "rows", lambda device, notify: iter([good, bad]))
     result = CliRunner().invoke(cli.app, ["selftest", "--device", "cpu"])
     assert result.exit_code == GATE_NOT_MET
     assert "thick" in result.stdout

@@ -72,7 +72,7 @@ def selftest(
     import torch
 
     from nerfcli.selftest.measure import MET, NOT_MET, by_formula
-    from nerfcli.selftest.suite import rows
+    from nerfcli.selftest.table import rows
 
     console = Console(quiet=quiet, json_lines=json)
     torch.set_num_threads(thread_count(threads))

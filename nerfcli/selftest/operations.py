@@ -117,11 +117,6 @@ def light_bound(rays: Sequence[Segments], precision: Precision) -> Errors:
     return Errors(bound, 2 * bound)
 
 
-def surface_inputs(precision: Precision) -> Inputs:
-    """Return the weights of a far surface."""
-    return {name: precision.tensor(values) for name, values in cases.FAR_SURFACE.items()}
-
-
 def composite(module: ModuleType, given: Inputs) -> Outcome:
     """Composite rays; errors of the gradient by density are relative to the magnitudes of its terms."""
     density, rgb = given["density"].detach().requires_grad_(), given["rgb"].detach().requires_grad_()
@@ -164,11 +159,6 @@ def _by(values: Tensor, density: Tensor) -> tuple[Tensor, ...]:
     if not values.requires_grad:
         return ()
     return torch.autograd.grad(torch.where(values.isnan(), 0.0, values).sum(), density, retain_graph=True)
-
-
-def depths_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Errors:
-    """Bound the depths of the rays that are meaningful in a precision."""
-    return depth_bound(meaningful(rays, precision), factor, precision)
 
 
 def _density_for(module: ModuleType, given: Inputs) -> Tensor:
@@ -232,9 +222,8 @@ def _depths(values: list[Tensor], columns: tuple[str, ...], given: Inputs, densi
         settled = given["settled"].to(density.device)
         values = [torch.where(settled[:, i], value, 0.0) for i, value in enumerate(values)]
     # Errors of the gradient of a spread are relative to terms that cancel, whose magnitudes only the tests know.
-    gradients = (
-        tuple(gradient for value in values for gradient in _by(value, density)) if columns != ("spread",) else ()
-    )
+    differentiable = () if columns == ("spread",) else values
+    gradients = tuple(gradient for value in differentiable for gradient in _by(value, density))
     counts = given["offsets"].diff()
     sizes = tuple(
         torch.cat([part.abs().max().expand_as(part) for part in gradient.split(counts.tolist()) if len(part)])

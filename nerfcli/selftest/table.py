@@ -1,8 +1,4 @@
-"""The table of hard cases: operation, inputs, bounds and the textbook's formula of each.
-
-The answers come from the definitions in float64, on exactly the numbers of the tested precision. The tests compare the
-definitions themselves with answers of 60 digits.
-"""
+"""The table of hard cases: operation, inputs, bounds and the textbook's formula of each; all rows of the selftest."""
 
 import functools
 import time
@@ -95,7 +91,7 @@ def checks() -> Iterator[Check]:
             "composite",
             functools.partial(operations.light_inputs, group.rays),
             operations.composite,
-            lambda precision, rays=group.rays: operations.light_bound(rays, precision),
+            functools.partial(operations.light_bound, group.rays),
             "u (8 + (n + 2) (1 + tau)), n and tau as far as light comes, compiled 8 u; twice for a gradient, relative "
             "to its terms",
             formula="1 - exp, cumulative product, 1 - sum of weights",
@@ -117,7 +113,7 @@ def checks() -> Iterator[Check]:
     yield Check(
         "distortion of a far, thin surface",
         "distortion",
-        operations.surface_inputs,
+        lambda precision: {name: precision.tensor(values) for name, values in cases.FAR_SURFACE.items()},
         operations.distortion,
         lambda precision: operations.both(8 if precision.compiled else 192, precision),
         "3 n u: sums of n terms that are all positive; compiled 8 u: sums in float64",
@@ -139,7 +135,9 @@ def checks() -> Iterator[Check]:
                 "light_ends",
                 lambda precision, rays=rays: operations.depth_inputs(operations.meaningful(rays, precision), precision),
                 functools.partial(operations.light_ends, columns),
-                functools.partial(operations.depths_bound, rays, 4 if columns == ("spread",) else 1),
+                lambda precision, rays=rays, factor=4 if columns == ("spread",) else 1: operations.depth_bound(
+                    operations.meaningful(rays, precision), factor, precision
+                ),
                 "u (16 + (n + 2) (1 + tau)), compiled 16 u; of a spread 4 times that; 16 times for a gradient, "
                 "relative to the largest of its ray",
                 formula="weights by 1 - exp at midpoints, their sum clamped at 1e-10",
@@ -239,3 +237,25 @@ def checks() -> Iterator[Check]:
             formula="lines in float32",
             textbook=operations.project_in_single,
         )
+
+
+def precisions(device: str) -> tuple[Precision, ...]:
+    """List the precisions to test on a device, with the compiled CPU kernels if they work on this machine."""
+    plain = tuple(
+        Precision(name, dtype, device) for name, dtype in (("float32", torch.float32), ("bfloat16", torch.bfloat16))
+    )
+    compiled = (Precision("compiled", torch.float32, "cpu", compiled=True),) if kernels.has_compiled() else ()
+    has_gpu_kernels = kernels.triton_unavailable_reason(torch.device(device)) is None
+    of_gpu = (Precision(OF_GPU, torch.float32, device, for_gpu=True),) if has_gpu_kernels else ()
+    return plain + of_gpu + compiled
+
+
+def rows(device: str, notify: Callable[[str], None]) -> Iterator[Row]:
+    """Measure and yield the rows one by one."""
+    kernels.prepare(notify)
+    if device != "cpu":
+        kernels.prepare(notify, device)
+    for check in checks():
+        for precision in precisions(device):
+            if check.is_for(precision):
+                yield row_of(check, precision)
