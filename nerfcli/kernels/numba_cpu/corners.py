@@ -4,7 +4,7 @@ Written as vectors: LLVM does not vectorise the same loops in Numba, and the has
 """
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 from llvmlite import ir
 from numba.core import types
@@ -99,5 +99,5 @@ def _corners(rows_of: Callable[..., list[Any]]) -> Any:
 
 
 # See `_corners`; for levels with a separate row for each vertex, and for levels whose vertices share rows by a hash.
-dense_corners: Callable[..., None] = cast(Any, _corners(_dense_rows))
-hashed_corners: Callable[..., None] = cast(Any, _corners(_hashed_rows))
+dense_corners = _corners(_dense_rows)
+hashed_corners = _corners(_hashed_rows)

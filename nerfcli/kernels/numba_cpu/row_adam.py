@@ -10,12 +10,12 @@ from typing import Any
 import numba
 import numpy as np
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba.core import types
 from numba.extending import intrinsic
 from torch import Tensor
 
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.vector import FLOATS, INTS, LANES, floats, in_all_lanes, ints
+from nerfcli.kernels.numba_cpu.vector import FLOATS, INTS, LANES, floats, in_all_lanes, ints, of_each
 
 FEATURES = 4
 
@@ -27,12 +27,6 @@ def _touched(builder: Any, gradient: Any) -> Any:
         swapped = ir.Constant(INTS, [lane ^ distance for lane in range(LANES)])
         touched = builder.or_(touched, builder.shuffle_vector(touched, touched, swapped))
     return touched
-
-
-def _square_root(builder: Any, vector: Any) -> Any:
-    """Return the square roots of a vector; LLVM's builder has none."""
-    kind = ir.FunctionType(FLOATS, [FLOATS])
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{LANES}f32"), [vector])
 
 
 def _step(builder: Any, places: Any, numbers: Any) -> None:
@@ -49,7 +43,7 @@ def _step(builder: Any, places: Any, numbers: Any) -> None:
         m = builder.fadd(builder.fmul(beta1, first), builder.fmul(builder.fsub(one, beta1), g))
         square = builder.fmul(builder.fmul(builder.fsub(one, beta2), g), g)
         v = builder.fadd(builder.fmul(beta2, second), square)
-        spread = builder.fadd(builder.fmul(_square_root(builder, v), correction), eps)
+        spread = builder.fadd(builder.fmul(of_each(builder, "llvm.sqrt", v), correction), eps)
         stepped = builder.fsub(table, builder.fdiv(builder.fmul(rate, m), spread))
         rows = builder.icmp_signed("!=", touched, ints(0))
         for place, new, old in ((first_at, m, first), (second_at, v, second), (table_at, stepped, table)):

@@ -1,13 +1,24 @@
 """Coordinates and cells of 16 steps along a ray, as vectors: LLVM does not vectorise the same loop written in Numba."""
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba.core import types
 from numba.extending import intrinsic
 
-from nerfcli.kernels.numba_cpu.vector import FLOAT, FLOATS, INTS, LANES, LONG, floats, in_all_lanes, ints, vector_at
+from nerfcli.kernels.numba_cpu.vector import (
+    FLOAT,
+    FLOATS,
+    INTS,
+    LANES,
+    LONG,
+    floats,
+    in_all_lanes,
+    ints,
+    of_each,
+    vector_at,
+)
 
 _ONE_BIT = ir.VectorType(ir.IntType(1), LANES)
 
@@ -18,11 +29,6 @@ def _larger(builder: Any, a: Any, b: Any) -> Any:
 
 def _smaller(builder: Any, a: Any, b: Any) -> Any:
     return builder.select(builder.fcmp_ordered("<", a, b), a, b)
-
-
-def _call(builder: Any, name: str, argument: Any) -> Any:
-    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(FLOATS, [FLOATS]), f"{name}.v{LANES}f32")
-    return builder.call(function, [argument])
 
 
 def _unit_cube(builder: Any, points: list[Any]) -> list[Any]:
@@ -38,11 +44,11 @@ def _contracted(builder: Any, points: list[Any], norm: Any) -> list[Any]:
 def _ball(builder: Any, points: list[Any]) -> list[Any]:
     x, y, z = (builder.fmul(along, along) for along in points)
     square = builder.fadd(builder.fadd(x, y), z)
-    return _contracted(builder, points, _call(builder, "llvm.sqrt", _larger(builder, square, floats(1.0))))
+    return _contracted(builder, points, of_each(builder, "llvm.sqrt", _larger(builder, square, floats(1.0))))
 
 
 def _cube(builder: Any, points: list[Any]) -> list[Any]:
-    x, y, z = (_call(builder, "llvm.fabs", along) for along in points)
+    x, y, z = (of_each(builder, "llvm.fabs", along) for along in points)
     largest = _larger(builder, _larger(builder, x, y), _larger(builder, z, floats(1.0)))
     return _contracted(builder, points, largest)
 
@@ -111,6 +117,6 @@ def _steps(cube_of: Callable[[Any, list[Any]], list[Any]]) -> Any:
 
 
 # See `_steps`; one for each of `CONTRACTIONS`.
-steps_in_cube: Callable[..., None] = cast(Any, _steps(_unit_cube))
-steps_in_ball: Callable[..., None] = cast(Any, _steps(_ball))
-steps_in_contracted_cube: Callable[..., None] = cast(Any, _steps(_cube))
+steps_in_cube = _steps(_unit_cube)
+steps_in_ball = _steps(_ball)
+steps_in_contracted_cube = _steps(_cube)

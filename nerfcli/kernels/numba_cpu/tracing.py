@@ -1,6 +1,6 @@
 """Rendering of pictures of a hash grid: marching, encoding, both networks and compositing in one pass.
 
-Same operation as `ComposedBackend.trace_rays`, two to three times as fast, because only the interval and the density of
+Same operation as `Backend.trace_rays`, two to three times as fast, because only the interval and the density of
 a sample are kept. A sample's colour is evaluated or skipped as soon as the sample is found, when the number of samples
 of its ray is not yet known; the weight of the skipped ones is summed, and bounds the error as before.
 """
@@ -13,15 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.kernels.contraction import CONTRACTIONS
 from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import UNSEEN, HashGrid, Intervals, March, Rays, RaysSeen
 from nerfcli.kernels.numba_cpu.depth import add_interval, light_ends_of, new_sums
 from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
-from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, colour_range, density_tile, flat_weights
-from nerfcli.kernels.numba_cpu.rays import CHUNK, padded
+from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, colour_range, density_tile
+from nerfcli.kernels.numba_cpu.rays import CHUNK
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.visible import LANES, ROUND, fill_round, new_round, occupied_blocks
+from nerfcli.kernels.numba_cpu.visible import LANES, ROUND, fill_round, flat_arguments, new_round
 
 # A sample's colour may be skipped if its weight is at most this fraction of `negligible`, the limit for its ray.
 PART = 1 / 32
@@ -153,15 +152,15 @@ def trace_rays(
     counts, found = np.zeros(count if keep_intervals else 0, np.int64), np.zeros(threads, np.int64)
     sums, quantiles, targets = new_sums(count, fractions)
     colours, unseen = np.zeros((count, 3)), np.zeros(count)
-    _trace_all(
-        rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
-        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), occupied_blocks(along.occupied.numpy()),
-        along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
-        grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
-        np.array(grid.resolutions, dtype=np.int32), flat_weights(grid.layers), along.max_optical_depth,
-        cones.contiguous().numpy(), spherical_harmonics(rays.directions, grid.view_degree).contiguous().numpy(),
-        negligible, targets, borders, sums, quantiles, colours, unseen, counts, owner, record, found,
-    )  # fmt: skip
+    harmonics = spherical_harmonics(rays.directions, grid.view_degree).contiguous().numpy()
+    given = (
+        *flat_arguments(rays, along, grid, grid.layers),
+        cones.contiguous().numpy(),
+        harmonics,
+        negligible,
+        targets,
+    )
+    _trace_all(*(*given, borders, sums, quantiles, colours, unseen, counts, owner, record, found))
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     spans = torch.empty(3, int(offsets[-1]))
     if keep_intervals:

@@ -34,14 +34,20 @@ def floats(value: float) -> Any:
 
 def in_all_lanes(builder: Any, scalar: Any, kind: Any) -> Any:
     """Return a vector of type `kind` with a scalar, computed by the machine code, in all lanes."""
-    undefined = ir.Constant(kind, ir.Undefined)
-    return builder.shuffle_vector(builder.insert_element(undefined, scalar, ir.Constant(INT, 0)), undefined, ints(0))
+    undefined, first = ir.Constant(kind, ir.Undefined), ir.Constant(ir.VectorType(INT, kind.count), [0] * kind.count)
+    return builder.shuffle_vector(builder.insert_element(undefined, scalar, ir.Constant(INT, 0)), undefined, first)
 
 
 def vector_at(builder: Any, pointer: Any, first: Any, step: Any, count: int, kind: Any) -> Any:
     """Return a pointer to a vector of type `kind`, `count` steps after element `first`."""
     element = builder.add(first, builder.mul(step, ir.Constant(LONG, count)))
     return builder.bitcast(builder.gep(pointer, [element]), kind.as_pointer())
+
+
+def of_each(builder: Any, name: str, vector: Any) -> Any:
+    """Return an LLVM function of floats, such as "llvm.sqrt", of each lane; LLVM's builder has none of them."""
+    kind = ir.FunctionType(FLOATS, [FLOATS])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{LANES}f32"), [vector])
 
 
 @intrinsic
@@ -51,9 +57,9 @@ def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
         byte = ir.PointerType(ir.IntType(8))
         place = builder.bitcast(builder.gep(data, [args[1]]), byte)
-        kind = ir.FunctionType(ir.VoidType(), [byte, *[ir.IntType(32)] * 3])
+        kind = ir.FunctionType(ir.VoidType(), [byte, *[INT] * 3])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        read, keep, data_cache = (ir.Constant(ir.IntType(32), value) for value in (0, 3, 1))
+        read, keep, data_cache = (ir.Constant(INT, value) for value in (0, 3, 1))
         builder.call(function, [place, read, keep, data_cache])
         return context.get_dummy_value()
 
@@ -66,6 +72,7 @@ prefetch: Callable[[Any, Any], None] = cast(Any, _prefetch)
 
 # Width of a table row in `gather_rows`, `scatter_rows` and `dot_rows`.
 ROW = 4
+ROW_FLOATS = ir.VectorType(FLOAT, ROW)
 CORNERS = 8
 
 
@@ -89,15 +96,13 @@ def _row_access(generate: Callable[..., None]) -> Any:
             offset, at, stride, row_at = (
                 context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 4, 5, 7)
             )
-            long, vector = ir.IntType(64), ir.VectorType(ir.FloatType(), ROW)
             corners = []
             for corner in range(CORNERS):
-                place = builder.add(at, builder.mul(stride, ir.Constant(long, corner)))
-                number = builder.zext(builder.load(builder.gep(index_data, [place])), long)
-                element = builder.add(offset, builder.mul(number, ir.Constant(long, ROW)))
-                pointer = builder.bitcast(builder.gep(flat_data, [element]), vector.as_pointer())
+                place = builder.add(at, builder.mul(stride, ir.Constant(LONG, corner)))
+                number = builder.zext(builder.load(builder.gep(index_data, [place])), LONG)
+                pointer = vector_at(builder, flat_data, offset, number, ROW, ROW_FLOATS)
                 corners.append((pointer, builder.gep(weight_data, [place])))
-            generate(builder, corners, builder.bitcast(builder.gep(row_data, [row_at]), vector.as_pointer()))
+            generate(builder, corners, builder.bitcast(builder.gep(row_data, [row_at]), ROW_FLOATS.as_pointer()))
             return context.get_dummy_value()
 
         return types.none(flat, offset, index, weight, at, stride, row, row_at), build
@@ -105,16 +110,9 @@ def _row_access(generate: Callable[..., None]) -> Any:
     return access
 
 
-def _in_all_lanes(builder: Any, pointer: Any) -> Any:
-    """Return the number at a pointer, in all lanes of a vector of one row."""
-    undefined = ir.Constant(ir.VectorType(ir.FloatType(), ROW), ir.Undefined)
-    first = builder.insert_element(undefined, builder.load(pointer), ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(ir.IntType(32), ROW), [0] * ROW))
-
-
 def _gather(builder: Any, corners: Any, row: Any) -> None:
     # All weights are loaded before anything is stored: the compiler cannot know that they do not overlap the row.
-    weights = [_in_all_lanes(builder, weight) for _, weight in corners]
+    weights = [in_all_lanes(builder, builder.load(weight), ROW_FLOATS) for _, weight in corners]
     total = None
     for (pointer, _), weight in zip(corners, weights, strict=True):
         product = builder.fmul(weight, builder.load(pointer, align=4), flags=("contract",))
@@ -124,7 +122,7 @@ def _gather(builder: Any, corners: Any, row: Any) -> None:
 
 def _scatter(builder: Any, corners: Any, row: Any) -> None:
     gradient = builder.load(row, align=4)
-    weights = [_in_all_lanes(builder, weight) for _, weight in corners]
+    weights = [in_all_lanes(builder, builder.load(weight), ROW_FLOATS) for _, weight in corners]
     for (pointer, _), weight in zip(corners, weights, strict=True):  # one after the other: two corners may share a row
         product = builder.fmul(weight, gradient, flags=("contract",))
         builder.store(builder.fadd(builder.load(pointer, align=4), product, flags=("contract",)), pointer, align=4)
@@ -132,7 +130,7 @@ def _scatter(builder: Any, corners: Any, row: Any) -> None:
 
 def _dot(builder: Any, corners: Any, row: Any) -> None:
     vector = builder.load(row, align=4)
-    lanes = [ir.Constant(ir.IntType(32), lane) for lane in range(ROW)]
+    lanes = [ir.Constant(INT, lane) for lane in range(ROW)]
     sums = []
     for pointer, _ in corners:
         product = builder.fmul(vector, builder.load(pointer, align=4))
@@ -174,36 +172,24 @@ def _block_product(
             a_at, a_row, a_step, b_at, b_step, depth, c_at, c_row = (
                 context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 2, 3, 5, 6, 7, 9, 10)
             )
-            index, scalar = ir.IntType(64), ir.FloatType()
-            vector = ir.VectorType(scalar, LANES)
-
-            def vector_at(pointer: Any, at: Any, lane: int) -> Any:
-                place = builder.gep(pointer, [builder.add(at, ir.Constant(index, lane))])
-                return builder.bitcast(place, vector.as_pointer())
-
+            width = ir.Constant(LONG, LANES)
             cells = [(row, column) for row in range(rows) for column in range(vectors)]
-            places = {
-                (row, column): vector_at(
-                    c_data, builder.add(c_at, builder.mul(c_row, ir.Constant(index, row))), column * LANES
-                )
-                for row, column in cells
-            }
-            sums = {}
-            for cell in cells:
-                sums[cell] = cgutils.alloca_once(builder, vector)
-                builder.store(begin(builder, places[cell]), sums[cell])
-            zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+            places, sums = {}, {}
+            for row, column in cells:
+                first = builder.add(c_at, builder.mul(c_row, ir.Constant(LONG, row)))
+                place = places[row, column] = vector_at(builder, c_data, first, width, column, FLOATS)
+                total = sums[row, column] = cgutils.alloca_once(builder, FLOATS)
+                builder.store(begin(builder, place), total)
             with cgutils.for_range(builder, depth) as loop:
                 b_row = builder.add(b_at, builder.mul(b_step, loop.index))
-                right = [builder.load(vector_at(b_data, b_row, v * LANES), align=4) for v in range(vectors)]
+                right = [
+                    builder.load(vector_at(builder, b_data, b_row, width, column, FLOATS), align=4)
+                    for column in range(vectors)
+                ]
                 a_column = builder.add(a_at, builder.mul(a_step, loop.index))
                 for row in range(rows):
-                    place = builder.add(a_column, builder.mul(a_row, ir.Constant(index, row)))
-                    left = builder.load(builder.gep(a_data, [place]))
-                    first = builder.insert_element(
-                        ir.Constant(vector, ir.Undefined), left, ir.Constant(ir.IntType(32), 0)
-                    )
-                    spread = builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
+                    place = builder.add(a_column, builder.mul(a_row, ir.Constant(LONG, row)))
+                    spread = in_all_lanes(builder, builder.load(builder.gep(a_data, [place])), FLOATS)
                     for column in range(vectors):
                         # "contract" lets LLVM fuse the two where the processor can; nothing else is relaxed.
                         product = builder.fmul(spread, right[column], flags=("contract",))
@@ -223,7 +209,7 @@ def _stored(builder: Any, place: Any) -> Any:
 
 
 def _zero(builder: Any, place: Any) -> Any:
-    return ir.Constant(ir.VectorType(ir.FloatType(), LANES), [0.0] * LANES)
+    return floats(0.0)
 
 
 def _as_it_is(builder: Any, total: Any) -> Any:
@@ -231,7 +217,7 @@ def _as_it_is(builder: Any, total: Any) -> Any:
 
 
 def _rectified(builder: Any, total: Any) -> Any:
-    zero = _zero(builder, None)
+    zero = floats(0.0)
     return builder.select(builder.fcmp_ordered("<=", total, zero), zero, total)  # NaN stays NaN, so that it is detected
 
 

@@ -274,6 +274,17 @@ def _sort(
                 encoded[to, feature] = code[thread, i, feature]
 
 
+def flat_arguments(rays: Rays, along: March, grid: HashGrid, layers: tuple[torch.Tensor, ...]) -> tuple[Any, ...]:
+    """Return rays, occupied cells, table and layers as the arrays that `_follow` takes, up to `deepest`."""
+    return (
+        rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
+        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), occupied_blocks(along.occupied.numpy()),
+        along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
+        grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
+        np.array(grid.resolutions, dtype=np.int32), flat_weights(layers), along.max_optical_depth,
+    )  # fmt: skip
+
+
 def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: torch.Tensor | None = None) -> Samples:
     """See `reference.visible_samples`; float32 on the CPU."""
     threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
@@ -285,14 +296,8 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: torch.Tens
         room = (threads, samples)
         owner, record = np.empty(room, np.int64), np.empty((*room, 6), np.float32)
         code, left = np.empty((*room, WIDTH), np.float32), np.empty((*room, 4), np.float32)
-        _visible(
-            rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
-            rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), occupied_blocks(along.occupied.numpy()),
-            along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
-            grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
-            np.array(grid.resolutions, dtype=np.int32), flat_weights(grid.layers[:2]), along.max_optical_depth,
-            along.least_weight, cones.contiguous().numpy(), borders, counts, owner, record, code, left, found, missing,
-        )  # fmt: skip
+        given = (*flat_arguments(rays, along, grid, grid.layers[:2]), along.least_weight, cones.contiguous().numpy())
+        _visible(*(*given, borders, counts, owner, record, code, left, found, missing))
         if (found >= 0).all():
             break
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
