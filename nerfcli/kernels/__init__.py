@@ -13,10 +13,10 @@ import torch
 
 from nerfcli.errors import UserError
 from nerfcli.interrupts import deferred_interrupts
+from nerfcli.kernels.composition import Backend
 from nerfcli.kernels.contraction import CONTRACTIONS, contract, contract_to_cube, grid_coordinates
 from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import (
-    Backend,
     BearingGrids,
     HashGrid,
     Intervals,
@@ -157,11 +157,12 @@ def _fast_backend(device: torch.device, dtype: torch.dtype, wanted: str) -> tupl
     if wanted == "numba_cpu" or (wanted == "auto" and device.type == "cpu" and dtype == torch.float32):
         if _numba_cpu() is None:
             return None, "Numba does not work on this machine"
+        if device.type != "cpu" or dtype != torch.float32:
+            given = f"{str(dtype).removeprefix('torch.')} on {device.type}"
+            return None, f"it supports float32 on the CPU only, not {given}"
         from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 
-        numba_backend = NumbaBackend()
-        refusal = numba_backend.refuses(device, dtype)
-        return (numba_backend, None) if refusal is None else (None, refusal)
+        return NumbaBackend(), None
     return None, None
 
 

@@ -1,8 +1,12 @@
-"""Ray operations composed of per-sample kernels, shared by backends with separate kernels."""
+"""Backends: ray operations composed of per-sample kernels. Letters as in `interface`.
+
+On a GPU, `render_rays` of a hash grid makes the host wait once, for the number of samples.
+"""
 
 import abc
 import math
-from typing import ClassVar, Protocol
+from types import ModuleType
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -29,51 +33,29 @@ from nerfcli.kernels.reference.compositing import contracted_distance, off_targe
 CHUNK = 2**16
 
 
-class SampleOperations(Protocol):
-    """Single operations on packed samples, as `reference` defines them."""
+class Backend(abc.ABC):
+    """The hot operations on one kind of device.
 
-    def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]: ...
-
-    def occupied_samples(self, rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]: ...
-
-    def ray_indices(self, offsets: Tensor) -> Tensor: ...
-
-    def optical_depth_before(self, density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor: ...
-
-    def keep_largest(self, cells: Tensor, coordinates: Tensor, values: Tensor) -> None: ...
-
-    def interval_weights(self, density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]: ...
-
-    def composite(
-        self, density: Tensor, rgb: Tensor, lengths: Tensor, *, offsets: Tensor, background: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]: ...
-
-    def distortion(self, weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor: ...
-
-    def light_ends(
-        self, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fractions: tuple[float, ...]
-    ) -> LightEnds: ...
-
-    def mixture_quantile(
-        self, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, fraction: float
-    ) -> Tensor: ...
-
-
-class ComposedBackend(abc.ABC):
-    """See `interface.Backend`. Subclasses differ in `parts`, and in how they sample and evaluate a hash grid."""
+    `name` is its name in `backend_for`; `deterministic` says whether the same inputs always give the same bits; `parts`
+    are the single operations on packed samples, as `reference` defines them. Subclasses differ in these, and in how
+    they sample and evaluate a hash grid.
+    """
 
     name: str
     deterministic: bool
-    parts: ClassVar[SampleOperations]
+    parts: ClassVar[ModuleType]
 
     def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
+        """Return origins (N, 3), directions (N, 3) and colours (N, C) in [0, 1] of chosen pixels (N,) int64."""
         return self.parts.pixel_rays(chosen, pixels)
 
     def light_ends(self, intervals: Intervals, *, fractions: tuple[float, ...]) -> LightEnds:
+        """Return where the light of rays is absorbed, without gradients; see `reference.light_ends`."""
         density, starts, ends, offsets = intervals
         return self.parts.light_ends(density, starts, ends, offsets=offsets, fractions=fractions)
 
     def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, fraction: float) -> Tensor:
+        """Return the distance (R / rays_per_pixel,) by which a fraction of the light of a group of rays is absorbed."""
         density, starts, ends, offsets = intervals
         return self.parts.mixture_quantile(
             density, starts, ends, offsets=offsets, rays_per_pixel=rays_per_pixel, fraction=fraction
@@ -91,13 +73,27 @@ class ComposedBackend(abc.ABC):
         visits: Tensor | None = None,
         trace: Trace | None = None,
     ) -> RaySums:
+        """Render rays for training, with gradients.
+
+        Args:
+            background: (R, 3) sRGB, without gradient.
+            sink: of the table's shape; the gradient with respect to the table is added to it instead of being passed to
+                autograd, which saves making, filling and adding a buffer of megabytes at every step.
+            visits: (C, C, C) over the unit cube; raised to the optical depth of the samples, including those left out
+                for their weight, see `keep_largest`.
+            trace: called with intermediate tensors.
+
+        Differentiable in origins, directions, the table and the layers.
+        """
         samples = self._visible(rays.detached(), march, medium, visits)
         starts, ends, offsets = samples.starts, samples.ends, samples.offsets
         index = self.parts.ray_indices(offsets) if samples.rays is None else samples.rays
         if torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad):
             samples = samples._replace(coordinates=self._coordinates(rays, samples, march.contraction))
         if isinstance(medium, HashGrid):
-            widths = _widths(rays.detached(), samples, index, medium, contraction=march.contraction)
+            widths = None
+            if medium.antialias and rays.cones is not None:
+                widths = sample_widths(rays.detached(), starts, ends, index=index, contraction=march.contraction)
             density, rgb = self._radiance(samples, rays.directions, index, medium, widths=widths, sink=sink)
         else:
             density, rgb = medium.radiance(samples.coordinates, rays.directions, index, sink=sink)
@@ -136,6 +132,14 @@ class ComposedBackend(abc.ABC):
         negligible: float = 0.0,
         keep_intervals: bool = True,
     ) -> RaysSeen:
+        """Render rays for pictures, without gradients.
+
+        Args:
+            background: (R, 3) or (3,) sRGB.
+            fractions: of light for the quantiles to compute, each between 0 and 1.
+            negligible: largest total weight of the samples of a ray whose colours are not evaluated.
+            keep_intervals: whether to return the samples; a backend may return them even if this is False.
+        """
         samples = self._visible(rays.detached(), march, medium, None)
         starts, ends, density, offsets = samples.starts, samples.ends, samples.density, samples.offsets
         lengths = ends - starts
@@ -161,6 +165,7 @@ class ComposedBackend(abc.ABC):
 
     @torch.no_grad()
     def density(self, coordinates: Tensor, medium: HashGrid | Medium) -> Tensor:
+        """Return the density (N,) at coordinates (N, 3) of the unit cube, without gradients."""
         if not isinstance(medium, HashGrid):
             return medium.density(coordinates)
         return self._density_of(self.hash_encode(coordinates, medium.table, medium.resolutions), medium)
@@ -168,10 +173,61 @@ class ComposedBackend(abc.ABC):
     @abc.abstractmethod
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
-    ) -> Tensor: ...
+    ) -> Tensor:
+        """Interpolate tables at points (N, 3) of the unit cube, giving (N, L * F), for media made of tables.
+
+        Differentiable in points and in the table, whose gradient goes into the sink if there is one.
+        """
 
     @abc.abstractmethod
-    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid, visits: Tensor | None) -> Samples:
+    def adam_rows(
+        self,
+        table: Tensor,
+        gradient: Tensor,
+        first: Tensor,
+        second: Tensor,
+        *,
+        step: int,
+        rate: float,
+        betas: tuple[float, float],
+        eps: float,
+        decay: float = 0.0,
+    ) -> None:
+        """Take one step of Adam with weight decay, in place, on rows with a nonzero gradient, and zero the gradient."""
+
+    @abc.abstractmethod
+    def project(
+        self, volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
+    ) -> Tensor:
+        """Return the line integrals (R,) of a volume (Z, Y, X) along lines in float64; see `reference.project`.
+
+        Differentiable in the volume.
+        """
+
+    @abc.abstractmethod
+    def back_project(
+        self,
+        values: Tensor,
+        origins: Tensor,
+        directions: Tensor,
+        *,
+        shape: tuple[int, int, int],
+        first: tuple[float, float, float],
+        size: float,
+    ) -> Tensor:
+        """Return the transpose of `project`: (Z, Y, X) from (R,), without gradients."""
+
+    @abc.abstractmethod
+    def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
+        """Return a volume (Z, Y, X) >= 0 near `target` with a smaller total variation, without gradients.
+
+        Args:
+            threshold: (Z, Y, X) > 0.
+            dual: (3, Z, Y, X), overwritten; see `reference.denoise_total_variation`.
+        """
+
+    @abc.abstractmethod
+    def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, visits: Tensor | None) -> Samples:
         """See `reference.visible_samples`."""
 
     @abc.abstractmethod
@@ -236,18 +292,3 @@ class ComposedBackend(abc.ABC):
             if visits is not None:
                 self.parts.keep_largest(visits, coordinates[reached], (density * (ends - starts))[reached])
             return Samples(starts[reached], ends[reached], density[reached], None, coordinates[reached], kept)
-
-
-def _widths(rays: Rays, samples: Samples, index: Tensor, grid: HashGrid, *, contraction: str) -> Tensor | None:
-    """Return the footprint widths (N,) of rays at their samples; None if the grid does not fade with them."""
-    if not grid.antialias or rays.cones is None:
-        return None
-    return sample_widths(
-        rays.origins,
-        rays.directions,
-        samples.starts,
-        samples.ends,
-        rays=index,
-        cones=rays.cones,
-        contraction=contraction,
-    )

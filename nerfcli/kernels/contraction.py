@@ -11,6 +11,8 @@ points along its diagonals nearer.
 import torch
 from torch import Tensor
 
+from nerfcli.kernels.interface import Rays
+
 # The names, in the order of their numbers in compiled kernels.
 CONTRACTIONS = ("none", "l2", "linf")
 
@@ -100,24 +102,9 @@ def cube_widths(points: Tensor, widths: Tensor, contraction: str) -> Tensor:
     return widths * ((2.0 - 1.0 / norm) / norm / 4.0)
 
 
-def sample_widths(
-    origins: Tensor,
-    directions: Tensor,
-    starts: Tensor,
-    ends: Tensor,
-    *,
-    rays: Tensor,
-    cones: Tensor,
-    contraction: str,
-) -> Tensor:
-    """Return the `cube_widths` (N,) of pixels at the midpoints of intervals along rays.
-
-    Args:
-        origins, directions: (R, 3), unit directions, training frame.
-        starts, ends: (N,) distances.
-        rays: (N,) int64, the ray of each interval.
-        cones: (R,) width of each ray's pixel per unit of distance.
-        contraction: one of `CONTRACTIONS`.
-    """
+def sample_widths(rays: Rays, starts: Tensor, ends: Tensor, *, index: Tensor, contraction: str) -> Tensor:
+    """Return the `cube_widths` (N,) of pixels at the midpoints of intervals (N,) along rays `index` (N,) with cones."""
+    assert rays.cones is not None
     middles = (starts + ends) / 2
-    return cube_widths(origins[rays] + directions[rays] * middles[:, None], cones[rays] * middles, contraction)
+    points = rays.origins[index] + rays.directions[index] * middles[:, None]
+    return cube_widths(points, rays.cones[index] * middles, contraction)

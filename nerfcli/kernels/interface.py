@@ -1,16 +1,13 @@
-"""Interface of backends: code above it works per ray, code inside it per sample.
+"""What backends are given and return: code above them works per ray, code inside them per sample.
 
 Letters in shapes: R rays; N samples of all rays, packed ray after ray, where ray r owns samples offsets[r] up to, not
 including, offsets[r + 1], with `offsets` (R + 1,) int64; S intervals per ray; G cells along a side of the occupancy
 grid; L levels of a table, T rows per level, F features per row.
-
-On a GPU, `render_rays` of a hash grid makes the host wait once, for the number of samples.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-import torch
 from torch import Tensor
 
 # Assumed colour of samples whose colour is not evaluated; the error is at most half of their weight.
@@ -216,139 +213,3 @@ class PixelTable(NamedTuple):
 
 # Called with a name, a tensor whose rows belong to samples, and the ray (N,) of each row.
 Trace = Callable[[str, Tensor, Tensor], None]
-
-
-class Backend(Protocol):
-    """The hot operations on one kind of device.
-
-    `name` is its name in `backend_for`; `deterministic` says whether the same inputs always give the same bits.
-    """
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def deterministic(self) -> bool: ...
-
-    def refuses(self, device: torch.device, dtype: torch.dtype) -> str | None:
-        """Return why tensors of this kind are not supported; None if they are."""
-        ...
-
-    def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
-        """Return origins (N, 3), directions (N, 3) and colours (N, C) in [0, 1] of chosen pixels (N,) int64."""
-        ...
-
-    def render_rays(
-        self,
-        rays: Rays,
-        march: March,
-        medium: HashGrid | Medium,
-        targets: Targets = Targets(),
-        *,
-        background: Tensor,
-        sink: Tensor | None = None,
-        visits: Tensor | None = None,
-        trace: Trace | None = None,
-    ) -> RaySums:
-        """Render rays for training, with gradients.
-
-        Args:
-            background: (R, 3) sRGB, without gradient.
-            sink: of the table's shape; the gradient with respect to the table is added to it instead of being passed to
-                autograd, which saves making, filling and adding a buffer of megabytes at every step.
-            visits: (C, C, C) over the unit cube; raised to the optical depth of the samples, including those left out
-                for their weight, see `keep_largest`.
-            trace: called with intermediate tensors.
-
-        Differentiable in origins, directions, the table and the layers.
-        """
-        ...
-
-    def trace_rays(
-        self,
-        rays: Rays,
-        march: March,
-        medium: HashGrid | Medium,
-        *,
-        background: Tensor,
-        fractions: tuple[float, ...] = (),
-        negligible: float = 0.0,
-        keep_intervals: bool = True,
-    ) -> RaysSeen:
-        """Render rays for pictures, without gradients.
-
-        Args:
-            background: (R, 3) or (3,) sRGB.
-            fractions: of light for the quantiles to compute, each between 0 and 1.
-            negligible: largest total weight of the samples of a ray whose colours are not evaluated.
-            keep_intervals: whether to return the samples; a backend may return them even if this is False.
-        """
-        ...
-
-    def light_ends(self, intervals: Intervals, *, fractions: tuple[float, ...]) -> LightEnds:
-        """Return where the light of rays is absorbed, without gradients; see `reference.light_ends`."""
-        ...
-
-    def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, fraction: float) -> Tensor:
-        """Return the distance (R / rays_per_pixel,) by which a fraction of the light of a group of rays is absorbed."""
-        ...
-
-    def density(self, coordinates: Tensor, medium: HashGrid | Medium) -> Tensor:
-        """Return the density (N,) at coordinates (N, 3) of the unit cube, without gradients."""
-        ...
-
-    def hash_encode(
-        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
-    ) -> Tensor:
-        """Interpolate tables at points (N, 3) of the unit cube, giving (N, L * F), for media made of tables.
-
-        Differentiable in points and in the table, whose gradient goes into the sink if there is one.
-        """
-        ...
-
-    def adam_rows(
-        self,
-        table: Tensor,
-        gradient: Tensor,
-        first: Tensor,
-        second: Tensor,
-        *,
-        step: int,
-        rate: float,
-        betas: tuple[float, float],
-        eps: float,
-        decay: float = 0.0,
-    ) -> None:
-        """Take one step of Adam with weight decay, in place, on rows with a nonzero gradient, and zero the gradient."""
-        ...
-
-    def project(
-        self, volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
-    ) -> Tensor:
-        """Return the line integrals (R,) of a volume (Z, Y, X) along lines in float64; see `reference.project`.
-
-        Differentiable in the volume.
-        """
-        ...
-
-    def back_project(
-        self,
-        values: Tensor,
-        origins: Tensor,
-        directions: Tensor,
-        *,
-        shape: tuple[int, int, int],
-        first: tuple[float, float, float],
-        size: float,
-    ) -> Tensor:
-        """Return the transpose of `project`: (Z, Y, X) from (R,), without gradients."""
-        ...
-
-    def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
-        """Return a volume (Z, Y, X) >= 0 near `target` with a smaller total variation, without gradients.
-
-        Args:
-            threshold: (Z, Y, X) > 0.
-            dual: (3, Z, Y, X), overwritten; see `reference.denoise_total_variation`.
-        """
-        ...

@@ -4,30 +4,26 @@ The pass with gradients reuses the coordinates and features of samples that marc
 that are not compiled, see `can_radiance`, is sampled and evaluated by the reference.
 """
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
 from nerfcli.kernels import numba_cpu, reference
-from nerfcli.kernels.composition import ComposedBackend, SampleOperations
+from nerfcli.kernels.composition import Backend
 from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import HashGrid, March, Medium, Rays, RaysSeen, Samples
 from nerfcli.kernels.numba_cpu.row_adam import FEATURES
 from nerfcli.kernels.reference.backend import encode_into
 
 
-class NumbaBackend(ComposedBackend):
+class NumbaBackend(Backend):
     """Backend composed of `numba_cpu`. The same seed and number of threads give the same bits."""
 
     name = "numba_cpu"
-    parts: ClassVar[SampleOperations] = numba_cpu
+    parts = numba_cpu
     deterministic = True
-
-    def refuses(self, device: torch.device, dtype: torch.dtype) -> str | None:
-        if device.type == "cpu" and dtype == torch.float32:
-            return None
-        return f"it supports float32 on the CPU only, not {str(dtype).removeprefix('torch.')} on {device.type}"
+    project = staticmethod(numba_cpu.project)
+    back_project = staticmethod(numba_cpu.back_project)
+    denoise_total_variation = staticmethod(numba_cpu.denoise_total_variation)
 
     @torch.no_grad()
     def trace_rays(
@@ -76,29 +72,9 @@ class NumbaBackend(ComposedBackend):
         module = numba_cpu if table.shape[-1] == FEATURES else reference
         module.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps, decay=decay)
 
-    def project(
-        self, volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
-    ) -> Tensor:
-        return numba_cpu.project(volume, origins, directions, first=first, size=size)
-
-    def back_project(
-        self,
-        values: Tensor,
-        origins: Tensor,
-        directions: Tensor,
-        *,
-        shape: tuple[int, int, int],
-        first: tuple[float, float, float],
-        size: float,
-    ) -> Tensor:
-        return numba_cpu.back_project(values, origins, directions, shape=shape, first=first, size=size)
-
-    def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
-        return numba_cpu.denoise_total_variation(target, threshold, dual, iterations=iterations)
-
-    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid, visits: Tensor | None) -> Samples:
+    def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, visits: Tensor | None) -> Samples:
         module = numba_cpu if _fits(grid, grid.layers[:2]) else reference
-        return module.visible_samples(rays, march, grid, visits)
+        return module.visible_samples(rays, along, grid, visits)
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         return numba_cpu.sample_coordinates(

@@ -1,17 +1,15 @@
 """Backend of the reference operations, on any device and in any precision."""
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
 from nerfcli.kernels import reference
-from nerfcli.kernels.composition import ComposedBackend, SampleOperations
+from nerfcli.kernels.composition import Backend
 from nerfcli.kernels.harmonics import spherical_harmonics
-from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
+from nerfcli.kernels.interface import HashGrid, Rays, Samples
 
 
-class ReferenceBackend(ComposedBackend):
+class ReferenceBackend(Backend):
     """Backend composed of `reference`.
 
     Args:
@@ -19,56 +17,20 @@ class ReferenceBackend(ComposedBackend):
     """
 
     name = "reference"
-    parts: ClassVar[SampleOperations] = reference
+    parts = reference
+    adam_rows = staticmethod(reference.adam_rows)
+    project = staticmethod(reference.project)
+    back_project = staticmethod(reference.back_project)
+    denoise_total_variation = staticmethod(reference.denoise_total_variation)
+    _visible_in_grid = staticmethod(reference.visible_samples)
 
     def __init__(self, device: torch.device):
         self.deterministic = device.type == "cpu"
-
-    def refuses(self, device: torch.device, dtype: torch.dtype) -> str | None:
-        return None
 
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
     ) -> Tensor:
         return encode_into(points, table, resolutions, widths=None, sink=sink)
-
-    def adam_rows(
-        self,
-        table: Tensor,
-        gradient: Tensor,
-        first: Tensor,
-        second: Tensor,
-        *,
-        step: int,
-        rate: float,
-        betas: tuple[float, float],
-        eps: float,
-        decay: float = 0.0,
-    ) -> None:
-        reference.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps, decay=decay)
-
-    def project(
-        self, volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
-    ) -> Tensor:
-        return reference.project(volume, origins, directions, first=first, size=size)
-
-    def back_project(
-        self,
-        values: Tensor,
-        origins: Tensor,
-        directions: Tensor,
-        *,
-        shape: tuple[int, int, int],
-        first: tuple[float, float, float],
-        size: float,
-    ) -> Tensor:
-        return reference.back_project(values, origins, directions, shape=shape, first=first, size=size)
-
-    def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
-        return reference.denoise_total_variation(target, threshold, dual, iterations=iterations)
-
-    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid, visits: Tensor | None) -> Samples:
-        return reference.visible_samples(rays, march, grid, visits)
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         return reference.sample_coordinates(

@@ -57,9 +57,7 @@ def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple
     before = optical_depth_before(density, lengths, offsets)
     depth = density * lengths
     weights = torch.exp(-before) * opacity(depth)
-    total = torch.zeros(len(offsets) - 1, dtype=density.dtype, device=density.device)
-    total = total.index_add(0, ray_indices(offsets), depth)
-    return weights, torch.exp(-total)
+    return weights, torch.exp(-sum_along_rays(depth, offsets))
 
 
 def sum_along_rays(values: Tensor, offsets: Tensor) -> Tensor:

@@ -83,15 +83,7 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: Tensor | N
     starts, ends, coordinates, offsets = occupied_samples(rays, along)
     widths = None
     if grid.antialias and rays.cones is not None:
-        widths = sample_widths(
-            rays.origins,
-            rays.directions,
-            starts,
-            ends,
-            rays=ray_indices(offsets),
-            cones=rays.cones,
-            contraction=along.contraction,
-        )
+        widths = sample_widths(rays, starts, ends, index=ray_indices(offsets), contraction=along.contraction)
     encoded = hash_encode(coordinates, grid.table, grid.resolutions, widths)
     thickness = density(encoded, grid.layers)
     lengths = ends - starts

@@ -5,13 +5,12 @@ mixtures of rays, total variation and projections of scans.
 """
 
 import weakref
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from nerfcli.kernels import reference
-from nerfcli.kernels.composition import SampleOperations
 from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
 from nerfcli.kernels.reference.backend import ReferenceBackend
 from nerfcli.kernels.triton_cuda import compositing, hash_grid, marching, networks, operations, rays
@@ -39,18 +38,13 @@ class TritonBackend(ReferenceBackend):
     """Backend composed of `triton_cuda`. Sums are atomic: results of the same seed differ in their last digits."""
 
     name = "triton_cuda"
-    parts: ClassVar[SampleOperations] = operations
+    parts = operations
 
     def __init__(self, device: torch.device):
         super().__init__(device)
         self.deterministic = False
         self._half = HalfCopy()
         self._capacity = marching.Capacity()
-
-    def refuses(self, device: torch.device, dtype: torch.dtype) -> str | None:
-        if device.type == "cuda" and dtype == torch.float32:
-            return None
-        return f"it supports float32 on CUDA only, not {str(dtype).removeprefix('torch.')} on {device.type}"
 
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
@@ -86,12 +80,12 @@ class TritonBackend(ReferenceBackend):
         code = hash_grid.encode(coordinates.contiguous(), table, medium.resolutions, widths=None, dtype=torch.float16)
         return networks.density(code, medium.layers)
 
-    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid, visits: Tensor | None) -> Samples:
+    def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, visits: Tensor | None = None) -> Samples:
         if not _fits(grid):
-            return reference.visible_samples(rays, march, grid, visits)
+            return reference.visible_samples(rays, along, grid, visits)
         with torch.no_grad():
             table = self._half.of(grid.table)
-            return marching.visible_samples(rays, march, grid, table=table, capacity=self._capacity, visits=visits)
+            return marching.visible_samples(rays, along, grid, table=table, capacity=self._capacity, visits=visits)
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         return sample_coordinates(

@@ -250,9 +250,6 @@ def _offsets(counts: Tensor) -> Tensor:
 
 def _widths(rays: Rays, along: March, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
     """Return the widths of pixels at samples; those in unused places of the buffers mean nothing."""
-    assert rays.cones is not None
     index = torch.zeros(len(starts), dtype=torch.int64, device=starts.device)
     fill_ray_indices(offsets.clamp_max(len(starts)), index)
-    return sample_widths(
-        rays.origins, rays.directions, starts, ends, rays=index, cones=rays.cones, contraction=along.contraction
-    )
+    return sample_widths(rays, starts, ends, index=index, contraction=along.contraction)
