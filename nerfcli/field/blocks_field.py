@@ -73,7 +73,6 @@ class BlocksField(Field):
     It is not trained itself: each block is trained separately. `render.spans` renders pictures of it.
 
     Args:
-        settings: of the blocks.
         fields: of the blocks, in the order of the settings.
         occupancy: (B, G, G, G) bool, each block's over its own cube; space is empty where it is False.
     """

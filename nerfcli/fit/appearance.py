@@ -29,8 +29,6 @@ class Appearance(nn.Module):
     """The parts that the components require, and how they enter the colour of a ray.
 
     Args:
-        components: of the model.
-        pool: the training photos.
         log_gains: (photos, 3) logarithms of their initial exposures.
         log_focal: see `Refinement`.
 
@@ -123,7 +121,6 @@ class Appearance(nn.Module):
         Args:
             rendered: (R, 3) composited on `behind`.
             transmittance: (R,) the fraction of light that passes through the field.
-            drawn: the pixels.
             behind: (R, 3) colours behind the field.
         """
         if self.background is not None:

@@ -24,9 +24,7 @@ def covered_cells(pool: PixelPool, side: int, contraction: str, depths: PointDep
     that photo's median known distance away. Occlusion is not considered.
 
     Args:
-        pool: the training photos.
         side: cells per axis.
-        contraction: of the field.
         depths: pixels at known distances; a photo without any takes the median over all photos.
 
     Returns:

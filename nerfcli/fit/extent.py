@@ -83,7 +83,6 @@ def lacks_depth(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> 
 
     Args:
         scene: cameras, and points or depth bounds if it has any.
-        settings: of the training.
         fills_frame: whether the photos show more than an object cut out by alpha.
     """
     contraction = _contraction(settings, fills_frame)
@@ -96,7 +95,6 @@ def choose_extent(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -
 
     Args:
         scene: cameras, and points or depth bounds; see `lacks_depth`.
-        settings: of the training.
         fills_frame: whether the photos show more than an object cut out by alpha.
 
     Raises:

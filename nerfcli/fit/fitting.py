@@ -61,9 +61,7 @@ class Fitting:
     """The state of a training. On a CPU, the same seed and thread count give the same numbers, step for step.
 
     Args:
-        pool: the training photos.
         marching, contraction, parallax: of the extent; see `RaySteps` for the steps along rays.
-        settings: of the training.
         log_gains: (photos, 3) logarithms of the photos' initial exposures.
         log_focal: logarithm of the initial factor of focal lengths, if these are learned.
         cameras_from: the fraction of the budget after which cameras learn.

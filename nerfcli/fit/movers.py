@@ -29,9 +29,6 @@ class Movers:
 
     Means are also over time, with weights that decay. Pixels of such a block are still rendered, but do not count in
     the loss; if the field comes to agree with them, they count again.
-
-    Args:
-        pool: the photos.
     """
 
     def __init__(self, pool: PixelPool):

@@ -34,7 +34,6 @@ class OpenCells:
     which these samples were empty; a coarse cell is open as long as they find something in one of its fine cells.
 
     Args:
-        field: the field being trained.
         covered: the coarse cells that may be filled, see `coverage.covered_cells`; None for all.
     """
 

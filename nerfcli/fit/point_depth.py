@@ -59,7 +59,6 @@ class PointRays:
 
     Args:
         sets: of pixels; the same number is drawn from each set, whatever its size. Empty sets are dropped.
-        pool: the photos that these pixels belong to.
     """
 
     def __init__(self, sets: Sequence[PointDepths], pool: PixelPool):
@@ -84,8 +83,6 @@ def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarit
 
     Args:
         tracks: of features in the pool's photos.
-        pool: the training photos.
-        training_from_scene: the normalisation.
     """
     surface = triangulate(pool.frames, tracks)
     kept = np.flatnonzero(np.isfinite(surface.misses_px))
@@ -113,8 +110,6 @@ def stereo_depths(dense: Sequence[DenseDepth], pool: PixelPool, training_from_sc
 
     Args:
         dense: the stereo depths of each photo of the pool.
-        pool: the training photos.
-        training_from_scene: the normalisation.
     """
     widths = [frame.camera.width for frame in pool.frames]
     firsts = pool.first_pixel.tolist()

@@ -64,7 +64,6 @@ class PoseRefinement(nn.Module):
 
     Args:
         poses: (P, 4, 4) `world_from_cam` as given, training frame.
-        cameras: of the photos.
     """
 
     def __init__(self, poses: np.ndarray, cameras: Sequence[Camera]):

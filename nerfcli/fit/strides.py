@@ -25,7 +25,6 @@ class RaySteps:
 
     Args:
         marching: the steps of the capture.
-        settings: of the field.
         parallax: of the capture, see `Extent`.
     """
 

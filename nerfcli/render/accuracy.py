@@ -91,11 +91,9 @@ def measure_error(
     """Render the centres of 256 random pixels with finer and finer intervals; the same pixels for the same seed.
 
     Args:
-        model: the trained model.
         frame: camera and pose in the scene's frame.
         depth: the depth to measure along with the colour.
         tolerance: tolerance of the rendering that `depth_stop` is about.
-        seed: seed for the choice of pixels.
     """
     total = frame.camera.width * frame.camera.height
     pixels = np.sort(np.random.default_rng(seed).choice(total, size=min(total, PIXELS), replace=False))

@@ -97,7 +97,6 @@ def requested(request: DepthRequest, ends: LightEnds, *, background_distance: Te
     """Select the requested depth (R,).
 
     Args:
-        request: the definition of depth.
         ends: where light ends, with the quantiles of `fractions(request)`, along the requested axis and in its unit.
         background_distance: (R,) that of the request, along the same axis and in the same unit.
     """

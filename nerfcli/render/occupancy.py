@@ -49,7 +49,6 @@ class Occupancy:
         """Evaluate the field at one random point in each of the chosen cells.
 
         Args:
-            field: the field being trained.
             detail: level of detail of the field, see `Field.medium`.
             cells: slice of the cells, numbered (z * side + y) * side + x; in this order their features are close in
                 memory.

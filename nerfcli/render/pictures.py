@@ -98,7 +98,6 @@ def render_picture(
     of the mixture of their end distances along the axis of depth, see `pixels`.
 
     Args:
-        model: the trained model.
         frame: camera and pose in the scene's frame.
         background: colour behind everything.
         depth: the depth to compute along with the colour; None for none.

@@ -49,9 +49,7 @@ def pixels_of_rays(
         valid: (R,) whether the rays exist.
         background: (R, 3) sRGB; a pixel that is not valid has the background of its first ray.
         factor: (R,) > 0, by which distances along the ray are multiplied to get the requested ones.
-        fractions: of light for the quantiles.
         count: rays per pixel, a divisor of R.
-        backend: backend of the field.
     """
     rgb, error, ends, to_background = seen.rgb, seen.truncation_error, _scaled(seen.ends, factor), factor
     if count > 1:

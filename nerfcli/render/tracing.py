@@ -44,7 +44,6 @@ def render_rays(
     """March rays through the model. The result of a ray does not depend on the other rays.
 
     Args:
-        model: the trained model.
         origins, directions: (R, 3) in the training frame, unit directions.
         background: (3,) or (R, 3) sRGB.
         cuts: (S + 1,) distances at which all rays are cut; by default those of pictures, see `uniform_cuts`.

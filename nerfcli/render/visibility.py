@@ -48,8 +48,6 @@ def depth_maps(
     """Render a small map of the median distance for each photo, through its own lens; see `without_steep`.
 
     Args:
-        model: the trained model.
-        frames: frames of the photos.
         max_size: largest longer side of the maps, pixels.
         on_progress: called with the fraction that is done.
     """

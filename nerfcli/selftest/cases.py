@@ -39,12 +39,7 @@ class Segments:
 
 @dataclass(frozen=True)
 class Group:
-    """Rays that are hard for the same reason.
-
-    Args:
-        name: the difficulty.
-        rays: the rays.
-    """
+    """Rays that are hard for the same reason."""
 
     name: str
     rays: tuple[Segments, ...]

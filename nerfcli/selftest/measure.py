@@ -71,8 +71,6 @@ class Row:
     """One hard case in one precision.
 
     Args:
-        case: the difficulty.
-        operation: the operation under test.
         precision: name of the arithmetic.
         errors: errors of nerfcli.
         bounds: largest permitted errors.

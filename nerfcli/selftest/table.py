@@ -28,8 +28,6 @@ class Check:
     """One hard case of one operation.
 
     Args:
-        case: the difficulty.
-        operation: its name.
         inputs: returns the inputs, rounded to a precision.
         run: runs a module's operation on the inputs.
         bound: returns the bounds of values and gradients in a precision.

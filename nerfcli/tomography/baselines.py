@@ -32,7 +32,6 @@ def filtered_back_projection(geometry: ScanGeometry, integrals: np.ndarray, grid
     Args:
         geometry: views at equal steps, over a full turn, or half a turn for parallel beams.
         integrals: (V, rows, columns) line integrals.
-        grid: grid of the volume.
 
     Returns:
         (Z, Y, X) attenuation in 1 / unit.
@@ -92,10 +91,7 @@ def sart_total_variation(
     """Reconstruct by SART with positivity and total variation denoising after each round over the views.
 
     Args:
-        geometry: geometry of the views.
         integrals: (V, rows, columns) line integrals.
-        grid: grid of the volume.
-        rounds: number of rounds over all views.
 
     Returns:
         (Z, Y, X) attenuation, >= 0.

@@ -139,7 +139,6 @@ class ScanGeometry:
         through the source that is parallel to the detector give numbers that are not finite.
 
         Args:
-            view: index of the view.
             points: (N, 3).
         """
         normal = np.cross(self.column_step[view], self.row_step[view])
@@ -214,7 +213,6 @@ def circular_cone(
         angles: (V,) radians, counter-clockwise seen from +z.
         source_origin, source_detector: distances from the source.
         pixel_width, pixel_height: size of the detector's pixels.
-        rows, columns: number of pixels.
 
     Raises:
         ValueError: source_origin or source_detector is not above 0.
@@ -241,7 +239,6 @@ def circular_parallel(
     Args:
         angles: (V,) radians, counter-clockwise seen from +z: rays of a view come from (cos a, sin a, 0).
         pixel_width, pixel_height: size of the detector's pixels.
-        rows, columns: number of pixels.
     """
     outward, right, down = _circle(angles)
     return ScanGeometry(

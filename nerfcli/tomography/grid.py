@@ -61,7 +61,6 @@ def grid_of_scan(geometry: ScanGeometry, size: float | None = None) -> VoxelGrid
     spans the detector's height at the axis. A detector of one row gets one layer.
 
     Args:
-        geometry: geometry of the scan.
         size: side of a voxel; by default the smaller side of a pixel at the object, or its width for a single row.
     """
     height, width = geometry.pixel_at_origin

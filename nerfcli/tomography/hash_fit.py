@@ -158,10 +158,8 @@ def fit_hash(
     """Fit a hash volume in place until the passes are done or the time is up.
 
     Args:
-        problem: the data to fit.
         volume: start of the fit, changed in place.
         strength: weight of total variation, as in `reconstruct`.
-        seed: seed for the choice of pixels and samples.
         passes: number of passes over all pixels; None for no limit.
         seconds: time limit; None for no limit, 0 for no step.
         progress: called with the fraction done and a short text.

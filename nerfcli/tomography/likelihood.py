@@ -131,8 +131,6 @@ def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Likelih
     is unknown, it is estimated from the noise between neighbouring pixels, see `photons_per_value`.
 
     Args:
-        scan: the scan.
-        views: indices of its views.
         binning: number of rows and columns to combine, as in `ScanGeometry.binned`: photons are added, line
             integrals averaged.
 

@@ -30,10 +30,6 @@ def marks(geometry: ScanGeometry, grid: VoxelGrid) -> np.ndarray:
 
     A voxel is seen by a view if its centre projects onto the detector. The missing wedge is computed at the origin, as
     it differs little between voxels.
-
-    Args:
-        geometry: geometry of the views that were fitted.
-        grid: grid of the volume.
     """
     seen, beside = np.zeros(grid.shape, dtype=np.int32), np.zeros(grid.shape, dtype=np.int32)
     y, x = np.meshgrid(grid.axis("y"), grid.axis("x"), indexing="ij")
@@ -92,9 +88,6 @@ def missing_wedge_deg(geometry: ScanGeometry) -> float:
 
     0 if the gap is below the thresholds of a wedge: then the views go all around. Only the origin is considered; at the
     object's border, the fan of rays fills some of the gaps.
-
-    Args:
-        geometry: geometry of the views.
     """
     direction = geometry.emitter if geometry.beam == "parallel" else -geometry.emitter
     angle = np.sort(np.rad2deg(np.arctan2(direction[:, 1], direction[:, 0])) % 180)

@@ -51,7 +51,6 @@ def highest_contrast_row(scan: Scan, views: np.ndarray | None = None) -> Row:
     """Choose the row with the most contrast; for a cone beam, only among rows near the plane of the source.
 
     Args:
-        scan: the scan.
         views: indices of the views to read; all if not given.
     """
     views = np.arange(scan.geometry.views) if views is None else views
@@ -94,7 +93,6 @@ def misfit(row: Row, *, shift: float = 0.0, mirrored: bool = False) -> np.ndarra
     """Return mean squared errors (views // 2,) with which a reconstruction from every second view predicts the others.
 
     Args:
-        row: line integrals.
         shift: columns that the detector is moved by, see `ScanGeometry.shifted`.
         mirrored: whether its columns are read from the other side.
     """

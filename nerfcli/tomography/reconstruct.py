@@ -44,13 +44,7 @@ SETTLED = 3e-4
 
 @dataclass(frozen=True)
 class Problem:
-    """Data and grid of a fit.
-
-    Args:
-        geometry: geometry of the views that are fitted.
-        likelihood: likelihood of their pixels.
-        grid: grid of the volume.
-    """
+    """Data and grid of a fit."""
 
     geometry: ScanGeometry
     likelihood: Likelihood
@@ -77,12 +71,7 @@ class Fit:
 
 
 class Projector:
-    """Rays of a scan through a grid, view by view.
-
-    Args:
-        geometry: geometry of the views.
-        grid: grid of the volumes.
-    """
+    """Rays of a scan through a grid, view by view."""
 
     def __init__(self, geometry: ScanGeometry, grid: VoxelGrid):
         self._geometry, self._grid = geometry, grid
@@ -142,8 +131,6 @@ def reconstruct(
     """Continue a fit until the passes or the time are used up, or it has converged.
 
     Args:
-        problem: the data to fit.
-        fit: start of the fit.
         strength: weight of total variation: beta = strength * sqrt(median over voxels of sum over rays of curvature *
             length), so that 1 is about the noise of a voxel without regularisation, for any dose and unit of the scan.
         passes: number of passes over all views; None for no limit.

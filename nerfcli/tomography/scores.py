@@ -58,9 +58,7 @@ def score_projections(
     """Compare the projections of a volume with the held-out views; return None if no view is held out.
 
     Args:
-        scan: the measurements.
         geometry: corrected geometry of all its views.
-        volume, grid: the reconstruction.
         air: factor on the open beam of each held-out view; 1 if not given.
     """
     views = np.array(scan.held_out, dtype=int)

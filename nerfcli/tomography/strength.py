@@ -34,7 +34,6 @@ class StrengthTrial:
     """Result of trials of total variation.
 
     Args:
-        strength: the chosen strength.
         tried: strengths and, for each, the mean deviance per pixel of views that were not fitted; 1 is noise alone.
         model_error: see `Poisson`; estimated from the views that were not fitted, 0 for line integrals.
     """
@@ -57,7 +56,6 @@ def choose_strength(
     Args:
         scan: the scan; every fifth of its training views is predicted.
         geometry: corrected geometry of all views.
-        grid: grid of the reconstruction.
         max_seconds: time limit for all trials together, each of which gets at most a quarter; None tries the default
             strength alone, so that the result does not depend on the machine.
         progress: called with the fraction done and a short text.

@@ -48,7 +48,6 @@ def write_volume(path: Path, volume: VolumeFile) -> None:
     """Write a volume in the format of the path's suffix: .nrrd, .mha, .nii or .tif; atomic.
 
     Args:
-        path: the file.
         volume: float32 or uint8.
 
     Raises:

@@ -29,7 +29,6 @@ class ScanDiagnosis:
     """Findings of the checks of a scan.
 
     Args:
-        sample: the examined data.
         findings: findings of all checks that could be made, in order.
         not_checked: names of the checks that could not be made, with the reason.
     """

@@ -20,8 +20,6 @@ class Sample:
     """Line integrals of some rows.
 
     Args:
-        scan: the scan.
-        rows: indices of the examined rows.
         integrals: (V, rows, columns) float32, unusable pixels interpolated.
         noise: standard deviation of a line integral where there is little object.
         object_level: line integral that only 0.5 % of the pixels exceed.

@@ -4,7 +4,6 @@ These files state neither the direction of rotation nor the side from which colu
 to turn counter-clockwise seen from +z, and columns to run from left to right seen from the source.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -160,13 +159,13 @@ def _frames(file: Any, name: str, path: Path) -> np.ndarray:
     return array
 
 
-def _walk(file: Any) -> Iterator[str]:
+def _walk(file: Any) -> list[str]:
     """Return the names of all datasets, in the order of the file."""
     import h5py
 
     names: list[str] = []
     file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-    return iter(names)
+    return names
 
 
 def _first(file: Any, name: str, path: Path) -> str:

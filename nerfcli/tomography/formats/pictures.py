@@ -16,7 +16,6 @@ def numbered(folder: Path, pattern: str = "*", *, without: str | None = None) ->
     """Return the pictures in a folder whose names match a pattern, in the order of the last number in their names.
 
     Args:
-        folder: the folder.
         pattern: shell pattern of the file names.
         without: regular expression of names to skip.
 

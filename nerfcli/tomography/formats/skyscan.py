@@ -4,7 +4,7 @@ The log states the pixel size at the object. "Rotation Direction=CC" turns the o
 source moves clockwise around it; columns run from right to left seen from the source, as in ASTRA's reader.
 """
 
-import re
+import glob
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +86,7 @@ def _white(fields: Statement, values: np.ndarray, notes: list[str]) -> float:
 
 def _projections(path: Path, fields: Statement) -> list[Path]:
     prefix = fields.text("Filename Prefix", path.stem)
-    paths = numbered(path.parent, f"{_escaped(prefix)}*", without=_OTHERS) or numbered(path.parent, without=_OTHERS)
+    paths = numbered(path.parent, f"{glob.escape(prefix)}*", without=_OTHERS) or numbered(path.parent, without=_OTHERS)
     count = fields.whole("Number of Files")
     # Some scanners also count a last file that repeats the first angle, which may be missing.
     if len(paths) not in (count, count - 1) or len(paths) == 0:
@@ -95,7 +95,3 @@ def _projections(path: Path, fields: Statement) -> list[Path]:
             f"expected TIFF or PNG files named {prefix}0000.tif and so on beside the log, all of them",
         )
     return paths
-
-
-def _escaped(text: str) -> str:
-    return re.sub(r"([\[\]*?])", r"[\1]", text)
