@@ -22,7 +22,6 @@ TRAINING: tuple[Group, ...] = (
             Mutant(".inverse().apply_pose(after)", ".apply_pose(after)"),
             Mutant("return mean_similarity(before, after).inverse().apply_pose(after)", "return after"),
             Mutant("reach = reach if reach > LEAST_REACH else 1.0", "reach = 1.0"),
-            Mutant("[-y, x, zero]", "[y, -x, zero]"),
         ),
     ),
     Group(
