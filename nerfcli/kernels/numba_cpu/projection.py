@@ -142,16 +142,16 @@ def back_project(
     """See `reference.back_project`; float32 values, lines in float64."""
     use_threads()
     out = np.zeros(shape[0] * shape[1] * shape[2], dtype=np.float32)
-    _back_project(
-        values.detach().contiguous().numpy(),
-        origins.contiguous().numpy(),
-        directions.contiguous().numpy(),
-        np.array(first, dtype=np.float64),
-        float(size),
-        np.array(shape[::-1]),
-        out,
-    )
+    _back_project(values.detach().contiguous().numpy(), *_arguments(origins, directions, first, size, shape), out)
     return torch.from_numpy(out).view(shape)
+
+
+def _arguments(
+    origins: Tensor, directions: Tensor, first: tuple[float, float, float], size: float, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray]:
+    """Return lines and grid as the loops take them."""
+    lines = origins.contiguous().numpy(), directions.contiguous().numpy()
+    return *lines, np.array(first, dtype=np.float64), float(size), np.array(shape[::-1])
 
 
 class _Project(torch.autograd.Function):
@@ -161,15 +161,8 @@ class _Project(torch.autograd.Function):
         ctx.save_for_backward(origins, directions)
         ctx.grid = {"shape": tuple(volume.shape), "first": first, "size": size}
         out = np.empty(len(origins), dtype=np.float32)
-        _project(
-            volume.detach().contiguous().view(-1).numpy(),
-            origins.contiguous().numpy(),
-            directions.contiguous().numpy(),
-            np.array(first, dtype=np.float64),
-            float(size),
-            np.array(volume.shape[::-1]),
-            out,
-        )
+        lines_and_grid = _arguments(origins, directions, first, size, tuple(volume.shape))
+        _project(volume.detach().contiguous().view(-1).numpy(), *lines_and_grid, out)
         return torch.from_numpy(out)
 
     @staticmethod
