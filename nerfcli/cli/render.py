@@ -272,7 +272,7 @@ def render(
         "--loop": (loop is not None and not writes_video, "--video"),
         "--video-layout": (video_layout != "separate" and not writes_video, "--video"),
         "--direction": (direction != "forward" and not writes_video, "--video"),
-        "--depth": (depth != "conditional" and "depth" not in chosen, "--outputs depth"),
+        "--depth": (depth != "conditional" and set(chosen) <= {"rgb", "opacity"}, "--outputs depth"),
         "--background-distance": (background_distance is not None and depth != "background", "--depth background"),
         "--level": (level != DepthRequest.level and not {"lower", "upper"} & set(chosen), "--outputs lower,upper"),
         "--depth-tolerance": (
