@@ -117,7 +117,7 @@ def stages(samples: int, log2_rows: int, device: Any, repeats: int) -> dict[str,
     """Return nanoseconds per sample of every kernel, with 32 samples per ray."""
     import torch
 
-    from nerfcli.kernels.interface import HashGrid, March, Rays
+    from nerfcli.kernels.interface import AdamStep, HashGrid, March, Rays
     from nerfcli.kernels.triton_cuda import compositing, depth, hash_grid, marching, networks, row_adam
 
     torch.manual_seed(0)
@@ -162,7 +162,7 @@ def stages(samples: int, log2_rows: int, device: Any, repeats: int) -> dict[str,
     def adam() -> None:
         sink.fill_(1e-6)
         row_adam.adam_rows(
-            master, sink, first, second, half=table, step=1, rate=1e-3, betas=(0.9, 0.99), eps=1e-15
+            master, sink, first, second, half=table, step=AdamStep(1, 1e-3, (0.9, 0.99), 1e-15)
         )  # fmt: skip
 
     functions: dict[str, Callable[[], Any]] = {

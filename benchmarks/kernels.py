@@ -24,7 +24,7 @@ from rich.table import Table
 from torch import Tensor
 
 from nerfcli.field.hash_field import HashField, HashFieldSettings
-from nerfcli.kernels import HashGrid, March, Rays, numba_cpu, reference
+from nerfcli.kernels import AdamStep, HashGrid, March, Rays, numba_cpu, reference
 
 SAMPLES_PER_RAY = 32
 SECONDS_EACH = 0.4
@@ -147,7 +147,7 @@ def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
     def step(module: Any, dtype: torch.dtype) -> tuple[Tensor, ...]:
         """Take a step of Adam on `samples` rows with gradients; the time includes copying the arrays."""
         arrays = [x.to(dtype, copy=True) for x in rows]
-        module.adam_rows(*arrays, step=3, rate=0.01, betas=(0.9, 0.99), eps=1e-15)
+        module.adam_rows(*arrays, step=AdamStep(3, 0.01, (0.9, 0.99), 1e-15))
         return arrays[0], arrays[2], arrays[3]
 
     yield Operation(

@@ -206,7 +206,7 @@ GROUPS: tuple[Group, ...] = (
         (),
         (
             Mutant("(1 - betas[1]) * g * g", "(1 - betas[1]) * g"),
-            Mutant("(1 - betas[0] ** step)", "(1 - betas[0])"),
+            Mutant("(1 - betas[0] ** number)", "(1 - betas[0])"),
             Mutant("/ (spread + eps)", "/ spread"),
             Mutant("gradient.zero_()", "gradient.abs()"),
             Mutant(".any(-1)", ".all(-1)"),

@@ -10,9 +10,10 @@ import numba
 import numpy as np
 import pytest
 import torch
+from numba.core import config
 
 from nerfcli import kernels
-from nerfcli.kernels import BearingGrids, HashGrid, March, PixelTable, Rays, numba_cpu, reference
+from nerfcli.kernels import AdamStep, BearingGrids, HashGrid, March, PixelTable, Rays, numba_cpu, reference
 from nerfcli.kernels.numba_cpu import visible
 from nerfcli.kernels.numba_cpu.exponential import exponential, sigmoid, sigmoid_slope
 from nerfcli.kernels.numba_cpu.threads import use_threads
@@ -411,7 +412,7 @@ def test_adam_rows(rows, magnitude, decay, generator):
     fast, exact = [v.clone() for v in values], [v.double() for v in values]
     for arrays, function in ((fast, numba_cpu.adam_rows), (exact, reference.adam_rows)):
         for step in (1, 2):
-            function(*arrays, step=step, rate=0.01, betas=(0.9, 0.99), eps=1e-15, decay=decay * magnitude)
+            function(*arrays, step=AdamStep(step, 0.01, (0.9, 0.99), 1e-15, decay * magnitude))
             if step == 1:
                 arrays[1] += values[1].to(arrays[1].dtype)
     for name, actual, expected in zip(("table", "gradient", "first", "second"), fast, exact, strict=True):
@@ -430,7 +431,7 @@ def test_adam_rows_is_adam_where_every_row_is_touched(decay, generator):
         parameter.grad = gradient.clone()
         optimiser.step()
         ours[1].copy_(gradient)
-        numba_cpu.adam_rows(*ours, step=step, rate=0.01, betas=(0.9, 0.99), eps=1e-15, decay=decay)
+        numba_cpu.adam_rows(*ours, step=AdamStep(step, 0.01, (0.9, 0.99), 1e-15, decay))
     assert_close(ours[0], parameter.detach(), "table")
 
 
@@ -491,10 +492,11 @@ def test_starting_numba_leaves_the_thread_count_alone():
 
 @once
 def test_numba_follows_when_the_thread_count_changes():
+    limit = int(config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     # Numba's own count used to stay where the last loop had left it, and loops that asked for two threads got one.
     for wanted in (1, 2, 1, 2):
         torch.set_num_threads(wanted)
-        assert use_threads() == numba.get_num_threads() == min(wanted, numba.config.NUMBA_NUM_THREADS)
+        assert use_threads() == numba.get_num_threads() == min(wanted, limit)
 
 
 def test_two_runs_are_bit_identical(generator):

@@ -26,6 +26,7 @@ from triton.runtime import interpreter
 
 from nerfcli import kernels
 from nerfcli.kernels import (
+    AdamStep,
     Backend,
     BearingGrids,
     HashGrid,
@@ -482,11 +483,11 @@ def test_adam_rows(rows, decay, generator):
     start[3].square_()
     start[1][:, 1::3] = 0.0
     start[1][:, 2::5, 1:] = 0.0
-    named = {"step": 3, "rate": 1e-2, "betas": (0.9, 0.99), "eps": 1e-15, "decay": decay}
+    step = AdamStep(3, 1e-2, (0.9, 0.99), 1e-15, decay)
     exact, fast = [x.double() for x in start], [x.clone().to(DEVICE) for x in start]
     half = fast[0].half()
-    reference.adam_rows(*exact, **named)
-    row_adam.adam_rows(*fast, half=half, **named)
+    reference.adam_rows(*exact, step=step)
+    row_adam.adam_rows(*fast, half=half, step=step)
     for name, a, b in zip(("table", "gradient", "first", "second"), fast, exact, strict=True):
         assert_close(a, b, name)
     assert torch.equal(half, fast[0].half())
@@ -585,7 +586,7 @@ def test_the_half_copy_follows_the_table(generator):
     backend = TritonBackend(DEVICE)
     table = torch.randn(1, 16, 4, generator=generator).to(DEVICE)
     gradient, first, second = torch.ones_like(table), torch.zeros_like(table), torch.zeros_like(table)
-    backend.adam_rows(table, gradient, first, second, step=1, rate=0.1, betas=(0.9, 0.99), eps=1e-15)
+    backend.adam_rows(table, gradient, first, second, step=AdamStep(1, 0.1, (0.9, 0.99), 1e-15))
     assert torch.equal(backend._half.of(table), table.half())
     with torch.no_grad():
         table.copy_(torch.zeros_like(table))

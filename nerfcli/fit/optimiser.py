@@ -7,6 +7,7 @@ from torch import Tensor
 
 from nerfcli.field.interface import Field
 from nerfcli.fit.adam import BETAS, EPS, Adam
+from nerfcli.kernels import AdamStep
 
 
 class FieldOptimiser:
@@ -45,10 +46,8 @@ class FieldOptimiser:
         self._adam.step(rate)
         rows = self._field.rows()
         if rows is not None and self.sink is not None and self._first is not None and self._second is not None:
-            moments = (self._first, self._second)
-            self._field.backend.adam_rows(
-                rows, self.sink, *moments, step=number, rate=rate, betas=BETAS, eps=EPS, decay=decay
-            )
+            step = AdamStep(number, rate, BETAS, EPS, decay)
+            self._field.backend.adam_rows(rows, self.sink, self._first, self._second, step=step)
 
     def state(self) -> dict[str, Tensor]:
         """Return the state for `restore`, without the field's own tensors."""

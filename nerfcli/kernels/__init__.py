@@ -17,6 +17,7 @@ from nerfcli.kernels.composition import Backend
 from nerfcli.kernels.contraction import CONTRACTIONS, contract, contract_to_cube, grid_coordinates
 from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import (
+    AdamStep,
     BearingGrids,
     HashGrid,
     Intervals,
@@ -34,6 +35,7 @@ from nerfcli.kernels.reference.backend import ReferenceBackend
 
 __all__ = [
     "CONTRACTIONS",
+    "AdamStep",
     "Backend",
     "BearingGrids",
     "HashGrid",

@@ -14,6 +14,7 @@ from torch import Tensor
 from nerfcli.kernels.contraction import sample_widths
 from nerfcli.kernels.interface import (
     UNSEEN,
+    AdamStep,
     HashGrid,
     Intervals,
     LightEnds,
@@ -180,19 +181,7 @@ class Backend(abc.ABC):
         """
 
     @abc.abstractmethod
-    def adam_rows(
-        self,
-        table: Tensor,
-        gradient: Tensor,
-        first: Tensor,
-        second: Tensor,
-        *,
-        step: int,
-        rate: float,
-        betas: tuple[float, float],
-        eps: float,
-        decay: float = 0.0,
-    ) -> None:
+    def adam_rows(self, table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, step: AdamStep) -> None:
         """Take one step of Adam with weight decay, in place, on rows with a nonzero gradient, and zero the gradient."""
 
     @abc.abstractmethod

@@ -120,6 +120,22 @@ class RaySums(NamedTuple):
     samples: Tensor
 
 
+class AdamStep(NamedTuple):
+    """A step of Adam on rows, see `adam_rows`.
+
+    Args:
+        number: from 1.
+        rate, betas, eps: of Adam.
+        decay: >= 0, weight in the loss of the sum of table^2 / 2 over the touched rows.
+    """
+
+    number: int
+    rate: float
+    betas: tuple[float, float]
+    eps: float
+    decay: float = 0.0
+
+
 class LightEnds(NamedTuple):
     """Distribution of absorption along each of R rays; see `light_ends`."""
 

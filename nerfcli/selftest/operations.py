@@ -13,7 +13,7 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from nerfcli.kernels import HashGrid, March, PixelTable, Rays, reference
+from nerfcli.kernels import AdamStep, HashGrid, March, PixelTable, Rays, reference
 from nerfcli.kernels.activations import density_from_log
 from nerfcli.selftest import cases, textbook
 from nerfcli.selftest.cases import MEANINGLESS, Ray, Segments, deepest_ray
@@ -320,7 +320,7 @@ def _layers(like: Tensor) -> tuple[Tensor, ...]:
 def adam(module: ModuleType, given: Inputs) -> Outcome:
     """Compute Adam's first step."""
     table, first, second = (torch.zeros_like(given["gradients"]) for _ in range(3))
-    module.adam_rows(table, given["gradients"].clone(), first, second, step=1, rate=RATE, betas=BETAS, eps=EPS)
+    module.adam_rows(table, given["gradients"].clone(), first, second, step=AdamStep(1, RATE, BETAS, EPS))
     return Outcome((table,))
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from nerfcli import kernels
+from nerfcli.kernels import AdamStep
 from nerfcli.kernels.activations import density_from_log
 from nerfcli.tomography.grid import VoxelGrid
 from nerfcli.tomography.reconstruct import Problem, curvature_bound
@@ -204,7 +205,7 @@ def fit_hash(
                 group["lr"] = rate
             optimiser.step()
             with torch.no_grad():
-                volume.backend.adam_rows(volume.table, sink, first, second, step=step, rate=rate, betas=BETAS, eps=EPS)
+                volume.backend.adam_rows(volume.table, sink, first, second, step=AdamStep(step, rate, BETAS, EPS))
             done += len(chosen) / count
             volume.passes += len(chosen) / count
             if progress is not None:

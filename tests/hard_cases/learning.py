@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from nerfcli.kernels import AdamStep
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT, density_from_log
 from nerfcli.render.occupancy import Occupancy
 from nerfcli.selftest.cases import GRADIENTS, LOGARITHMS
@@ -75,7 +76,7 @@ def _adam_row(precision: Precision) -> Row:
     table, first, second = (torch.zeros_like(gradient) for _ in range(3))
     module = precision.parts
     start = time.perf_counter()
-    module.adam_rows(table, gradient.clone(), first, second, step=1, rate=RATE, betas=BETAS, eps=EPS)
+    module.adam_rows(table, gradient.clone(), first, second, step=AdamStep(1, RATE, BETAS, EPS))
     seconds = time.perf_counter() - start
     half = gradient.half()
     moment, square = (0.1 * half), (0.01 * half * half)

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerfcli.kernels import numba_cpu, reference
 from nerfcli.kernels.composition import Backend
 from nerfcli.kernels.harmonics import spherical_harmonics
-from nerfcli.kernels.interface import HashGrid, March, Medium, Rays, RaysSeen, Samples
+from nerfcli.kernels.interface import AdamStep, HashGrid, March, Medium, Rays, RaysSeen, Samples
 from nerfcli.kernels.numba_cpu.row_adam import FEATURES
 from nerfcli.kernels.reference.backend import encode_into
 
@@ -56,21 +56,9 @@ class NumbaBackend(Backend):
     ) -> Tensor:
         return _encode(points, table, resolutions, computed=None, widths=None, sink=sink)
 
-    def adam_rows(
-        self,
-        table: Tensor,
-        gradient: Tensor,
-        first: Tensor,
-        second: Tensor,
-        *,
-        step: int,
-        rate: float,
-        betas: tuple[float, float],
-        eps: float,
-        decay: float = 0.0,
-    ) -> None:
+    def adam_rows(self, table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, step: AdamStep) -> None:
         module = numba_cpu if table.shape[-1] == FEATURES else reference
-        module.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps, decay=decay)
+        module.adam_rows(table, gradient, first, second, step=step)
 
     def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, visits: Tensor | None) -> Samples:
         module = numba_cpu if _fits(grid, grid.layers[:2]) else reference

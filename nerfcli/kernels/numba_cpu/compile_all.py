@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerfcli import child
 from nerfcli.errors import UserError
-from nerfcli.kernels.interface import HashGrid, March, PixelTable, Rays
+from nerfcli.kernels.interface import AdamStep, HashGrid, March, PixelTable, Rays
 from nerfcli.kernels.numba_cpu import machine_code
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.coordinates import sample_coordinates
@@ -77,7 +77,7 @@ def run_training() -> None:
     colour, _, spread = composite(thickness, rgb, lengths, offsets=offsets, background=torch.zeros(3))
     (colour.sum() + distortion(spread, *spans, offsets).sum()).backward()
     gradient, first, second = (torch.zeros(8, 16, 4) for _ in range(3))
-    adam_rows(table, gradient, first, second, step=1, rate=0.0, betas=(0.9, 0.99), eps=1e-15)
+    adam_rows(table, gradient, first, second, step=AdamStep(1, 0.0, (0.9, 0.99), 1e-15))
 
 
 def run_rendering() -> None:

@@ -14,6 +14,7 @@ from numba.core import types
 from numba.extending import intrinsic
 from torch import Tensor
 
+from nerfcli.kernels.interface import AdamStep
 from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.vector import FLOATS, INTS, LANES, floats, in_all_lanes, ints, of_each
 
@@ -81,21 +82,11 @@ def _update(
             step_vector(table, gradient, first, second, i * LANES, rate, beta1, beta2, correction, eps, decay)
 
 
-def adam_rows(
-    table: Tensor,
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    *,
-    step: int,
-    rate: float,
-    betas: tuple[float, float],
-    eps: float,
-    decay: float = 0.0,
-) -> None:
+def adam_rows(table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, step: AdamStep) -> None:
     """See `reference.adam_rows`; float32 on the CPU, rows of 4 features."""
-    scale = rate / (1 - betas[0] ** step)
-    correction = (1 - betas[1] ** step) ** -0.5
+    number, rate, betas, eps, decay = step
+    scale = rate / (1 - betas[0] ** number)
+    correction = (1 - betas[1] ** number) ** -0.5
     flat = [x.detach().view(-1).numpy() for x in (table, gradient, first, second)]
     numbers = [np.float32(x) for x in (scale, *betas, correction, eps, decay)]
     _update(*(*flat, *numbers, use_threads()))

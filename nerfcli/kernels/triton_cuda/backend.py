@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels import reference
-from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
+from nerfcli.kernels.interface import AdamStep, HashGrid, March, Rays, Samples
 from nerfcli.kernels.reference.backend import ReferenceBackend
 from nerfcli.kernels.triton_cuda import compositing, hash_grid, marching, networks, operations, rays
 from nerfcli.kernels.triton_cuda.coordinates import sample_coordinates
@@ -53,24 +53,11 @@ class TritonBackend(ReferenceBackend):
             return hash_grid.hash_encode(points, table, resolutions, sink)
         return super().hash_encode(points, table, resolutions, sink=sink)
 
-    def adam_rows(
-        self,
-        table: Tensor,
-        gradient: Tensor,
-        first: Tensor,
-        second: Tensor,
-        *,
-        step: int,
-        rate: float,
-        betas: tuple[float, float],
-        eps: float,
-        decay: float = 0.0,
-    ) -> None:
-        if table.shape[-1] != hash_grid.FEATURES:
-            super().adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps, decay=decay)
-            return
-        half = self._half.of(table)
-        adam_rows(table, gradient, first, second, half=half, step=step, rate=rate, betas=betas, eps=eps, decay=decay)
+    def adam_rows(self, table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, step: AdamStep) -> None:
+        if table.shape[-1] == hash_grid.FEATURES:
+            adam_rows(table, gradient, first, second, half=self._half.of(table), step=step)
+        else:
+            super().adam_rows(table, gradient, first, second, step=step)
 
     @torch.no_grad()
     def density(self, coordinates: Tensor, medium: Any) -> Tensor:

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
+from nerfcli.kernels.interface import AdamStep, HashGrid, March, Rays, Samples
 from nerfcli.kernels.reference import keep_largest, mixture_quantile
 from nerfcli.kernels.triton_cuda import marching, row_adam
 from nerfcli.kernels.triton_cuda.compositing import composite, distortion, interval_weights, optical_depth_before
@@ -34,20 +34,6 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
     return marching.visible_samples(rays, along, grid, table=grid.table.half(), capacity=marching.Capacity())
 
 
-def adam_rows(
-    table: Tensor,
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    *,
-    step: int,
-    rate: float,
-    betas: tuple[float, float],
-    eps: float,
-    decay: float = 0.0,
-) -> None:
+def adam_rows(table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, step: AdamStep) -> None:
     """See `reference.adam_rows`."""
-    half = table.half()
-    row_adam.adam_rows(
-        table, gradient, first, second, half=half, step=step, rate=rate, betas=betas, eps=eps, decay=decay
-    )
+    row_adam.adam_rows(table, gradient, first, second, half=table.half(), step=step)

@@ -6,6 +6,7 @@ The pass also zeroes the gradient. Same operation as `reference.adam_rows`, for 
 import triton.language as tl
 from torch import Tensor
 
+from nerfcli.kernels.interface import AdamStep
 from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
 
 FEATURES = 4
@@ -34,26 +35,15 @@ def _update(
     tl.store(gradient + at, tl.zeros([BLOCK, 4], tl.float32), mask=touched)
 
 
-def adam_rows(
-    table: Tensor,
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    *,
-    half: Tensor,
-    step: int,
-    rate: float,
-    betas: tuple[float, float],
-    eps: float,
-    decay: float = 0.0,
-) -> None:
+def adam_rows(table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, half: Tensor, step: AdamStep) -> None:
     """See `reference.adam_rows`; float32, rows of 4 features.
 
     Args:
         half: of the table's shape, float16; changed rows are copied to it.
     """
     rows = table.numel() // FEATURES
-    scale, correction = rate / (1 - betas[0] ** step), (1 - betas[1] ** step) ** -0.5
+    number, rate, betas, eps, decay = step
+    scale, correction = rate / (1 - betas[0] ** number), (1 - betas[1] ** number) ** -0.5
     launch(
         _update, (blocks(rows, BLOCK),), table.detach(), half, gradient, first, second, rows, scale, *betas,
         correction, float(eps), float(decay), BLOCK=BLOCK,

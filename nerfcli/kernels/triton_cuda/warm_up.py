@@ -2,7 +2,7 @@
 
 import torch
 
-from nerfcli.kernels.interface import HashGrid, March, PixelTable, Rays, Targets
+from nerfcli.kernels.interface import AdamStep, HashGrid, March, PixelTable, Rays, Targets
 from nerfcli.kernels.triton_cuda.backend import TritonBackend
 
 
@@ -36,6 +36,6 @@ def warm_up(device: torch.device) -> None:
             (sums.rgb.sum() + sums.distortion.sum()).backward()
         backend.trace_rays(rays.detached(), march, grid, background=torch.zeros(3, device=device), fractions=(0.5,))
     backend.density(torch.full((2, 3), 0.5, device=device), grid)
-    backend.adam_rows(table, sink, first, second, step=1, rate=0.0, betas=(0.9, 0.99), eps=1e-15)
+    backend.adam_rows(table, sink, first, second, step=AdamStep(1, 0.0, (0.9, 0.99), 1e-15))
     if device.type == "cuda":
         torch.cuda.synchronize(device)
