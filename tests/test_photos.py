@@ -83,6 +83,14 @@ def test_photos_in_formats_that_are_not_read_are_named_and_not_passed_over(folde
     }
 
 
+def test_broken_links_are_named_and_not_passed_over(folder: Path):
+    (folder / "f.jpg").symlink_to(folder / "elsewhere.jpg")
+    (folder / "g.jpg").symlink_to(folder / "a.jpg")
+    photos = find_photos(folder)
+    assert photos.names == ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg", "g.jpg")
+    assert photos.unreadable == {"f.jpg": "a link to a file that does not exist"}
+
+
 def test_a_folder_of_nothing_but_such_photos_says_so(tmp_path: Path):
     for number in range(4):
         (tmp_path / f"IMG_{number}.DNG").write_bytes(b"not for Pillow")

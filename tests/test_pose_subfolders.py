@@ -183,3 +183,14 @@ def test_doctor_examines_the_photos_of_all_subfolders(rig: Path, scene: Path, tm
     (cameras,) = (finding for finding in content["findings"] if finding["check"] == "cameras")
     assert cameras["summary"].startswith("one camera in each of 2 folders")
     assert nerfcli("doctor", scene, "--subfolders").exit_code == BAD_INPUT
+
+
+def test_photos_behind_links_to_folders_are_found_once(tmp_path: Path):
+    for folder in ("photos/right", "elsewhere"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "a.jpg").touch()
+    (tmp_path / "photos" / "again").symlink_to(tmp_path / "photos")
+    (tmp_path / "photos" / "copy").symlink_to(tmp_path / "photos" / "right")
+    (tmp_path / "photos" / "left").symlink_to(tmp_path / "elsewhere")
+    found = [path.relative_to(tmp_path).as_posix() for path in list_photos(tmp_path / "photos", subfolders=True)]
+    assert found == ["photos/left/a.jpg", "photos/right/a.jpg"]

@@ -6,7 +6,7 @@ from pathlib import Path
 from nerfcli import scene as scenes
 from nerfcli.doctor.photo_facts import Source
 from nerfcli.errors import UserError, in_shell
-from nerfcli.media.images import list_photos, list_unsupported, name_in, where_photos_may_be
+from nerfcli.media.images import list_photos, list_unreadable, name_in, where_photos_may_be
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
         scene = scenes.load(path)
         sources = tuple(Source(f.name, f.image, f.mask) for f in scene.frames if f.image is not None)
         return ExaminedCapture(path, sources, scene)
-    photos = [*list_photos(path, subfolders=subfolders), *list_unsupported(path, subfolders=subfolders)]
+    photos = [*list_photos(path, subfolders=subfolders), *list_unreadable(path, subfolders=subfolders)]
     if not photos:
         raise UserError(f"no photos and no scene in {path}", where_photos_may_be(path))
     return ExaminedCapture(path, tuple(Source(name_in(path, photo), photo) for photo in photos), None)

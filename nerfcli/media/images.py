@@ -284,12 +284,12 @@ def list_photos(folder: Path, *, subfolders: bool = False) -> list[Path]:
     return sorted(paths, key=lambda path: name_in(folder, path))
 
 
-def list_unsupported(folder: Path, *, subfolders: bool = False) -> list[Path]:
-    """Return the photos in formats that cannot be read (raw, JPEG XL), as `list_photos` does.
+def list_unreadable(folder: Path, *, subfolders: bool = False) -> list[Path]:
+    """Return photos in formats that cannot be read (raw, JPEG XL), and broken links, as `list_photos` does.
 
     A file is left out if a readable picture of the same name, apart from the suffix, is beside it.
     """
-    paths = [path for each in _folders(folder, subfolders=subfolders) for path in _unsupported(each)]
+    paths = [path for each in _folders(folder, subfolders=subfolders) for path in _unreadable(each)]
     return sorted(paths, key=lambda path: name_in(folder, path))
 
 
@@ -310,14 +310,21 @@ def where_photos_may_be(folder: Path) -> str:
 
 
 def _folders(folder: Path, *, subfolders: bool) -> list[Path]:
-    """Return a folder and, on request, all of its subfolders; hidden ones are left out."""
+    """Return a folder and, on request, all of its subfolders; not hidden ones, nor links to the others."""
     if not subfolders:
         return [folder]
-    below = (path for path in folder.rglob("*") if path.is_dir())
-    return [folder, *(path for path in below if not any(p.startswith(".") for p in path.relative_to(folder).parts))]
+    below = [path for path in folder.rglob("*") if path.is_dir()]
+    shown = [path for path in below if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+    folders = [
+        folder,
+        *(path for path in shown if not path.is_symlink()),
+        *(path for path in shown if path.is_symlink()),
+    ]
+    return list({path.resolve(): path for path in reversed(folders)}.values())
 
 
-def _unsupported(folder: Path) -> list[Path]:
+def _unreadable(folder: Path) -> list[Path]:
     read = {path.stem for path in list_images(folder)}
-    files = (path for path in folder.iterdir() if not path.name.startswith("."))
-    return [path for path in files if path.suffix.lower() in _UNSUPPORTED_SUFFIXES and path.stem not in read]
+    files = [path for path in folder.iterdir() if not path.name.startswith(".") and path.stem not in read]
+    broken = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and not path.exists()]
+    return [*(path for path in files if path.suffix.lower() in _UNSUPPORTED_SUFFIXES), *broken]

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.media.exif import Exif, read_exif
 from nerfcli.media.focal_evidence import focal_evidence, with_digital_zoom
-from nerfcli.media.images import list_photos, list_unsupported, name_in, read_image, where_photos_may_be
+from nerfcli.media.images import list_photos, list_unreadable, name_in, read_image, where_photos_may_be
 from nerfcli.media.panoramas import is_panorama
 
 # Three views determine a scene up to scale, but leave nothing to check them with; four are the fewest that do.
@@ -64,12 +64,15 @@ def find_photos(
     if not folder.is_dir():
         raise UserError(f"{folder} is a file, not a folder of photos", "give the folder that contains the photos")
     paths = list_photos(folder, subfolders=subfolders)
-    unsupported = list_unsupported(folder, subfolders=subfolders)
-    if not paths and not unsupported:
+    hopeless = list_unreadable(folder, subfolders=subfolders)
+    if not paths and not hopeless:
         raise UserError(f"no photos in {folder}", where_photos_may_be(folder))
     photos: list[Photo] = []
     unreadable = {
-        name_in(folder, path): f"{path.suffix} files are not supported; convert them to JPEG" for path in unsupported
+        name_in(folder, path): f"{path.suffix} files are not supported; convert them to JPEG"
+        if path.exists()
+        else "a link to a file that does not exist"
+        for path in hopeless
     }
     with ThreadPoolExecutor(_READERS) as readers:
         for index, found in enumerate(readers.map(lambda path: _examine(path, name_in(folder, path)), paths)):
