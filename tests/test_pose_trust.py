@@ -218,7 +218,7 @@ def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(solved: Solved, 
             ]
             assert np.degrees((relative[0].rotation * relative[1].rotation.inverse()).angle()) < 0.4
     assert notes == [
-        "3 photos are in smaller models, next: from the accepted model (about 5 min)",
+        "3 photos in smaller models, next: from the accepted model (about 5 min)",
         "from the accepted model: 10 of 10 photos registered, accepted",
     ]
 
