@@ -27,6 +27,14 @@ def test_a_file_where_a_run_is_needed_is_named(tmp_path):
     assert error[0] == f"Error: {tmp_path / 'notes.txt'} is a file, not a run folder"
 
 
+def test_json_nested_too_deeply_is_refused_and_not_a_traceback(tmp_path):
+    """Before the format of IN is known, each reader looks into it."""
+    (tmp_path / "reconstruction.json").write_text("[" * 100_000)
+    result = nerfcli("convert", tmp_path / "reconstruction.json", tmp_path / "out", "--to", "transforms")
+    assert result.exit_code == BAD_INPUT
+    assert "not valid JSON" in error_of(result)[0]
+
+
 def test_doctor_refuses_the_number_of_further_photos_where_no_run_is(tmp_path):
     lines = error_of(nerfcli("doctor", tmp_path, "--views", "3"))
     assert "--views is for runs" in lines[0]

@@ -249,3 +249,11 @@ def test_captures_of_other_programs_show_their_cameras_and_how_to_train_on_them(
     assert any("focal" in line for line in shown)
     assert shown[-1].startswith("  to train: nerfcli convert ")
     assert shown[-1].endswith(" SCENE --to nerfcli")
+
+
+def test_headers_of_arrays_that_python_cannot_parse_are_damage(tmp_path):
+    """NumPy passes on what Python's tokenizer raises at a header without an end."""
+    path = tmp_path / "a.npy"
+    np.save(path, np.zeros((2, 3)))
+    path.write_bytes(path.read_bytes().replace(b"}", b"("))
+    assert f"{path} is damaged or does not contain arrays" in info(path).stderr.splitlines()[0]

@@ -5,6 +5,7 @@ An archive holds one array per map under the names of `exr.CHANNELS` or "rgb", a
     archive = np.load("a.npz"); depth = archive["depth"]; meta = json.loads(str(archive["meta"]))
 """
 
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -17,6 +18,12 @@ from nerfcli.errors import UserError
 from nerfcli.media.depth_pictures import DepthMeta, check_map
 
 META = "meta"
+
+# Exceptions of NumPy for damaged files.
+_DAMAGED = (
+    *(OSError, ValueError, EOFError, KeyError, NotImplementedError),
+    *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
 
 
 def write_npy(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
@@ -69,7 +76,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
                 return {name: loaded[name] for name in loaded.files if name != META}
     except FileNotFoundError as error:
         raise UserError(f"cannot read {path}: {error.strerror}", "give a .npy or .npz file") from error
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+    except _DAMAGED as error:
         raise UserError(
             f"{path} is damaged or does not contain arrays of numbers: {error}", "render the depth map again"
         ) from error

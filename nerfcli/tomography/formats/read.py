@@ -117,13 +117,13 @@ def _has_transforms(folder: Path) -> bool:
         return False
     try:
         return "transmission" in str(json.loads(file.read_text(encoding="utf-8")).get("measurement"))
-    except (OSError, ValueError, AttributeError):
+    except (OSError, ValueError, AttributeError, RecursionError):
         return False
 
 
 def _states_stack(path: Path) -> bool:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
     return isinstance(content, dict) and {"projections", "kind", "beam"} <= set(content)
