@@ -26,13 +26,14 @@ from nerfcli.runs.files import FIELD
 from nerfcli.runs.run import Run
 from nerfcli.surface import extent
 from nerfcli.surface.colmap_dense import read_map, write_map, write_photo, write_sparse, write_stereo
+from nerfcli.surface.colours import point_colours, surface_colours
 from nerfcli.surface.extent import Grid, scene_box
 from nerfcli.surface.fusion import FusedVolume, fuse
 from nerfcli.surface.marching import mesh_of, simplified, surface_of, without_small_pieces
 from nerfcli.surface.points import agreed_points
 from nerfcli.surface.settings import SurfaceSettings
 from nerfcli.surface.views import DepthView, normals_of, plane_rays
-from nerfcli.surface.volume import density_at, point_colours, sample_volume, surface_colours
+from nerfcli.surface.volume import density_at, sample_volume
 from nerfcli.workflows.describe import describe
 from nerfcli.workflows.export import export_run
 

@@ -110,13 +110,11 @@ def detect(capture: Capture, *, axes: str, progress: Callable[[float, str], None
     poses = poses_of(capture)
     conventions = [Convention(name, inverted) for inverted in (False, True) for name in _different_axes(axes)]
     best, question = _axes_and_scale(evidence, poses, conventions, declared)
-    questions, further = (
-        [question],
-        [
-            ("image size", [replace(best, intrinsics_scale=scale) for scale in SCALES]),
-            ("pixel centre", [replace(best, pixel_centre=centre) for centre in (0.5, 0.0)]),
-        ],
-    )
+    questions = [question]
+    further = [
+        ("image size", [replace(best, intrinsics_scale=scale) for scale in SCALES]),
+        ("pixel centre", [replace(best, pixel_centre=centre) for centre in (0.5, 0.0)]),
+    ]
     for name, variants in further if evidence.shows_intrinsics else ():
         tried = [(variant, _errors(evidence, poses, variant, axes)) for variant in variants]
         question = _question(name, tried, declared, evidence)

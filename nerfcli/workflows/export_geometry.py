@@ -24,13 +24,14 @@ from nerfcli.render.model import Model
 from nerfcli.render.visibility import coverage_and_parallax
 from nerfcli.runs.run import Run
 from nerfcli.surface.colmap_dense import photo_name, write_photo, write_sparse, write_stereo
+from nerfcli.surface.colours import surface_colours
 from nerfcli.surface.extent import Grid, automatic_voxel, scene_box
 from nerfcli.surface.fusion import fuse
 from nerfcli.surface.marching import SEEN, Mesh, simplified, surface_of, without_small_pieces
 from nerfcli.surface.points import agreed_points
 from nerfcli.surface.settings import MOST_VIEWS, SurfaceSettings
 from nerfcli.surface.views import DepthView, depth_views, spread_frames
-from nerfcli.surface.volume import automatic_volume_voxel, sample_volume, surface_colours
+from nerfcli.surface.volume import automatic_volume_voxel, sample_volume
 from nerfcli.workflows.notices import Notify, Progress, part_of
 
 FORMAT = "nerfcli geometry 1"

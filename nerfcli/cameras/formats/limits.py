@@ -1,4 +1,4 @@
-"""Limits of the numbers in captures, beyond which they are damaged even if the file parses; exactly rigid poses."""
+"""Checks of the numbers in captures, which may be damaged even if the file parses: cameras, positions and poses."""
 
 from collections.abc import Callable
 
