@@ -36,9 +36,9 @@ def reason_of(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
-def count_of(number: int, noun: str) -> str:
-    """Return a number with its noun, which takes an s unless the number is 1."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+def several(count: int, singular: str, plural: str = "") -> str:
+    """Return a count with its noun: 1 photo, 2 photos."""
+    return f"{count} {singular if count == 1 else plural or singular + 's'}"
 
 
 def listed(names: Sequence[str], most: int) -> str:

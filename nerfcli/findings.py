@@ -63,8 +63,3 @@ def as_json(finding: Finding) -> dict[str, object]:
         "advice": finding.advice,
         "photos": [{"name": name, "what": what} for name, what in finding.photos],
     }
-
-
-def several(count: int, singular: str, plural: str = "") -> str:
-    """Return a count with its noun: 1 photo, 2 photos."""
-    return f"{count} {singular if count == 1 else plural or singular + 's'}"

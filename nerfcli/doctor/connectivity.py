@@ -7,7 +7,8 @@ import numpy as np
 
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
-from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, worst
+from nerfcli.errors import several
+from nerfcli.findings import BAD, GOOD, LOOK, Finding, worst
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.retrieval import alike, likeness
 

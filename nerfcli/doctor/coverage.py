@@ -10,8 +10,8 @@ from nerfcli.cameras.formats.colmap import read_model
 from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_direction, views_of
 from nerfcli.doctor.geometry import BASELINE_BAD, BASELINE_LOOK
 from nerfcli.doctor.photo_facts import PhotoFacts
-from nerfcli.errors import count_of
-from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, worst
+from nerfcli.errors import several
+from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
 from nerfcli.media.geodesy import east_north_up
 from nerfcli.scene import Scene, model_folder
 
@@ -132,7 +132,7 @@ def points(scene: Scene) -> Finding | None:
     return Finding(
         "points",
         LOOK if few else GOOD,
-        f"{middle:.0f} 3D points in the median photo" + (f", {count_of(len(few), 'photo')} with few" if few else ""),
+        f"{middle:.0f} 3D points in the median photo" + (f", {several(len(few), 'photo')} with few" if few else ""),
         middle,
         f"per photo: look below {_POINTS_LOOK}",
         "their poses are uncertain: check renderings from there" if few else "",

@@ -8,7 +8,8 @@ import numpy as np
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.moving import Patch
 from nerfcli.doctor.photo_facts import PhotoFacts
-from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, worst
+from nerfcli.errors import several
+from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
 from nerfcli.multiview.stationary import LEAST_FRACTION, together
 
 # Baseline over depth: 0.1 is an angle of 6 degrees between two rays to the same point.

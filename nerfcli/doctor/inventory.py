@@ -9,7 +9,8 @@ import numpy as np
 
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
-from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_above, verdict_below
+from nerfcli.errors import several
+from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_above, verdict_below
 from nerfcli.media.focal_evidence import focal_evidence
 
 FEWEST_PHOTOS = 4

@@ -12,7 +12,8 @@ import numpy as np
 from nerfcli.doctor.examination import Diagnosis
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.doctor.quality import BLURRED, STOPS_LOOK
-from nerfcli.findings import BAD, GOOD, LOOK, VERDICTS, Finding, several, worst
+from nerfcli.errors import several
+from nerfcli.findings import BAD, GOOD, LOOK, VERDICTS, Finding, worst
 from nerfcli.pages import page
 from nerfcli.pages.embedded_pictures import data_uri, jpeg_bytes, picture_rule, png_bytes
 

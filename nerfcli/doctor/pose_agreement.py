@@ -13,7 +13,8 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.frame import Frame
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
-from nerfcli.findings import BAD, GOOD, LOOK, Finding, several
+from nerfcli.errors import several
+from nerfcli.findings import BAD, GOOD, LOOK, Finding
 from nerfcli.multiview.epipolar import sampson_angles
 
 # Photos that look alike match at the wrong place, too: of the pairs of fox, 18 % are off by more than 10 px. They have

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.cameras.formats.run_cameras import RunCameras
-from nerfcli.errors import UserError, count_of, listed
+from nerfcli.errors import UserError, listed, several
 from nerfcli.runs.config import RunConfig
 from nerfcli.runs.log import LogEntry
 from nerfcli.runs.run import Run
@@ -83,7 +83,7 @@ def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
     yield from _of_poses(facts.poses or {})
     missing = facts.config.missing_photos
     if missing:
-        yield "scene", f"{count_of(len(missing), 'photo')} missing: {listed(missing, _NAMED)}"
+        yield "scene", f"{several(len(missing), 'photo')} missing: {listed(missing, _NAMED)}"
     for note in facts.config.warnings:
         yield "training", note
     rollbacks = max((entry.get("rollbacks", 0) for entry in facts.log), default=0)
@@ -140,7 +140,7 @@ def _of_poses(poses: dict[str, Any]) -> Iterator[tuple[str, str]]:
     left_out = [image for image in poses.get("images", []) if not image.get("registered")]
     if left_out:
         reasons = [f"{image['name']} ({image.get('reason') or 'unknown reason'})" for image in left_out]
-        yield "poses", f"{count_of(len(left_out), 'photo')} without a pose: {listed(reasons, _NAMED)}"
+        yield "poses", f"{several(len(left_out), 'photo')} without a pose: {listed(reasons, _NAMED)}"
     for failure in poses.get("verdict", {}).get("failures", []):
         yield "poses", str(failure)
     attempts = poses.get("attempts", [])

@@ -12,7 +12,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import nearest_to_rays
-from nerfcli.errors import UserError, count_of
+from nerfcli.errors import UserError, several
 from nerfcli.scale.estimate import ScaleEstimate
 
 # A corner is used if two of its directions differ by at least this; with less, its depth is hardly known.
@@ -154,7 +154,7 @@ def _no_scale(pattern: str, sightings: Sightings, reasons: Sequence[str]) -> Use
     photos = len({index for seen in sightings.values() for index, _ in seen})
     most = max(set(reasons), key=reasons.count) if reasons else "no side has two triangulated corners"
     return UserError(
-        f"no scale from the {pattern} in {count_of(photos, 'photo')}: {len(reasons)} of {len(sightings)}"
+        f"no scale from the {pattern} in {several(photos, 'photo')}: {len(reasons)} of {len(sightings)}"
         f" corners cannot be triangulated, mostly {most}",
         "the pattern must not move, and at least two photos must show it from different directions",
     )

@@ -13,7 +13,7 @@ from nerfcli.convert.conversion import ConventionOverrides, Conversion, TargetOp
 from nerfcli.convert.formats import Format, UserInputs, recording
 from nerfcli.convert.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.convert.world_frame import WorldFrame, in_world_frame
-from nerfcli.errors import UserError, count_of
+from nerfcli.errors import UserError, several
 from nerfcli.media.images import HEIC_SUFFIXES
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
@@ -85,7 +85,7 @@ def _describe_outside(capture: Capture) -> str | None:
     if not outside:
         return None
     return (
-        f"the principal point of {count_of(len(outside), 'photo')}, such as {outside[0]}, is outside the picture; if "
+        f"the principal point of {several(len(outside), 'photo')}, such as {outside[0]}, is outside the picture; if "
         "the intrinsics are for larger pictures, say so with --from-size (--detect finds the factor)"
     )
 
@@ -165,7 +165,7 @@ def contents(capture: Capture) -> str:
     """Describe the content of a capture in a few words."""
     cameras = len({frame.camera for frame in capture.frames})
     counts = ((len(capture.frames), "image"), (cameras, "camera"), (len(capture.points), "point"))
-    return ", ".join(count_of(number, noun) for number, noun in counts)
+    return ", ".join(several(number, noun) for number, noun in counts)
 
 
 def _record(done: Conversion, to: str) -> dict[str, Any]:

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, several
 from nerfcli.evaluate.depth_errors import measure_depth_errors
-from nerfcli.findings import several
 from nerfcli.media.masks import read_mask
 from nerfcli.render.depth_errors import STRATA, DepthErrors
 from nerfcli.render.model import Model

@@ -7,7 +7,7 @@ from pathlib import Path
 from nerfcli import scene as scenes
 from nerfcli.atomic import clear_leftovers
 from nerfcli.cameras.orientation import describe_rescaling
-from nerfcli.errors import UserError, count_of, listed
+from nerfcli.errors import UserError, listed, several
 from nerfcli.exclusive import exclusive
 from nerfcli.runs.blocks import divide
 from nerfcli.runs.config import split_hash
@@ -106,7 +106,7 @@ def _trained(
     loaded = scene_for(settings, folder, holdout=holdout)
     if loaded.missing:
         names = listed(loaded.missing, NAMES_SHOWN)
-        warn(f"{count_of(len(loaded.missing), 'missing photo')} of {folder} skipped: {names}")
+        warn(f"{several(len(loaded.missing), 'missing photo')} of {folder} skipped: {names}")
     for text in describe_rescaling(loaded.rescaled):
         notify(text)
 

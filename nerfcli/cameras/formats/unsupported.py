@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterable
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture
-from nerfcli.errors import UserError, count_of
+from nerfcli.errors import UserError, several
 
 # Parameters that every format of perspective pictures has a place for.
 _PINHOLE = ("f", "fx", "fy", "cx", "cy")
@@ -41,7 +41,7 @@ def lost_of_cameras(capture: Capture, lost: Callable[[Camera], Iterable[str]]) -
     """
     cameras = {frame.camera for frame in capture.frames}
     counts = Counter(name for camera in cameras for name in lost(camera))
-    return [f"{name} of {count_of(count, 'camera')}" for name, count in sorted(counts.items())]
+    return [f"{name} of {several(count, 'camera')}" for name, count in sorted(counts.items())]
 
 
 def distortion(camera: Camera) -> dict[str, float]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pycolmap
 
-from nerfcli.errors import count_of
+from nerfcli.errors import several
 from nerfcli.multiview.graph import consistent_groups
 from nerfcli.poses.engine.database import keep_geometries
 from nerfcli.poses.engine.ladder import SMALLER_BASELINE
@@ -152,7 +152,7 @@ def grow(
         return given
     what = "from the accepted model"
     takes = mapped.seconds * len(apart) / (len(placed) + len(apart))
-    tell(f"{count_of(len(apart), 'photo')} in smaller models, next: {what} (about {duration(takes)})")
+    tell(f"{several(len(apart), 'photo')} in smaller models, next: {what} (about {duration(takes)})")
 
     def make() -> MappedModels:
         return _mapped_without(mapped, frozenset(), report, base=pycolmap.Reconstruction(model))

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
-from nerfcli.errors import TOO_FEW_PHOTOS, UserError, count_of
+from nerfcli.errors import TOO_FEW_PHOTOS, UserError, several
 from nerfcli.media.exif import Exif, read_exif
 from nerfcli.media.focal_evidence import focal_evidence, with_digital_zoom
 from nerfcli.media.images import list_photos, list_unreadable, name_in, read_image, where_photos_may_be
@@ -131,7 +131,7 @@ def _examine(path: Path, name: str) -> Photo | str:
 def _too_few(folder: Path, photos: list[Photo], unreadable: dict[str, str]) -> UserError:
     add = "20 or more that overlap by two thirds work well"
     if not unreadable:
-        text = f"{folder} has only {count_of(len(photos), 'photo')}; at least {MIN_PHOTOS} are needed"
+        text = f"{folder} has only {several(len(photos), 'photo')}; at least {MIN_PHOTOS} are needed"
         return UserError(text, f"add photos from other viewpoints; {add}", TOO_FEW_PHOTOS)
     name, reason = next(iter(unreadable.items()))
     few = f"only {len(photos)}" if photos else "none"

@@ -7,7 +7,7 @@ from typing import Any
 
 from nerfcli.cameras.calibration import Calibration, PhotoCalibration, Picture, calibrated
 from nerfcli.cameras.orientation import counted, describe_rescaling, rescaling
-from nerfcli.errors import UserError, count_of
+from nerfcli.errors import UserError, several
 from nerfcli.media.exif import Exif
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.panoramas import MOST_OF_A_CAMERA, PANORAMA
@@ -190,7 +190,7 @@ def _notes(given: GivenIntrinsics, found: Sequence[PhotoCalibration]) -> tuple[s
     ways = [f"{count} by {how}" for count, how in ((named, "name"), (len(found) - named, "size")) if count]
     used = len({one.number for one in found})
     first = (
-        f"intrinsics of {calibration.path} ({given.use}): {count_of(used, 'camera')} for "
+        f"intrinsics of {calibration.path} ({given.use}): {several(used, 'camera')} for "
         f"{len(found)} photos, {' and '.join(ways)}"
     )
     other_sizes = counted(rescaling(calibration.cameras[one.number], one.camera) for one in found)

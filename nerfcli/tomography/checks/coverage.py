@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_above, verdict_below
+from nerfcli.errors import several
+from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_above, verdict_below
 from nerfcli.tomography.checks.sample import Sample
 from nerfcli.tomography.circle import circle_of
 from nerfcli.tomography.geometry import ScanGeometry

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from nerfcli.findings import Finding, several, verdict_above, verdict_below, worst
+from nerfcli.errors import several
+from nerfcli.findings import Finding, verdict_above, verdict_below, worst
 from nerfcli.tomography.checks.sample import Sample
 
 # Standard deviations of noise beyond which a pixel counts as brighter than the open beam.

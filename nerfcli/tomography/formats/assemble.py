@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.errors import UserError
-from nerfcli.findings import several
+from nerfcli.errors import UserError, several
 from nerfcli.holdout import names_held_out
 from nerfcli.tomography.circle import Circle
 from nerfcli.tomography.formats.scan_options import MILLIMETRES, ScanOptions, check_pixel_size
