@@ -583,6 +583,16 @@ def test_exposures_are_kept_on_evidence():
     assert [change for change in tried if change[0] == "exposure"] == []
 
 
+def test_a_sky_that_points_confirm_is_in_the_model_from_the_start():
+    facts = replace(FITTED, sky_fraction=0.2, sky_confirmed=True)
+    model, decisions = with_evidence(Components(), facts)
+    assert model == Components(background="sphere")
+    assert decisions[0].kept
+    assert decisions[0].why == "20 % of the pixels look like a sky and have no 3D points in front of them"
+    assert with_evidence(Components(), replace(facts, fixed=("background",)))[0] == Components()
+    assert ("background", "sphere") not in proposals(model, signs(0.0, 0.3), facts)[0]
+
+
 def test_a_sky_that_pixels_look_like_is_tried_and_kept_if_it_does_not_lose():
     change = ("background", "sphere")
     nearby = signs(0.0, 0.0)

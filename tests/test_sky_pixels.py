@@ -6,7 +6,8 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.multiview import sky
-from nerfcli.multiview.sky import sky_masks
+from nerfcli.multiview.sky import PointsBefore, points_before, sky_masks
+from nerfcli.multiview.tracks import Tracks
 from nerfcli.photos.loading import LoadedPhoto
 
 CAMERA = Camera.pinhole(160, 120, 140.0)
@@ -101,3 +102,52 @@ def test_a_mask_is_no_sky():
     for mask in sky_masks(masked, threads=2):
         assert not mask[:, :79].any()
         assert mask[:, 80:].any()
+
+
+def before(points: np.ndarray, of: list[LoadedPhoto], *, seen_by: int) -> PointsBefore:
+    """Return what the tracks of these points (N, 3), each seen by the first photos, say about the masks of the sky."""
+    numbers, indices = np.tile(np.arange(len(points)), seen_by), np.repeat(np.arange(seen_by), len(points))
+    rays = points[numbers] - np.array([one.frame.centre for one in of])[indices]
+    tracks = Tracks(indices, numbers, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    return points_before(sky_masks(of, threads=1), of, tracks)
+
+
+def points_in_front(count: int, *, above: bool) -> np.ndarray:
+    """Return points (N, 3) 2 to 5 units away, above the skyline or below."""
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(2.0, 5.0, count)
+    slope = rng.uniform(-0.35, -0.25, count) if above else rng.uniform(-0.1, 0.4, count)
+    return np.stack([rng.uniform(-0.3, 0.3, count) * depth, slope * depth, depth], axis=-1)
+
+
+def test_points_below_the_skyline_confirm_the_sky_and_points_above_refute_it():
+    ground = before(points_in_front(800, above=False), photos(), seen_by=3)
+    assert ground.found == 0
+    area = np.mean([mask.mean() for mask in sky_masks(photos(), threads=1)])
+    assert 0.7 * 5 * 700 * area / (1 - area) < ground.expected < 5 * 800 * area / (1 - area)
+    assert ground.confirm
+    assert not ground.refute
+    both = np.concatenate([points_in_front(800, above=False), points_in_front(30, above=True)])
+    wall = before(both, photos(), seen_by=3)
+    assert 60 < wall.found <= 150  # in all five photos, wherever the three that see them stand
+    assert wall.refute
+    assert not wall.confirm
+
+
+def test_few_points_and_points_of_two_photos_decide_nothing():
+    for points, seen_by in ((points_in_front(100, above=False), 3), (points_in_front(800, above=True), 2)):
+        found = before(points, photos(), seen_by=seen_by)
+        assert not found.confirm
+        assert not found.refute
+    assert points_before([np.zeros((120, 160), bool)] * 5, photos(), Tracks(*empty())) == PointsBefore(0, 0.0)
+
+
+def empty() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
+
+
+def test_more_points_than_needed_are_thinned_out(monkeypatch):
+    monkeypatch.setattr(sky, "MOST_POINTS", 400)
+    whole = before(points_in_front(800, above=False), photos(), seen_by=3)
+    monkeypatch.undo()
+    assert 0.4 < whole.expected / before(points_in_front(800, above=False), photos(), seen_by=3).expected < 0.6

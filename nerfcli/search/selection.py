@@ -67,6 +67,7 @@ class Facts:
         points: number of pixels that see a point at a known distance.
         stereo: number of pixels with a depth from stereo matching.
         sky_fraction: fraction of the pixels that look like a sky, see `multiview.sky`.
+        sky_confirmed: whether 3D points confirm that it is one.
         exposure_spread: standard deviation of the photos' brightness at points that they share, in logarithms of light.
         fixed: names of the components that the user has set.
     """
@@ -79,6 +80,7 @@ class Facts:
     points: int = 0
     stereo: int = 0
     sky_fraction: float = 0.0
+    sky_confirmed: bool = False
     exposure_spread: float = 0.0
     fixed: tuple[str, ...] = ()
 
@@ -144,8 +146,8 @@ def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bo
 def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
     """Return the model with components that photos support before any training, unless set, and the decisions.
 
-    These are points, at which rays should end, depths from stereo matching, and exposures from shared pixels. They are
-    in the model from the first step on: later, density has formed elsewhere already.
+    These are points, at which rays should end, depths from stereo matching, exposures from shared pixels, and a sky
+    that 3D points confirm. They are in the model from the first step on: later, density has formed elsewhere already.
     """
     wanted: list[tuple[Change, str]] = []
     if facts.points and may_use_points(requested, facts):
@@ -156,6 +158,11 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
             per_cent = 100.0 * math.expm1(facts.exposure_spread)
             reason = f"photos differ in brightness by {per_cent:.0f} % at the same points"
             wanted.append((("exposure", "learned"), reason))
+    if facts.sky_confirmed:
+        reason = (
+            f"{100.0 * facts.sky_fraction:.0f} % of the pixels look like a sky and have no 3D points in front of them"
+        )
+        wanted.append((("background", "sphere"), reason))
     wanted = [(change, reason) for change, reason in wanted if change[0] not in facts.fixed]
     values: dict[str, Any] = dict(change for change, _ in wanted)
     model = replace(requested, **values)

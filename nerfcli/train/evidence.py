@@ -12,7 +12,7 @@ from nerfcli.fit.extent import Extent
 from nerfcli.fit.point_depth import PointDepths, point_depths, stereo_depths
 from nerfcli.multiview.correspondences import SharedFeatures
 from nerfcli.multiview.exposures import matched_log_gains
-from nerfcli.multiview.sky import sky_masks
+from nerfcli.multiview.sky import PointsBefore, points_before, sky_masks
 from nerfcli.multiview.stereo import LEAST_SIDE_PX, DenseDepth, affordable_side_px, dense_depths
 from nerfcli.photos.exif_exposure import log_exposures
 from nerfcli.photos.held_out_exposure import exif_slope
@@ -102,19 +102,31 @@ class Evidence:
         return float(measured.mean(1).std()) if len(measured) else 0.0
 
     @cached_property
-    def _plain(self) -> Tensor:
-        masks = sky_masks(self.album.photos, threads=self.settings.threads)
-        return torch.from_numpy(np.concatenate([mask.ravel() for mask in masks])).to(self.pool.colours.device)
+    def _sky_masks(self) -> list[np.ndarray]:
+        return sky_masks(self.album.photos, threads=self.settings.threads)
+
+    @cached_property
+    def _points_before_sky(self) -> PointsBefore:
+        # Tracks from matches would have two photos each.
+        return points_before(self._sky_masks, self.album.photos, self.shared.of_model)
+
+    @cached_property
+    def sky_fraction(self) -> float:
+        """Fraction of the pixels that look like a sky; 0 if there are 3D points in front of them."""
+        pixels = sum(mask.size for mask in self._sky_masks)
+        return 0.0 if self._points_before_sky.refute else sum(int(mask.sum()) for mask in self._sky_masks) / pixels
 
     @property
-    def sky_fraction(self) -> float:
-        """Fraction of the pixels that look like a sky."""
-        return float(self._plain.float().mean())
+    def sky_confirmed(self) -> bool:
+        """Whether these pixels are enough for a sky, and 3D points are everywhere else."""
+        return self.sky_fraction > LEAST_SKY_FRACTION and self._points_before_sky.confirm
 
     @property
     def sky(self) -> Tensor | None:
         """Pixels of the pool that look like a sky, (pixels,) bool; None if they are too few to be one."""
-        return self._plain if self.sky_fraction > LEAST_SKY_FRACTION else None
+        if self.sky_fraction <= LEAST_SKY_FRACTION:
+            return None
+        return torch.from_numpy(np.concatenate([mask.ravel() for mask in self._sky_masks])).to(self.pool.colours.device)
 
     @cached_property
     def of_stereo(self) -> PointDepths:

@@ -246,7 +246,7 @@ def _facts(scene: Scene, evidence: Evidence) -> Facts:
         fixed=settings.fixed,
     )
     if not facts.has_alpha and "background" not in facts.fixed:
-        facts = replace(facts, sky_fraction=evidence.sky_fraction)
+        facts = replace(facts, sky_fraction=evidence.sky_fraction, sky_confirmed=evidence.sky_confirmed)
     if may_use_points(settings.components, facts) and (shared.of_model.count or has_time or settings.components.points):
         facts = replace(facts, points=len(evidence.of_tracks.numbers))
         if may_use_stereo(settings.components, facts, has_time=bool(evidence.side_px)):
