@@ -1,0 +1,117 @@
+"""Depth of photos of cameras that moved forward, on two textured walls whose distance is known in closed form."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_stereo import LENS, NORMALS, PINHOLE, found, photo, truth
+
+from nerfcli.cameras.rigid import rotation_from_vector
+from nerfcli.multiview import forward_stereo
+from nerfcli.multiview.forward_stereo import forward_depths
+from nerfcli.multiview.stereo_view import view_of
+from nerfcli.photos.loading import LoadedPhoto
+
+AHEAD = (0.0, 0.3, 0.6, -0.3)
+
+
+def walls(count: int = 400) -> np.ndarray:
+    """Points (N, 3) of the walls."""
+    x, y = np.random.default_rng(1).uniform(-1.5, 1.5, (2, count))
+    return np.stack([x, y, ((3.0 - x[:, None] * NORMALS[:, 0]) / NORMALS[:, 2]).min(-1)], axis=-1)
+
+
+def matched(one: LoadedPhoto, other: LoadedPhoto) -> tuple[np.ndarray, np.ndarray]:
+    found = forward_depths(view_of(one, 200), view_of(other, 200), walls())
+    assert found is not None
+    return found
+
+
+CASES = {
+    "pinhole": lambda: [photo(0.0, z=z) for z in AHEAD],
+    "lens": lambda: [photo(0.0, z=z, camera=LENS) for z in AHEAD],
+    "beside the view": lambda: [photo(0.4 * z, z=z, turned=0.1 * z) for z in AHEAD],
+    "epipole outside": lambda: [photo(1.2 * z, z=z) for z in AHEAD],
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("case", CASES)
+def test_pixels_have_their_distance_within_the_error_that_is_claimed(case):
+    photos = CASES[case]()
+    for one, depth in zip(photos, found(photos), strict=True):
+        columns, rows = depth.pixels.T
+        assert len(columns) > 0.3 * PINHOLE.width * PINHOLE.height
+        off = depth.distances / truth(one.frame.camera, one.frame.world_from_cam)[0][rows, columns] - 1.0
+        assert np.median(np.abs(off)) < 0.012  # 0.1 columns
+        assert np.percentile(np.abs(off) / depth.errors, 68) < 1.0
+        assert np.mean(np.abs(off) < 0.05) > 0.97
+
+
+@pytest.mark.parametrize("z", [0.5, -0.5], ids=["ahead", "behind"])
+@pytest.mark.parametrize("x", [0.0, 0.7], ids=["in view", "epipole outside"])
+def test_inverse_depths_of_a_pair_are_unbiased(x, z):
+    one, other = photo(0.0), photo(x * z, z=z)
+    rho, errors = matched(one, other)
+    distances, _ = truth(PINHOLE, one.frame.world_from_cam)
+    bearings = PINHOLE.pixel_bearings()[0].reshape(150, 200, 3)
+    off = rho * distances * bearings[..., 2] - 1.0
+    known = np.isfinite(off)
+    assert known.mean() > 0.4
+    assert abs(np.median(off[known])) < 0.01  # 0.1 columns
+    assert np.percentile(np.abs(off[known]) / (errors * distances * bearings[..., 2])[known], 68) < 1.0
+    assert np.isfinite(errors).all()
+
+
+def test_the_centre_towards_which_the_camera_moves_has_no_depth():
+    rho, _ = matched(photo(0.0), photo(0.0, z=0.4))
+    assert np.isnan(rho[70:80, 95:105]).all()  # less than 0.05 * 180 px from the epipole
+
+
+NOTHING = {
+    "the same place": (0.0, 0.0, 400),
+    "beside": (0.5, 0.1, 400),
+    "too few points": (0.0, 0.5, 11),
+    "beyond the points": (0.0, 9.0, 400),
+}
+
+
+@pytest.mark.parametrize("case", NOTHING)
+def test_pairs_without_forward_motion_or_points_are_left_alone(case):
+    x, z, count = NOTHING[case]
+    assert forward_depths(view_of(photo(0.0), 200), view_of(photo(x, z=z), 200), walls(count)) is None
+
+
+def test_views_in_opposite_directions_are_left_alone():
+    one, other = photo(0.0), photo(0.0, z=0.5, turned=np.pi)
+    assert forward_depths(view_of(one, 200), view_of(other, 200), walls()) is None
+
+
+@given(st.floats(-np.pi, np.pi), st.floats(0.1, 6.0))
+def test_a_sector_contains_its_angles_also_across_the_end_of_the_circle(first, size):
+    angles = first + np.linspace(0.0, size, 2000)
+    begin, extent = forward_stereo._sector(np.arctan2(np.sin(angles), np.cos(angles)))
+    step = 2.0 * np.pi / forward_stereo.SECTORS
+    assert size <= extent <= size + 2.0 * step + 1e-9
+    assert np.all(np.mod(angles - begin, 2.0 * np.pi) <= extent + 1e-9)
+
+
+def test_a_full_circle_is_one_sector():
+    assert forward_stereo._sector(np.linspace(-np.pi, np.pi, 5000))[1] == pytest.approx(2.0 * np.pi)
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3), st.integers(0, 2**31))
+def test_axes_are_a_rotation_along_the_baseline(vector, seed):
+    axis = np.random.default_rng(seed).normal(size=3)
+    axis /= np.linalg.norm(axis)
+    axes = forward_stereo._axes(axis, rotation_from_vector(np.array(vector)))
+    assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    assert axes[2] == pytest.approx(axis)
+
+
+def test_points_at_twice_the_distance_of_the_second_camera_are_shifted_by_the_logarithm_of_two():
+    points = np.array([[0.5, 0.3, 2.0]] * 20)
+    assert forward_stereo._range(points, 1.0) == pytest.approx((0.85 * np.log(2.0), 1.15 * np.log(2.0)))
+    assert forward_stereo._range(points, -2.0) == pytest.approx((0.85 * np.log(2.0), 1.15 * np.log(2.0)))
+    assert forward_stereo._range(points, 1.99) is None  # magnified 200 times
