@@ -41,6 +41,13 @@ def several(count: int, singular: str, plural: str = "") -> str:
     return f"{count} {singular if count == 1 else plural or singular + 's'}"
 
 
+def duration(seconds: float) -> str:
+    """Format a duration: 8 s, 3 min, 1.5 h."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
 def listed(names: Sequence[str], most: int) -> str:
     """Return names separated by commas; if there are more than `most`, the others are only counted."""
     more = f" and {len(names) - most} more" if len(names) > most else ""

@@ -179,7 +179,7 @@ def estimate(photos: Path, scene_dir: Path, progress: Callable[[str, int, int], 
 def test_photos_without_overlap_are_too_few_and_leave_no_scene(tmp_path: Path):
     write_noise(tmp_path / "photos")
     reported: list[str] = []
-    said = r"only 0 of 5 photos registered.*matches no other photo well"
+    said = r"^none of 5 photos registered.*matches no other photo well"
     with worker_in_this_process(), pytest.raises(UserError, match=said) as caught:
         estimate_poses(
             tmp_path / "photos",

@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, TextIO, TypedDict, TypeVar
 
 import typer
 
-from nerfcli.errors import INTERRUPTED, OUT_OF_MEMORY, TERMINATED, UserError
+from nerfcli.errors import INTERRUPTED, OUT_OF_MEMORY, TERMINATED, UserError, duration
 from nerfcli.interrupts import Terminated
 
 P = ParamSpec("P")
@@ -21,6 +21,8 @@ R = TypeVar("R")
 
 # Without a terminal, progress is a plain line at most this often.
 PLAIN_LINE_SECONDS = 10.0
+# Fraction of the work that has to be done before the time left is estimated; details may state a better estimate.
+LEAST_TIMED, STATES_LEFT = 0.02, " left"
 # Error numbers of a full disk and of an exhausted quota. Files that commands write have errors of their own for these.
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 # Widths of tables of findings and of numbers in a file or a pipe, which have no width of their own.
@@ -147,15 +149,24 @@ def _bar(title: str) -> Iterator[Callable[[float, str], None]]:
 
 @contextmanager
 def _plain_lines(title: str) -> Iterator[Callable[[float, str], None]]:
-    last = time.monotonic()
+    began = last = time.monotonic()
+    first: float | None = None  # a training that is resumed does not begin at 0
 
     def update(fraction: float, detail: str) -> None:
-        nonlocal last
-        if time.monotonic() - last >= PLAIN_LINE_SECONDS:
-            last = time.monotonic()
-            _stderr(f"{title}: {100 * fraction:.0f} % {detail}".rstrip())
+        nonlocal first, last
+        now = time.monotonic()
+        first = fraction if first is None else first
+        if now - last >= PLAIN_LINE_SECONDS:
+            last = now
+            left = "" if STATES_LEFT in detail else _time_left(now - began, fraction - first, 1.0 - fraction)
+            _stderr(f"{title}: {100 * fraction:.0f} % {detail}".rstrip() + left)
 
     yield update
+
+
+def _time_left(seconds: float, done: float, to_do: float) -> str:
+    """Return the time that the fraction `to_do` takes, for the end of a line, if `done` took these seconds."""
+    return f", about {duration(seconds * to_do / done)} left" if done >= LEAST_TIMED else ""
 
 
 def _stderr(text: str) -> None:

@@ -182,7 +182,8 @@ def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:
         return UserError(text, first["advice"], TOO_FEW_PHOTOS)
     if enough:
         return None
-    placed = f"only {report.registered} of {report.total} photos registered ({photos_dir})"
+    count = f"only {report.registered}" if report.registered else "none"
+    placed = f"{count} of {report.total} photos registered ({photos_dir})"
     if sum(report.parts[1:]) > _MUCH_APART * report.total:
         sizes = " + ".join(str(size) for size in report.parts)
         text = f"{placed}: they form parts of {sizes} photos with few matches between them (disconnected)"

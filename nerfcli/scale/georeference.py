@@ -69,8 +69,9 @@ def georeference_by_points(frames: Sequence[Frame], control: ControlPoints, sour
     }
     if len(seen) < 3:
         why = "; ".join(f"{name}: {reason}" for name, reason in list(unused.items())[:4])
+        count = f"only {len(seen)}" if seen else "none"
         raise UserError(
-            f"only {len(seen)} of {len(control.places)} control points can be used" + (f" ({why})" if why else ""),
+            f"{count} of {len(control.places)} control points can be used" + (f" ({why})" if why else ""),
             "at least 3 are needed, each in two photos or more that show it from different directions",
         )
     names = list(seen)

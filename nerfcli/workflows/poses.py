@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from nerfcli.convert.camera_files import read_calibration
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, duration
 from nerfcli.poses import structure_from_motion
-from nerfcli.poses.input.plan import Plan, TimeEstimate, duration
+from nerfcli.poses.input.plan import Plan, TimeEstimate
 from nerfcli.poses.input.settings import Limits, PoseSettings
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 from nerfcli.poses.model.cameras import USES, GivenIntrinsics

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pycolmap
 
+from nerfcli.errors import duration
 from nerfcli.poses.engine.database import clear_matches, forget_features, keep_geometries, register_photos
 from nerfcli.poses.input.job import Job, Report, WorkMask
-from nerfcli.poses.input.plan import duration, limit_seconds, matching_seconds
+from nerfcli.poses.input.plan import limit_seconds, matching_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
 # Largest factor by which a mask raises the feature limit: more would only add fine features at noise level.

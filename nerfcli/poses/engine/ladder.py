@@ -13,6 +13,7 @@ from typing import Any
 
 import pycolmap
 
+from nerfcli.errors import duration
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
@@ -21,7 +22,7 @@ from nerfcli.poses.engine.mapped import MappedModels
 from nerfcli.poses.engine.mapping import MapperOptions, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
-from nerfcli.poses.input.plan import duration, extraction_seconds, mapping_seconds, matching_seconds
+from nerfcli.poses.input.plan import extraction_seconds, mapping_seconds, matching_seconds
 from nerfcli.poses.input.settings import FULL_SIZE
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model.intrinsics import field_of_view_deg

@@ -12,7 +12,7 @@ from typing import Any
 
 import pycolmap
 
-from nerfcli.errors import several
+from nerfcli.errors import duration, several
 from nerfcli.multiview.graph import consistent_groups
 from nerfcli.poses.engine.database import keep_geometries
 from nerfcli.poses.engine.ladder import SMALLER_BASELINE
@@ -26,7 +26,7 @@ from nerfcli.poses.engine.mapping import (
 )
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import capture_order
-from nerfcli.poses.input.plan import at_once_seconds, duration, mapping_seconds
+from nerfcli.poses.input.plan import at_once_seconds, mapping_seconds
 from nerfcli.poses.input.stages import stage_key
 from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict
 from nerfcli.poses.judge.checks import Checks

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli import child
-from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
+from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError, duration
 from nerfcli.memory import resident_bytes
-from nerfcli.poses.input.plan import duration
 from nerfcli.poses.input.settings import Limits
 from nerfcli.poses.judge.checks import UNDERWAY
 

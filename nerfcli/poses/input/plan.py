@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from nerfcli.errors import duration
 from nerfcli.poses.input.pairs import Pairing, retrieval_feature_count
 from nerfcli.poses.input.photos import Photos
 from nerfcli.poses.input.settings import PoseSettings
@@ -241,10 +242,3 @@ def _fraction_done(stage: str, done: int, total: int) -> float:
 
 def _telling(stage: str) -> float:
     return _TELLING_OF.get(stage, _TELLING)
-
-
-def duration(seconds: float) -> str:
-    """Format a duration: 8 s, 3 min, 1.5 h."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from nerfcli.cameras.alignment import align as similarity
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.poses.input.plan import duration
+from nerfcli.errors import duration
 from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.localise import pixels_of, place
 from nerfcli.poses.model.projection import Array, is_ahead, offsets_px
