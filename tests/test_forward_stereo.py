@@ -1,8 +1,10 @@
 """Depth of photos of cameras that moved forward, on two textured walls whose distance is known in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from test_stereo import LENS, NORMALS, PINHOLE, found, photo, truth
 
@@ -100,10 +102,12 @@ def test_a_full_circle_is_one_sector():
     assert forward_stereo._sector(np.linspace(-np.pi, np.pi, 5000))[1] == pytest.approx(2.0 * np.pi)
 
 
+@example([0.0, 0.0, 0.0], 0)
+@example([0.0, 0.0, 0.0], 1)
 @given(st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3), st.integers(0, 2**31))
 def test_axes_are_a_rotation_along_the_baseline(vector, seed):
     axis = np.random.default_rng(seed).normal(size=3)
-    axis /= np.linalg.norm(axis)
+    axis = np.eye(3)[seed] if seed < 3 else axis / np.linalg.norm(axis)
     axes = forward_stereo._axes(axis, rotation_from_vector(np.array(vector)))
     assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
     assert np.linalg.det(axes) == pytest.approx(1.0)
@@ -115,3 +119,16 @@ def test_points_at_twice_the_distance_of_the_second_camera_are_shifted_by_the_lo
     assert forward_stereo._range(points, 1.0) == pytest.approx((0.85 * np.log(2.0), 1.15 * np.log(2.0)))
     assert forward_stereo._range(points, -2.0) == pytest.approx((0.85 * np.log(2.0), 1.15 * np.log(2.0)))
     assert forward_stereo._range(points, 1.99) is None  # magnified 200 times
+    assert forward_stereo._range(points, 3.0) is None  # behind the second camera
+    near = np.concatenate([points, np.array([[0.1, 0.1, 1.1]] * 20)])  # magnified 11 times
+    assert forward_stereo._range(near, 1.0) == (0.0, pytest.approx(np.log(forward_stereo.MOST_MAGNIFICATION)))
+
+
+def test_nothing_is_sampled_from_behind_a_view():
+    """A view to the right, at 80 degrees from the baseline, shows directions at 75 degrees on the right only."""
+    one = photo(0.0, turned=np.radians(80.0))
+    view = view_of(replace(one, pixels=np.full_like(one.pixels, 200)), 200)
+    phi = np.linspace(-np.pi, np.pi, 90, dtype=np.float32)
+    sampled = forward_stereo._sampled(view, np.eye(3), np.log(np.array([3.7], np.float32)), phi)
+    assert np.all(sampled[np.abs(phi) < 0.3] == 200)
+    assert not sampled[np.abs(phi) > np.pi / 2].any()

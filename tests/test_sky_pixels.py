@@ -1,6 +1,7 @@
 """Pixels that look like a sky, in photos of a sky by direction above textured hills and of a plain wall."""
 
 import numpy as np
+import pytest
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -151,3 +152,14 @@ def test_more_points_than_needed_are_thinned_out(monkeypatch):
     whole = before(points_in_front(800, above=False), photos(), seen_by=3)
     monkeypatch.undo()
     assert 0.4 < whole.expected / before(points_in_front(800, above=False), photos(), seen_by=3).expected < 0.6
+
+
+def test_a_scene_far_from_the_origin_gives_the_same_counts():
+    both = np.concatenate([points_in_front(800, above=False), points_in_front(30, above=True)])
+    away = np.array([300.0, -200.0, 100.0])
+    elsewhere = photos()
+    for one in elsewhere:
+        one.frame.world_from_cam[:3, 3] += away
+    found, wanted = before(both + away, elsewhere, seen_by=3), before(both, photos(), seen_by=3)
+    assert found.found == pytest.approx(wanted.found, abs=2)
+    assert found.expected == pytest.approx(wanted.expected, rel=0.01)
