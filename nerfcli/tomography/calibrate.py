@@ -26,6 +26,8 @@ TILT_RANGE = np.deg2rad(2.0)
 SIGNIFICANT = 3.0
 # Weight, in photons of air, of the prior that a view's open beam is that of the scan: it drifts by about 1 %.
 PRIOR_PHOTONS = 1e4
+# The largest line integral of a ray beside the object.
+MOST_IN_AIR = 0.01
 
 
 @dataclass(frozen=True)
@@ -71,18 +73,22 @@ def detector_tilt(scan: Scan) -> Correction:
     return Correction(value, float(np.nanmean(better)), error)
 
 
-def air_factors(likelihood: Poisson, integrals: torch.Tensor, *, margin: float = 0.01) -> torch.Tensor:
+def beside_object(likelihood: Poisson, integrals: torch.Tensor) -> torch.Tensor:
+    """Return the mask (views, pixels) of the pixels whose rays pass beside the object, from their line integrals."""
+    return (integrals < MOST_IN_AIR) & (likelihood.open_beam > 0)
+
+
+def air_factors(likelihood: Poisson, integrals: torch.Tensor) -> torch.Tensor:
     """Estimate the brightness of each view relative to the open beam, from pixels beside the object.
 
-    Formula: sum of counts over sum of expected counts, for pixels whose line integral is below `margin`, with
-    `PRIOR_PHOTONS` added to both. Views without such pixels get 1.
+    Formula: sum of counts over sum of expected counts, for pixels beside the object, with `PRIOR_PHOTONS` added to
+    both. Views without such pixels get 1.
 
     Args:
         likelihood: counts, open beam and background, (views, pixels).
         integrals: (views, pixels) line integrals of a first reconstruction.
-        margin: the largest line integral that counts as air.
     """
-    air = (integrals < margin) & (likelihood.open_beam > 0)
+    air = beside_object(likelihood, integrals)
     expected = torch.where(air, likelihood.open_beam * torch.exp(-integrals) + likelihood.background, 0).double().sum(1)
     counted = torch.where(air, likelihood.counts, 0).double().sum(1)
     return ((counted + PRIOR_PHOTONS) / (expected + PRIOR_PHOTONS)).float()

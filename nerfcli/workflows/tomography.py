@@ -18,7 +18,7 @@ from nerfcli.errors import UserError
 from nerfcli.exclusive import exclusive
 from nerfcli.memory import default_memory_limit
 from nerfcli.runs.files import LOCK, METRICS
-from nerfcli.tomography.calibrate import air_factors, detector_tilt
+from nerfcli.tomography.calibrate import air_factors, beside_object, detector_tilt
 from nerfcli.tomography.centre import FEWEST_VIEWS, centre_of
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid, grid_of_scan
@@ -337,8 +337,7 @@ def _air(
     fit = reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES)
     integrals = Projector(coarse, small).forward(fit.volume, np.arange(len(views)))
     factors = air_factors(binned, integrals)
-    air = (integrals < 0.01) & (binned.open_beam > 0)
-    photons = torch.where(air, binned.counts, 0).sum(1)
+    photons = torch.where(beside_object(binned, integrals), binned.counts, 0).sum(1)
     error = float((1 / photons.clamp_min(1)).sqrt().median())
     spread = float(factors.std()) if len(factors) > 1 else 0.0
     if not forced and spread <= DRIFT * error:
