@@ -321,3 +321,9 @@ def test_a_calibration_is_fitted_to_the_picture_on_disk(tmp_path):
         fit_to_picture(camera, pose, path=path, measure=lambda _: (80, 100, 5))
     with pytest.raises(UserError, match="spherical picture"):
         turned(camera_of("EQUIRECTANGULAR"), pose, orientation=6)
+
+
+def test_a_picture_contains_its_left_and_upper_edge_but_not_the_others():
+    camera = Camera.pinhole(4, 3, 5.0)
+    pixels = np.array([[0.0, 0.0], [3.999, 2.999], [4.0, 1.0], [1.0, 3.0], [-0.001, 1.0], [1.0, -0.001], [np.nan, 1.0]])
+    assert camera.contains(pixels).tolist() == [True, True, False, False, False, False, False]

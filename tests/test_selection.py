@@ -588,7 +588,7 @@ def test_a_sky_that_points_confirm_is_in_the_model_from_the_start():
     model, decisions = with_evidence(Components(), facts)
     assert model == Components(background="sphere")
     assert decisions[0].kept
-    assert decisions[0].why == "20 % of the pixels look like a sky and have no 3D points in front of them"
+    assert decisions[0].why == "20 % of the pixels look like a sky, with hardly any 3D point in front"
     assert with_evidence(Components(), replace(facts, fixed=("background",)))[0] == Components()
     assert ("background", "sphere") not in proposals(model, signs(0.0, 0.3), facts)[0]
 

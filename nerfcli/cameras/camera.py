@@ -167,6 +167,10 @@ class Camera:
         pixels, valid = self.project(points_cam)
         return valid & ((pixels >= 0) & (pixels <= self.size)).all(axis=1)
 
+    def contains(self, pixels: np.ndarray) -> np.ndarray:
+        """Return which positions (N, 2) are in a pixel of the picture, so not on its right or lower edge; (N,) bool."""
+        return np.asarray(((pixels >= 0) & (pixels < self.size)).all(axis=1))
+
     def project_jacobian(self, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute the Jacobian of pixels with respect to points (N, 3) in camera axes and camera parameters.
 

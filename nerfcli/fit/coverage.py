@@ -44,7 +44,7 @@ def covered_cells(pool: PixelPool, side: int, contraction: str, depths: PointDep
         near_axis = away @ pose[:3, 2] >= distances * math.cos(math.radians(widest / 2 * BEYOND_CORNER))
         left, distances = left[near_axis], distances[near_axis]
         pixels, valid = camera.project(away[near_axis] @ pose[:3, :3])
-        inside = valid & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+        inside = valid & camera.contains(pixels)
         count[left] += np.where(inside, np.where(distances >= OWN_SPACE * own, LEAST_PHOTOS, 1), 0)
     covered = torch.from_numpy(count >= LEAST_PHOTOS).reshape(side, side, side)
     return covered.to(pool.colours.device)

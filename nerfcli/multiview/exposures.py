@@ -53,7 +53,7 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
             camera = second.frame.camera
             away = np.linalg.norm(points - second.frame.centre, axis=1)
             places, seen = camera.project(apply(inverse(second.frame.world_from_cam), points))
-            seen &= (places >= 0).all(1) & (places < (camera.width, camera.height)).all(1)
+            seen &= camera.contains(places)
             column, row = np.where(seen[:, None], places, 0).astype(np.int64).T
             with np.errstate(invalid="ignore"):
                 seen &= np.abs(maps[other][row, column] / np.maximum(away, 1e-12) - 1.0) < CONSISTENT

@@ -14,9 +14,9 @@ from nerfcli.multiview.stereo_view import (
     BLOCK_PX,
     DISPARITY_ERROR_PX,
     FEWEST_SHARED,
-    MOST_DISPARITIES,
     View,
     disparities,
+    disparity_count,
     per_pixel,
     range_of,
     seen_by,
@@ -147,7 +147,7 @@ def _grid(logs: np.ndarray, around: np.ndarray, span: tuple[float, float], *, fo
     full = focal * math.exp(float(logs.max()))  # as fine as the photo where that is coarsest
     by_area = math.sqrt(ENLARGEMENT * logs.size / (angle * max(extent, 1e-3)))
     scale, row_scale = (min(full, by_area * factor) for factor in (math.sqrt(NARROWING), 1.0 / math.sqrt(NARROWING)))
-    count = 16 * int(np.clip(math.ceil((span[1] - span[0]) * scale / 16), 1, MOST_DISPARITIES // 16))
+    count = disparity_count((span[1] - span[0]) * scale)
     return _Grid(
         float(logs.max() if is_ahead else logs.min()),
         -scale if is_ahead else scale,

@@ -9,9 +9,9 @@ from nerfcli.multiview.stereo_view import (
     BLOCK_PX,
     DISPARITY_ERROR_PX,
     FEWEST_SHARED,
-    MOST_DISPARITIES,
     View,
     disparities,
+    disparity_count,
     per_pixel,
     range_of,
 )
@@ -57,8 +57,8 @@ def sideways_depths(one: View, other: View, points: np.ndarray) -> tuple[np.ndar
     least, most = range_of(off, float(np.median(inverse_z)))
     per_disparity = narrowing / (focal * baseline)  # inverse z
     # The matcher prefers whole disparities: make that of the plane whole.
-    least, most = per_disparity * math.floor(least / per_disparity), most
-    count = 16 * int(np.clip(np.ceil((most - least) / per_disparity / 16), 1, MOST_DISPARITIES // 16))
+    least = per_disparity * math.floor(least / per_disparity)
+    count = disparity_count((most - least) / per_disparity)
     low, high = _bounds(one, turned, focal)
     other_low, other_high = _bounds(other, turned, focal)
     top, bottom = max(low[1], other_low[1]), min(high[1], other_high[1])

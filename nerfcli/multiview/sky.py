@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from nerfcli.cameras.camera import Camera
 from nerfcli.multiview.tracks import Tracks
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.loading import LoadedPhoto
@@ -109,16 +108,11 @@ def points_before(masks: Sequence[np.ndarray], photos: Sequence[LoadedPhoto], tr
         inner = cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8), borderType=cv2.BORDER_REPLICATE) > 0
         in_camera = (points - photo.frame.centre) @ photo.frame.world_from_cam[:3, :3]
         pixels, valid = photo.frame.camera.project(in_camera[in_camera[:, 2] > 0])
-        column, row = pixels[valid & _inside(pixels, photo.frame.camera)].astype(np.int64).T
+        column, row = pixels[valid & photo.frame.camera.contains(pixels)].astype(np.int64).T
         found += int(inner[row, column].sum())
         elsewhere = int((~mask)[row, column].sum())
         expected += elsewhere * float(inner.mean()) / max(1.0 - float(mask.mean()), 1e-6)
     return PointsBefore(found, expected)
-
-
-def _inside(pixels: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the mask (N,) of the pixels (N, 2) that are in the picture of a camera."""
-    return np.asarray((pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1))
 
 
 class _Small:
@@ -154,7 +148,7 @@ def _agreed(own: _Small, others: Sequence[_Small], up: np.ndarray) -> np.ndarray
     mine = own.levels.reshape(-1, 3)[candidate]
     for other in others:
         pixels, valid_there = other.camera.project(rays[candidate] @ other.turn)
-        inside = _inside(pixels, other.camera)
+        inside = other.camera.contains(pixels)
         in_front = np.einsum("pi,i->p", rays[candidate], other.turn[:, 2]) > 0
         seen = valid_there & inside & in_front
         column, row = np.where(seen, pixels.T, 0).astype(np.int64)

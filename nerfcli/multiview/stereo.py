@@ -1,4 +1,4 @@
-"""Dense depth of training photos by stereo matching: semi-global matching of rectified pairs that agree.
+"""Dense depth of training photos by stereo matching: semi-global matching of pairs of photos that agree.
 
 rho is an inverse depth along the optical axis.
 """
@@ -72,10 +72,11 @@ def dense_depths(
 ) -> list[DenseDepth]:
     """Estimate the distance of the pixels of each photo on which several of its neighbours agree.
 
-    Each photo is rectified with up to `NEIGHBOURS` others and matched by semi-global matching. A depth is accepted if
-    `LEAST_AGREEING` neighbours agree on it within the errors (one, where there is only one), and if the depth map of a
-    neighbour confirms it. It is the mean of the agreeing depths, weighted by inverse variance. Panoramas are matched by
-    the faces of a cube, each like a photo.
+    Each photo is matched with up to `NEIGHBOURS` others by semi-global matching, rectified, or sampled along epipolar
+    lines where the camera moved along the viewing direction. A depth is accepted if `LEAST_AGREEING` neighbours agree
+    on it within the errors (one, where there is only one), and if the depth map of a neighbour confirms it.
+    It is the mean of the agreeing depths, weighted by inverse variance. Panoramas are matched by the faces of a cube,
+    each like a photo.
 
     Args:
         tracks: sparse points, which determine the neighbours and the range of depths.
@@ -139,9 +140,8 @@ def _points_shown(photos: Sequence[LoadedPhoto], tracks: Tracks) -> tuple[np.nda
         away = points - photo.frame.centre
         same_side = np.einsum("pi,pi->p", away, towards) > SAME_SIDE_COS * np.linalg.norm(away, axis=1)
         pixels, valid = photo.frame.camera.project(apply(inverse(photo.frame.world_from_cam), points))
-        inside = (pixels >= 0).all(1) & (pixels < (photo.frame.camera.width, photo.frame.camera.height)).all(1)
         in_front = away @ photo.frame.world_from_cam[:3, 2] > 0
-        shown[index] = same_side & valid & inside & in_front
+        shown[index] = same_side & valid & photo.frame.camera.contains(pixels) & in_front
     return points, shown
 
 
@@ -195,7 +195,7 @@ def _depth(
     bearings, _ = view.pinhole.bearings(np.stack([columns, rows], axis=-1) + 0.5)
     camera = photo.frame.camera
     pixels, valid = camera.project(bearings)
-    inside = valid & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    inside = valid & camera.contains(pixels)
     whole = np.floor(pixels[inside]).astype(np.int64)
     _, first = np.unique(whole @ (1, camera.width), return_index=True)
     distances = 1.0 / (rho * bearings[:, 2])

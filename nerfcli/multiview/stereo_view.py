@@ -4,6 +4,7 @@ Letters: K is the matrix of a pinhole camera, R its rotation from the scene's ax
 optical axis.
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -84,6 +85,11 @@ def range_of(values: np.ndarray, typical: float) -> tuple[float, float]:
     least, most = np.percentile(values, RANGE_PERCENTILES)
     margin = max(BEYOND * (most - least), LEAST_RANGE * typical)
     return least - margin, most + margin
+
+
+def disparity_count(columns: float) -> int:
+    """Return how many disparities to search for a range in columns; the matcher needs a multiple of 16."""
+    return 16 * int(np.clip(math.ceil(columns / 16), 1, MOST_DISPARITIES // 16))
 
 
 def disparities(left: np.ndarray, right: np.ndarray, count: int) -> np.ndarray:

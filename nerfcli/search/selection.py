@@ -159,9 +159,7 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
             reason = f"photos differ in brightness by {per_cent:.0f} % at the same points"
             wanted.append((("exposure", "learned"), reason))
     if facts.sky_confirmed:
-        reason = (
-            f"{100.0 * facts.sky_fraction:.0f} % of the pixels look like a sky and have no 3D points in front of them"
-        )
+        reason = f"{100.0 * facts.sky_fraction:.0f} % of the pixels look like a sky, with hardly any 3D point in front"
         wanted.append((("background", "sphere"), reason))
     wanted = [(change, reason) for change, reason in wanted if change[0] not in facts.fixed]
     values: dict[str, Any] = dict(change for change, _ in wanted)

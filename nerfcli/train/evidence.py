@@ -112,16 +112,16 @@ class Evidence:
 
     @cached_property
     def sky_fraction(self) -> float:
-        """Fraction of the pixels that look like a sky; 0 if there are 3D points in front of them."""
-        pixels = sum(mask.size for mask in self._sky_masks)
-        return 0.0 if self._points_before_sky.refute else sum(int(mask.sum()) for mask in self._sky_masks) / pixels
+        """Fraction of the pixels that look like a sky; 0 if that is enough for one, but 3D points are in front."""
+        found = sum(int(mask.sum()) for mask in self._sky_masks) / sum(mask.size for mask in self._sky_masks)
+        return 0.0 if found > LEAST_SKY_FRACTION and self._points_before_sky.refute else found
 
     @property
     def sky_confirmed(self) -> bool:
         """Whether these pixels are enough for a sky, and 3D points are everywhere else."""
         return self.sky_fraction > LEAST_SKY_FRACTION and self._points_before_sky.confirm
 
-    @property
+    @cached_property
     def sky(self) -> Tensor | None:
         """Pixels of the pool that look like a sky, (pixels,) bool; None if they are too few to be one."""
         if self.sky_fraction <= LEAST_SKY_FRACTION:
