@@ -61,7 +61,12 @@ GROUPS: tuple[Group, ...] = (
     ),
     Group(
         "kernels/reference/compositing.py",
-        ("tests/test_reference_kernels.py", "tests/test_worked_examples.py", "tests/test_priors.py"),
+        (
+            "tests/test_reference_kernels.py",
+            "tests/test_worked_examples.py",
+            "tests/test_priors.py",
+            "tests/test_components.py",
+        ),
         "",
         (),
         (
@@ -76,6 +81,7 @@ GROUPS: tuple[Group, ...] = (
             Mutant("of_targets) + transmittance[first:]", "of_targets)"),
             Mutant("first = len(transmittance) - len(distances)", "first = 0"),
             Mutant("(MOST_DEVIATION * distance)).clamp_max(1.0)", "(MOST_DEVIATION * distance))"),
+            Mutant("(distance / near).square().clamp_max(1.0)", "distance.square().clamp_max(1.0)"),
         ),
     ),
     Group(
@@ -85,7 +91,7 @@ GROUPS: tuple[Group, ...] = (
         (),
         (
             Mutant("transmittance <= math.exp(-march.max", "transmittance >= math.exp(-march.max"),
-            Mutant("if targets.near_scaling and", "if not targets.near_scaling and"),
+            Mutant("if targets.near is not None and", "if targets.near is None and"),
             Mutant("contracted_distance(starts), contracted_distance(ends)", "starts, ends"),
             Mutant("middles = (starts + ends) / 2", "middles = starts"),
             Mutant("if medium.antialias and", "if not medium.antialias and"),

@@ -229,6 +229,17 @@ TRAINING: tuple[Group, ...] = (
     ),
     Group(
         "fit/fitting.py",
+        ("tests/test_field_kinds.py",),
+        "gradients_are_scaled",
+        (),
+        (
+            Mutant("min(1.0, marching.near / NEAR_PER_POINT)", "marching.near / NEAR_PER_POINT"),
+            Mutant("min(1.0, marching.near / NEAR_PER_POINT)", "1.0"),
+            Mutant("if self.components.near else None", "if True else None"),
+        ),
+    ),
+    Group(
+        "fit/fitting.py",
         ("tests/test_exposure_and_background.py",),
         "directions_without_pixels or light_of_the_sky",
         (),

@@ -101,10 +101,10 @@ def assert_agree(fast: dict[str, Tensor], exact: dict[str, Tensor], *, relative:
 
 BRANCHES = {
     "colours alone": Targets(),
-    "near": Targets(near_scaling=True),
+    "near": Targets(near=1.0),
     "distortion": Targets(distortion=True),
     "distances": Targets(distances=torch.tensor([2.0, 1.5, 1.7])),
-    "all": Targets(True, True, torch.tensor([1.2, 1.5])),
+    "all": Targets(0.7, True, torch.tensor([1.2, 1.5])),
 }
 
 
@@ -303,7 +303,7 @@ def radiance_by_hand(field: Field, rays: Rays, kept: list[list[tuple[float, floa
     return density, rgb, ends - starts, starts, index
 
 
-@pytest.mark.parametrize("near", [False, True])
+@pytest.mark.parametrize("near", [None, 1.0, 1.3])
 @pytest.mark.parametrize("name", MEDIA)
 def test_rays_of_a_training_are_single_operations_one_after_the_other(name, near):
     """Values and gradients by a loop, independent of `kernels.composition`, which both backends share."""
@@ -324,14 +324,14 @@ def test_rays_of_a_training_are_single_operations_one_after_the_other(name, near
         return rays._replace(origins=origins, directions=directions)
 
     given = learnable()
-    sums = field.backend.render_rays(given, march, field.medium(), Targets(near_scaling=near), background=background)
+    sums = field.backend.render_rays(given, march, field.medium(), Targets(near=near), background=background)
     found = gradients((sums.rgb * background.flip(0)).sum() + sums.transmittance.square().sum(), given)
 
     given = learnable()
     kept = samples_by_hand(field, given, march)
     density, rgb, lengths, starts, index = radiance_by_hand(field, given, kept)
-    if near:
-        scale = starts.square().clamp_max(1.0)
+    if near is not None:
+        scale = (starts / near).square().clamp_max(1.0)
         assert (scale < 1).any()
         density = scale * density + (1 - scale) * density.detach()
         rgb = scale[:, None] * rgb + (1 - scale[:, None]) * rgb.detach()
@@ -395,7 +395,7 @@ def test_rays_that_meet_nothing_see_the_background(wanted):
     field = field_of("compiled sizes", torch.float32, wanted)
     rays, march = rays_and_march(5, torch.float32, empty=True)
     background = torch.rand(5, 3)
-    targets = Targets(True, True, torch.tensor([1.0]))
+    targets = Targets(1.0, True, torch.tensor([1.0]))
     sums: RaySums = field.backend.render_rays(rays, march, field.medium(), targets, background=background)
     assert torch.equal(sums.rgb, background)
     assert sums.transmittance.tolist() == [1.0] * 5

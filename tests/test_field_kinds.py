@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,13 +23,15 @@ from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
 from nerfcli.fit import fitting
 from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.optimiser import FieldOptimiser
-from nerfcli.kernels import March, Rays, numba_cpu, reference, spherical_harmonics
+from nerfcli.kernels import HashGrid, March, Rays, RaySums, Targets, numba_cpu, reference, spherical_harmonics
 from nerfcli.photos.loading import load_photos
 from nerfcli.photos.pool import PixelPool
 from nerfcli.render.model import Marching, Model, load_model, save_model
+from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 
+DEFAULTS = Components()
 SMALL: dict[str, FieldSettings] = {
     "hash": HashFieldSettings(contraction="none", log2_rows=8, coarsest=4, finest=32),
     "voxels": VoxelFieldSettings(contraction="none", view_degree=2, log2_vertices=9),
@@ -276,16 +279,19 @@ def test_rows_of_the_hash_grid_decay_where_photos_say_little():
             torch.testing.assert_close(moved[3], torch.full((4,), -1e-3), rtol=1e-4, atol=0)
 
 
-def training_of_two_photos(scene: Scene, *, has_alpha: bool, log2_rows: int) -> Fitting:
+def training_of_two_photos(
+    scene: Scene, *, has_alpha: bool, log2_rows: int, near: float = 0.1, components: Components = DEFAULTS
+) -> Fitting:
     photos = [
         replace(photo, pixels=photo.pixels[..., : 3 + has_alpha])
         for photo in load_photos(scene.train_frames[:2], factor=8, threads=1)
     ]
     pool = PixelPool(photos, Similarity(1.0, np.eye(3), np.zeros(3)), torch.device("cpu"))
     settings = TrainSettings(
-        budget_seconds=None, steps=9, log2_rows=log2_rows, first_samples_per_step=2**20, samples_per_step=2**20
-    )
-    return Fitting(pool, Marching(0.1, 4.0, 0.5, 0.0), contraction="none", settings=settings)
+        budget_seconds=None, steps=9, log2_rows=log2_rows, first_samples_per_step=2**20, samples_per_step=2**20,
+        components=components,
+    )  # fmt: skip
+    return Fitting(pool, Marching(near, 4.0, 0.5, 0.0), contraction="none", settings=settings)
 
 
 @pytest.mark.parametrize("has_alpha", [True, False])
@@ -311,6 +317,24 @@ def test_steps_of_large_tables_have_more_rays(log2_rows, most, spheres: Scene, m
     monkeypatch.setattr(fitting, "ROWS_PER_RAY", 8)
     training = training_of_two_photos(spheres, has_alpha=True, log2_rows=log2_rows)
     assert training.advance(0.5).rays == most
+
+
+@pytest.mark.parametrize(("begin", "near", "wanted"), [(0.12, True, 0.4), (0.6, True, 1.0), (0.12, False, None)])
+def test_gradients_are_scaled_up_to_the_nearest_point_or_the_unit_ball(
+    begin, near, wanted, spheres: Scene, monkeypatch: pytest.MonkeyPatch
+):
+    """Rays begin at 0.3 of the distance of the nearest point."""
+    components = Components(near=near)
+    training = training_of_two_photos(spheres, has_alpha=False, log2_rows=8, near=begin, components=components)
+    backend, given = training.field.backend, []
+
+    def render_rays(rays: Rays, march: March, medium: HashGrid, targets: Targets, **others: Any) -> RaySums:
+        given.append(targets.near)
+        return type(backend).render_rays(backend, rays, march, medium, targets, **others)
+
+    monkeypatch.setattr(backend, "render_rays", render_rays)
+    training.advance(0.5)
+    assert given == [pytest.approx(wanted)]
 
 
 def test_marching_and_learning_see_pixels_of_the_same_width():

@@ -219,7 +219,7 @@ def test_points_reveal_a_narrow_baseline_and_rays_begin_before_them():
     assert has_narrow_baseline(scene)
     similarity, marching, _ = narrow_frame(scene)
     assert 4.0 < 1 / similarity.scale < 4.4
-    assert marching.near / similarity.scale == pytest.approx(0.7 / similarity.scale)
+    assert marching.near / similarity.scale == pytest.approx(0.3 / similarity.scale)
     assert marching.near / similarity.scale < 4.0
 
 

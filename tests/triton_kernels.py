@@ -544,7 +544,7 @@ def whole(
 @pytest.mark.parametrize(("count", "with_sink"), [(0, False), (1, True), (5, False), (23, True)])
 def test_a_training_gets_what_the_reference_gives_in_float64(count, with_sink):
     """Colours, distortion and gradients of rays, layers and rows, with and without a sink and fading levels."""
-    given = {"hidden": 64 if with_sink else 32, "targets": Targets(True, True), "with_sink": with_sink}
+    given = {"hidden": 64 if with_sink else 32, "targets": Targets(1.0, True), "with_sink": with_sink}
     exact = whole(kernels.backend_for(torch.device("cpu"), torch.float64), torch.float64, count, **given)
     fast = whole(TritonBackend(DEVICE), torch.float32, count, **given)
     assert int(fast["samples"]) == int(exact["samples"])

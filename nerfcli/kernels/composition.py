@@ -98,8 +98,8 @@ class Backend(abc.ABC):
             density, rgb = self._radiance(samples, rays.directions, index, medium, widths=widths, sink=sink)
         else:
             density, rgb = medium.radiance(samples.coordinates, rays.directions, index, sink=sink)
-        if targets.near_scaling and density.requires_grad:
-            scale_gradients(density, rgb, distance=starts)
+        if targets.near is not None and density.requires_grad:
+            scale_gradients(density, rgb, distance=starts, near=targets.near)
         colour, transmittance, weights = self.parts.composite(
             density, rgb, ends - starts, offsets=offsets, background=background
         )

@@ -92,12 +92,12 @@ class Targets(NamedTuple):
     """Losses of training besides the colour loss.
 
     Args:
-        near_scaling: whether gradients of samples at distance t < 1 are multiplied by t^2, see `scale_gradients`.
+        near: > 0, distance below which gradients of samples are scaled down, see `scale_gradients`; None for nowhere.
         distortion: whether `RaySums.distortion` is computed.
         distances: (K,) > 0 at which the light of the last K rays should be absorbed, K <= R; None without such rays.
     """
 
-    near_scaling: bool = False
+    near: float | None = None
     distortion: bool = False
     distances: Tensor | None = None
 

@@ -148,13 +148,13 @@ def off_target(
     return sum_along_rays(weights[part] * deviation, of_targets) + transmittance[first:]
 
 
-def scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor) -> None:
-    """Multiply the gradients that reach these tensors by min(1, distance^2).
+def scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor, near: float) -> None:
+    """Multiply the gradients that reach these tensors by min(1, (distance / near)^2).
 
     Space near a camera is crossed by many of its rays and by no other camera's: without this it learns faster than the
     space that all cameras see, and fog grows in front of the lenses.
     Source: Philip and Deschaintre 2023, Floaters no more, arXiv:2305.02756, eq. 6.
     """
-    scale = distance.square().clamp_max(1.0)
+    scale = (distance / near).square().clamp_max(1.0)
     density.register_hook(lambda gradient: gradient * scale)
     rgb.register_hook(lambda gradient: gradient * scale[:, None])
