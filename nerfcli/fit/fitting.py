@@ -35,7 +35,7 @@ MOST_RAYS, ROWS_PER_RAY = 2**14, 2**5
 DEEPEST = 7.0
 # Samples that absorb less of their ray's light than this have hardly any gradient: they are left out before their
 # colours are computed, so that steps with the same number of samples have more rays.
-LEAST_WEIGHT = 1e-3
+LEAST_WEIGHT = 3e-3
 # Weight of the opacity of rays that see the sky.
 SKY_WEIGHT = 0.1
 # Weight of the roughness of a learned background. Directions that no photo shows take the colours of their neighbours;
