@@ -232,10 +232,16 @@ TRAINING: tuple[Group, ...] = (
         ("tests/test_field_kinds.py",),
         "gradients_are_scaled",
         (),
+        (Mutant("self.ray_steps.nearest if components.near else None", "self.ray_steps.nearest"),),
+    ),
+    Group(
+        "fit/strides.py",
+        ("tests/test_field_kinds.py",),
+        "gradients_are_scaled",
+        (),
         (
             Mutant("min(1.0, marching.near / NEAR_PER_POINT)", "marching.near / NEAR_PER_POINT"),
             Mutant("min(1.0, marching.near / NEAR_PER_POINT)", "1.0"),
-            Mutant("if self.components.near else None", "if True else None"),
         ),
     ),
     Group(

@@ -16,7 +16,6 @@ from nerfcli.fit.delayed import Delayed
 from nerfcli.fit.error_map import BEGINS, ErrorMap
 from nerfcli.fit.losses import colour_losses, distance_losses, opacity_entropy
 from nerfcli.fit.movers import Movers
-from nerfcli.fit.normalisation import NEAR_PER_POINT
 from nerfcli.fit.open_cells import OpenCells
 from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.fit.point_depth import PointRays, fading
@@ -104,8 +103,6 @@ class Fitting:
         # The largest fraction of any budget so far: a training resumed with a larger budget begins at a smaller one.
         self.largest_fraction = 0.0
         self.components = settings.components
-        # Nearer than the nearest 3D point, and than the unit ball's radius, gradients are scaled down.
-        self._near = min(1.0, marching.near / NEAR_PER_POINT) if self.components.near else None
         if size is None:
             size = chosen_size(
                 settings.field,
@@ -234,7 +231,7 @@ class Fitting:
             Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
             self._march(edges, self.cells.at(self.step))._replace(least_weight=LEAST_WEIGHT),
             self.field.medium(self._detail),
-            Targets(self._near, bool(components.distortion), drawn.distances),
+            Targets(self.ray_steps.nearest if components.near else None, bool(components.distortion), drawn.distances),
             background=background,
             sink=self.optimiser.sink,
             visits=self.cells.visits,

@@ -6,6 +6,7 @@ from torch import Tensor
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
 from nerfcli.field.sizes import cube_side
+from nerfcli.fit.normalisation import NEAR_PER_POINT
 from nerfcli.render.model import Marching
 
 # Until this fraction of the budget, steps along rays are this many times as long as those of the capture: the initial
@@ -23,6 +24,8 @@ MOST_HALVINGS = 2
 class RaySteps:
     """The steps along the rays of one training: long ones first, the shortest ones from half of the budget on.
 
+    `nearest` is the distance of the nearest 3D point, at most 1, up to which gradients are scaled down.
+
     Args:
         marching: the steps of the capture.
         parallax: of the capture, see `Extent`.
@@ -30,6 +33,7 @@ class RaySteps:
 
     def __init__(self, marching: Marching, settings: FieldSettings, *, parallax: float, device: torch.device):
         self._marching, self._detailed = marching, settings.detailed
+        self.nearest = min(1.0, marching.near / NEAR_PER_POINT)
         self._halved = 2 ** halvings(marching, settings, parallax)
         self._edges = marching.stretched(1 / self._halved).edges().to(device, torch.float32)
 
