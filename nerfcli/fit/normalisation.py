@@ -19,9 +19,9 @@ from nerfcli.scene import Scene
 FARTHEST = 300.0
 NEAREST = 0.02
 # Rays begin at this fraction of the nearest depth: points miss surfaces without features, such as the ground and leaves
-# in front of a building, which would otherwise end up too far away; bounds that come with a capture are meant to
-# include everything. In a box, points reach up to the cameras. Source for bounds: load_llff.py of the code of NeRF,
-# Mildenhall et al. 2020.
+# in front of a building, which would otherwise end up too far away; even nearer, fog that no other photo contradicts
+# would remain. Bounds that come with a capture are meant to include everything. In a box, points reach up to the
+# cameras. Source for bounds: load_llff.py of the code of NeRF, Mildenhall et al. 2020.
 NEAR_PER_POINT, NEAR_PER_BOUND, NEAR_IN_BOX = 0.3, 0.9, 0.5
 # Rays begin at most this far away: depths larger than the unit ball do not tell how near a surface may be.
 MOST_NEAR = 0.5

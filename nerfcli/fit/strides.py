@@ -24,7 +24,8 @@ MOST_HALVINGS = 2
 class RaySteps:
     """The steps along the rays of one training: long ones first, the shortest ones from half of the budget on.
 
-    `nearest` is the distance of the nearest 3D point, at most 1, up to which gradients are scaled down.
+    Gradients are scaled down nearer to a camera than `nearest`: where rays begin, divided by `NEAR_PER_POINT`, at most
+    1. That is the distance of the nearest 3D point if the capture has points and no bounds.
 
     Args:
         marching: the steps of the capture.
