@@ -14,7 +14,14 @@ from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import from_parts, rotation_from_vector
-from nerfcli.evaluate.billboards import COMPARED_PIXELS, Billboards, GeometryComparison, GeometryEvidence, random_pixels
+from nerfcli.evaluate.billboards import (
+    COMPARED_PIXELS,
+    Billboards,
+    GeometryComparison,
+    GeometryEvidence,
+    gain_error_db,
+    random_pixels,
+)
 from nerfcli.evaluate.metrics import to_8_bit
 from nerfcli.evaluate.protocol import Extras, HeldOutPhoto, evaluate_model, over_white
 from nerfcli.photos.loading import load_photos
@@ -90,6 +97,75 @@ def test_a_gain_that_is_too_small_is_named_with_what_it_takes(gain: float, error
     assert words.startswith("no evidence of geometry")
     assert ("to be sure" in words) == bool(needed)
     assert needed in words
+
+
+def gain_db(errors: list[np.ndarray]) -> float:
+    return float(np.mean([10 * np.log10(parts[:, 1].sum() / parts[:, 0].sum()) for parts in errors]))
+
+
+def test_the_error_of_a_gain_is_that_of_photos_made_of_other_parts():
+    """Evidence: a bootstrap, which draws the parts of each photo anew 2000 times."""
+    generator = np.random.default_rng(3)
+    pixels = generator.integers(200, 300, (3, 16, 1))
+    errors = list(np.concatenate([pixels * generator.lognormal(size=(3, 16, 2)), pixels], axis=2))
+    redrawn = [gain_db([parts[generator.integers(16, size=16)] for parts in errors]) for _ in range(2000)]
+    assert gain_error_db(errors) == pytest.approx(np.std(redrawn), rel=0.15)
+
+
+def test_photos_whose_gains_differ_are_sure_if_all_their_parts_agree():
+    """One held-out photo has a near neighbour, the other has none: gains of 0.8 and 4.6 dB."""
+    gains = np.array([0.8, 4.6])
+    pixels = np.full(16, 256.0)
+    errors = [np.stack([pixels, pixels * 10 ** (gain / 10), pixels], axis=1) for gain in gains]
+    assert gain_error_db(errors) == pytest.approx(0.0, abs=1e-9)
+    # Parts without pixels change nothing.
+    cut = [np.concatenate([parts, np.zeros((3, 3))]) for parts in errors]
+    assert gain_error_db(cut) == gain_error_db(errors)
+
+
+def test_photos_of_one_part_tell_no_error():
+    assert gain_error_db([np.array([[1.0, 2.0, 9.0]]), np.array([[0.0, 0.0, 0.0], [3.0, 5.0, 9.0]])]) is None
+
+
+def test_the_error_of_two_parts_is_half_their_difference():
+    """Without one part, the gain of a photo of two parts is that of the other."""
+    parts = np.array([[4.0, 9.0, 30.0], [5.0, 2.0, 20.0]])
+    gains = 10 * np.log10(parts[:, 1] / parts[:, 0])
+    assert gain_error_db([parts]) == pytest.approx(abs(gains[0] - gains[1]) / 2)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "inside", "outside", "shown"),
+    [
+        pytest.param(20, 15, 0.6, 0.09, False, id="corner"),
+        pytest.param(20, 60, 0.193, 0.075, False, id="columns"),
+        pytest.param(80, 15, 0.193, 0.075, False, id="rows"),
+        pytest.param(80, 60, 0.12, 0.12, True, id="everywhere"),
+        pytest.param(80, 60, 0.105, 0.105, False, id="everywhere, small"),
+    ],
+)
+def test_a_gain_in_one_region_is_not_sure(
+    width: int, height: int, inside: float, outside: float, shown: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """A field that is off by 0.1 on grey photos, and billboards that are off by more in one region only."""
+    views = turned(4)
+    grey = np.full((60, 80, 3), 128, np.uint8)
+    billboards = Billboards(views[:2], [grey, grey])
+
+    def off(view: Frame, pixels: np.ndarray) -> np.ndarray:
+        in_region = (pixels[:, 0] < width) & (pixels[:, 1] < height)
+        return np.repeat(128 / 255 + np.where(in_region, inside, outside)[:, None], 3, axis=1)
+
+    monkeypatch.setattr(billboards, "colours", off)
+    evidence = GeometryComparison(billboards)
+    for view in views[2:]:
+        evidence.add(view, grey / 255 + 0.1, grey, np.ones((60, 80), bool))
+    shape = evidence.shape()
+    assert shape is not None
+    assert shape.shown == shown
+    of_region = width * height / 4800
+    expected = 10 * np.log10((of_region * inside**2 + (1 - of_region) * outside**2) / 0.1**2)
+    assert shape.gain_db == pytest.approx(expected, abs=0.3)
 
 
 def test_the_distance_of_a_round_wall_is_found():

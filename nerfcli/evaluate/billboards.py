@@ -34,8 +34,10 @@ COMPARED_PIXELS = 4096
 # A ray's colour is a mean over the billboards of this many near cameras, weighted with 1 / (angle^2 + LEAST_ANGLE^2),
 # where angle is that between the ray and the camera's line of sight at the point that is hit.
 BLENDED, LEAST_ANGLE_RAD = 6, math.radians(0.5)
-# A gain is significant if it is above this, and above this many standard errors over the held-out photos.
+# A gain is significant if it is above this, and above this many standard errors. These come from parts of the photos,
+# PARTS x PARTS each: there are often only two photos, whose gains differ because one of them has near neighbours.
 LEAST_GAIN_DB, STANDARD_ERRORS = 1.0, 2.0
+PARTS = 4
 SEED = 7
 
 
@@ -47,7 +49,7 @@ class GeometryEvidence:
         psnr: PSNR of the billboards, mean over the photos, dB.
         field_psnr: PSNR of the field on the same pixels.
         gain_db: field_psnr minus psnr.
-        error_db: its standard error; None with one photo.
+        error_db: its standard error, see `gain_error_db`; None if no photo has two parts.
         shown: whether the gain is significant.
         seconds: the time that fitting and comparing took.
     """
@@ -195,7 +197,7 @@ class GeometryComparison:
     def __init__(self, billboards: Billboards):
         self._billboards = billboards
         self._generator = np.random.default_rng(SEED + 1)
-        self._pairs: list[tuple[float, float]] = []
+        self._errors: list[np.ndarray] = []  # of each photo, (parts, 3), as for `gain_error_db`
         self._seconds = billboards.seconds
         self.failure: str | None = None
 
@@ -225,19 +227,49 @@ class GeometryComparison:
         pixels = random_pixels(frame, counting, COMPARED_PIXELS, self._generator)
         columns, rows = pixels.astype(int).T
         truth = small[rows, columns] / 255.0
-        of_field = np.square(downscale(to_8_bit(rendered), factor)[rows, columns] / 255.0 - truth).mean()
-        of_billboards = np.square(self._billboards.colours(frame, pixels) - truth).mean()
-        self._pairs.append((psnr_of(float(of_field)), psnr_of(float(of_billboards))))
+        of_field = np.square(downscale(to_8_bit(rendered), factor)[rows, columns] / 255.0 - truth).mean(axis=1)
+        of_billboards = np.square(self._billboards.colours(frame, pixels) - truth).mean(axis=1)
+        parts = PARTS * (PARTS * rows // height) + PARTS * columns // width
+        sums = [np.bincount(parts, weights) for weights in (of_field, of_billboards, None)]
+        self._errors.append(np.stack(sums, axis=1))
         self._seconds += time.perf_counter() - began
 
     def shape(self) -> GeometryEvidence | None:
         """Return the evidence for geometry; None if no photo could be compared or a comparison failed."""
-        if not self._pairs or self.failure is not None:
+        if not self._errors or self.failure is not None:
             return None
-        pairs = np.array(self._pairs)
-        gains = pairs[:, 0] - pairs[:, 1]
-        gain = float(gains.mean())
-        error = float(gains.std(ddof=1) / math.sqrt(len(gains))) if len(gains) > 1 else None
+        psnrs = np.array([_psnrs(parts.sum(axis=0)) for parts in self._errors])
+        field_psnr, psnr = (float(column.mean()) for column in psnrs.T)
+        gain, error = field_psnr - psnr, gain_error_db(self._errors)
         shown = gain > LEAST_GAIN_DB and gain > STANDARD_ERRORS * (error or 0.0)
-        field_psnr, psnr = (float(column.mean()) for column in pairs.T)
         return GeometryEvidence(psnr, field_psnr, gain, error, shown, self._seconds)
+
+
+def gain_error_db(errors: Sequence[np.ndarray]) -> float | None:
+    """Return the standard error of the mean gain over photos, in dB: the jackknife over their parts.
+
+    sqrt(sum over photos of (n - 1) / n sum over parts of (g - mean of g)^2) / photos,
+
+    where g is the photo's gain without one of its n parts. Source: Shao and Tu 1995, The Jackknife and Bootstrap,
+    chapter 6, with photos as strata.
+
+    Args:
+        errors: of each photo, (parts, 3): the squared errors of the field and of the billboards, and the number of
+            pixels, summed over each part. Parts without pixels do not count.
+
+    Returns:
+        None if no photo has two parts.
+    """
+    variances = []
+    for parts in errors:
+        used = parts[parts[:, 2] > 0]
+        if len(used) > 1:
+            without = np.array([np.subtract(*_psnrs(rest)) for rest in used.sum(axis=0) - used])
+            variances.append((len(used) - 1) * float(without.var()))
+    return math.sqrt(sum(variances)) / len(errors) if variances else None
+
+
+def _psnrs(sums: np.ndarray) -> tuple[float, float]:
+    """Return the PSNR of the field and of the billboards, dB, from sums of squared errors and of pixels, (3,)."""
+    of_field, of_billboards, pixels = sums.tolist()
+    return psnr_of(of_field / pixels), psnr_of(of_billboards / pixels)
