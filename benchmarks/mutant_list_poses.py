@@ -207,6 +207,28 @@ POSES: tuple[Group, ...] = (
         ),
     ),
     Group(
+        "poses/judge/parallax.py",
+        ("tests/test_pose_trust.py",),
+        "uncentred or hardly or only_turns",
+        (),
+        (
+            Mutant("shift = middle[:, None] * longest", "shift = 0 * middle[:, None]"),
+            Mutant("_STEPS = 200", "_STEPS = 5"),
+            Mutant("NO_PARALLAX_PX = 3.0", "NO_PARALLAX_PX = 0.1"),
+        ),
+    ),
+    Group(
+        "poses/judge/acceptance.py",
+        ("tests/test_pose_trust.py",),
+        "uncentred or hardly or only_turns",
+        (),
+        (
+            Mutant("turn.parallax_px < _LEAST_GAIN * (held_out_px or np.inf)", "True"),
+            Mutant("(held_out_px or np.inf)", "(held_out_px or 0.0)"),
+            Mutant("_LEAST_GAIN = 3.5", "_LEAST_GAIN = 1.0"),
+        ),
+    ),
+    Group(
         "poses/model/cameras.py",
         ("tests/test_panoramas.py",),
         "",

@@ -15,8 +15,9 @@ import pycolmap
 import pytest
 import synthetic_captures as synthetic
 from scipy.spatial.transform import Rotation
-from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
+from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Lens, Noise, Scene, View
 
+from nerfcli.cameras.alignment import align
 from nerfcli.multiview.graph import Bottlenecks, connected_groups, consistent_groups
 from nerfcli.poses.engine import ladder, mapping
 from nerfcli.poses.engine import second_chance as chances
@@ -511,6 +512,40 @@ def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
     assert turn.focal_px == pytest.approx(WIDE.params[0], rel=0.03)
 
 
+def test_a_lens_with_an_uncentred_axis_hides_no_turn(tmp_path: Path):
+    """The mapper makes up depth for what its lens lacks: points explain matches to half a pixel, with a focal length
+    that is wrong by more than half. A rotation with two radial terms and a principal point explains them as well.
+    """
+    lens = Lens("OPENCV", 1000, 750, (800.0, 805.0, 512.0, 370.0, -0.2, 0.08, 0.001, -0.002))
+    still = solve(
+        tmp_path, synthetic.panorama(12, lens, turn_deg=120), synthetic.room(2500, seed=0), Noise(features_px=0.25)
+    )
+    measures = still.examined.verdict.measures
+    assert still.model.num_reg_images() == 12
+    assert measures["triangulation_angle_deg"] > 10
+    assert still.model.camera(1).mean_focal_length() > 1.4 * 802.5
+    assert measures["parallax_px"] < 1.5 * measures["held_out"]["median_px"]
+    assert still.kinds == ["no baseline (pure rotation)"]
+
+
+def test_small_photos_of_cameras_that_hardly_move_have_depth(tmp_path: Path):
+    """640 x 360 pixels, cameras 0.17 apart in a room of 8 x 8: rotations explain all to 3 px, points to 0.4."""
+    lens = Lens("SIMPLE_RADIAL", 640, 360, (556.0, 320.0, 180.0, -0.03))
+    steps = np.random.default_rng(0).normal(scale=0.1, size=(12, 3))
+    turned = synthetic.panorama(12, lens, turn_deg=120)
+    views = [
+        View(lens, view.cam_from_world + np.column_stack([np.zeros((3, 3)), step]))
+        for view, step in zip(turned, steps, strict=True)
+    ]
+    moved = solve(tmp_path, views, synthetic.room(2500, seed=0), Noise(features_px=0.25))
+    assert moved.kinds == []
+    assert moved.examined.verdict.measures["parallax_px"] < 3
+    found = np.array([moved.model.image(number).projection_center() for number in range(1, 13)])
+    true = np.array([view.centre for view in views])
+    missed = align(found, true).apply(found) - true
+    assert np.sqrt(np.square(missed).sum(1).mean()) < 0.05 * np.sqrt(np.square(steps).sum(1).mean())
+
+
 def test_parts_that_share_nothing_are_reported_separately(tmp_path: Path):
     far = (40.0, 0.0, 0.0)
     scene = synthetic.together(synthetic.boulder(600, seed=0), synthetic.boulder(300, seed=1, centre=far))
@@ -583,6 +618,23 @@ def test_a_wrong_focal_length_in_exif_is_ignored(tmp_path: Path):
     (camera,) = climbed.models[0].cameras.values()
     assert camera.mean_focal_length() == pytest.approx(WIDE.params[0], rel=0.02)
     assert not camera.has_prior_focal_length
+
+
+def test_a_camera_without_placed_photos_has_no_focal_length(tmp_path: Path):
+    """EXIF's focal lengths are 20 and 10 times too long, and all photos of the second camera show something else."""
+    views = synthetic.ring(8, [WIDE], seed=0, turn_deg=120)
+    views += synthetic.turned_away([View(LONG, view.cam_from_world) for view in views[:2]])
+    synthetic.write_database(tmp_path / "database.db", views, synthetic.boulder(700, seed=0), noise=Noise(), seed=0)
+    job = synthetic.synthetic_job(tmp_path, views, seed=0)
+    groups = tuple(replace(group, focal_px=20 * WIDE.params[0], focal_is_prior=True) for group in job.groups)
+    job = replace(job, groups=groups)
+    register_photos(job)
+    match(job, job.pairs, lambda *progress: None)
+    notes: list[str] = []
+    climbed = climb(job, lambda *progress: None, notes.append)
+    assert len(job.groups) == 2
+    assert list(climbed.models[0].cameras) == [1]
+    assert sum("was not used" in note for note in notes) == 1
 
 
 def test_a_given_initial_pair_is_tried_once(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

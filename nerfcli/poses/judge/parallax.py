@@ -1,8 +1,9 @@
 """Parallax: how far matches deviate from a pure rotation of the camera.
 
 Without a baseline there is no depth, and a mapper that is forced to find some finds noise. A rotation about the lens
-moves every pixel by a homography, whatever its depth; the focal length and one distortion term that fit this best are
-estimated, and the remaining error is parallax.
+moves every pixel by a homography, whatever its depth; the focal length, two radial terms and the principal point that
+fit this best are estimated, and the remaining error is parallax. With fewer terms, a mapper that makes up depth for
+what its lens lacks would look better than a rotation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,8 +25,11 @@ _MOST_MATCHES = 150
 # The focal length is searched within these multiples of the longer side; beyond them, any pair looks like a rotation.
 _FOCAL_RANGE = (0.3, 4.0)
 _FOCAL_STARTS = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
-_MOST_DISTORTION = 0.4
-_STEPS = 40
+# Largest values and first steps of the two radial terms, and of the principal point's distance from the centre over
+# the longer side.
+_MOST = np.array([0.4, 0.4, 0.1, 0.1])
+_FIRST_STEPS = (0.15, 0.05, 0.05, 0.01, 0.01)
+_STEPS = 200
 
 
 @dataclass(frozen=True)
@@ -59,17 +63,19 @@ def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[i
     other = _from_middle([(pair.pixels_other, sizes[pair.other]) for pair in chosen], counts)
 
     def left_over(values: Array) -> float:
-        focal, distortion = float(np.exp(values[0])), float(values[1])
-        if not _FOCAL_RANGE[0] < focal < _FOCAL_RANGE[1] or abs(distortion) > _MOST_DISTORTION:
+        focal, (second, fourth), middle = float(np.exp(values[0])), values[1:3], values[3:]
+        if not _FOCAL_RANGE[0] < focal < _FOCAL_RANGE[1] or np.any(np.abs(values[1:]) > _MOST):
             return 1e6
+        shift = middle[:, None] * longest
         focal *= longest
-        medians = _rest(_rays(one / focal, distortion), _rays(other / focal, distortion), counts)
-        return float(np.quantile(medians, _QUANTILE) * focal)
+        p, q = (_rays((places - shift) / focal, second, fourth) for places in (one, other))
+        return float(np.quantile(_rest(p, q, counts), _QUANTILE) * focal)
 
-    start = min(np.log(_FOCAL_STARTS), key=lambda value: left_over(np.array([value, 0.0])))
-    simplex = np.array([[start, 0.0], [start + 0.15, 0.0], [start, 0.05]])
+    start = np.zeros(5)
+    start[0] = min(np.log(_FOCAL_STARTS), key=lambda value: left_over(np.array([value, 0.0, 0.0, 0.0, 0.0])))
+    simplex = np.vstack([start, start + np.diag(_FIRST_STEPS)])
     options = {"maxiter": _STEPS, "initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2}
-    found = minimize(left_over, simplex[0], method="Nelder-Mead", options=options)
+    found = minimize(left_over, start, method="Nelder-Mead", options=options)
     return RotationFit(float(found.fun), float(np.exp(found.x[0]) * longest))
 
 
@@ -97,11 +103,12 @@ def _from_middle(photos: Sequence[tuple[Array, tuple[int, int]]], counts: NDArra
     return places
 
 
-def _rays(distorted: Array, distortion: float) -> Array:
-    """Return unit rays (P, 3, M) of a pinhole with one radial term, inverted by fixed-point iteration."""
+def _rays(distorted: Array, second: float, fourth: float) -> Array:
+    """Return unit rays (P, 3, M) of a pinhole with two radial terms, inverted by fixed-point iteration."""
     x, y = given_x, given_y = distorted[:, 0], distorted[:, 1]
     for _ in range(5):
-        scale = np.maximum(1 + distortion * np.minimum(x * x + y * y, 25.0), 0.2)
+        squares = np.minimum(x * x + y * y, 25.0)
+        scale = np.maximum(1 + squares * (second + squares * fourth), 0.2)
         x, y = given_x / scale, given_y / scale
     return np.stack([x, y, np.ones_like(x)], axis=1) / np.sqrt(x * x + y * y + 1)[:, None]
 
