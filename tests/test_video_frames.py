@@ -96,6 +96,19 @@ def test_a_camera_that_stands_still_gets_no_frames_for_it(tmp_path):
     assert distances.min() > 0.9 * MOVED_FRACTION
 
 
+@pytest.mark.parametrize(("pixels", "count", "expected"), [(20.0, None, 22), (20.0, 10, 10), (80.0, None, 45)])
+def test_a_camera_that_moves_little_gets_frames_all_the_same(
+    tmp_path: Path, pixels: float, count: int | None, expected: int
+):
+    """A picture 160 wide that moves by 20 pixels in 4 s differs 12 times by 1 %, and twice as often by half of it."""
+    offsets = np.linspace(0, pixels, 100)
+    path = encode(tmp_path / "far.mp4", pan(list(offsets)), fps=25)
+    extract(path, tmp_path / "frames", count=count)
+    numbers = numbers_in(tmp_path / "frames")
+    assert len(numbers) == pytest.approx(expected, rel=0.15)
+    assert np.diff(offsets[numbers]).min() > 0.9 * 160 * 0.005
+
+
 def test_a_camera_that_never_moves_is_reported(tmp_path):
     path = encode(tmp_path / "still.mp4", pan([0.0] * 30))
     with pytest.raises(UserError, match="has only 1 different frames; at least 4") as error:

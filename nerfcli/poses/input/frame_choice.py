@@ -20,6 +20,9 @@ _MOTION_SIZE_PX = 320
 # The picture has moved when half of its corners moved by this fraction of its longer side: about what is needed for
 # parallax, and more than the shake of a hand that holds still.
 MOVED_FRACTION = 0.01
+# If a whole video moves by less than this many such steps (a drone far away), smaller ones count, down to a fraction of
+# this size: hundreds of its frames are then worth more than a handful.
+_FEW_STEPS, _LEAST_STEP = 24, 0.25
 # Fewer corners than this do not measure motion; then pictures that differ by less than this, of 255, are the same.
 _MIN_CORNERS = 12
 _SAME_LEVELS = 3.0
@@ -103,6 +106,12 @@ def choose_frames(seconds: np.ndarray, measures: Sequence[FrameMeasure], *, coun
     sharp = np.array([measure.sharpness for measure in measures])
     stretches = zip(first, [*first[1:], len(measures)], strict=True)
     return [int(start + np.argmax(sharp[start:end])) for start, end in stretches]
+
+
+def smallest_step(measures: Sequence[FrameMeasure]) -> float:
+    """Return by how much a frame must have moved to differ from another, as a fraction of the longer side."""
+    steps = sum(measure.moved >= MOVED_FRACTION for measure in measures)
+    return MOVED_FRACTION * min(1.0, max(_LEAST_STEP, steps / _FEW_STEPS))
 
 
 def _path(seconds: np.ndarray, moved: np.ndarray) -> np.ndarray:

@@ -17,12 +17,12 @@ from nerfcli.atomic import atomic_folder, write_json
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.media.video_input import MeasuredFrames, Video, measure_frames, open_video, read_frames
 from nerfcli.poses.input.frame_choice import (
-    MOVED_FRACTION,
     SHARPNESS_SIZE_PX,
     FrameMeasure,
     FrameMeter,
     MotionPicture,
     choose_frames,
+    smallest_step,
 )
 from nerfcli.poses.input.photos import MIN_PHOTOS
 
@@ -86,12 +86,14 @@ def extract_frames(
     if count is not None and count > total:
         notify(f"{path.name} has only {total} frames, but --frames is {count}: using all of them")
     numbers = choose_frames(measured.seconds, measured.values, count=min(count or DEFAULT_FRAMES, total))
+    step = smallest_step(measured.values)
     with atomic_folder(folder) as partial:
         frames = _write(
             partial,
             video,
             numbers,
             measured,
+            step,
             lambda fraction: progress(_MEASURING_FRACTION + (1 - _MEASURING_FRACTION) * fraction, "writing frames"),
         )
         if len(frames) < MIN_PHOTOS:
@@ -107,7 +109,7 @@ def extract_frames(
             "frames_in_video": total,
             "frames": frames,
             "settings": {
-                "moved_share": MOVED_FRACTION,
+                "moved_share": step,
                 "sharpness_size_px": SHARPNESS_SIZE_PX,
                 "jpeg_quality": _JPEG_QUALITY,
             },
@@ -126,6 +128,7 @@ def _write(
     video: Video,
     numbers: Sequence[int],
     measured: MeasuredFrames[FrameMeasure],
+    step: float,
     progress: Callable[[float], None],
 ) -> list[dict[str, Any]]:
     """Write the chosen frames that differ from the one written before; of similar frames, the sharpest one.
@@ -133,7 +136,8 @@ def _write(
     Returns the file's name, the number in the video from 0, the time, and the sharpness of each.
     """
     written: list[dict[str, Any]] = []
-    for number, picture in _different(zip(numbers, read_frames(video, numbers), strict=True), measured.values):
+    chosen = zip(numbers, read_frames(video, numbers), strict=True)
+    for number, picture in _different(chosen, measured.values, step=step):
         name = f"frame_{number:06d}.jpg"
         Image.fromarray(picture).save(folder / name, quality=_JPEG_QUALITY, subsampling=0)
         seconds, sharp = float(measured.seconds[number]), measured.values[number].sharpness
@@ -143,14 +147,14 @@ def _write(
 
 
 def _different(
-    frames: Iterator[tuple[int, np.ndarray]], measures: Sequence[FrameMeasure]
+    frames: Iterator[tuple[int, np.ndarray]], measures: Sequence[FrameMeasure], *, step: float
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the frames without repetitions: of a run of frames that show the same, only the sharpest."""
     best: tuple[int, np.ndarray] | None = None
     first: MotionPicture | None = None
     for number, picture in frames:
         motion = MotionPicture(picture)
-        if best is not None and first is not None and first.moved_to(motion) < MOVED_FRACTION:
+        if best is not None and first is not None and first.moved_to(motion) < step:
             if measures[number].sharpness > measures[best[0]].sharpness:
                 best = number, picture
             continue
