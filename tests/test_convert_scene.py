@@ -107,6 +107,52 @@ def test_a_known_distance_reaches_training_as_metres(tmp_path):
     assert (again.unit, again.unit_source, again.pixels) == ("metre", "1 known distance", "upright")
 
 
+def test_a_folder_of_masks_reaches_training(tmp_path):
+    """Every third mask is named as by COLMAP; the second photo has none."""
+    capture = photographed(capture_of([PINHOLE]), tmp_path / "project" / "images")
+    write_transforms(capture, tmp_path / "project" / "transforms.json")
+    masks = tmp_path / "project" / "masks"
+    for index, frame in enumerate(capture.frames):
+        place = masks / (f"{frame.name}.png" if index % 3 == 0 else Path(frame.name).with_suffix(".png"))
+        if index != 1:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            Image.new("L", (frame.camera.width, frame.camera.height), 255).save(place)
+    options = ("--to", "nerfcli", "--masks", masks)
+    result = nerfcli("convert", tmp_path / "project", tmp_path / "scene", *options)
+    assert result.exit_code == 0, result.stderr
+    count = len(capture.frames)
+    assert f"{count - 1} masks" in result.stderr
+    frames = scenes.load(tmp_path / "scene").frames
+    assert [frame.mask is None for frame in frames] == [index == 1 for index in range(count)]
+    assert all(frame.mask is None or frame.mask.parent.is_relative_to(masks) for frame in frames)
+    assert json.loads(nerfcli("info", tmp_path / "scene", "--json").stdout)["masks"] == count - 1
+
+
+def test_masks_of_other_photos_are_an_error(tmp_path):
+    capture = photographed(capture_of([PINHOLE]), tmp_path / "images")
+    write_transforms(capture, tmp_path / "transforms.json")
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "other.png").touch()
+    options = ("--to", "nerfcli", "--masks", tmp_path / "masks")
+    result = nerfcli("convert", tmp_path / "transforms.json", tmp_path / "scene", *options)
+    assert (result.exit_code, not (tmp_path / "scene").exists()) == (BAD_INPUT, True)
+    assert f"has no mask of any of the {len(capture.frames)} photos" in error_of(result)[0]
+
+
+@pytest.mark.parametrize(("left_out", "told"), [(0, True), (1, False)])
+def test_masks_beside_photos_that_are_not_used_are_told(left_out: int, told: bool, tmp_path):
+    """Named by file name alone, as masks/0001.png for images/0001.jpg; a folder that lacks some is something else."""
+    capture = photographed(capture_of([PINHOLE]), tmp_path / "images")
+    write_transforms(capture, tmp_path / "transforms.json")
+    (tmp_path / "mask").mkdir()
+    for frame in capture.frames[left_out:]:
+        (tmp_path / "mask" / f"{Path(frame.name).stem}.png").touch()
+    facts = json.loads(nerfcli("info", tmp_path, "--json").stdout)
+    assert facts["masks"] is None
+    command = f"nerfcli convert {tmp_path} SCENE --to nerfcli --masks {tmp_path / 'mask'}"
+    assert facts["unused_masks"] == (f"{tmp_path / 'mask'} is not used; to train with it: {command}" if told else None)
+
+
 @pytest.mark.parametrize("camera", [BROWN, PRISM], ids=lambda camera: camera.model)
 def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
     """Projections into the stored pictures, which OpenCV turns, against the cameras that training loads."""

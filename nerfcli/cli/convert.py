@@ -78,6 +78,10 @@ def convert(
         float, typer.Option(help="The intrinsics in IN refer to pictures larger than stated by this factor.", min=1e-3)
     ] = 1.0,
     images: Annotated[Path | None, typer.Option(help="Folder of the photos, if IN does not point to them.")] = None,
+    masks: Annotated[
+        Path | None,
+        typer.Option(help="Folder of masks named after the photos, if IN has none; black is ignored in training."),
+    ] = None,
     intrinsics: Annotated[
         Path | None,
         typer.Option(
@@ -173,6 +177,7 @@ def convert(
       nerfcli convert fox/transforms.json fox/sparse/0 --to colmap
       nerfcli convert fern poses.txt --to kitti --allow-loss
       nerfcli convert photos-scene-run refined-scene --to nerfcli
+      nerfcli convert colmap-project statue-scene --to nerfcli --masks statue-masks
       nerfcli convert poses.txt capture.npz --to npz --intrinsics cameras.txt
       nerfcli convert transforms.json opencv.json --to transforms --axes opencv --pixel-center 0
       nerfcli convert scene/ metric.npz --to npz --world-up z --origin focus --distance "a.jpg b.jpg 1.25"
@@ -201,7 +206,8 @@ def convert(
     )
 
     def given() -> UserInputs:
-        return UserInputs(images=images, camera=None if intrinsics is None else read_intrinsics(intrinsics))
+        camera = None if intrinsics is None else read_intrinsics(intrinsics)
+        return UserInputs(images=images, camera=camera, masks=masks)
 
     if detect:
         if to is not None or target is not None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import NAMED_AXES, Convention, expressed, opencv_from_axes, reinterpreted
-from nerfcli.convert.formats import Format, UserInputs, recognise, with_photos
+from nerfcli.convert.formats import Format, UserInputs, recognise, with_masks, with_photos
 from nerfcli.convert.probes import probes_of, projected
 from nerfcli.convert.readback import READERS, UnstatedFacts, read_ply
 from nerfcli.convert.reduction import reduced
@@ -86,6 +86,8 @@ def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tup
     capture = form.parse(found, given)
     if given.images is not None:
         capture = with_photos(capture, given.images)
+    if given.masks is not None:
+        capture = with_masks(capture, given.masks)
     true_convention = Convention(
         axes=form.axes if overrides.axes is None else overrides.axes,
         inverted=overrides.inverted,

@@ -34,6 +34,7 @@ from nerfcli.convert.scene_folder import SCENE_FILES, losses_scene, parse_model,
 from nerfcli.convert.stored_pixels import STORED, UPRIGHT, measure
 from nerfcli.errors import UserError, in_shell
 from nerfcli.media.images import list_images
+from nerfcli.media.masks import mask_of
 
 
 @dataclass(frozen=True)
@@ -43,10 +44,12 @@ class UserInputs:
     Args:
         images: the folder of the photos, to which names are relative.
         camera: the camera of all frames, for formats without cameras.
+        masks: a folder of masks named after the photos, see `media.masks.mask_of`.
     """
 
     images: Path | None = None
     camera: Camera | None = None
+    masks: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,25 @@ def with_photos(capture: Capture, folder: Path) -> Capture:
     for frame in capture.frames:
         candidates = (folder / frame.name, folder / Path(frame.name).name)
         frames.append(replace(frame, image=next((path for path in candidates if path.is_file()), frame.image)))
+    return replace(capture, frames=tuple(frames))
+
+
+def with_masks(capture: Capture, folder: Path) -> Capture:
+    """Return the capture with masks from a folder, by the names of the photos or by their file names alone.
+
+    Photos without a mask there keep the one that they have.
+
+    Raises:
+        UserError: no photo has a mask there.
+    """
+    found = [mask_of(frame.name, folder) for frame in capture.frames]
+    if not any(found):
+        name = Path(capture.frames[0].name)
+        raise UserError(
+            f"{folder} has no mask of any of the {len(found)} photos",
+            f"masks are named after the photos: {name.name}.png or {name.stem}.png for {name}",
+        )
+    frames = (f if mask is None else replace(f, mask=mask) for f, mask in zip(capture.frames, found, strict=True))
     return replace(capture, frames=tuple(frames))
 
 

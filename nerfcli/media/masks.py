@@ -4,6 +4,7 @@ A mask is a picture in any format, named after its photo. It has the size of the
 the file: tools that ignore the EXIF orientation write the latter, and the mask is then turned like the photo.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from nerfcli.media.images import HEIC_SUFFIXES, IMAGE_SUFFIXES, read_image, upri
 # Formats whose compression leaves artefacts around an edge, in both the black and the white areas.
 _LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg", ".webp"}) | HEIC_SUFFIXES
 _MIDDLE = 128
+_FOLDERS = ("masks", "mask")
 _HINT = "a mask must have the size of its photo; black pixels are ignored"
 
 
@@ -32,6 +34,20 @@ def find_mask(name: str, masks: Path) -> Path | None:
         *(base.with_name(base.name + suffix) for base in (whole, stem) for suffix in suffixes),
     ]
     return next((mask for mask in candidates if mask.is_file()), None)
+
+
+def masks_beside(names: Iterable[str], folder: Path) -> Path | None:
+    """Return the folder masks or mask in `folder` that has a mask of every photo; None if there is none."""
+    names = list(names)
+    for masks in (folder / name for name in _FOLDERS):
+        if masks.is_dir() and names and all(mask_of(name, masks) for name in names):
+            return masks
+    return None
+
+
+def mask_of(name: str, masks: Path) -> Path | None:
+    """Find the mask of a photo as `find_mask`, or else by its file name alone."""
+    return find_mask(name, masks) or find_mask(Path(name).name, masks)
 
 
 def read_mask(path: Path, photo: Path) -> np.ndarray:

@@ -33,7 +33,7 @@ def convert_capture(
 
     Args:
         source: a file or folder in a known format.
-        given: photos and cameras that the source does not name.
+        given: photos, masks and cameras that the source does not name.
         overrides: conventions of the source that differ from those of its format.
 
     Raises:
@@ -164,8 +164,11 @@ def detection_record(found: detect.Detection, form: str) -> dict[str, Any]:
 def contents(capture: Capture) -> str:
     """Describe the content of a capture in a few words."""
     cameras = len({frame.camera for frame in capture.frames})
+    masks = sum(frame.mask is not None for frame in capture.frames)
     counts = ((len(capture.frames), "image"), (cameras, "camera"), (len(capture.points), "point"))
-    return ", ".join(several(number, noun) for number, noun in counts)
+    return ", ".join(
+        [*(several(number, noun) for number, noun in counts), *([several(masks, "mask")] if masks else [])]
+    )
 
 
 def _record(done: Conversion, to: str) -> dict[str, Any]:

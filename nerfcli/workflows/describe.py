@@ -153,6 +153,8 @@ def _describe_scene(folder: Path) -> dict[str, Any]:
         "photos": len(scene.frames),
         "held_out": len(scene.test_frames),
         "missing": len(scene.missing),
+        "masks": sum(frame.mask is not None for frame in scene.frames) or None,
+        "unused_masks": scenes.describe_unused_masks(scene),
         **_camera_facts(scene.frames),
         "rescaled": describe_rescaling(scene.rescaled),
         "points": len(scene.points),

@@ -14,7 +14,7 @@ from nerfcli.runs.config import split_hash
 from nerfcli.runs.files import BLOCKS, CONFIG, LOCK, METRICS, STATE
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
+from nerfcli.scene import Scene, describe_unused_masks
 from nerfcli.train import loop
 from nerfcli.train.following import follow
 from nerfcli.train.ranks import joined_ranks
@@ -108,6 +108,8 @@ def _trained(
         names = listed(loaded.missing, NAMES_SHOWN)
         warn(f"{several(len(loaded.missing), 'missing photo')} of {folder} skipped: {names}")
     for text in describe_rescaling(loaded.rescaled):
+        notify(text)
+    if text := describe_unused_masks(loaded):
         notify(text)
 
     if resume and not Run(run).is_trained and not (run / STATE).exists():
