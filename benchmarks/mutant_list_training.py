@@ -177,6 +177,8 @@ TRAINING: tuple[Group, ...] = (
             Mutant("axis=1) * training_from_scene.scale", "axis=1)"),
             Mutant("(surface.misses_px[kept] / HALF_ERROR_PX) ** 2", "surface.misses_px[kept] / HALF_ERROR_PX"),
             Mutant("max(0.0, 1.0 - fraction)", "1.0 - fraction"),
+            Mutant("if parallax < 1.0 else 1.0", "if parallax < 0.5 else 1.0"),
+            Mutant("NARROW_STEPS / max(step, NARROW_STEPS)", "NARROW_STEPS / max(step, 1)"),
             Mutant("// PIXELS_PER_POINT // len(self.sets)", "// PIXELS_PER_POINT"),
         ),
     ),

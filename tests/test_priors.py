@@ -225,7 +225,31 @@ def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(c
 
 
 def test_points_fade_out():
-    assert [fading(fraction) for fraction in (0.0, 0.25, 1.0, 1.5)] == [1.0, 0.75, 0.0, 0.0]
+    wide = [fading(fraction, step=5000, parallax=1.0) for fraction in (0.0, 0.25, 1.0, 1.5)]
+    assert wide == [1.0, 0.75, 0.0, 0.0]
+    # Photos of a narrow baseline tell depth better after 800 steps.
+    assert [fading(0.5, step=step, parallax=0.5) for step in (0, 800, 3200)] == [0.5, 0.5, 0.125]
+
+
+@pytest.mark.parametrize(("parallax", "weight"), [(1.0, 0.5), (0.5, 0.125)])
+def test_points_of_a_narrow_baseline_fade_with_the_steps_of_a_training(
+    parallax: float, weight: float, capture: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Half of the budget and four times 800 steps: a loss of 4 for each distance adds 4 times its weight."""
+    settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
+    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    losses = []
+    for value in (0.0, 4.0):
+        monkeypatch.setattr(
+            "nerfcli.fit.fitting.distance_losses", lambda off, *, fraction, value=value: 0 * off + value
+        )
+        fitting = prepared.fitting()
+        assert fitting.points is not None
+        trusted = [replace(points, trust=torch.ones_like(points.trust)) for points in fitting.points.sets]
+        fitting.points = PointRays(trusted, prepared.pool)
+        fitting.step, fitting.parallax = 3200, parallax
+        losses.append(fitting.advance(0.5).loss)
+    assert losses[1] - losses[0] == pytest.approx(0.1 * weight * 4.0, rel=1e-4)
 
 
 def test_undecided_rays_have_the_largest_entropy_and_decided_ones_no_infinite_slope():

@@ -192,7 +192,7 @@ class Fitting:
         rays = min(self._most_rays, max(64, round(settings.samples_at(self.step) / max(1.0, self.samples_per_ray))))
         source = self.pool if self.error_map is None or self.largest_fraction < BEGINS else self.error_map
         drawn = source.draw(rays, self.generator)
-        if self.points is None or fading(fraction) == 0.0:
+        if self.points is None or fraction >= 1.0:
             return drawn
         return self.points.added_to(drawn, self.generator)
 
@@ -252,7 +252,8 @@ class Fitting:
             loss = loss + components.entropy * (opacity_entropy(seen.transmittance).sum() / count)
         if len(whole.distances):
             losses_of_distances = drawn.trust * distance_losses(seen.off_target, fraction=fraction)
-            loss = loss + components.points * fading(fraction) * (losses_of_distances.sum() / len(whole.distances))
+            weight = components.points * fading(fraction, step=self.step, parallax=self.parallax)
+            loss = loss + weight * (losses_of_distances.sum() / len(whole.distances))
         if self.parts.sky is not None:
             opacity = (1.0 - seen.transmittance) * self.parts.sky[drawn.numbers]
             loss = loss + SKY_WEIGHT * opacity.sum() / count

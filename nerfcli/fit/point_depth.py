@@ -20,6 +20,8 @@ PIXELS_PER_POINT = 8
 HALF_ERROR_PX = 1.0
 # Expected relative error of a stereo distance at which its pixel has half the weight.
 HALF_ERROR = 0.05
+# With a narrow baseline, depths are known less well than photos tell them after more steps than this.
+NARROW_STEPS = 800
 
 
 @dataclass(frozen=True)
@@ -125,9 +127,14 @@ def _usable(numbers: np.ndarray, distances: np.ndarray, trust: np.ndarray, *, po
     return PointDepths(torch.from_numpy(numbers).to(device), *known).among(pool)
 
 
-def fading(fraction: float) -> float:
-    """Return the weight of the points at a fraction of the budget, linear from 1 to 0.
+def fading(fraction: float, *, step: int, parallax: float) -> float:
+    """Return the weight of the points at a fraction of the budget, linear from 1 to 0; after 800 steps with a narrow
+    baseline, also in proportion to 1 / step.
 
     Once there are surfaces, photos tell more; but without points, haze before them comes back where few photos look.
+
+    Args:
+        parallax: of the capture, see `Extent`; below 1 with a narrow baseline.
     """
-    return max(0.0, 1.0 - fraction)
+    part = NARROW_STEPS / max(step, NARROW_STEPS) if parallax < 1.0 else 1.0
+    return part * max(0.0, 1.0 - fraction)
