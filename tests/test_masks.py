@@ -57,7 +57,10 @@ def laid_out(photos: Photos, masks: Path, folder: Path) -> tuple[tuple[WorkMask,
         (["a.b.jpg", "a.b.tif"], "a.b.jpg"),
         (["a.b.jpg.tif"], "a.b.jpg.tif"),
         (["a.b.webp"], "a.b.webp"),
-        (["a.png", "a.b.c.png", "a.b.txt"], None),
+        (["a.b_mask.JPG", "a.b.TIF"], "a.b.TIF"),
+        (["a.b_mask.JPG", "a.b_mask.png"], "a.b_mask.png"),
+        (["a.b_mask.JPG"], "a.b_mask.JPG"),
+        (["a.png", "a.b.c.png", "a.b.txt", "a.b.jpg_mask.png"], None),
     ],
 )
 def test_a_mask_is_named_after_its_photo(masks, there, found):

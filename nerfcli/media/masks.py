@@ -23,15 +23,18 @@ _HINT = "a mask must have the size of its photo; black pixels are ignored"
 def find_mask(name: str, masks: Path) -> Path | None:
     """Find the mask of the photo `name` in the folder `masks`; None if it has none.
 
-    The order of preference is photo.jpg.png (COLMAP's name), photo.png, the photo's own name, then other formats.
+    The order of preference is photo.jpg.png (COLMAP's name), photo.png, the photo's own name, then other formats, and
+    last photo_mask.png (OpenDroneMap's name) in any format.
     """
     whole, stem = masks / name, (masks / name).with_suffix("")
-    suffixes = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
+    named_mask = stem.with_name(f"{stem.name}_mask")
+    lower = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
+    suffixes = (*lower, *(suffix.upper() for suffix in lower))
     candidates = [
         whole.with_name(whole.name + ".png"),
         stem.with_name(stem.name + ".png"),
         whole,
-        *(base.with_name(base.name + suffix) for base in (whole, stem) for suffix in suffixes),
+        *(base.with_name(base.name + suffix) for base in (whole, stem, named_mask) for suffix in suffixes),
     ]
     return next((mask for mask in candidates if mask.is_file()), None)
 
