@@ -229,6 +229,17 @@ POSES: tuple[Group, ...] = (
         ),
     ),
     Group(
+        "poses/judge/acceptance.py",
+        ("tests/test_pose_trust.py",),
+        "long_lens or few_photos_may",
+        (),
+        (
+            Mutant("determined = unusual", "pass"),
+            Mutant("camera_id not in determined or not", "camera_id not in determined and not"),
+            Mutant("given=given, determined=determined)", "given=given)"),
+        ),
+    ),
+    Group(
         "poses/model/cameras.py",
         ("tests/test_panoramas.py",),
         "",

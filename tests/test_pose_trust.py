@@ -763,3 +763,17 @@ def test_a_few_photos_may_have_a_focal_length_that_others_may_not(photos, focal,
     for camera in model.cameras.values():  # each has few photos, but all together have not
         camera.params = [3.2 * camera.width, *camera.params[1:]]
     assert len(acceptance._implausible(model, PLAUSIBLE, given=())) == len(model.cameras)
+    assert acceptance._implausible(model, PLAUSIBLE, given=(), determined=list(model.cameras)) == []
+    first.params = [11.0 * first.width, *first.params[1:]]
+    assert len(acceptance._implausible(model, PLAUSIBLE, given=(), determined=list(model.cameras))) == 1
+
+
+def test_a_long_lens_that_the_photos_determine_is_accepted(tmp_path: Path):
+    """A macro lens and cropped photos: 3.6 times the longer side, known to better than 1 %."""
+    lens = Lens("SIMPLE_RADIAL", 1000, 1000, (3600.0, 500.0, 500.0, 0.0))
+    views = synthetic.ring(16, [lens], seed=0, radius=9.0)
+    far = solve(tmp_path, views, synthetic.boulder(900, seed=0))
+    assert far.kinds == []
+    assert far.model.num_reg_images() == 16
+    (camera,) = far.model.cameras.values()
+    assert camera.mean_focal_length() == pytest.approx(3600.0, rel=0.02)

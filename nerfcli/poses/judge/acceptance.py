@@ -33,8 +33,9 @@ _LEAST_IN_FRONT = 0.95
 # Root mean square distance of the cameras from their centre, over the median distance to the points.
 _LEAST_SPREAD = 0.003
 # Focal lengths over the longer side. A model without depth may have any; if only cameras of a few photos are outside
-# the usual range, the points of the others determine them. Photos from the internet have up to 3 times and more.
-_FOCAL_RANGE, _FOCAL_RANGE_OF_FEW, _FEW = (0.3, 3.0), (0.2, 10.0), 0.1
+# the usual range, the points of the others determine them. Photos from the internet have up to 3 times and more, and so
+# have cropped photos by macro lenses; what the photos determine may be in the wider range, too.
+_FOCAL_RANGE, _WIDER_FOCAL_RANGE, _FEW = (0.3, 3.0), (0.2, 10.0), 0.1
 _MOST_HELD_OUT_PX = 4.0
 # Parallax over the error of unused observations: with less, the points of a model explain matches hardly better than a
 # rotation does. Measured where a rotation explains all to 3 px: up to 2.7 in wrong models, 3.8 to 11 in models whose
@@ -90,6 +91,7 @@ def judge(
     threads: int,
     held: Sequence[VerifiedPair] = (),
     given: Collection[int] = (),
+    determined: Collection[int] = (),
     fixed: Sequence[int] = (),
     checks: Checks | None = None,
 ) -> Verdict:
@@ -103,6 +105,7 @@ def judge(
         names: the user's name for each photo of the model.
         held: pairs that support photos located from points of the model, see `localise.shared_pairs`.
         given: ids of cameras with given intrinsics, whose focal lengths are not checked.
+        determined: ids of cameras whose focal lengths are known to 1 %, see `lens_observability.focal_is_determined`.
     """
     run = (Checks() if checks is None else checks).run
     found: list[Agreement] = run("agreement of pairs", lambda: agreements(model, pairs), otherwise=[])
@@ -141,7 +144,7 @@ def judge(
         *_no_baseline(turn, geometry, unused["median_px"]),
         *_contradicted(contradictions, fraction, found, names=names),
         *_turned(measures["rotations"]),
-        *_implausible(model, measures, given=given),
+        *_implausible(model, measures, given=given, determined=determined),
     ]
     return Verdict(measures, tuple(failures))
 
@@ -284,7 +287,11 @@ def _turned(rotations: Mapping[str, Any]) -> list[Failure]:
 
 
 def _implausible(
-    model: pycolmap.Reconstruction, measures: Mapping[str, Any], *, given: Collection[int]
+    model: pycolmap.Reconstruction,
+    measures: Mapping[str, Any],
+    *,
+    given: Collection[int],
+    determined: Collection[int] = (),
 ) -> list[Failure]:
     """Return a failure for each value that no real capture has."""
     checks = [
@@ -309,16 +316,21 @@ def _implausible(
         for camera in _cameras_in_use(model)
         if camera.camera_id not in given and not _sees_behind(camera)
     }
-    low, high = _FOCAL_RANGE
     photos = Counter(lenses_of(model).values())
-    unusual = sum(photos[camera_id] for camera_id, focal in focals.items() if not low < focal < high)
-    if unusual < _FEW * photos.total():
-        low, high = _FOCAL_RANGE_OF_FEW
+    unusual = [camera_id for camera_id, focal in focals.items() if not _within(_FOCAL_RANGE, focal)]
+    if sum(photos[camera_id] for camera_id in unusual) < _FEW * photos.total():
+        determined = unusual
     advice = "give the intrinsics with --intrinsics, or use photos with EXIF data"
     return failures + [
         Failure(
-            "the intrinsics are implausible", f"the estimated focal length is {focal:.2f} times the longer side", advice
+            "the intrinsics are implausible",
+            f"the estimated focal length is {focals[camera_id]:.2f} times the longer side",
+            advice,
         )
-        for focal in focals.values()
-        if not low < focal < high
+        for camera_id in unusual
+        if camera_id not in determined or not _within(_WIDER_FOCAL_RANGE, focals[camera_id])
     ]
+
+
+def _within(limits: tuple[float, float], value: float) -> bool:
+    return limits[0] < value < limits[1]

@@ -15,6 +15,7 @@ from nerfcli.poses.judge.contradictions import leave_out_contradicting, without_
 from nerfcli.poses.judge.parallax import RotationFit, best_rotation_fit, panorama_rotation_fit
 from nerfcli.poses.judge.uncertainty import pose_blur_px
 from nerfcli.poses.model.intrinsics import ModelLenses, choose_lenses
+from nerfcli.poses.model.lens_observability import focal_is_determined
 from nerfcli.poses.model.localise import shared_pairs
 from nerfcli.poses.model.reasons import FEW_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, read_verified_pairs
@@ -85,6 +86,7 @@ def examine(
         seed=job.seed,
         threads=job.threads,
         given=job.given_cameras,
+        determined=[camera for camera, found in lenses.uncertainty.items() if focal_is_determined(found)],
         fixed=job.fixed_cameras,
         checks=checks,
     )

@@ -215,6 +215,11 @@ def uncertainty(
     }
 
 
+def focal_is_determined(found: Mapping[str, Any]) -> bool:
+    """Return whether an `uncertainty` knows the focal length to 1 % (one standard deviation)."""
+    return found["focal_percent"] is not None and found["focal_percent"] < 100 * _WEAK_FOCAL
+
+
 def is_centred(camera: pycolmap.Camera) -> bool:
     """Return whether the principal point is less than a tenth of the picture's size away from the centre."""
     x, y = camera.principal_point_x / camera.width, camera.principal_point_y / camera.height
