@@ -209,7 +209,7 @@ POSES: tuple[Group, ...] = (
     Group(
         "poses/judge/parallax.py",
         ("tests/test_pose_trust.py",),
-        "uncentred or hardly or only_turns",
+        "off_centre or few_pixels or only_turns",
         (),
         (
             Mutant("shift = middle[:, None] * longest", "shift = 0 * middle[:, None]"),
@@ -220,7 +220,7 @@ POSES: tuple[Group, ...] = (
     Group(
         "poses/judge/acceptance.py",
         ("tests/test_pose_trust.py",),
-        "uncentred or hardly or only_turns",
+        "off_centre or few_pixels or only_turns",
         (),
         (
             Mutant("turn.parallax_px < _LEAST_GAIN * (held_out_px or np.inf)", "True"),
@@ -231,7 +231,7 @@ POSES: tuple[Group, ...] = (
     Group(
         "poses/judge/acceptance.py",
         ("tests/test_pose_trust.py",),
-        "long_lens or few_photos_may",
+        "long_focal or few_photos_may",
         (),
         (
             Mutant("determined = unusual", "pass"),

@@ -27,7 +27,7 @@ from nerfcli.errors import UserError, in_shell
 from nerfcli.holdout import moments, names_held_out
 from nerfcli.media.exif import read_exif
 from nerfcli.media.images import image_size, list_images
-from nerfcli.media.masks import find_mask, masks_beside
+from nerfcli.media.masks import find_mask, masks_inside
 
 MODEL_FOLDER = "sparse/0"
 
@@ -372,12 +372,10 @@ def _no_scene(path: Path) -> UserError:
 
 
 def describe_unused_masks(scene: Scene) -> str | None:
-    """Say how to train with a folder of masks beside the photos that no file of the scene names; None without one."""
+    """Describe how to use a folder of masks in the scene's folder that none of its files mentions; None without one."""
     if any(frame.mask is not None for frame in scene.frames):
         return None
-    folder = scene.root if scene.root.is_dir() else scene.root.parent
-    masks = masks_beside((frame.name for frame in scene.frames), folder)
+    masks = masks_inside(scene.root, [frame.name for frame in scene.frames])
     if masks is None:
         return None
-    command = f"nerfcli convert {in_shell(scene.root)} SCENE --to nerfcli --masks {in_shell(masks)}"
-    return f"{masks} is not used; to train with it: {command}"
+    return f"{masks}; to use them: nerfcli convert {in_shell(scene.root)} SCENE --to nerfcli --masks {in_shell(masks)}"

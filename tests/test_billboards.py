@@ -103,8 +103,8 @@ def gain_db(errors: list[np.ndarray]) -> float:
     return float(np.mean([10 * np.log10(parts[:, 1].sum() / parts[:, 0].sum()) for parts in errors]))
 
 
-def test_the_error_of_a_gain_is_that_of_photos_made_of_other_parts():
-    """Evidence: a bootstrap, which draws the parts of each photo anew 2000 times."""
+def test_the_standard_error_of_a_gain_agrees_with_a_bootstrap():
+    """The bootstrap resamples the parts of each photo 2000 times."""
     generator = np.random.default_rng(3)
     pixels = generator.integers(200, 300, (3, 16, 1))
     errors = list(np.concatenate([pixels * generator.lognormal(size=(3, 16, 2)), pixels], axis=2))
@@ -112,7 +112,7 @@ def test_the_error_of_a_gain_is_that_of_photos_made_of_other_parts():
     assert gain_error_db(errors) == pytest.approx(np.std(redrawn), rel=0.15)
 
 
-def test_photos_whose_gains_differ_are_sure_if_all_their_parts_agree():
+def test_different_gains_of_two_photos_are_certain_if_their_parts_agree():
     """One held-out photo has a near neighbour, the other has none: gains of 0.8 and 4.6 dB."""
     gains = np.array([0.8, 4.6])
     pixels = np.full(16, 256.0)
@@ -123,11 +123,11 @@ def test_photos_whose_gains_differ_are_sure_if_all_their_parts_agree():
     assert gain_error_db(cut) == gain_error_db(errors)
 
 
-def test_photos_of_one_part_tell_no_error():
+def test_photos_with_one_part_have_no_standard_error():
     assert gain_error_db([np.array([[1.0, 2.0, 9.0]]), np.array([[0.0, 0.0, 0.0], [3.0, 5.0, 9.0]])]) is None
 
 
-def test_the_error_of_two_parts_is_half_their_difference():
+def test_the_standard_error_from_two_parts_is_half_their_difference():
     """Without one part, the gain of a photo of two parts is that of the other."""
     parts = np.array([[4.0, 9.0, 30.0], [5.0, 2.0, 20.0]])
     gains = 10 * np.log10(parts[:, 1] / parts[:, 0])
@@ -144,7 +144,7 @@ def test_the_error_of_two_parts_is_half_their_difference():
         pytest.param(80, 60, 0.105, 0.105, False, id="everywhere, small"),
     ],
 )
-def test_a_gain_in_one_region_is_not_sure(
+def test_a_gain_in_only_one_region_is_not_significant(
     width: int, height: int, inside: float, outside: float, shown: bool, monkeypatch: pytest.MonkeyPatch
 ):
     """A field that is off by 0.1 on grey photos, and billboards that are off by more in one region only."""

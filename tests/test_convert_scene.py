@@ -128,29 +128,35 @@ def test_a_folder_of_masks_reaches_training(tmp_path):
     assert json.loads(nerfcli("info", tmp_path / "scene", "--json").stdout)["masks"] == count - 1
 
 
-def test_masks_of_other_photos_are_an_error(tmp_path):
+def test_a_mask_folder_without_masks_of_these_photos_is_an_error(tmp_path):
     capture = photographed(capture_of([PINHOLE]), tmp_path / "images")
     write_transforms(capture, tmp_path / "transforms.json")
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks" / "other.png").touch()
-    options = ("--to", "nerfcli", "--masks", tmp_path / "masks")
-    result = nerfcli("convert", tmp_path / "transforms.json", tmp_path / "scene", *options)
-    assert (result.exit_code, not (tmp_path / "scene").exists()) == (BAD_INPUT, True)
-    assert f"has no mask of any of the {len(capture.frames)} photos" in error_of(result)[0]
+    for folder, message in (
+        ("masks", f"contains no mask for any of the {len(capture.frames)} photos"),
+        ("nowhere", "does not exist"),
+        ("images", f"contains photos, such as images/{Path(capture.frames[0].name).name}"),
+    ):
+        options = ("--to", "nerfcli", "--masks", tmp_path / folder)
+        result = nerfcli("convert", tmp_path / "transforms.json", tmp_path / "scene", *options)
+        assert (result.exit_code, not (tmp_path / "scene").exists()) == (BAD_INPUT, True)
+        assert message in error_of(result)[0]
 
 
-@pytest.mark.parametrize(("left_out", "told"), [(0, True), (1, False)])
-def test_masks_beside_photos_that_are_not_used_are_told(left_out: int, told: bool, tmp_path):
-    """Named by file name alone, as masks/0001.png for images/0001.jpg; a folder that lacks some is something else."""
+@pytest.mark.parametrize(("missing", "reported"), [(0, True), (1, False)])
+def test_info_reports_a_complete_folder_of_unused_masks(missing: int, reported: bool, tmp_path):
+    """Masks match by file name alone, mask/0001.png for images/0001.jpg; an incomplete folder may be something else."""
     capture = photographed(capture_of([PINHOLE]), tmp_path / "images")
     write_transforms(capture, tmp_path / "transforms.json")
     (tmp_path / "mask").mkdir()
-    for frame in capture.frames[left_out:]:
+    for frame in capture.frames[missing:]:
         (tmp_path / "mask" / f"{Path(frame.name).stem}.png").touch()
     facts = json.loads(nerfcli("info", tmp_path, "--json").stdout)
     assert facts["masks"] is None
     command = f"nerfcli convert {tmp_path} SCENE --to nerfcli --masks {tmp_path / 'mask'}"
-    assert facts["unused_masks"] == (f"{tmp_path / 'mask'} is not used; to train with it: {command}" if told else None)
+    expected = f"{tmp_path / 'mask'}; to use them: {command}" if reported else None
+    assert facts["unused_masks"] == expected
 
 
 @pytest.mark.parametrize("camera", [BROWN, PRISM], ids=lambda camera: camera.model)

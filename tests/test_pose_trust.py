@@ -512,9 +512,9 @@ def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
     assert turn.focal_px == pytest.approx(WIDE.params[0], rel=0.03)
 
 
-def test_a_lens_with_an_uncentred_axis_hides_no_turn(tmp_path: Path):
-    """The mapper makes up depth for what its lens lacks: points explain matches to half a pixel, with a focal length
-    that is wrong by more than half. A rotation with two radial terms and a principal point explains them as well.
+def test_turning_on_the_spot_with_an_off_centre_lens_is_recognised(tmp_path: Path):
+    """The mapper's lens model is too simple, and made-up depth compensates for it: points fit to half a pixel, with a
+    focal length 40 % too long. A rotation with two radial terms and a principal point fits as well.
     """
     lens = Lens("OPENCV", 1000, 750, (800.0, 805.0, 512.0, 370.0, -0.2, 0.08, 0.001, -0.002))
     still = solve(
@@ -528,8 +528,8 @@ def test_a_lens_with_an_uncentred_axis_hides_no_turn(tmp_path: Path):
     assert still.kinds == ["no baseline (pure rotation)"]
 
 
-def test_small_photos_of_cameras_that_hardly_move_have_depth(tmp_path: Path):
-    """640 x 360 pixels, cameras 0.17 apart in a room of 8 x 8: rotations explain all to 3 px, points to 0.4."""
+def test_parallax_of_a_few_pixels_is_accepted_if_points_explain_it(tmp_path: Path):
+    """640 x 360 pixels, cameras 0.17 apart in a room of 8 x 8: rotations fit to 3 px, points to 0.4."""
     lens = Lens("SIMPLE_RADIAL", 640, 360, (556.0, 320.0, 180.0, -0.03))
     steps = np.random.default_rng(0).normal(scale=0.1, size=(12, 3))
     turned = synthetic.panorama(12, lens, turn_deg=120)
@@ -620,7 +620,7 @@ def test_a_wrong_focal_length_in_exif_is_ignored(tmp_path: Path):
     assert not camera.has_prior_focal_length
 
 
-def test_a_camera_without_placed_photos_has_no_focal_length(tmp_path: Path):
+def test_a_camera_whose_photos_are_not_registered_is_no_error(tmp_path: Path):
     """EXIF's focal lengths are 20 and 10 times too long, and all photos of the second camera show something else."""
     views = synthetic.ring(8, [WIDE], seed=0, turn_deg=120)
     views += synthetic.turned_away([View(LONG, view.cam_from_world) for view in views[:2]])
@@ -768,7 +768,7 @@ def test_a_few_photos_may_have_a_focal_length_that_others_may_not(photos, focal,
     assert len(acceptance._implausible(model, PLAUSIBLE, given=(), determined=list(model.cameras))) == 1
 
 
-def test_a_long_lens_that_the_photos_determine_is_accepted(tmp_path: Path):
+def test_a_long_focal_length_that_the_photos_determine_is_accepted(tmp_path: Path):
     """A macro lens and cropped photos: 3.6 times the longer side, known to better than 1 %."""
     lens = Lens("SIMPLE_RADIAL", 1000, 1000, (3600.0, 500.0, 500.0, 0.0))
     views = synthetic.ring(16, [lens], seed=0, radius=9.0)

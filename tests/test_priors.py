@@ -227,7 +227,7 @@ def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(c
 def test_points_fade_out():
     wide = [fading(fraction, step=5000, parallax=1.0) for fraction in (0.0, 0.25, 1.0, 1.5)]
     assert wide == [1.0, 0.75, 0.0, 0.0]
-    # Photos of a narrow baseline tell depth better after 800 steps.
+    # With a narrow baseline, also by 800 / step.
     assert [fading(0.5, step=step, parallax=0.5) for step in (0, 800, 3200)] == [0.5, 0.5, 0.125]
 
 

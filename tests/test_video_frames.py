@@ -97,7 +97,7 @@ def test_a_camera_that_stands_still_gets_no_frames_for_it(tmp_path):
 
 
 @pytest.mark.parametrize(("pixels", "count", "expected"), [(20.0, None, 22), (20.0, 10, 10), (80.0, None, 45)])
-def test_a_camera_that_moves_little_gets_frames_all_the_same(
+def test_a_video_that_moves_little_still_gets_enough_frames(
     tmp_path: Path, pixels: float, count: int | None, expected: int
 ):
     """A picture 160 wide that moves by 20 pixels in 4 s differs 12 times by 1 %, and twice as often by half of it."""

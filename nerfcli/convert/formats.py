@@ -138,15 +138,19 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
     Photos without a mask there keep the one that they have.
 
     Raises:
-        UserError: no photo has a mask there.
+        UserError: there is no such folder, it has no mask for any photo, or it contains the photos.
     """
+    if not folder.is_dir():
+        raise UserError(f"the mask folder {folder} does not exist", "give a folder with a mask for each photo")
     found = [mask_of(frame.name, folder) for frame in capture.frames]
     if not any(found):
-        name = Path(capture.frames[0].name)
         raise UserError(
-            f"{folder} has no mask of any of the {len(found)} photos",
-            f"masks are named after the photos: {name.name}.png or {name.stem}.png for {name}",
+            f"{folder} contains no mask for any of the {len(found)} photos",
+            "masks are named after the photos: IMG_1.jpg.png, IMG_1.png or IMG_1_mask.png for IMG_1.jpg",
         )
+    for frame, mask in zip(capture.frames, found, strict=True):
+        if mask is not None and frame.image is not None and mask.resolve() == frame.image.resolve():
+            raise UserError(f"{folder} contains photos, such as {frame.name}", "give a folder that has only masks")
     frames = (f if mask is None else replace(f, mask=mask) for f, mask in zip(capture.frames, found, strict=True))
     return replace(capture, frames=tuple(frames))
 

@@ -20,7 +20,7 @@ PIXELS_PER_POINT = 8
 HALF_ERROR_PX = 1.0
 # Expected relative error of a stereo distance at which its pixel has half the weight.
 HALF_ERROR = 0.05
-# With a narrow baseline, depths are known less well than photos tell them after more steps than this.
+# With a narrow baseline, known distances are less accurate than what the field has learned after this many steps.
 NARROW_STEPS = 800
 
 
@@ -128,8 +128,9 @@ def _usable(numbers: np.ndarray, distances: np.ndarray, trust: np.ndarray, *, po
 
 
 def fading(fraction: float, *, step: int, parallax: float) -> float:
-    """Return the weight of the points at a fraction of the budget, linear from 1 to 0; after 800 steps with a narrow
-    baseline, also in proportion to 1 / step.
+    """Return the weight of known distances at a fraction of the budget, linear from 1 to 0.
+
+    With a narrow baseline, the weight is also multiplied by min(1, 800 / step).
 
     Once there are surfaces, photos tell more; but without points, haze before them comes back where few photos look.
 

@@ -4,7 +4,7 @@ A mask is a picture in any format, named after its photo. It has the size of the
 the file: tools that ignore the EXIF orientation write the latter, and the mask is then turned like the photo.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,9 +39,8 @@ def find_mask(name: str, masks: Path) -> Path | None:
     return next((mask for mask in candidates if mask.is_file()), None)
 
 
-def masks_beside(names: Iterable[str], folder: Path) -> Path | None:
-    """Return the folder masks or mask in `folder` that has a mask of every photo; None if there is none."""
-    names = list(names)
+def masks_inside(folder: Path, names: Sequence[str]) -> Path | None:
+    """Return folder/masks or folder/mask if it has a mask for every photo; None if neither does."""
     for masks in (folder / name for name in _FOLDERS):
         if masks.is_dir() and names and all(mask_of(name, masks) for name in names):
             return masks

@@ -110,7 +110,7 @@ def _trained(
     for text in describe_rescaling(loaded.rescaled):
         notify(text)
     if text := describe_unused_masks(loaded):
-        notify(text)
+        notify(f"unused masks: {text}")
 
     if resume and not Run(run).is_trained and not (run / STATE).exists():
         # A script that a scheduler starts again always gives --resume, and may have been ended before a checkpoint.

@@ -256,7 +256,7 @@ def _tell_of_exif(given: Job, best: MappedModels, tell: Tell) -> None:
     for number, (group, used) in enumerate(zip(given.groups, best.job.groups, strict=True), start=1):
         if group.focal_px is None or used.focal_px is not None or not best.models:
             continue
-        if number not in best.models[0].cameras:  # none of its photos is placed
+        if number not in best.models[0].cameras:  # none of its photos are registered
             continue
         found_px = best.models[0].camera(number).mean_focal_length()
         if abs(math.log(found_px / group.focal_px)) > _FAR_FROM_EXIF:

@@ -20,8 +20,8 @@ _MOTION_SIZE_PX = 320
 # The picture has moved when half of its corners moved by this fraction of its longer side: about what is needed for
 # parallax, and more than the shake of a hand that holds still.
 MOVED_FRACTION = 0.01
-# If a whole video moves by less than this many such steps (a drone far away), smaller ones count, down to a fraction of
-# this size: hundreds of its frames are then worth more than a handful.
+# If a whole video has fewer such movements than this (a drone far away), smaller ones count, down to this fraction of
+# them: a handful of frames would be too few for poses and training.
 _FEW_STEPS, _LEAST_STEP = 24, 0.25
 # Fewer corners than this do not measure motion; then pictures that differ by less than this, of 255, are the same.
 _MIN_CORNERS = 12

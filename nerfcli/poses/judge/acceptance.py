@@ -34,7 +34,7 @@ _LEAST_IN_FRONT = 0.95
 _LEAST_SPREAD = 0.003
 # Focal lengths over the longer side. A model without depth may have any; if only cameras of a few photos are outside
 # the usual range, the points of the others determine them. Photos from the internet have up to 3 times and more, and so
-# have cropped photos by macro lenses; what the photos determine may be in the wider range, too.
+# do cropped photos by macro lenses: a focal length that the photos determine may also be in the wider range.
 _FOCAL_RANGE, _WIDER_FOCAL_RANGE, _FEW = (0.3, 3.0), (0.2, 10.0), 0.1
 _MOST_HELD_OUT_PX = 4.0
 # Parallax over the error of unused observations: with less, the points of a model explain matches hardly better than a
@@ -232,7 +232,7 @@ def _rotation_measure(errors: Sequence[RotationError]) -> dict[str, Any]:
 def _no_baseline(turn: RotationFit | None, geometry: Mapping[str, Any], held_out_px: float | None) -> list[Failure]:
     """Return the failure if a rotation explains the matches nearly as well as the model, or the cameras are together.
 
-    A small parallax is one where photos are small or far away from the scene.
+    Parallax in pixels is also small in small photos and far from the scene, where a model may still be right.
     """
     spread = geometry["camera_spread_over_distance"]
     if turn is not None and turn.explains_all and turn.parallax_px < _LEAST_GAIN * (held_out_px or np.inf):

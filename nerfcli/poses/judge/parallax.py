@@ -2,8 +2,8 @@
 
 Without a baseline there is no depth, and a mapper that is forced to find some finds noise. A rotation about the lens
 moves every pixel by a homography, whatever its depth; the focal length, two radial terms and the principal point that
-fit this best are estimated, and the remaining error is parallax. With fewer terms, a mapper that makes up depth for
-what its lens lacks would look better than a rotation.
+fit this best are estimated, and the remaining error is parallax. With fewer terms, made-up depth that compensates for
+the mapper's simple lens model would fit better than a rotation.
 """
 
 from collections.abc import Mapping, Sequence
