@@ -20,7 +20,7 @@ from nerfcli.runs.components import Components
 from nerfcli.runs.files import STATE
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train.moving_masks import FOLDER, write_moving_masks
+from nerfcli.train.left_out import write_left_out
 
 CPU = torch.device("cpu")
 SAME = Similarity(1.0, np.eye(3), np.zeros(3))
@@ -120,11 +120,12 @@ def test_a_training_leaves_out_what_one_photo_shows(spheres, spheres_run, tmp_pa
         losses.append(np.median([fitting.advance(0.5).loss for _ in range(steps)][-20:]))
     assert movers is not None
     notes: list[str] = []
-    write_moving_masks(tmp_path, movers, pool, notify=notes.append)
-    written = [path.relative_to(tmp_path / FOLDER) for path in sorted((tmp_path / FOLDER).rglob("*.png"))]
+    folder = tmp_path / "movers"
+    write_left_out(folder, movers.masks(), notify=notes.append)
+    written = [path.relative_to(folder) for path in sorted(folder.rglob("*.png"))]
     name = spheres.train_frames[1].name
     assert written == [Path(f"{name}.png")]
-    mask = read_image(tmp_path / FOLDER / written[0])
+    mask = read_image(folder / written[0])
     assert (mask[place] == 0).all()
     assert f"in 1 of {len(photos)} photos, most in {name}" in notes[0]
     assert losses[1] < 0.8 * losses[0]

@@ -12,7 +12,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
+import numpy as np
 import pytest
 import torch
 from commands import error_of, nerfcli
@@ -20,11 +22,12 @@ from commands import error_of, nerfcli
 from nerfcli.errors import LOST_RANK, TERMINATED
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.fit.ranks import SingleProcess
+from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.pool import PixelBatch
 from nerfcli.runs.components import Components, choose
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.train import loop
+from nerfcli.train import evidence, loop
 from nerfcli.workflows import machine
 from nerfcli.workflows.train import train_scene
 
@@ -34,7 +37,7 @@ SPHERES = Path(__file__).parents[1] / "sample_scenes" / "spheres"
 VARIANTS = {
     "": (200, 34),
     "exposure,background=black": (200, 34),
-    "pixels=error,points,entropy,movers": (100, 24),
+    "pixels=error,points,entropy,movers,occluders": (100, 24),
     "cameras=all": (100, 14),
 }
 SMALL = TrainSettings(
@@ -82,8 +85,14 @@ def train_until(step: int, run: Path, settings: TrainSettings) -> None:
         if fraction >= stop:
             raise KeyboardInterrupt
 
-    with suppress(KeyboardInterrupt):
+    with suppress(KeyboardInterrupt), patch.object(evidence, "occluder_masks", left_halves):
         train_scene(SPHERES, run, settings, overwrite=True, progress=progress)
+
+
+def left_halves(photos: Sequence[LoadedPhoto], *_: object, threads: int) -> list[np.ndarray]:
+    """Stand in for occluders, of which the spheres have none."""
+    shapes = (photo.pixels.shape[:2] for photo in photos)
+    return [np.broadcast_to(np.arange(width) < width // 2, (height, width)) for height, width in shapes]
 
 
 def of_rank(rank: int, port: int, count: int = 2) -> dict[str, str]:

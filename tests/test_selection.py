@@ -583,6 +583,17 @@ def test_exposures_are_kept_on_evidence():
     assert [change for change in tried if change[0] == "exposure"] == []
 
 
+def test_what_hides_surfaces_is_left_out_if_there_is_any():
+    facts = replace(FITTED, points=900, stereo=80_000, occluded_fraction=0.013)
+    both = Components(points=0.1, stereo=True)
+    model, decisions = with_evidence(Components(), facts)
+    assert model == replace(both, occluders=True)
+    assert decisions[2].why == "1.3 % of the pixels hide surfaces that other photos see"
+    assert with_evidence(Components(), replace(facts, occluded_fraction=0.0))[0] == both
+    assert with_evidence(Components(), replace(facts, fixed=("occluders",)))[0] == both
+    assert with_evidence(Components(), replace(facts, has_alpha=True))[0] == Components()
+
+
 def test_a_sky_that_points_confirm_is_in_the_model_from_the_start():
     facts = replace(FITTED, sky_fraction=0.2, sky_confirmed=True)
     model, decisions = with_evidence(Components(), facts)

@@ -1,5 +1,6 @@
 """Moving things such as people, cars and leaves: leave out of the loss what one photo shows and others do not."""
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
@@ -62,6 +63,10 @@ class Movers:
     def weights(self, numbers: Tensor) -> Tensor:
         """Return the weights of pixels (N,) in the loss: 0 where something moves, else 1."""
         return (~self.moving[self._blocks_of(numbers)]).float()
+
+    def masks(self) -> dict[str, np.ndarray]:
+        """Return the `mask` of each photo, by its name."""
+        return {frame.name: self.mask(photo).cpu().numpy() for photo, frame in enumerate(self._pool.frames)}
 
     def mask(self, photo: int) -> Tensor:
         """Return the pixels of a photo that count: (height, width) bool, False where something moves."""

@@ -1,6 +1,6 @@
 """Training photos in memory, and random pixels of them with their rays."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
@@ -184,12 +184,37 @@ class PixelPool:
         self._bearings = BearingTables(self.cameras, device, storage=storage)
         self.without_ray = sum(int((~self._bearings.valid(camera)).sum()) for camera in self.cameras)
 
-        def usable(photo: LoadedPhoto) -> np.ndarray:
+        def usable(index: int) -> np.ndarray:
+            photo = photos[index]
             good = self._bearings.valid(photo.frame.camera)
             return good if photo.used is None else good & photo.used.ravel()
 
-        usable_counts = [int(usable(photo).sum()) for photo in photos]
-        self.usable_count = sum(usable_counts)
+        self._use(usable, storage)
+
+    def leave_out(self, masks: Sequence[np.ndarray], *, storage: PhotoStorage = IN_MEMORY) -> None:
+        """Do not draw the pixels of masks (H, W) bool, one per photo, from now on.
+
+        Raises:
+            UserError: no pixel would be left.
+        """
+        earlier = None if self.usable is None else self.usable.cpu().numpy()
+        firsts = self.first_pixel.tolist()
+
+        def usable(index: int) -> np.ndarray:
+            kept = ~masks[index].ravel()
+            if earlier is None:
+                return kept
+            begin, end = np.searchsorted(earlier, (firsts[index], firsts[index] + len(kept)))
+            before = np.zeros_like(kept)
+            before[earlier[begin:end] - firsts[index]] = True
+            return kept & before
+
+        self._use(usable, storage)
+
+    def _use(self, usable: Callable[[int], np.ndarray], storage: PhotoStorage) -> None:
+        """List the usable pixels; `usable` gives those of a photo by its index, (pixels of the photo,) bool."""
+        counts = [int(usable(index).sum()) for index in range(len(self.frames))]
+        self.usable_count = sum(counts)
         if self.usable_count == 0:
             raise UserError(
                 "no pixels are left to train on", "check the masks: white pixels are used, black ones are ignored"
@@ -197,11 +222,12 @@ class PixelPool:
         self.usable: Tensor | None = None
         if self.usable_count < len(self.colours):  # a list of all pixels would be larger than the photos
             numbers = storage.array((self.usable_count,), np.int64)
-            ends = np.cumsum(usable_counts)
-            for photo, first, count, end in zip(photos, self.first_pixel.tolist(), usable_counts, ends, strict=True):
-                numbers[end - count : end] = first + np.flatnonzero(usable(photo))
+            for index, (first, count, end) in enumerate(
+                zip(self.first_pixel.tolist(), counts, np.cumsum(counts), strict=True)
+            ):
+                numbers[end - count : end] = first + np.flatnonzero(usable(index))
                 storage.release_pages()
-            self.usable = torch.from_numpy(numbers).to(device)
+            self.usable = torch.from_numpy(numbers).to(self.colours.device)
 
     @property
     def has_alpha(self) -> bool:

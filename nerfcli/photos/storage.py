@@ -55,7 +55,7 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
         frame.image is not None and frame.image.suffix.lower() not in (".jpg", ".jpeg") for frame in frames
     )
     photos = (4 if may_have_alpha else 3) * sum(sizes) + 12 * sum(of_cameras.values())
-    if any(frame.mask is not None for frame in frames):
+    if settings.components.occluders or any(frame.mask is not None for frame in frames):
         photos += 9 * sum(sizes)
     if settings.model == "auto":  # trials train on a list of pixels, those they are not scored on
         photos += 9 * sum(sizes) + 12 * sum(of_cameras.values())

@@ -49,6 +49,8 @@ class Components:
         antialias: whether details smaller than a pixel fade out of its view; see `reference.hash_encode`.
         pixels: sampling of pixels: uniform ("anywhere"), or half of them where the "error" is large; see `error_map`.
         movers: whether pixels that show moving things are left out of the loss; see `fit.movers`.
+        occluders: whether pixels are left out where something hides a surface that other photos see; see
+            `multiview.occluders`.
     """
 
     background: str = "auto"
@@ -65,6 +67,7 @@ class Components:
     antialias: bool = False
     pixels: str = "anywhere"
     movers: bool = False
+    occluders: bool = False
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,7 @@ CHOICES = {
     "antialias": Choice(False, True, (False, True)),
     "pixels": Choice("anywhere", "error", PIXELS),
     "movers": Choice(False, True, (False, True)),
+    "occluders": Choice(False, True, (False, True)),
 }
 assert tuple(CHOICES) == tuple(field.name for field in fields(Components))
 

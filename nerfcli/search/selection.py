@@ -68,6 +68,7 @@ class Facts:
         stereo: number of pixels with a depth from stereo matching.
         sky_fraction: fraction of the pixels that look like a sky, see `multiview.sky`.
         sky_confirmed: whether 3D points confirm that it is one.
+        occluded_fraction: fraction of the pixels where something hides a surface that other photos see.
         exposure_spread: standard deviation of the photos' brightness at points that they share, in logarithms of light.
         fixed: names of the components that the user has set.
     """
@@ -81,6 +82,7 @@ class Facts:
     stereo: int = 0
     sky_fraction: float = 0.0
     sky_confirmed: bool = False
+    occluded_fraction: float = 0.0
     exposure_spread: float = 0.0
     fixed: tuple[str, ...] = ()
 
@@ -146,14 +148,18 @@ def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bo
 def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
     """Return the model with components that photos support before any training, unless set, and the decisions.
 
-    These are points, at which rays should end, depths from stereo matching, exposures from shared pixels, and a sky
-    that 3D points confirm. They are in the model from the first step on: later, density has formed elsewhere already.
+    These are points, at which rays should end, depths from stereo matching, the omission of what hides surfaces that
+    other photos see, exposures from shared pixels, and a sky that 3D points confirm. They are in the model from the
+    first step on: later, density has formed elsewhere already.
     """
     wanted: list[tuple[Change, str]] = []
     if facts.points and may_use_points(requested, facts):
         wanted.append((("points", CHOICES["points"].on), f"{facts.points:,} pixels see a 3D point at a known distance"))
         if facts.stereo:
             wanted.append((("stereo", True), f"several photos agree on the depth of {facts.stereo} pixels"))
+        if facts.occluded_fraction:
+            reason = f"{100.0 * facts.occluded_fraction:.1f} % of the pixels hide surfaces that other photos see"
+            wanted.append((("occluders", True), reason))
         if facts.exposure_spread > LIKELY_EXPOSURE_SPREAD:
             per_cent = 100.0 * math.expm1(facts.exposure_spread)
             reason = f"photos differ in brightness by {per_cent:.0f} % at the same points"

@@ -1,7 +1,8 @@
-"""Evidence from the training photos before training: pixels at known distances, relative exposures, the sky."""
+"""Evidence from the training photos before training: known distances, exposures, the sky, what hides surfaces."""
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -12,10 +13,12 @@ from nerfcli.fit.extent import Extent
 from nerfcli.fit.point_depth import PointDepths, point_depths, stereo_depths
 from nerfcli.multiview.correspondences import SharedFeatures
 from nerfcli.multiview.exposures import matched_log_gains
+from nerfcli.multiview.occluders import occluder_masks
 from nerfcli.multiview.sky import PointsBefore, points_before, sky_masks
 from nerfcli.multiview.stereo import LEAST_SIDE_PX, DenseDepth, affordable_side_px, dense_depths
 from nerfcli.photos.exif_exposure import log_exposures
 from nerfcli.photos.held_out_exposure import exif_slope
+from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.pool import Album, PixelPool
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
@@ -74,20 +77,25 @@ class Evidence:
         return found
 
     @cached_property
+    def _matched_log_gains(self) -> np.ndarray:
+        dense = self._dense
+        began = time.perf_counter()
+        found = matched_log_gains(self.album.photos, dense)
+        self.stereo_seconds += time.perf_counter() - began
+        return found
+
+    @cached_property
     def log_gains(self) -> np.ndarray:
         """Logarithms of exposures from pixels that several photos share, (photos, 3); NaN where unknown.
 
         All are NaN if EXIF does not confirm them: surfaces that look brighter from one side differ between photos just
         as exposures do, and their differences add up along a ring of cameras.
         """
-        dense = self._dense
-        began = time.perf_counter()
-        found = matched_log_gains(self.album.photos, dense)
+        found = self._matched_log_gains
         exif = log_exposures([photo.frame for photo in self.album.photos])
         measured = np.isfinite(found).all(1) & np.isfinite(exif)
         if measured.sum() < FEWEST_EXIF or exif_slope(np.flatnonzero(measured), found[measured], exif[measured]) == 0.0:
-            found = np.full_like(found, np.nan)
-        self.stereo_seconds += time.perf_counter() - began
+            return np.full_like(found, np.nan)
         return found
 
     def gains_or(self, others: Tensor) -> Tensor:
@@ -129,6 +137,28 @@ class Evidence:
         return torch.from_numpy(np.concatenate([mask.ravel() for mask in self._sky_masks])).to(self.pool.colours.device)
 
     @cached_property
+    def occluders(self) -> list[np.ndarray]:
+        """Masks (H, W) of the photos' pixels where something hides a surface that other photos see."""
+        dense, gains, skies = self._dense, self._matched_log_gains, self._sky_masks
+        began = time.perf_counter()
+        found = occluder_masks(self.album.photos, dense, skies, gains, threads=self.settings.threads)
+        self.stereo_seconds += time.perf_counter() - began
+        return found
+
+    @property
+    def occluded_fraction(self) -> float:
+        """Fraction of the pixels that `occluders` contain."""
+        return sum(int(mask.sum()) for mask in self.occluders) / sum(mask.size for mask in self.occluders)
+
+    @property
+    def photos_without_occluders(self) -> list[LoadedPhoto]:
+        """The photos, with `used` False where there are occluders."""
+        return [
+            replace(photo, used=~mask if photo.used is None else photo.used & ~mask)
+            for photo, mask in zip(self.album.photos, self.occluders, strict=True)
+        ]
+
+    @cached_property
     def of_stereo(self) -> PointDepths:
         """Depths from stereo matching."""
         found = stereo_depths(self._dense, self.pool, self.extent.training_from_scene)
@@ -140,4 +170,5 @@ class Evidence:
 
     def sets(self, components: Components) -> list[PointDepths]:
         """Return the sets of depths that a model with points uses."""
-        return [self.of_tracks, self.of_stereo] if components.stereo else [self.of_tracks]
+        found = [self.of_tracks, self.of_stereo] if components.stereo else [self.of_tracks]
+        return [depths.among(self.pool) for depths in found]

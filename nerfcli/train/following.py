@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -39,6 +40,7 @@ class SharedPreparation:
     log_focal: float
     depths: tuple[PointDepths, ...] | None
     sky: Tensor | None
+    occluders: list[np.ndarray] | None
 
 
 def start_others(fitting: Fitting, prepared: Prepared) -> None:
@@ -57,6 +59,7 @@ def start_others(fitting: Fitting, prepared: Prepared) -> None:
         prepared.log_focal,
         None if points is None else tuple(_moved(depths, "cpu") for depths in points.sets),
         None if prepared.sky is None else prepared.sky.cpu(),
+        prepared.occluders,
     )
     ranks.from_first(decided)
     _copy_state(fitting)
@@ -86,6 +89,8 @@ def follow(scene: Scene, run: Path, settings: TrainSettings, ranks: SingleProces
     device = torch.device(settings.device)
     similarity = decided.extent.training_from_scene
     pool = PixelPool(album.photos, similarity, device, colours=album.colours, storage=storage)
+    if decided.occluders is not None:
+        pool.leave_out(decided.occluders, storage=storage)
     prepared = Prepared(
         settings,
         factor,
@@ -99,6 +104,7 @@ def follow(scene: Scene, run: Path, settings: TrainSettings, ranks: SingleProces
         points=None if decided.depths is None else PointRays([_moved(d, device) for d in decided.depths], pool),
         seconds=0.0,
         sky=None if decided.sky is None else decided.sky.to(device),
+        occluders=decided.occluders,
     )
     fitting = prepared.fitting(ranks)
     _copy_state(fitting)

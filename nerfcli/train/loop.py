@@ -25,8 +25,8 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
 from nerfcli.train.following import END, SETTLE, TIMED_STEPS, WAIT, describe_efficiency, start_others
+from nerfcli.train.left_out import write_left_out
 from nerfcli.train.live import LiveTraining
-from nerfcli.train.moving_masks import write_moving_masks
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
 from nerfcli.train.waypoints import FRACTIONS, forget_waypoints, keep_waypoint, measure_waypoints
@@ -96,6 +96,9 @@ def train(
     else:
         totals = Totals(seconds=prepared.seconds, searched=prepared.seconds)
         _clear(run)
+    if prepared.occluders is not None:
+        named = zip(prepared.pool.frames, prepared.occluders, strict=True)
+        write_left_out(run / "occluders", {frame.name: ~mask for frame, mask in named}, notify=notify)
     _describe(scene, run, settings, prepared, resume=resume)
     checkpoints = Checkpoints(run, fitting, totals, prepared=prepared, scene=scene)
     checkpoints.write_cameras()
@@ -138,7 +141,7 @@ def train(
     if fitting.rollbacks:
         notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
     if fitting.movers is not None:
-        write_moving_masks(run, fitting.movers, prepared.pool, notify=notify)
+        write_left_out(run / "movers", fitting.movers.masks(), notify=notify)
     measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)
     if ranks.count > 1 and seconds:
         notify(describe_efficiency(fitting, seconds))

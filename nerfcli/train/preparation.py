@@ -77,6 +77,8 @@ class Prepared:
         points: pixels whose distance is known, if the components use them.
         seconds: of the budget, spent on all this.
         sky: (pixels,) bool, the pixels of the pool that look like a sky; None if no sky is learned or known.
+        occluders: for each photo of the pool the mask (height, width) bool of the pixels that are left out because
+            something hides a surface there; None if the components keep them.
     """
 
     settings: TrainSettings
@@ -91,6 +93,7 @@ class Prepared:
     points: PointRays | None
     seconds: float
     sky: Tensor | None
+    occluders: list[np.ndarray] | None
 
     def fitting(self, ranks: SingleProcess = ALONE) -> Fitting:
         """Return the training before its first step, for this one of the ranks."""
@@ -205,10 +208,26 @@ def prepare(
         gains = selection.log_gains
     elif settings.components.exposure == "learned" and settings.components.stereo:
         gains = evidence.gains_or(gains)
+    occluders = None
+    if settings.components.occluders:
+        pool.leave_out(evidence.occluders, storage=storage)
+        occluders = evidence.occluders
     points = _points(scene, settings, evidence) if settings.components.points else None
     seconds = evidence.stereo_seconds if selection is None else selection.seconds
     return Prepared(
-        settings, factor, storage, extent, pool, selection, reference, gains, log_focal, points, seconds, sky
+        settings,
+        factor,
+        storage,
+        extent,
+        pool,
+        selection,
+        reference,
+        gains,
+        log_focal,
+        points,
+        seconds,
+        sky,
+        occluders,
     )
 
 
@@ -251,7 +270,12 @@ def _facts(scene: Scene, evidence: Evidence) -> Facts:
         facts = replace(facts, points=len(evidence.of_tracks.numbers))
         if may_use_stereo(settings.components, facts, has_time=bool(evidence.side_px)):
             stereo = len(evidence.of_stereo.numbers)
-            facts = replace(facts, stereo=stereo, exposure_spread=evidence.exposure_spread)
+            facts = replace(
+                facts,
+                stereo=stereo,
+                exposure_spread=evidence.exposure_spread,
+                occluded_fraction=evidence.occluded_fraction if "occluders" not in facts.fixed else 0.0,
+            )
     return facts
 
 
@@ -277,7 +301,7 @@ def _search(scene: Scene, evidence: Evidence, facts: Facts, *, storage: PhotoSto
     requested, log_focal, measured = with_known_cameras(settings.components, facts)
     model, _ = with_evidence(requested, facts)
     trials = Trials(
-        album.photos,
+        evidence.photos_without_occluders if model.occluders else album.photos,
         evidence.extent,
         settings=settings,
         exif=_exif(scene),

@@ -1,0 +1,37 @@
+"""Write masks of the pixels that a training leaves out, to look at and to edit."""
+
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.photos.mask_files import write_masks
+
+# Number of photos named in the message.
+_NAMED = 3
+
+
+def write_left_out(folder: Path, masks: Mapping[str, np.ndarray], *, notify: Callable[[str], None]) -> None:
+    """Write FOLDER/PHOTO.png, black where pixels are left out, for each photo with such pixels; report how many.
+
+    Args:
+        folder: in the run, named like the component that leaves them out; what it holds is replaced.
+        masks: (height, width) bool by the name of the photo, True where pixels are used.
+
+    Raises:
+        UserError: the masks cannot be written.
+    """
+    left_out = {name: 100.0 * float(1.0 - mask.mean()) for name, mask in masks.items()}
+    most = sorted((name for name in left_out if left_out[name]), key=lambda name: -left_out[name])
+    shutil.rmtree(folder, ignore_errors=True)
+    write_masks(folder, {name: masks[name] for name in most})
+    if not most:
+        notify(f"{folder.name}: none found")
+        return
+    named = ", ".join(f"{name} {left_out[name]:.0f} %" for name in most[:_NAMED])
+    mean = np.mean(list(left_out.values()))
+    notify(
+        f"{folder.name}: {mean:.1f} % of the pixels left out, in {len(most)} of {len(masks)} photos, most in {named}; "
+        f"masks in {folder}"
+    )
