@@ -1,4 +1,4 @@
-"""Things that hide a surface in one photo, on textured walls with things painted into one of the photos."""
+"""What hides a surface in one photo, on textured walls with a disc of leaves painted into one of the photos."""
 
 import json
 from dataclasses import replace
@@ -83,7 +83,7 @@ def test_nothing_is_found_where_nothing_is_hidden():
 
 @pytest.mark.parametrize("factor", [0.3, 1.8])
 @pytest.mark.parametrize("contrast", [0.1, 1.0])
-def test_light_on_a_surface_is_not_a_thing(factor, contrast):
+def test_light_on_a_surface_hides_nothing(factor, contrast):
     """A soft shadow or highlight, on surfaces with and without detail, whose depth it makes unknown."""
     weight = cv2.GaussianBlur(DISC.astype(np.float64), (0, 0), 6)[..., None]
     photos = [replace(one, pixels=(100 + contrast * (one.pixels - 128.0)).astype(np.uint8)) for one in walls()]
@@ -152,6 +152,16 @@ def test_what_a_single_photo_knows_to_be_nearer_is_no_contradiction():
     on_card = 2.0 / PINHOLE.pixel_bearings()[0].reshape(150, 200, 3)[rows, columns, 2]
     dense[1] = DenseDepth(np.stack([columns, rows], axis=-1), on_card, np.full(len(rows), 0.002))
     assert not masks(photos, dense)[0].any()
+
+
+def test_an_occluder_is_kept_where_its_outline_is_unknown():
+    """Leaves cover the right half of a photo. Of the other photos, it is the left two thirds that have a depth."""
+    columns = np.broadcast_to(np.arange(200), (150, 200))
+    photos = walls()
+    photos[0] = painted(photos[0], columns > 95, leaves())
+    own, others = known(photos[0], columns <= 95), photos[1:]
+    assert masks(photos, [own, *(known(one) for one in others)])[0][columns > 95].mean() > 0.9
+    assert not masks(photos, [own, *(known(one, columns < 130) for one in others)])[0].any()
 
 
 def test_a_photo_in_which_hardly_any_depth_is_found_is_not_judged():
@@ -233,7 +243,7 @@ def test_a_training_leaves_out_what_it_finds_and_writes_masks(capture, tmp_path,
     )
     chosen = TrainSettings(
         budget_seconds=None, steps=40, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, model=model,
-        components=Components() if model == "auto" else Components(occluders=True),
+        components=Components(occluders=True), fixed=("occluders",),
     )  # fmt: skip
     notes: list[str] = []
     train(capture, tmp_path / "run", chosen, resume=False, notify=notes.append, on_progress=lambda progress: None)

@@ -583,15 +583,19 @@ def test_exposures_are_kept_on_evidence():
     assert [change for change in tried if change[0] == "exposure"] == []
 
 
-def test_what_hides_surfaces_is_left_out_if_there_is_any():
+def test_what_hides_surfaces_is_reported_but_not_left_out_unasked():
     facts = replace(FITTED, points=900, stereo=80_000, occluded_fraction=0.013)
-    both = Components(points=0.1, stereo=True)
-    model, decisions = with_evidence(Components(), facts)
-    assert model == replace(both, occluders=True)
-    assert decisions[2].why == "1.3 % of the pixels hide surfaces that other photos see"
-    assert with_evidence(Components(), replace(facts, occluded_fraction=0.0))[0] == both
-    assert with_evidence(Components(), replace(facts, fixed=("occluders",)))[0] == both
-    assert with_evidence(Components(), replace(facts, has_alpha=True))[0] == Components()
+    model, _ = with_evidence(Components(), facts)
+    assert model == Components(points=0.1, stereo=True)
+    found = {decision.component: decision for decision in proposals(model, signs(0.0), facts)[1]}
+    assert not found["occluders"].kept
+    assert "1.3 % of the pixels hide surfaces that other photos see; --with occluders" in found["occluders"].why
+    for start, other in (
+        (replace(model, occluders=True), facts),
+        (model, replace(facts, occluded_fraction=0.0)),
+        (model, replace(facts, fixed=("occluders",))),
+    ):
+        assert "occluders" not in [decision.component for decision in proposals(start, signs(0.0), other)[1]]
 
 
 def test_a_sky_that_points_confirm_is_in_the_model_from_the_start():

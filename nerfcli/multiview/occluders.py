@@ -1,4 +1,4 @@
-"""Things that hide a surface in one photo: people who pass, leaves in front of the lens.
+"""Occluders: what hides a surface in one photo, such as people who pass or leaves in front of the lens.
 
 Where several photos agree on a surface, another photo that looks at it shows its colours and detail. If not, it shows
 something nearer. If nothing is known about the depth of that, it would float somewhere on its rays, where no other
@@ -18,7 +18,7 @@ from nerfcli.photos.loading import LoadedPhoto
 
 # Size at which photos are compared, the number of other photos that each is compared with (the nearest ones), and the
 # most pixels with a known depth that are used of each.
-LONGER_SIDE_PX, OTHERS, MOST_POINTS = 160, 6, 40_000
+LONGER_SIDE_PX, OTHERS, MOST_POINTS = 160, 6, 20_000
 # Two depths at the same place are of one surface if they differ by less than this fraction. Depths with larger expected
 # errors are not used: a wrong surface is contradicted, too.
 SAME_SURFACE = 0.03
@@ -31,16 +31,19 @@ WINDOW_PX, UNLIKE, LIKE, LEAST_DETAIL = 7, 0.4, 0.8, 8.0
 # A photo is not judged if less than this fraction of the pixels that agree with others has a depth of its own: stereo
 # matching with it has failed, as with a wrong pose.
 LEAST_KNOWN = 0.5
-# Smallest region of contradictions, as a fraction of the photo, and least fraction of the compared pixels of a thing
-# that are in such regions.
+# Smallest region of contradictions, as a fraction of the photo, and least fraction of the compared pixels of an
+# occluder that are in such regions.
 LEAST_PART, MOST_OF = 0.002, 0.5
-# A thing ends at this distance from the contradictions, as a fraction of the longer side.
+# An occluder ends at this distance from the contradictions, as a fraction of the longer side.
 REACH = 0.06
-# A thing with a border of which more than the second number is nearer than this fraction of what it hides continues a
+# An occluder whose extent is not known is kept whole: one of which more than this fraction of the edge is where it ends
+# by distance.
+MOST_OPEN = 0.25
+# A region with a border of which more than the second number is nearer than this fraction of what it hides continues a
 # known surface.
 NEARER, MOST_NEARER = 0.94, 0.25
-# Narrower gaps in a thing look like what it hides by chance. Pixels at its edge are mixed with what is behind it: this
-# many pixels around it belong to it.
+# Narrower gaps in an occluder look like what it hides by chance. Pixels at its edge are mixed with what is behind it:
+# this many pixels around it belong to it.
 GAP_PX, MARGIN_PX = 7, 2
 # sRGB levels are about this power of light.
 GAMMA = 1.0 / 2.2
@@ -57,8 +60,8 @@ def occluder_masks(
     """Return for each photo the mask (H, W) of the pixels where something hides what other photos see.
 
     Pixels contradict a surface on which at least two other photos agree if their colour and their detail are
-    different. A thing consists of pixels without a known depth around such contradictions. It does not count if it
-    continues a nearer surface: then it is a side of an object on which stereo matching has failed.
+    different. An occluder consists of pixels without a known depth around such contradictions. If such a region
+    continues a nearer surface, it is none, but a side of an object on which stereo matching has failed.
 
     Args:
         dense: stereo depths of the photos.
@@ -158,7 +161,7 @@ def _expected(own: _Small, others: Sequence[_Small]) -> _Expected:
 
 
 def _hidden(own: _Small, others: Sequence[_Small]) -> np.ndarray:
-    """Return the mask (h, w) of the things that hide surfaces on which at least two other photos agree."""
+    """Return the mask (h, w) of what hides surfaces on which at least two other photos agree."""
     mask = np.zeros(own.distances.shape, bool)
     if len(others) < 2:
         return mask
@@ -173,11 +176,13 @@ def _hidden(own: _Small, others: Sequence[_Small]) -> np.ndarray:
     within_reach = unknown & (away <= REACH * max(mask.shape))
     count, labels = cv2.connectedComponents(within_reach.astype(np.uint8), connectivity=4)
     for label in range(1, count):
-        thing = labels == label
-        core = thing & contradicts & compared
-        enough = max(LEAST_PART * mask.size, MOST_OF * (thing & compared).sum())
-        if core.sum() >= enough and not _continues(own, expected, core):
-            mask |= thing
+        region = labels == label
+        core = region & contradicts & compared
+        enough = max(LEAST_PART * mask.size, MOST_OF * (region & compared).sum())
+        edge = (cv2.dilate(region.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~region
+        if core.sum() < enough or unknown[edge].mean() > MOST_OPEN or _continues(own, expected, core):
+            continue
+        mask |= region
     whole = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))
     side = 2 * MARGIN_PX + 1
     return cv2.dilate(whole, np.ones((side, side), np.uint8)) > 0
@@ -223,10 +228,10 @@ def _large_regions(mask: np.ndarray) -> np.ndarray:
     return large[labels]
 
 
-def _continues(own: _Small, expected: _Expected, thing: np.ndarray) -> bool:
-    """Return whether a thing (h, w) borders on known surfaces that are nearer than what it hides in each pixel."""
+def _continues(own: _Small, expected: _Expected, region: np.ndarray) -> bool:
+    """Return whether a region (h, w) borders on known surfaces that are nearer than what it hides there."""
     square = np.ones((5, 5), np.uint8)
-    behind = cv2.dilate(np.where(thing, expected.distances, 0.0), square)
-    border = (behind > 0.0) & ~thing & np.isfinite(own.distances)
+    behind = cv2.dilate(np.where(region, expected.distances, 0.0), square)
+    border = (behind > 0.0) & ~region & np.isfinite(own.distances)
     nearer = own.distances[border] < NEARER * behind[border]
     return bool(nearer.mean() > MOST_NEARER) if len(nearer) else False

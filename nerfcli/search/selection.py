@@ -148,18 +148,14 @@ def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bo
 def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
     """Return the model with components that photos support before any training, unless set, and the decisions.
 
-    These are points, at which rays should end, depths from stereo matching, the omission of what hides surfaces that
-    other photos see, exposures from shared pixels, and a sky that 3D points confirm. They are in the model from the
-    first step on: later, density has formed elsewhere already.
+    These are points, at which rays should end, depths from stereo matching, exposures from shared pixels, and a sky
+    that 3D points confirm. They are in the model from the first step on: later, density has formed elsewhere already.
     """
     wanted: list[tuple[Change, str]] = []
     if facts.points and may_use_points(requested, facts):
         wanted.append((("points", CHOICES["points"].on), f"{facts.points:,} pixels see a 3D point at a known distance"))
         if facts.stereo:
             wanted.append((("stereo", True), f"several photos agree on the depth of {facts.stereo} pixels"))
-        if facts.occluded_fraction:
-            reason = f"{100.0 * facts.occluded_fraction:.1f} % of the pixels hide surfaces that other photos see"
-            wanted.append((("occluders", True), reason))
         if facts.exposure_spread > LIKELY_EXPOSURE_SPREAD:
             per_cent = 100.0 * math.expm1(facts.exposure_spread)
             reason = f"photos differ in brightness by {per_cent:.0f} % at the same points"
@@ -191,6 +187,9 @@ def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list
         declined.append(
             untried("exposure", "learned", f"not tried, photos differ in brightness by only {spread:.1f} %")
         )
+    if facts.occluded_fraction and not start.occluders:
+        hidden = f"{100.0 * facts.occluded_fraction:.1f} % of the pixels hide surfaces that other photos see"
+        declined.append(untried("occluders", True, f"not taken, {hidden}; --with occluders leaves them out"))
     check = facts.cameras
     if facts.cameras_known is not None:
         declined.append(untried("cameras", "poses", f"not tried, {facts.cameras_known}"))
