@@ -270,12 +270,9 @@ def _facts(scene: Scene, evidence: Evidence) -> Facts:
         facts = replace(facts, points=len(evidence.of_tracks.numbers))
         if may_use_stereo(settings.components, facts, has_time=bool(evidence.side_px)):
             stereo = len(evidence.of_stereo.numbers)
-            facts = replace(
-                facts,
-                stereo=stereo,
-                exposure_spread=evidence.exposure_spread,
-                occluded_fraction=evidence.occluded_fraction if "occluders" not in facts.fixed else 0.0,
-            )
+            facts = replace(facts, stereo=stereo, exposure_spread=evidence.exposure_spread)
+            if "occluders" not in facts.fixed and is_worth_a_search(budget, settings.steps):  # else it is not reported
+                facts = replace(facts, occluded_fraction=evidence.occluded_fraction)
     return facts
 
 
