@@ -153,6 +153,7 @@ def test_the_index_stands_before_the_frames(tmp_path):
 @pytest.mark.parametrize("problem", [KeyError("ours"), KeyboardInterrupt()])
 @pytest.mark.parametrize("kind", ["mp4", "gif"])
 def test_nothing_is_left_after_an_exception(tmp_path, num_frames, problem, kind, monkeypatch):
+    imageio_ffmpeg.get_ffmpeg_exe()  # starts a process of its own the first time
     encoders = []
     start = subprocess.Popen
 
@@ -167,7 +168,7 @@ def test_nothing_is_left_after_an_exception(tmp_path, num_frames, problem, kind,
         raise problem
 
     with pytest.raises(type(problem)) as caught:
-        write_video(tmp_path / "a", interrupted, form=FORMATS[kind], fps=30)
+        write_video(tmp_path / f"a.{kind}", interrupted, form=FORMATS[kind], fps=30)
     assert caught.value is problem
     assert list(tmp_path.iterdir()) == []
     assert len(encoders) == (num_frames > 0)
