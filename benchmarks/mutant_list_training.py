@@ -273,7 +273,9 @@ TRAINING: tuple[Group, ...] = (
         "",
         (),
         (
-            Mutant("min(proportional, both) < min(between, mean)", "proportional < min(between, mean)"),
+            Mutant("min(proportional, both) >= min(between, mean)", "proportional >= min(between, mean)"),
+            Mutant("_slope(exif, log_gains) if proportional < both else", "_slope(exif, log_gains) if True else"),
+            Mutant("/ (places[2:] - places[:-2])", "/ 2"),
             Mutant("by_exif[:, None] + offsets", "by_exif[:, None]"),
             Mutant("log_gains[has_exif] - predicted[:, None]", "log_gains[has_exif]"),
             Mutant("if by_place >= _left_out", "if by_place < _left_out"),

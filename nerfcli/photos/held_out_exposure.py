@@ -36,9 +36,10 @@ def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray)
 def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> float:
     """Return the slope, from 0 to 1, of the photos' log gains over their log exposures in EXIF.
 
-    Tone curves make it smaller than 1. By leave-one-out cross-validation, it is 0 if the mean of the other photos or
-    the photos before and after predict a photo better, by squared errors, than EXIF does alone or with an offset from
-    the photos before and after.
+    Tone curves make it smaller than 1. Log gains follow either EXIF alone, or EXIF with an offset that is interpolated
+    from the photos before and after; then the slope is that of the differences from these photos, which light and
+    surfaces that change along the capture hardly affect. Leave-one-out cross-validation decides, by squared errors. The
+    slope is 0 if the mean of the other photos or the photos before and after predict a photo better than both.
 
     Args:
         places, log_gains: see `gains_between`.
@@ -49,15 +50,21 @@ def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> f
     if len(places) < 3:
         return 1.0
 
-    def by_exif(others: np.ndarray, offset: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    def by_exif(others: np.ndarray) -> np.ndarray:
         slope = _slope(exif[others], log_gains[others])
-        return slope * exif[~others] + offset(log_gains[others] - slope * exif[others, None])
+        return slope * exif[~others] + (log_gains[others] - slope * exif[others, None]).mean(0)
 
-    proportional = _left_out(lambda o: by_exif(o, lambda rest: rest.mean(0)), log_gains)
-    both = _left_out(lambda o: by_exif(o, lambda rest: _interpolated(places[o], rest, places[~o])[0]), log_gains)
+    def by_both(others: np.ndarray) -> np.ndarray:
+        slope = _local_slope(places[others], exif[others], log_gains[others])
+        rest = log_gains[others] - slope * exif[others, None]
+        return slope * exif[~others] + _interpolated(places[others], rest, places[~others])[0]
+
+    proportional, both = _left_out(by_exif, log_gains), _left_out(by_both, log_gains)
     between = _left_out(lambda o: _interpolated(places[o], log_gains[o], places[~o])[0], log_gains)
     mean = _left_out(lambda o: log_gains[o].mean(0), log_gains)
-    return _slope(exif, log_gains) if min(proportional, both) < min(between, mean) else 0.0
+    if min(proportional, both) >= min(between, mean):
+        return 0.0
+    return _slope(exif, log_gains) if proportional < both else _local_slope(places, exif, log_gains)
 
 
 def gains_beyond_exif(
@@ -85,6 +92,15 @@ def _slope(exif: np.ndarray, log_gains: np.ndarray) -> float:
     off = exif - exif.mean()
     squares = 3.0 * float(np.square(off).sum())
     return float(np.clip((off[:, None] * log_gains).sum() / squares, 0.0, 1.0)) if squares > 0 else 0.0
+
+
+def _local_slope(places: np.ndarray, exif: np.ndarray, log_gains: np.ndarray) -> float:
+    """Return the least-squares slope of the photos' differences from those before and after, clipped to [0, 1]."""
+    values = np.concatenate([exif[:, None], log_gains], axis=1)
+    weight = ((places[1:-1] - places[:-2]) / (places[2:] - places[:-2]))[:, None]
+    off = values[1:-1] - (1.0 - weight) * values[:-2] - weight * values[2:]
+    squares = 3.0 * float(np.square(off[:, 0]).sum())
+    return float(np.clip((off[:, :1] * off[:, 1:]).sum() / squares, 0.0, 1.0)) if squares > 0 else 0.0
 
 
 def _left_out(predict: Callable[[np.ndarray], np.ndarray], log_gains: np.ndarray) -> float:
