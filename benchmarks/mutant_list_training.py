@@ -268,6 +268,37 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
+        "field/exposure.py",
+        ("tests/test_exposure_and_background.py",),
+        "exposures or differences",
+        (),
+        (Mutant("torch.where(self._learned, self.free, self.free.detach())", "self.free"),),
+    ),
+    Group(
+        "fit/appearance.py",
+        ("tests/test_exposure_and_background.py",),
+        "known_exposures",
+        (),
+        (
+            Mutant('~known if components.exposure == "matched"', 'known if components.exposure == "matched"'),
+            Mutant("gains.nan_to_num(0.0)", "gains"),
+        ),
+    ),
+    Group(
+        "train/evidence.py",
+        ("tests/test_matched_exposures.py",),
+        "",
+        (),
+        (Mutant('if self.settings.components.exposure == "matched"', "if False"),),
+    ),
+    Group(
+        "train/checkpoints.py",
+        ("tests/test_held_out_exposure.py",),
+        "keeps",
+        (),
+        (Mutant('components.exposure == "exif"', 'components.exposure != "learned"'),),
+    ),
+    Group(
         "photos/held_out_exposure.py",
         ("tests/test_held_out_exposure.py",),
         "",
@@ -297,6 +328,8 @@ TRAINING: tuple[Group, ...] = (
         "",
         (),
         (
+            Mutant("facts.photos <= FEW_PHOTOS", "facts.photos < FEW_PHOTOS"),
+            Mutant('start.exposure in ("matched", "learned")', 'start.exposure == "learned"'),
             Mutant("signs.far_fraction <= LEAST_FAR_FRACTION", "signs.far_fraction < 0"),
             Mutant("painted < LEAST_SKY_PSNR and painted - one", "painted - one"),
             Mutant("painted - one < LEAST_SKY_DB", "one - painted < LEAST_SKY_DB"),

@@ -24,7 +24,7 @@ def test_every_component_is_varied_but_those_that_change_what_is_measured():
     assert adds["view=0"] is False
     assert adds["near=false"] is False
     assert adds["background=sphere"] is True
-    assert adds["exposure=exif"] is adds["exposure=learned"] is True
+    assert adds["exposure=exif"] is adds["exposure=matched"] is adds["exposure=learned"] is True
     for variant in found:
         name = variant.name.partition("=")[0]
         changed = {key for key in CHOICES if getattr(variant.components, key) != getattr(Components(), key)}

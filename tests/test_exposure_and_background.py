@@ -113,12 +113,35 @@ def test_a_gain_multiplies_linear_light_and_its_gradient_is_right():
 
 def test_only_differences_between_photos_are_learned():
     start = torch.randn(7, 3)
-    one, other = Exposure(start), Exposure(start + torch.tensor([5.0, -1.0, 0.3]))
+    every = torch.ones(7, dtype=torch.bool)
+    one, other = Exposure(start, every), Exposure(start + torch.tensor([5.0, -1.0, 0.3]), every)
     assert one.log_gains().mean(0).tolist() == pytest.approx([0.0] * 3, abs=1e-6)
     assert torch.allclose(one.log_gains(), other.log_gains(), atol=1e-5)
     one(torch.rand(4, 3), torch.tensor([0, 3, 3, 6])).square().sum().backward()
     assert one.free.grad is not None
     assert one.free.grad.sum(0).abs().max() < 1e-5  # no gradient for a gain that all photos share
+
+
+def test_known_exposures_keep_their_differences_while_the_others_are_learned(capture, tmp_path):
+    """Two of the three training photos are known, with exposures that they do not have."""
+    components = Components(exposure="matched", masks="empty")
+    settings = replace(SHORT, components=components, steps=60)
+    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    given = torch.tensor([[0.9, 0.6, 0.3], [-0.9, -0.6, -0.3], [math.nan] * 3])
+    training = replace(prepared, log_gains=given).fitting()
+    assert training.parts.exposure is not None
+    assert training.parts.exposure.log_gains()[2].tolist() == [0.0] * 3
+    for step in range(60):
+        training.advance(step / 60)
+    found = training.parts.exposure.log_gains().detach()
+    assert (found[0] - found[1] - (given[0] - given[1])).abs().max() < 1e-6
+    assert (found[2] - found[:2].mean(0)).abs().min() > 0.01
+    assert found.mean(0).abs().max() < 1e-6
+    # All of it is restored when a training is resumed.
+    again = replace(prepared, log_gains=given).fitting()
+    again.restore(*training.state())
+    assert again.parts.exposure is not None
+    assert torch.equal(again.parts.exposure.log_gains(), training.parts.exposure.log_gains())
 
 
 def test_exif_gives_stops_between_photos(capture, tmp_path):

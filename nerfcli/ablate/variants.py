@@ -73,7 +73,7 @@ def _offers(name: str, chosen: Components, capture: CaptureTraits) -> list[Value
     if name == "stereo" and not chosen.points:
         return []
     if name == "exposure" and capture.has_exif:
-        return ["exif", CHOICES[name].on]
+        return ["exif", "matched", CHOICES[name].on]
     return [CHOICES[name].on]
 
 

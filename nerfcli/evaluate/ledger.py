@@ -58,6 +58,7 @@ def _exposure(config: RunConfig) -> Entry:
     how = {
         "none": "no exposure is fitted",
         "exif": "from EXIF, including that of held-out photos",
+        "matched": "from pixels that training photos share; held-out photos use EXIF",
         "learned": "fitted to training photos; held-out photos use EXIF",
     }
     return Entry("exposure", False, how.get(chosen, str(chosen)))

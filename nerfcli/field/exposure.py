@@ -42,15 +42,20 @@ class Exposure(nn.Module):
 
     Args:
         start: (P, 3) initial logarithms of the gains; only differences between photos matter.
+        learned: (P,) bool, the photos whose gains are learned; those of the others keep their differences.
     """
 
-    def __init__(self, start: Tensor):
+    _learned: Tensor
+
+    def __init__(self, start: Tensor, learned: Tensor):
         super().__init__()
         self.free = nn.Parameter(start.clone())
+        self.register_buffer("_learned", learned[:, None], persistent=False)
 
     def log_gains(self) -> Tensor:
         """Return the logarithms of the gains (P, 3), with mean 0 over the photos in every channel."""
-        return self.free - self.free.mean(0)
+        gains = torch.where(self._learned, self.free, self.free.detach())
+        return gains - gains.mean(0)
 
     def forward(self, rgb: Tensor, photos: Tensor) -> Tensor:
         """Return colours (R, 3) as the photos (R,) show them."""

@@ -29,7 +29,7 @@ class Appearance(nn.Module):
     """The parts that the components require, and how they enter the colour of a ray.
 
     Args:
-        log_gains: (photos, 3) logarithms of their initial exposures.
+        log_gains: (photos, 3) logarithms of their initial exposures, NaN where unknown.
         log_focal: see `Refinement`.
 
     Raises:
@@ -51,8 +51,12 @@ class Appearance(nn.Module):
             self.background = (SphereBackground(1) if kind == "constant" else SphereBackground()).to(device)
         self.exposure: Exposure | None = None
         if components.exposure != "none":
-            self.exposure = Exposure(log_gains.to(device, torch.float32))
-            self.exposure.requires_grad_(components.exposure == "learned")
+            gains = log_gains.to(device, torch.float32)
+            known = gains.isfinite().all(1)
+            # Known exposures are fixed: with few photos, view dependence would take the place of learned ones.
+            learned = ~known if components.exposure == "matched" else torch.ones_like(known)
+            self.exposure = Exposure(gains.nan_to_num(0.0), learned)
+            self.exposure.requires_grad_(components.exposure != "exif")
         self.cameras = None if components.cameras == "fixed" else Refinement(components.cameras, pool, log_focal)
         self.is_random = kind == "random" or (kind == "auto" and pool.has_alpha)
         self._pool = pool

@@ -62,7 +62,7 @@ class Fitting:
 
     Args:
         marching, contraction, parallax: of the extent; see `RaySteps` for the steps along rays.
-        log_gains: (photos, 3) logarithms of the photos' initial exposures.
+        log_gains: (photos, 3) logarithms of the photos' initial exposures, NaN where unknown.
         log_focal: logarithm of the initial factor of focal lengths, if these are learned.
         cameras_from: the fraction of the budget after which cameras learn.
         points: pixels whose distance is known.

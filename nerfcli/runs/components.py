@@ -16,7 +16,7 @@ Change = tuple[str, Value]
 # Colours behind the field.
 BACKGROUNDS = ("auto", "black", "constant", "random", "sphere")
 LEARNED_BACKGROUNDS = ("constant", "sphere")
-EXPOSURES = ("none", "exif", "learned")
+EXPOSURES = ("none", "exif", "matched", "learned")
 CAMERAS = ("fixed", "poses", "focal", "all")
 # Meaning of black in a mask: unknown, or empty space.
 MASKS = ("ignore", "empty")
@@ -34,7 +34,8 @@ class Components:
             training, for photos with alpha; "auto" is random for photos with alpha and black for all others.
         view: dependence of colours on the viewing direction: highest degree of the spherical harmonics that the colour
             network takes, 0 (no dependence) to 3.
-        exposure: gains of the photos, see `field.exposure`: "none", from "exif", or "learned" starting from EXIF.
+        exposure: gains of the photos, see `field.exposure`: "none"; from "exif"; from "matched" pixels, see
+            `multiview.exposures`, and learned for photos without such pixels; or all "learned", starting from EXIF.
         cameras: camera parameters of the training photos that are trained with the field: "poses"; "focal", the focal
             length of each lens; "all", both and radial distortion; or "fixed", none. See `refinement`.
         masks: meaning of black in masks: "ignore", not used; or "empty", empty space, as with alpha.

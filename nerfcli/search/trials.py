@@ -103,7 +103,7 @@ class Trials:
         exif: (photos,) logarithms of EXIF exposures, relative to their mean.
         log_focal: see `Fitting`.
         depths: sets of pixels whose distance is known.
-        log_gains: (photos, 3) initial values of learned exposures, if matched pixels give any.
+        log_gains: (photos, 3) exposures from matched pixels, NaN where unknown; None if they are not used.
         sky: see `Fitting`.
         colours, storage: see `PixelPool`.
 
@@ -158,7 +158,7 @@ class Trials:
         Returns:
             The state; None if there were fewer than the fewest steps.
         """
-        gains = self._log_gains if components.exposure == "learned" else None
+        gains = self._log_gains if components.exposure in ("matched", "learned") else None
         fitting = self._fitting(components, seed=self._settings.seed, log_gains=gains, cameras_from=0.0)
         took: list[float] = []
 
@@ -201,7 +201,7 @@ class Trials:
             seed: of everything random; candidates with the same seed draw the same pixels.
         """
         learned = start.signs.log_gains if self._log_gains is None else self._log_gains
-        gains = {"exif": self._exif, "learned": learned}.get(components.exposure)
+        gains = {"exif": self._exif, "matched": self._log_gains, "learned": learned}.get(components.exposure)
         fitting = self._fitting(components, seed=seed, log_gains=gains, cameras_from=FORK_FRACTION)
         self._take_up(fitting, start)
         if fitting.parts.background is not None:

@@ -75,9 +75,9 @@ class Checkpoints:
         )
 
     def _held_out_exposures(self) -> dict[str, Any]:
-        """Return the exposures of held-out photos for `Model`, from the learned ones; nothing if none are learned."""
+        """Return the exposures of held-out photos for `Model`, from those of training photos; EXIF needs none."""
         exposure, test = self._fitting.parts.exposure, self._scene.test_frames
-        if exposure is None or self._fitting.components.exposure != "learned":
+        if exposure is None or self._fitting.components.exposure == "exif":
             return {}
         place = {frame.name: index for index, frame in enumerate(self._scene.frames)}
         places = np.array([place[frame.name] for frame in self._scene.train_frames], dtype=int)

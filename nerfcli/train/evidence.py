@@ -89,9 +89,12 @@ class Evidence:
         """Logarithms of exposures from pixels that several photos share, (photos, 3); NaN where unknown.
 
         All are NaN if EXIF does not confirm them: surfaces that look brighter from one side differ between photos just
-        as exposures do, and their differences add up along a ring of cameras.
+        as exposures do, and their differences add up along a ring of cameras. Only a user who asks for
+        exposure=matched gets them without EXIF.
         """
         found = self._matched_log_gains
+        if self.settings.components.exposure == "matched":
+            return found
         exif = log_exposures([photo.frame for photo in self.album.photos])
         measured = np.isfinite(found).all(1) & np.isfinite(exif)
         if measured.sum() < FEWEST_EXIF or exif_slope(np.flatnonzero(measured), found[measured], exif[measured]) == 0.0:

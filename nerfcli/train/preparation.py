@@ -71,8 +71,8 @@ class Prepared:
         storage: where arrays of the size of the photos are kept.
         selection: result of the automatic selection of components; None if there was none.
         log_exposure: mean log exposure of the training photos by EXIF; None if unknown or not used.
-        log_gains: (photos, 3) logarithms of their exposures relative to it: from the trials, from stereo matching, or
-            from EXIF; 0 where unknown.
+        log_gains: (photos, 3) logarithms of their exposures relative to it: from matched pixels, NaN where unknown, for
+            exposure=matched; else from the trials, from matched pixels or from EXIF, 0 where unknown.
         log_focal: logarithm of the initial factor of focal lengths.
         points: pixels whose distance is known, if the components use them.
         seconds: of the budget, spent on all this.
@@ -206,6 +206,9 @@ def prepare(
     reference, gains = _exposures(scene, settings.components, notify=notify)
     if selection is not None and selection.log_gains is not None:
         gains = selection.log_gains
+    elif settings.components.exposure == "matched":
+        gains = torch.from_numpy(evidence.log_gains)
+        notify(f"matched pixels give the exposure of {int(gains.isfinite().all(1).sum())} of {len(gains)} photos")
     elif settings.components.exposure == "learned" and settings.components.stereo:
         gains = evidence.gains_or(gains)
     occluders = None
@@ -262,6 +265,7 @@ def _facts(scene: Scene, evidence: Evidence) -> Facts:
         has_exif=bool(np.ptp(_exif(scene)) > 0.0),
         cameras_known=_known(scene) or (None if has_time else "the budget is too short to match photos"),
         cameras=_camera_check(evidence) if lacks_points and has_time else None,
+        photos=len(album.photos),
         fixed=settings.fixed,
     )
     if not facts.has_alpha and "background" not in facts.fixed:
@@ -270,9 +274,12 @@ def _facts(scene: Scene, evidence: Evidence) -> Facts:
         facts = replace(facts, points=len(evidence.of_tracks.numbers))
         if may_use_stereo(settings.components, facts, has_time=bool(evidence.side_px)):
             stereo = len(evidence.of_stereo.numbers)
-            facts = replace(facts, stereo=stereo, exposure_spread=evidence.exposure_spread)
-            if "occluders" not in facts.fixed and is_worth_a_search(budget, settings.steps):  # else it is not reported
-                facts = replace(facts, occluded_fraction=evidence.occluded_fraction)
+            facts = replace(
+                facts,
+                stereo=stereo,
+                exposure_spread=evidence.exposure_spread,
+                occluded_fraction=evidence.occluded_fraction if "occluders" not in facts.fixed else 0.0,
+            )
     return facts
 
 
@@ -297,6 +304,7 @@ def _search(scene: Scene, evidence: Evidence, facts: Facts, *, storage: PhotoSto
         return Selection(components, tuple(decisions), time.perf_counter() - began)
     requested, log_focal, measured = with_known_cameras(settings.components, facts)
     model, _ = with_evidence(requested, facts)
+    uses_matched = facts.exposure_spread > 0.0 or requested.exposure == "matched"
     trials = Trials(
         evidence.photos_without_occluders if model.occluders else album.photos,
         evidence.extent,
@@ -304,7 +312,7 @@ def _search(scene: Scene, evidence: Evidence, facts: Facts, *, storage: PhotoSto
         exif=_exif(scene),
         log_focal=log_focal,
         depths=evidence.sets(model) if facts.points else [],
-        log_gains=evidence.gains_or(torch.zeros(len(album.photos), 3)) if facts.exposure_spread else None,
+        log_gains=torch.from_numpy(evidence.log_gains) if uses_matched else None,
         sky=None if facts.has_alpha else evidence.sky,
         colours=album.colours,
         storage=storage,
