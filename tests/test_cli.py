@@ -29,6 +29,7 @@ from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, 
 from nerfcli.interrupts import install_handlers
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
+from nerfcli.photos.mask_files import write_masks
 from nerfcli.runs import settings
 from nerfcli.runs.log import append_log, read_log
 from nerfcli.train import loop
@@ -543,6 +544,23 @@ def test_a_finished_training_is_kept_another_one_refused_and_overwritten_on_dema
     longer = nerfcli("train", capture, "--steps", "2", "--downscale", "8", "--seed", "5", "--resume")
     assert longer.exit_code == 0
     assert "resumed at step 1" in longer.stderr
+
+
+def test_masks_of_an_earlier_training_are_removed_unless_the_scene_has_them(capture, tmp_path):
+    run, masked = capture.with_name("spheres-run"), tmp_path / "masked"
+    assert nerfcli("train", capture, *QUICK).exit_code == 0
+    first = scene.load(capture).train_frames[0]
+    for folder in ("occluders", "movers"):
+        write_masks(run / folder, {first.name: np.zeros((first.camera.height, first.camera.width), bool)})
+    converted = nerfcli("convert", capture, masked, "--to", "nerfcli", "--masks", run / "occluders")
+    assert converted.exit_code == 0, converted.stderr
+    refused = nerfcli("train", masked, *QUICK, "-o", run, "--overwrite")
+    assert refused.exit_code == BAD_INPUT
+    assert "has masks of the scene, such as" in error_of(refused)[0]
+    assert len(list(run.glob("*/**/*.png"))) == 2
+    assert nerfcli("train", capture, *QUICK, "--overwrite").exit_code == 0
+    assert not (run / "occluders").exists()
+    assert not (run / "movers").exists()
 
 
 @pytest.mark.parametrize("left", [None, (), ("cameras.json", "config.json")])

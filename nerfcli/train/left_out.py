@@ -8,6 +8,8 @@ import numpy as np
 
 from nerfcli.photos.mask_files import write_masks
 
+# Folders of a run, named like the components that leave pixels out.
+OCCLUDERS, MOVERS = "occluders", "movers"
 # Number of photos named in the message.
 _NAMED = 3
 
@@ -16,7 +18,7 @@ def write_left_out(folder: Path, masks: Mapping[str, np.ndarray], *, notify: Cal
     """Write FOLDER/PHOTO.png, black where pixels are left out, for each photo with such pixels; report how many.
 
     Args:
-        folder: in the run, named like the component that leaves them out; what it holds is replaced.
+        folder: `OCCLUDERS` or `MOVERS` in the run; what it holds is replaced.
         masks: (height, width) bool by the name of the photo, True where pixels are used.
 
     Raises:

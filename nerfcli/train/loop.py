@@ -1,6 +1,7 @@
 """The training of a scene from photos to checkpoint, within a budget of time or steps."""
 
 import resource
+import shutil
 import sys
 import time
 from collections import deque
@@ -25,7 +26,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
 from nerfcli.train.following import END, SETTLE, TIMED_STEPS, WAIT, describe_efficiency, start_others
-from nerfcli.train.left_out import write_left_out
+from nerfcli.train.left_out import MOVERS, OCCLUDERS, write_left_out
 from nerfcli.train.live import LiveTraining
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
@@ -98,7 +99,7 @@ def train(
         _clear(run)
     if prepared.occluders is not None:
         named = zip(prepared.pool.frames, prepared.occluders, strict=True)
-        write_left_out(run / "occluders", {frame.name: ~mask for frame, mask in named}, notify=notify)
+        write_left_out(run / OCCLUDERS, {frame.name: ~mask for frame, mask in named}, notify=notify)
     _describe(scene, run, settings, prepared, resume=resume)
     checkpoints = Checkpoints(run, fitting, totals, prepared=prepared, scene=scene)
     checkpoints.write_cameras()
@@ -141,7 +142,7 @@ def train(
     if fitting.rollbacks:
         notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
     if fitting.movers is not None:
-        write_left_out(run / "movers", fitting.movers.masks(), notify=notify)
+        write_left_out(run / MOVERS, fitting.movers.masks(), notify=notify)
     measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)
     if ranks.count > 1 and seconds:
         notify(describe_efficiency(fitting, seconds))
@@ -153,6 +154,9 @@ def _clear(run: Path) -> None:
         run.mkdir(parents=True, exist_ok=True)
         for old in (run / STATE, run / FIELD, run / LOG, *run.glob(FAILURES)):
             old.unlink(missing_ok=True)
+        for masks in (run / OCCLUDERS, run / MOVERS):
+            if masks.is_dir():
+                shutil.rmtree(masks)
     except OSError as error:
         raise cannot_write(run, error) from error
     forget_waypoints(run)

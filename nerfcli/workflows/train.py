@@ -304,6 +304,14 @@ def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, o
             f"{path} exists", "add --resume to continue, --overwrite to replace it, or choose another folder with -o"
         )
     _refuse_others(path)
+    inside = [
+        frame.mask for frame in scene.frames if frame.mask and frame.mask.resolve().is_relative_to(path.resolve())
+    ]
+    if inside and not resume:
+        raise UserError(
+            f"{path} is to be replaced, but has masks of the scene, such as {inside[0]}",
+            "choose another folder with -o",
+        )
     return False
 
 
