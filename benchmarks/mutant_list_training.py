@@ -281,7 +281,7 @@ TRAINING: tuple[Group, ...] = (
         (),
         (
             Mutant('~known if components.exposure == "matched"', 'known if components.exposure == "matched"'),
-            Mutant("gains.nan_to_num(0.0)", "gains"),
+            Mutant("torch.where(known[:, None], gains, 0.0)", "gains"),
         ),
     ),
     Group(

@@ -554,9 +554,10 @@ def test_masks_of_an_earlier_training_are_removed_unless_the_scene_has_them(capt
         write_masks(run / folder, {first.name: np.zeros((first.camera.height, first.camera.width), bool)})
     converted = nerfcli("convert", capture, masked, "--to", "nerfcli", "--masks", run / "occluders")
     assert converted.exit_code == 0, converted.stderr
-    refused = nerfcli("train", masked, *QUICK, "-o", run, "--overwrite")
-    assert refused.exit_code == BAD_INPUT
-    assert "has masks of the scene, such as" in error_of(refused)[0]
+    for option in ("--overwrite", "--resume"):
+        refused = nerfcli("train", masked, *QUICK, "-o", run, option)
+        assert refused.exit_code == BAD_INPUT
+        assert "holds masks that this scene uses, such as" in error_of(refused)[0]
     assert len(list(run.glob("*/**/*.png"))) == 2
     assert nerfcli("train", capture, *QUICK, "--overwrite").exit_code == 0
     assert not (run / "occluders").exists()

@@ -29,7 +29,9 @@ from nerfcli.field.exposure import exposed
 from nerfcli.kernels import RaysSeen
 from nerfcli.render.model import Model
 from nerfcli.render.rays import CENTRES, pixel_rays
+from nerfcli.runs.components import Components
 from nerfcli.runs.config import RunConfig
+from nerfcli.runs.decisions import Selection
 
 UP = np.array([0.0, -1.0, 0.0])
 BLACK = (0.0, 0.0, 0.0)
@@ -220,6 +222,9 @@ def test_the_ledger_says_what_each_way_to_poses_has_seen():
     foreign = seen({"history": {"from": "blender"}})
     assert (foreign["poses"], foreign["training"]) == (None, False)
     assert seen({})["poses"] is None
+    chosen = Selection(Components(exposure="matched"), (), 0.0)
+    (exposure,) = [entry for entry in leak_ledger(RunConfig(selection=chosen)) if entry.stage == "exposure"]
+    assert "training photos share" in exposure.how
     assert summary_line(leak_ledger(RunConfig(history={"from": "llff"}))).startswith(
         "held-out photos were used by normalisation; perhaps used by poses, intrinsics, points; not used by "
     )

@@ -29,7 +29,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals
 from nerfcli.train.loop import Progress, train
-from nerfcli.train.preparation import prepare
+from nerfcli.train.preparation import EarlierDecisions, prepare
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
 LEARNED = Components(background="sphere", exposure="learned")
@@ -142,6 +142,19 @@ def test_known_exposures_keep_their_differences_while_the_others_are_learned(cap
     again.restore(*training.state())
     assert again.parts.exposure is not None
     assert torch.equal(again.parts.exposure.log_gains(), training.parts.exposure.log_gains())
+
+
+def test_a_resumed_training_keeps_the_exposures_that_auto_has_fixed(capture, tmp_path, monkeypatch):
+    """EXIF of three photos is too little to confirm them again, as with other stereo depths it might be."""
+    found = np.array([[0.4] * 3, [-0.4] * 3, [np.nan] * 3])
+    monkeypatch.setattr("nerfcli.train.evidence.dense_depths", lambda *photos, **options: [])
+    monkeypatch.setattr("nerfcli.train.evidence.matched_log_gains", lambda photos, dense: found)
+    settings, notes = replace(SHORT, model="auto", components=Components()), []
+    first = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    begun = EarlierDecisions(first.extent, Components(exposure="matched"))
+    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=begun, notify=notes.append)
+    np.testing.assert_array_equal(prepared.log_gains.numpy(), found)
+    assert "matched pixels give the exposure of 2 of 3 photos; the others are learned" in notes
 
 
 def test_exif_gives_stops_between_photos(capture, tmp_path):

@@ -1,5 +1,6 @@
 """Exposures of held-out photos from neighbouring photos: closed forms, and storing them in a run and using them."""
 
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -96,6 +97,14 @@ def test_the_slope_over_exif_is_exact_beside_a_drift_that_is_linear_in_the_place
     jumps = np.array([0, 0, 1, -1, 1, 1, 0, 0]) / 3.0
     gains = 0.6 * jumps[:, None] + drifting(np.array(places))
     assert exif_slope(np.array(places), gains, jumps) == pytest.approx(0.6, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_one_exposure_in_exif_explains_no_drift(seed):
+    """Interpolation between places that are not evenly spaced leaves rounding errors of it."""
+    places = np.array([place for place in range(16) if place % 8 != 4])
+    gains = np.cumsum(np.random.default_rng(seed).normal(0, 0.1, (14, 3)), axis=0)
+    assert exif_slope(places, gains - gains.mean(0), np.full(14, math.log(1 / 125 * 100 / 16))) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -104,7 +104,7 @@ def train(
     Components, for --with and --without:
       background  auto, black, constant, random, sphere: colour behind the field
       view        0 to 3: degree of view-dependent colour
-      exposure    none, exif, matched, learned: brightness and white balance of each photo
+      exposure    none, exif, matched (fixed, from pixels that photos share), learned: brightness and white balance
       cameras     fixed, poses, focal, all: camera parameters optimized together with the field
       masks       ignore, empty: whether black in masks is unknown or empty space
       points      a weight: surfaces at the 3D points of matched features
@@ -119,8 +119,10 @@ def train(
       occluders   true, false: leave out what hides, in one photo, a surface that others see
 
     Unless they are set with --with or --without, points, stereo, occluders, exposure, cameras, background and view are
-    selected automatically: short trainings on up to 15 % of the budget keep a component if it improves PSNR by more
-    than the noise, on training pixels left out of these trials. --model default skips the selection.
+    selected automatically. The first three and exposures from matched pixels are used where the photos support them,
+    unless that loses more than 1 dB in a trial. For the rest, short trainings on up to 15 % of the budget keep a
+    component if it improves PSNR by more than the noise, on training pixels left out of these trials. --model default
+    skips the selection.
 
     Types of field, for --field: hash (a multiresolution hash grid with two small networks: best quality for its time),
     voxels (a dense grid of density and spherical harmonics), mlp (one network on Fourier features: small and slow).

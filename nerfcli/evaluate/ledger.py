@@ -54,12 +54,12 @@ def summary_line(ledger: list[Entry]) -> str:
 
 def _exposure(config: RunConfig) -> Entry:
     """Return the entry of the exposure, which is never fitted to a held-out photo; its EXIF may be used."""
-    chosen = config.settings.components.exposure
+    chosen = config.components.exposure
     how = {
         "none": "no exposure is fitted",
         "exif": "from EXIF, including that of held-out photos",
-        "matched": "from pixels that training photos share; held-out photos use EXIF",
-        "learned": "fitted to training photos; held-out photos use EXIF",
+        "matched": "from pixels that training photos share; held-out photos use EXIF and the photos around",
+        "learned": "fitted to training photos; held-out photos use EXIF and the photos around",
     }
     return Entry("exposure", False, how.get(chosen, str(chosen)))
 

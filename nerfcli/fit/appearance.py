@@ -55,7 +55,7 @@ class Appearance(nn.Module):
             known = gains.isfinite().all(1)
             # Known exposures are fixed: with few photos, view dependence would take the place of learned ones.
             learned = ~known if components.exposure == "matched" else torch.ones_like(known)
-            self.exposure = Exposure(gains.nan_to_num(0.0), learned)
+            self.exposure = Exposure(torch.where(known[:, None], gains, 0.0), learned)
             self.exposure.requires_grad_(components.exposure != "exif")
         self.cameras = None if components.cameras == "fixed" else Refinement(components.cameras, pool, log_focal)
         self.is_random = kind == "random" or (kind == "auto" and pool.has_alpha)

@@ -121,7 +121,7 @@ class Fitting:
         if settings.random_start:
             assert isinstance(self.field, HashField)
             self.field.start_randomly(settings.random_start)
-        gains = torch.zeros(len(pool.first_pixel), 3) if log_gains is None else log_gains
+        gains = torch.full((len(pool.first_pixel), 3), torch.nan) if log_gains is None else log_gains
         self.points, self.error_map, self.movers = points, error_map, movers
         self.parts = Appearance(self.components, pool, log_gains=gains, log_focal=log_focal)
         self._cameras_from = cameras_from

@@ -12,6 +12,9 @@ from nerfcli.render.model import Model
 # the training photos taken before and after; those training photos alone; the mean of all training photos.
 SOURCES = ("none", "EXIF", "EXIF and training photos around", "training photos around", "their mean")
 
+# Log exposures that differ by less are the same but for rounding: a hundredth of a stop is 0.007.
+SAME_EXPOSURE = 1e-4
+
 
 def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Interpolate log gains (T, 3) from photos taken before and after, or return 0, the mean, if that is better.
@@ -89,9 +92,14 @@ def gains_beyond_exif(
 
 def _slope(exif: np.ndarray, log_gains: np.ndarray) -> float:
     """Return the least-squares slope of log gains (P, 3) over `exif`, one for all channels, clipped to [0, 1]."""
-    off = exif - exif.mean()
-    squares = 3.0 * float(np.square(off).sum())
-    return float(np.clip((off[:, None] * log_gains).sum() / squares, 0.0, 1.0)) if squares > 0 else 0.0
+    return _slope_through_zero(exif - exif.mean(), log_gains)
+
+
+def _slope_through_zero(exif: np.ndarray, log_gains: np.ndarray) -> float:
+    """Return the slope of log gains (P, 3) over differences of `exif` (P,), clipped to [0, 1]; 0 if these are equal."""
+    if not (np.abs(exif) > SAME_EXPOSURE).any():
+        return 0.0
+    return float(np.clip((exif[:, None] * log_gains).sum() / (3.0 * np.square(exif).sum()), 0.0, 1.0))
 
 
 def _local_slope(places: np.ndarray, exif: np.ndarray, log_gains: np.ndarray) -> float:
@@ -99,8 +107,7 @@ def _local_slope(places: np.ndarray, exif: np.ndarray, log_gains: np.ndarray) ->
     values = np.concatenate([exif[:, None], log_gains], axis=1)
     weight = ((places[1:-1] - places[:-2]) / (places[2:] - places[:-2]))[:, None]
     off = values[1:-1] - (1.0 - weight) * values[:-2] - weight * values[2:]
-    squares = 3.0 * float(np.square(off[:, 0]).sum())
-    return float(np.clip((off[:, :1] * off[:, 1:]).sum() / squares, 0.0, 1.0)) if squares > 0 else 0.0
+    return _slope_through_zero(off[:, 0], off[:, 1:])
 
 
 def _left_out(predict: Callable[[np.ndarray], np.ndarray], log_gains: np.ndarray) -> float:

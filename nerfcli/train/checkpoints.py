@@ -75,7 +75,7 @@ class Checkpoints:
         )
 
     def _held_out_exposures(self) -> dict[str, Any]:
-        """Return the exposures of held-out photos for `Model`, from those of training photos; EXIF needs none."""
+        """Return the exposures of held-out photos for `Model`, from training photos; none with exposure=exif."""
         exposure, test = self._fitting.parts.exposure, self._scene.test_frames
         if exposure is None or self._fitting.components.exposure == "exif":
             return {}

@@ -1,4 +1,4 @@
-"""Write masks of the pixels that a training leaves out, to look at and to edit."""
+"""Write masks of the pixels that a training leaves out, to look at."""
 
 import shutil
 from collections.abc import Callable, Mapping
@@ -12,6 +12,13 @@ from nerfcli.photos.mask_files import write_masks
 OCCLUDERS, MOVERS = "occluders", "movers"
 # Number of photos named in the message.
 _NAMED = 3
+
+
+def remove_left_out(run: Path) -> None:
+    """Remove the masks of an earlier training from a run folder."""
+    for folder in (run / OCCLUDERS, run / MOVERS):
+        if folder.is_dir():
+            shutil.rmtree(folder)
 
 
 def write_left_out(folder: Path, masks: Mapping[str, np.ndarray], *, notify: Callable[[str], None]) -> None:

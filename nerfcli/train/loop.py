@@ -1,7 +1,6 @@
 """The training of a scene from photos to checkpoint, within a budget of time or steps."""
 
 import resource
-import shutil
 import sys
 import time
 from collections import deque
@@ -26,7 +25,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
 from nerfcli.train.following import END, SETTLE, TIMED_STEPS, WAIT, describe_efficiency, start_others
-from nerfcli.train.left_out import MOVERS, OCCLUDERS, write_left_out
+from nerfcli.train.left_out import MOVERS, OCCLUDERS, remove_left_out, write_left_out
 from nerfcli.train.live import LiveTraining
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
@@ -154,9 +153,7 @@ def _clear(run: Path) -> None:
         run.mkdir(parents=True, exist_ok=True)
         for old in (run / STATE, run / FIELD, run / LOG, *run.glob(FAILURES)):
             old.unlink(missing_ok=True)
-        for masks in (run / OCCLUDERS, run / MOVERS):
-            if masks.is_dir():
-                shutil.rmtree(masks)
+        remove_left_out(run)
     except OSError as error:
         raise cannot_write(run, error) from error
     forget_waypoints(run)

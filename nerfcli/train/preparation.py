@@ -172,7 +172,7 @@ def prepare(
     device = torch.device(settings.device)
     shared = SharedFeatures(scene, album.photos, threads=settings.threads)
     if begun is not None:
-        extent = begun.extent
+        extent, settings = begun.extent, replace(settings, components=begun.components)
     else:
         located = scene
         if lacks_depth(scene, settings, fills_frame=album.fills_frame):
@@ -190,14 +190,12 @@ def prepare(
         notify(f"{pool.without_ray} pixels are skipped: they lie outside the lens model's field of view")
     evidence = Evidence(shared, album, pool, extent, settings, notify)
     selection, log_focal = None, 0.0
-    if begun is not None:
-        settings = replace(settings, components=begun.components)
-    elif settings.model == "auto":
+    if begun is None and settings.model == "auto":
         began = time.perf_counter()
         facts = _facts(scene, evidence)
         selection = _search(scene, evidence, facts, storage=storage, began=began)
         settings, log_focal = replace(settings, components=selection.components), selection.log_focal
-    elif settings.components.cameras in LEARN_FOCAL:
+    elif begun is None and settings.components.cameras in LEARN_FOCAL:
         _, log_focal, decisions = with_known_cameras(settings.components, _facts(scene, evidence))
         for decision in decisions:
             notify(decision.in_words())
@@ -208,7 +206,9 @@ def prepare(
         gains = selection.log_gains
     elif settings.components.exposure == "matched":
         gains = torch.from_numpy(evidence.log_gains)
-        notify(f"matched pixels give the exposure of {int(gains.isfinite().all(1).sum())} of {len(gains)} photos")
+        known = int(gains.isfinite().all(1).sum())
+        others = "" if known == len(gains) else "; the others are learned"
+        notify(f"matched pixels give the exposure of {known} of {len(gains)} photos{others}")
     elif settings.components.exposure == "learned" and settings.components.stereo:
         gains = evidence.gains_or(gains)
     occluders = None

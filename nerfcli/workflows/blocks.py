@@ -15,6 +15,7 @@ from nerfcli.runs.log import LogEntry, append_log
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
+from nerfcli.train.left_out import remove_left_out
 from nerfcli.workflows.notices import Notify, Progress, no_progress, one_of_several, silent, warn_python
 from nerfcli.workflows.train import train_or_continue
 
@@ -117,6 +118,7 @@ def train_blocks(
 
 def _write(run: Path, scene: Scene, blocks: Sequence[Run], settings: TrainSettings) -> None:
     """Write the files of a joined run besides its field: cameras, configuration, and a combined log of the blocks."""
+    remove_left_out(run)  # of a training without blocks
     write_cameras(run, scene.train_frames, scene.test_frames)
     write_config(run, RunConfig.describing(scene, settings, factor=blocks[0].config.downscale, contraction="l2"))
     last = [block.log[-1] for block in blocks]

@@ -17,6 +17,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene, describe_unused_masks
 from nerfcli.train import loop
 from nerfcli.train.following import follow
+from nerfcli.train.left_out import MOVERS, OCCLUDERS
 from nerfcli.train.ranks import joined_ranks
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.workflows.view_worker import viewer_beside
@@ -285,6 +286,13 @@ def scene_for(settings: TrainSettings, folder: Path, *, holdout: str | None) -> 
 def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:
     """Return whether the run at `path` is complete with these settings; raise if it may not be replaced otherwise."""
     run = Run(path)
+    rewritten = [(path / folder).resolve() for folder in (OCCLUDERS, MOVERS)]
+    for frame in scene.frames:
+        if frame.mask is not None and any(frame.mask.resolve().is_relative_to(folder) for folder in rewritten):
+            raise UserError(
+                f"{path} holds masks that this scene uses, such as {frame.mask}; training would delete them",
+                "choose another folder with -o",
+            )
     if resume and run.config.split_sha256 != split_hash(scene.test_names):
         before = run.config.holdout
         raise UserError(
@@ -304,14 +312,6 @@ def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, o
             f"{path} exists", "add --resume to continue, --overwrite to replace it, or choose another folder with -o"
         )
     _refuse_others(path)
-    inside = [
-        frame.mask for frame in scene.frames if frame.mask and frame.mask.resolve().is_relative_to(path.resolve())
-    ]
-    if inside and not resume:
-        raise UserError(
-            f"{path} is to be replaced, but has masks of the scene, such as {inside[0]}",
-            "choose another folder with -o",
-        )
     return False
 
 
