@@ -287,10 +287,11 @@ def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, o
     """Return whether the run at `path` is complete with these settings; raise if it may not be replaced otherwise."""
     run = Run(path)
     rewritten = [(path / folder).resolve() for folder in (OCCLUDERS, MOVERS)]
-    for frame in scene.frames:
-        if frame.mask is not None and any(frame.mask.resolve().is_relative_to(folder) for folder in rewritten):
+    masks = {frame.mask.parent: frame.mask for frame in scene.frames if frame.mask is not None}  # one of each folder
+    for parent, mask in masks.items():
+        if any(parent.resolve().is_relative_to(folder) for folder in rewritten):
             raise UserError(
-                f"{path} holds masks that this scene uses, such as {frame.mask}; training would delete them",
+                f"{path} holds masks that this scene uses, such as {mask}; training would delete them",
                 "choose another folder with -o",
             )
     if resume and run.config.split_sha256 != split_hash(scene.test_names):
