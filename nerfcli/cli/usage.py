@@ -7,6 +7,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from nerfcli.cli.batch import example_of_many
 from nerfcli.cli.console import command
+from nerfcli.cli.removed import refuse_removed
 
 # The class of click, or of typer's own copy of click, depending on the version of typer.
 _UsageError: Any = typer.BadParameter.__bases__[0]
@@ -42,12 +43,13 @@ class Program(TyperGroup):
 class Command(TyperCommand):
     """A command with more helpful usage errors.
 
-    They also name the commands that have an unknown option, show how to give several inputs, describe a missing
-    argument, and explain what is wrong with a number.
+    They also say what replaces a removed option, name the commands that have an unknown one, show how to give several
+    inputs, describe a missing argument, and explain what is wrong with a number.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; see `TyperCommand.parse_args`."""
+        refuse_removed(str(self.name), args)
         try:
             return super().parse_args(ctx, args)
         except _UsageError as error:

@@ -1,0 +1,50 @@
+"""Options that earlier versions had and what to use instead, for one release each."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from nerfcli.errors import UserError
+
+WRONG_USAGE = 2
+
+
+class Removed(NamedTuple):
+    """An option that a command no longer has, or no longer takes a value of.
+
+    Args:
+        command: name of the command.
+        name: the option, "--members", or the option with one of its values, "--to tsdf".
+        since: date of the removal.
+        instead: what to use, for the hint.
+    """
+
+    command: str
+    name: str
+    since: str
+    instead: str
+
+
+REMOVED: tuple[Removed, ...] = ()
+
+
+def refuse_removed(command: str, arguments: Sequence[str]) -> None:
+    """Refuse the arguments of a command if one of them is an option, or a value of one, that was removed.
+
+    Raises:
+        UserError: one is; the hint says what to use instead.
+    """
+    for removed in REMOVED:
+        option, _, value = removed.name.partition(" ")
+        if removed.command == command and any(value in ("", *given) for given in _values(option, arguments)):
+            raise UserError(f"{removed.name} was removed on {removed.since}", removed.instead, WRONG_USAGE)
+
+
+def _values(option: str, arguments: Sequence[str]) -> list[list[str]]:
+    """Return what follows each use of an option: the items of a comma-separated list, each without "=VALUE" too."""
+    found = []
+    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        name, joined, text = argument.partition("=")
+        if name == option:
+            items = (text if joined else following).split(",")
+            found.append([*items, *(item.partition("=")[0] for item in items)])
+    return found
