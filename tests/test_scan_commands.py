@@ -312,7 +312,6 @@ def test_hounsfield_units_of_water_and_air(tmp_path: Path, bean_run: Path) -> No
     [
         (("train", "SCAN", "--holdout", "every:4"), "--holdout"),
         (("train", "SCAN", "--blocks", "2"), "--blocks"),
-        (("render", "RUN", "--dry-run"), "--dry-run"),
         (("render", "RUN", "--video"), "--video"),
         (("render", "RUN", "--lens", "fisheye"), "--lens"),
         (("evaluate", "RUN", "--align", "pose"), "--align"),

@@ -1,7 +1,6 @@
 """nerfcli evaluate: metrics of a run on its held-out photos, and their spread between seeds."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,7 +9,6 @@ import typer
 from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Overwrite, Quiet, Require, Threads, one_of
-from nerfcli.errors import UserError
 from nerfcli.workflows.machine import device_name, thread_count
 
 if TYPE_CHECKING:
@@ -56,9 +54,6 @@ def evaluate(
             help="Scans: run folder of a reconstruction from more views, to compare with; it is not the truth."
         ),
     ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show how much time, memory and disk it would take; writes nothing.")
-    ] = False,
     require: Require = None,
     device: Device = "auto",
     threads: Threads = 0,
@@ -85,7 +80,6 @@ def evaluate(
       nerfcli evaluate photos-scene-run --align colour --overwrite
       nerfcli evaluate photos-scene-run --seeds 3
       nerfcli evaluate photos-scene-run --members
-      nerfcli evaluate photos-scene-run --dry-run --json
       nerfcli evaluate first-run second-run third-run
       nerfcli evaluate tooth-15-views-run --reference tooth-run
     """
@@ -104,9 +98,6 @@ def evaluate(
         )
     if members and (len(runs) > 1 or seeds > 1):
         raise typer.BadParameter("--members takes a single run, without --seeds", param_hint="--members")
-    if dry_run and (members or seeds > 1):
-        option = "--members" if members else "--seeds"
-        raise typer.BadParameter(f"cannot be combined with {option}", param_hint="--dry-run")
     if seeds > 1 and len(runs) > 1:
         raise typer.BadParameter("--seeds takes a single run and trains the other seeds itself", param_hint="--seeds")
     console = Console(quiet=quiet, json_lines=json)
@@ -153,14 +144,6 @@ def evaluate(
         ]
         console.table(("", "PSNR", "SSIM", "LPIPS"), rows, styles={})
 
-    def plan(folder: Path, one_of_many: bool) -> None:
-        from nerfcli.workflows.render_plan import plan_evaluation
-
-        if is_reconstruction(folder):
-            raise UserError(f"{folder} is a reconstruction of a scan; --dry-run is for photos", "remove --dry-run")
-        found = plan_evaluation(folder, **how)
-        console.facts(folder, asdict(found), f"{folder}: {found.describe()}")
-
     def work(folder: Path, one_of_many: bool) -> None:
         if is_reconstruction(folder):
             measure_scan(folder)
@@ -172,10 +155,6 @@ def evaluate(
             measure_members(folder)
         check_requirements(Run(folder), found, requirements)
 
-    if dry_run:
-        for run in runs:
-            for_each_input(run, plan, command="evaluate")
-        return
     if seeds == 1 and len(runs) == 1:
         for_each_input(runs[0], work, command="evaluate")
         return

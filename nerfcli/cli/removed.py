@@ -24,7 +24,10 @@ class Removed(NamedTuple):
     instead: str
 
 
-REMOVED: tuple[Removed, ...] = ()
+REMOVED: tuple[Removed, ...] = (
+    Removed("evaluate", "--dry-run", "2026-11-29", "time three views: nerfcli render RUN --frames 0:3 -o three"),
+    Removed("render", "--dry-run", "2026-11-29", "time three views: add --frames 0:3 -o three"),
+)
 
 
 def refuse_removed(command: str, arguments: Sequence[str]) -> None:

@@ -1,8 +1,8 @@
 """nerfcli render: render pictures, depth maps and videos of a run."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -127,9 +127,6 @@ def render(
         bool,
         typer.Option("--cameras-only", help="Render nothing; only write cameras.json and camera_path.json."),
     ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show how much time, memory and disk it would take; writes nothing.")
-    ] = False,
     max_size: Annotated[
         int | None,
         typer.Option(help="Maximum longer side of the pictures, in pixels.  [default: training resolution]", min=8),
@@ -192,7 +189,6 @@ def render(
       nerfcli render photos-scene-run --cameras orbit --count 120 --video
       nerfcli render photos-scene-run --cameras orbit --outputs rgb,depth --video-layout side-by-side --video-format gif
       nerfcli render photos-scene-run --cameras ellipse --count 1200 --frames 3/8 --jobs 4
-      nerfcli render photos-scene-run --cameras orbit --dry-run --json
       nerfcli render photos-scene-run --cameras interpolate --through a.jpg,k.jpg,c.jpg --video
       nerfcli render photos-scene-run --cameras camera_path.json --nerfstudio-frame dataparser_transforms.json --video
       nerfcli render photos-scene-run --cameras ellipse --count 240 --cameras-only -o ellipse/
@@ -260,8 +256,6 @@ def render(
         depth_tolerance=depth_tolerance,
     )
     options.one_of(colour_map, COLOUR_MAPS, "--colour-map")
-    if cameras_only and dry_run:
-        raise typer.BadParameter("it renders nothing; remove --dry-run", param_hint="--cameras-only")
     if max_size is not None and (width is not None or height is not None):
         raise typer.BadParameter("cannot be combined with --width or --height", param_hint="--max-size")
     look = render_options.look_of(width, height, lens=lens, fov_deg=fov, crop=crop)
@@ -325,22 +319,20 @@ def render(
             write_frames(chosen_views, target, fps=fps, overwrite=overwrite, warn=console.warn)
             console.result(target)
             return
-        how: dict[str, Any] = {
-            "views": views,
-            "settings": settings,
-            "device": device_name(device),
-            "threads": thread_count(threads),
-            "step": step,
-            "part": part,
-        }
-        if dry_run:
-            from nerfcli.workflows.render_plan import plan_rendering
-
-            plan = plan_rendering(folder, **how)
-            console.facts(folder, asdict(plan), f"{folder}: {plan.describe()}")
-            return
         with console.callbacks(f"render {views.name}") as callbacks:
-            written = render_run(folder, target, jobs=jobs, overwrite=overwrite, **how, **callbacks)
+            written = render_run(
+                folder,
+                target,
+                views=views,
+                settings=settings,
+                device=device_name(device),
+                threads=thread_count(threads),
+                step=step,
+                jobs=jobs,
+                part=part,
+                overwrite=overwrite,
+                **callbacks,
+            )
         for path in written:
             console.result(path)
 
