@@ -71,7 +71,7 @@ def check_that_it_parses(line: str) -> None:
 
 def needed(command: str, folder: Path) -> tuple[Any, ...]:
     """Return the arguments that a command needs besides its input."""
-    return {"convert": (folder / "out.npz", "--to", "npz"), "export": ("--to", "mesh")}.get(command, ())
+    return {"convert": (folder / "out.json", "--to", "transforms"), "export": ("--to", "mesh")}.get(command, ())
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, *WITHOUT_INPUT])
@@ -187,7 +187,7 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --depth-tolerance 0.1 --outputs lower", "--depth-tolerance: it works with --outputs confidence"),
         ("render x --outputs depth --rgba", "--rgba: it works with --outputs rgb"),
         ("render x --outputs rgb --depth median", "--depth: it works with --outputs depth"),
-        ("convert x y --to npz --no-verify --tolerance 1", "--tolerance: nothing is compared with --no-verify"),
+        ("convert x y --to ply --no-verify --tolerance 1", "--tolerance: nothing is compared with --no-verify"),
         ("render x --count 20", "--count: it works with --cameras orbit, ellipse, spiral, interpolate"),
         ("train x --field voxels --levels 4", "--levels: it works with --field hash"),
         ("train x --field mlp --log2-rows 12", "--log2-rows: it works with --field hash"),

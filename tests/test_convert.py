@@ -19,7 +19,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import OPENCV_FROM_LLFF, OPENCV_FROM_OPENGL
 from nerfcli.cameras.formats import blender, colmap_binary, llff, opensfm, trajectories, transforms, transforms_cameras
-from nerfcli.cameras.formats.archive import write_npz
+from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.formats.ply import write_ply
 from nerfcli.cameras.frame import Capture, Observations
 from nerfcli.cli.convert import FORMATS_WRITTEN
@@ -44,10 +44,9 @@ def with_images(capture: Capture, folder: Path) -> Capture:
     return replace(capture, frames=tuple(replace(f, image=folder / f.name) for f in capture.frames))
 
 
-def npz_of(tmp_path: Path, capture: Capture) -> Path:
-    path = tmp_path / "in.npz"
-    write_npz(capture, path)
-    return path
+def model_of(tmp_path: Path, capture: Capture) -> Path:
+    write_colmap_binary(capture, tmp_path / "in")
+    return tmp_path / "in"
 
 
 def farthest_px(a: Capture, b: Capture) -> float:
@@ -124,7 +123,7 @@ CAMERAS = {
 
 @pytest.mark.parametrize("program", ["nerfstudio", "instant-ngp"])
 def test_programs_that_read_transforms_name_it(program, tmp_path):
-    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    source = model_of(tmp_path, capture_of([PINHOLE]))
     named = nerfcli("convert", source, tmp_path / "program.json", "--to", program, "--json")
     assert named.exit_code == 0, named.stderr
     assert json.loads(named.stdout)["to"] == "transforms"
@@ -139,9 +138,8 @@ def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
     capture = capture_of(CAMERAS.get(form, EVERYTHING))
     write_photos(tmp_path / "images", capture)
     capture = with_images(capture, tmp_path / "images")
-    first = nerfcli("convert", npz_of(tmp_path, capture), tmp_path / "sparse" / "0", "--to", "colmap")
-    assert first.exit_code == 0, first.stderr
-    there = nerfcli("convert", tmp_path / "sparse" / "0", tmp_path / "there", "--to", form, "--allow-loss", "--json")
+    source = model_of(tmp_path, capture)
+    there = nerfcli("convert", source, tmp_path / "there", "--to", form, "--allow-loss", "--json")
     assert there.exit_code == 0, there.stderr
     report = json.loads(there.stdout)
     assert report["verification"]["max_px"] < LIMIT_PX
@@ -160,7 +158,7 @@ def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
     assert farthest_px(capture, again) < LIMIT_PX
 
 
-@pytest.mark.parametrize("form", ["colmap", "colmap-text", "npz"])
+@pytest.mark.parametrize("form", ["colmap", "colmap-text"])
 def test_points_and_observations_survive(form, tmp_path):
     capture = replace(capture_of(EVERYTHING), colours=None)
     names = [frame.name.replace(" ", "_") for frame in capture.frames]
@@ -176,22 +174,17 @@ def test_points_and_observations_survive(form, tmp_path):
     np.testing.assert_array_equal(again.observations.pixels, capture.observations.pixels)
 
 
-@pytest.mark.parametrize("form", ["transforms", "npz"])
-def test_axes_and_pixel_centre_of_the_written_file(form, tmp_path):
+def test_axes_and_pixel_centre_of_the_written_file(tmp_path):
     """By hand: with OpenCV axes the matrix is world_from_cam itself, and with centres at 0 cx is half a pixel less."""
-    capture = capture_of([PINHOLE])
-    out = tmp_path / ("out.json" if form == "transforms" else "out.npz")
+    source, out = model_of(tmp_path, capture_of([PINHOLE])), tmp_path / "out.json"
+    capture = load(source, UserInputs(), ConventionOverrides())[2]
     options = ("--axes", "opencv", "--pixel-center", "0", "--allow-loss")
-    result = nerfcli("convert", npz_of(tmp_path, capture), out, "--to", form, *options)
+    result = nerfcli("convert", source, out, "--to", "transforms", *options)
     assert result.exit_code == 0, result.stderr
-    if form == "transforms":
-        content = json.loads(out.read_text())
-        matrix, cx = content["frames"][0]["transform_matrix"], content["cx"]
-    else:
-        with np.load(out) as arrays:
-            matrix, cx = arrays["world_from_cam"][0], arrays["camera_params"][0, 2]
+    content = json.loads(out.read_text())
+    matrix = content["frames"][0]["transform_matrix"]
     np.testing.assert_allclose(matrix, capture.frames[0].world_from_cam, rtol=0, atol=1e-15)
-    assert cx == PINHOLE.params[2] - 0.5
+    assert content["cx"] == PINHOLE.params[2] - 0.5
     options = ("--from-axes", "opencv", "--from-pixel-center", "0")
     assert nerfcli("convert", out, tmp_path / "back", "--to", "colmap", *options).exit_code == 0
     assert farthest_px(capture, load(tmp_path / "back", UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
@@ -205,11 +198,11 @@ def test_axes_and_pixel_centre_of_the_written_file(form, tmp_path):
     ],
 )
 def test_a_convention_that_the_format_fixes_is_refused(form, options, message, tmp_path):
-    source = npz_of(tmp_path, replace(capture_of([PINHOLE]), observations=None))
+    source = model_of(tmp_path, replace(capture_of([PINHOLE]), observations=None))
     result = nerfcli("convert", source, tmp_path / "out", "--to", form, *options)
     assert result.exit_code == BAD_INPUT
     assert message in error_of(result)[0]
-    assert set(listing(tmp_path)) == {"in.npz"}
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
@@ -228,7 +221,7 @@ def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
 def test_intrinsics_for_another_size(tmp_path):
     """Intrinsics for twice the resolution, principal point off the middle, in a file with the size of the photos."""
     double = Camera("PINHOLE", 640, 480, (1000.0, 1010.0, 642.5, 477.0))
-    source = npz_of(tmp_path, capture_of([double]))
+    source = model_of(tmp_path, capture_of([double]))
     result = nerfcli("convert", source, tmp_path / "out", "--to", "colmap", "--from-size", "2")
     assert result.exit_code == 0
     assert "principal point" not in result.stderr
@@ -242,10 +235,11 @@ def test_the_world_frame_and_its_scale(tmp_path):
     capture = capture_of([PINHOLE])
     first, second = capture.frames[:2]
     metres = 2.5 * float(np.linalg.norm(first.centre - second.centre))
-    out = tmp_path / "out.npz"
+    write_photos(tmp_path / "images", capture)
+    out = tmp_path / "out"
     distance = f"{','.join(map(str, first.centre))} {','.join(map(str, second.centre))} {metres}"
     options = ("--origin", "centre-of-cameras", "--world-up", "-y", "--distance", distance, "--json")
-    result = nerfcli("convert", npz_of(tmp_path, capture), out, "--to", "npz", *options)
+    result = nerfcli("convert", model_of(tmp_path, capture), out, "--to", "nerfcli", *options)
     assert result.exit_code == 0, result.stderr
     again = load(out, UserInputs(), ConventionOverrides())[2]
     centres = np.array([frame.centre for frame in again.frames])
@@ -260,21 +254,21 @@ def test_the_world_frame_and_its_scale(tmp_path):
 def test_markers_in_the_photos_give_metres(tmp_path):
     # Markers with a side of 120 pixels at 120 / 0.7 pixels per unit; --markers declares the side to be 0.05 m.
     frames = photos_of(tmp_path, sheet_of_markers([3, 17], 120), per_unit=120 / 0.7)
-    source = npz_of(tmp_path, Capture(tuple(frames), np.zeros((0, 3)), (), None, "npz"))
-    result = nerfcli("convert", source, tmp_path / "out.npz", "--to", "npz", "--markers", "DICT_4X4_50:0.05", "--json")
+    source = model_of(tmp_path, Capture(tuple(frames), np.zeros((0, 3)), (), None, "made"))
+    result = nerfcli("convert", source, tmp_path / "out", "--to", "nerfcli", "--markers", "DICT_4X4_50:0.05", "--json")
     assert result.exit_code == 0, result.stderr
     assert "from ArUco markers (DICT_4X4_50, 0.05 m), 8 sides" in result.stderr
     assert json.loads(result.stdout)["new_from_old"]["scale"] == pytest.approx(0.05 / 0.7, rel=1e-4)
-    assert load(tmp_path / "out.npz", UserInputs(), ConventionOverrides())[2].unit == "metre"
+    assert load(tmp_path / "out", UserInputs(), ConventionOverrides())[2].unit == "metre"
 
 
 @pytest.mark.parametrize(
     "options", [("--markers", "DICT_4X4_50"), ("--markers", "DICT_4X4_50:0.05", "--scale", "2"), ("--scale", "-1")]
 )
 def test_a_scale_that_says_nothing_or_two_of_them(options, tmp_path):
-    source = npz_of(tmp_path, capture_of([PINHOLE]))
-    assert nerfcli("convert", source, tmp_path / "out.npz", "--to", "npz", *options).exit_code == USAGE
-    assert not (tmp_path / "out.npz").exists()
+    source = model_of(tmp_path, capture_of([PINHOLE]))
+    assert nerfcli("convert", source, tmp_path / "out", "--to", "colmap", *options).exit_code == USAGE
+    assert not (tmp_path / "out").exists()
 
 
 # Losses
@@ -293,7 +287,7 @@ def test_a_scale_that_says_nothing_or_two_of_them(options, tmp_path):
 )
 def test_losses_are_refused_and_named_then_accepted_and_verified(form, camera, lost, tmp_path):
     capture = capture_of([camera])
-    source = npz_of(tmp_path, capture)
+    source = model_of(tmp_path, capture)
     before = listing(tmp_path)
     result = nerfcli("convert", source, tmp_path / "out", "--to", form)
     assert result.exit_code == BAD_INPUT
@@ -313,7 +307,7 @@ def test_losses_are_refused_and_named_then_accepted_and_verified(form, camera, l
 def test_features_are_left_out_with_a_warning(tmp_path):
     capture = capture_of([PINHOLE])
     seen = Observations(np.zeros(3, np.int64), np.arange(3), np.ones((3, 2)))
-    source = npz_of(tmp_path, replace(capture, observations=seen))
+    source = model_of(tmp_path, replace(capture, observations=seen))
     result = nerfcli("convert", source, tmp_path / "out.json", "--to", "transforms")
     assert result.exit_code == 0
     assert "Warning: transforms cannot hold 3 observations" in result.stderr
@@ -321,7 +315,7 @@ def test_features_are_left_out_with_a_warning(tmp_path):
 
 def test_the_effect_of_a_lost_term_is_reported_in_pixels(tmp_path):
     """The loss of the distortion moves pixels by at most f k r^3 at the corner of the picture."""
-    source = npz_of(tmp_path, capture_of([RADIAL]))
+    source = model_of(tmp_path, capture_of([RADIAL]))
     result = nerfcli("convert", source, tmp_path / "out", "--to", "llff", "--allow-loss", "--json")
     assert result.exit_code == 0, result.stderr
     (corner,), _ = RADIAL.bearings(np.zeros((1, 2)))
@@ -385,7 +379,7 @@ FAULTS = {
 def test_a_fault_of_a_writer_is_found_and_nothing_is_kept(name, tmp_path, monkeypatch):
     form, module, function, fault = FAULTS[name]
     capture = capture_of([SQUARE])
-    source = npz_of(tmp_path, capture)
+    source = model_of(tmp_path, capture)
     before = listing(tmp_path)
     right = getattr(module, function)
     if fault is None:
@@ -407,7 +401,7 @@ def test_a_fault_of_a_writer_is_found_and_nothing_is_kept(name, tmp_path, monkey
 
 
 def test_half_a_pixel_is_half_a_pixel(tmp_path, monkeypatch):
-    source = npz_of(tmp_path, capture_of([SQUARE]))
+    source = model_of(tmp_path, capture_of([SQUARE]))
     monkeypatch.setattr(transforms, "record_of_camera", half_a_pixel(transforms_cameras.record_of_camera))
     result = nerfcli("convert", source, tmp_path / "out", "--to", "transforms", "--allow-loss")
     assert "is off by 0.707 px" in error_of(result)[0]
@@ -420,8 +414,8 @@ def test_half_a_pixel_is_half_a_pixel(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("moved", ["max_deg", "max_centre_shift", "max_point_shift"])
 def test_poses_count_even_where_no_point_is_seen(moved, tmp_path):
-    wanted = TargetOptions(format_named("npz"))
-    checked = convert(capture_of([SQUARE]), tmp_path / "out.npz", source_format="made", wanted=wanted).verification
+    wanted = TargetOptions(format_named("colmap"))
+    checked = convert(capture_of([SQUARE]), tmp_path / "out", source_format="made", wanted=wanted).verification
     assert checked is not None
     assert checked.holds
     change: dict[str, Any] = {moved: 1e-6}
@@ -431,13 +425,13 @@ def test_poses_count_even_where_no_point_is_seen(moved, tmp_path):
 def test_without_points_cameras_are_compared_by_synthetic_ones(tmp_path):
     capture = capture_of([SQUARE])
     bare = replace(capture, points=np.zeros((0, 3)), colours=None, observations=None)
-    result = nerfcli("convert", npz_of(tmp_path, bare), tmp_path / "out.json", "--to", "transforms")
+    result = nerfcli("convert", model_of(tmp_path, bare), tmp_path / "out.json", "--to", "transforms")
     assert result.exit_code == 0
     assert "projections of synthetic points in " in " ".join(result.stderr.split())
 
 
 def test_a_view_under_another_name_is_found(tmp_path, monkeypatch):
-    source = npz_of(tmp_path, capture_of([SQUARE]))
+    source = model_of(tmp_path, capture_of([SQUARE]))
     monkeypatch.setattr(transforms, "relative_path", lambda frame, folder: "photo 01.png")
     result = nerfcli("convert", source, tmp_path / "out", "--to", "transforms", "--allow-loss")
     assert result.exit_code == GATE_NOT_MET
@@ -445,7 +439,7 @@ def test_a_view_under_another_name_is_found(tmp_path, monkeypatch):
 
 
 def test_after_a_fault_the_old_result_stands(tmp_path, monkeypatch):
-    source = npz_of(tmp_path, replace(capture_of([SQUARE])))
+    source = model_of(tmp_path, replace(capture_of([SQUARE])))
     out = tmp_path / "sparse" / "0"
     assert nerfcli("convert", source, out, "--to", "colmap").exit_code == 0
     before = listing(tmp_path)
@@ -469,7 +463,7 @@ def test_coordinates_of_the_globe_are_compared_as_finely_as_float64_can(tmp_path
 
 
 def test_points_alone(tmp_path):
-    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    source = model_of(tmp_path, capture_of([PINHOLE]))
     result = nerfcli("convert", source, tmp_path / "points.ply", "--to", "ply", "--allow-loss")
     assert result.exit_code == 0, result.stderr
     assert "6 cameras and their poses" in result.stderr
@@ -478,23 +472,23 @@ def test_points_alone(tmp_path):
     shifted = replace(capture, points=capture.points + 1e-9)
     wrong = replace(format_named("ply"), write=lambda _, path: write_ply(shifted, path))
     with pytest.raises(UserError, match="its points are off by"):
-        convert(capture, tmp_path / "2.ply", source_format="npz", wanted=TargetOptions(wrong, allow_loss=True))
+        convert(capture, tmp_path / "2.ply", source_format="made", wanted=TargetOptions(wrong, allow_loss=True))
 
 
 def test_points_beside_a_transforms_json_are_compared_too(tmp_path, monkeypatch):
-    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    source = model_of(tmp_path, capture_of([PINHOLE]))
     right = transforms.write_ply
     monkeypatch.setattr(transforms, "write_ply", lambda c, path: right(replace(c, points=c.points[:, ::-1]), path))
     result = nerfcli("convert", source, tmp_path / "out", "--to", "transforms", "--allow-loss")
     assert result.exit_code == GATE_NOT_MET
-    assert set(listing(tmp_path)) == {"in.npz"}
+    assert not (tmp_path / "out").exists()
 
 
 # The command
 
 
 def test_stdout_is_the_path_and_stderr_the_report(tmp_path):
-    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    source = model_of(tmp_path, capture_of([PINHOLE]))
     result = nerfcli("convert", source, tmp_path / "out", "--to", "colmap")
     assert result.stdout == f"{tmp_path / 'out'}\n"
     assert "largest residual" in result.stderr
@@ -503,7 +497,7 @@ def test_stdout_is_the_path_and_stderr_the_report(tmp_path):
 
 
 def test_an_existing_result_is_kept(tmp_path):
-    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    source = model_of(tmp_path, capture_of([PINHOLE]))
     (tmp_path / "out.json").write_text("mine")
     result = nerfcli("convert", source, tmp_path / "out.json", "--to", "transforms", "--allow-loss")
     assert result.exit_code == BAD_INPUT
@@ -513,15 +507,15 @@ def test_an_existing_result_is_kept(tmp_path):
 
 def test_an_output_that_cannot_exist_is_an_error_of_two_lines(tmp_path):
     (tmp_path / "file").write_text("hello")
-    source = npz_of(tmp_path, capture_of([PINHOLE]))
-    result = nerfcli("convert", source, tmp_path / "file" / "x.npz", "--to", "npz")
+    source = model_of(tmp_path, capture_of([PINHOLE]))
+    result = nerfcli("convert", source, tmp_path / "file" / "model", "--to", "colmap")
     assert result.exit_code == BAD_INPUT
     assert "cannot write" in error_of(result)[0]
     assert (tmp_path / "file").read_text() == "hello"
 
 
 def test_a_folder_of_other_things_is_not_replaced_by_a_model(tmp_path):
-    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    source = model_of(tmp_path, capture_of([PINHOLE]))
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"photo")
     before = listing(tmp_path)
@@ -532,8 +526,7 @@ def test_a_folder_of_other_things_is_not_replaced_by_a_model(tmp_path):
 
 def test_many_captures_each_under_its_name(tmp_path):
     for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        write_npz(capture_of([PINHOLE]), tmp_path / name / "capture.npz")
+        write_colmap_binary(capture_of([PINHOLE]), tmp_path / name)
     lines = f"{tmp_path / 'one'}\n{tmp_path / 'three'}\n{tmp_path / 'two'}\n"
     result = nerfcli("convert", "-", tmp_path / "out", "--to", "colmap", stdin=lines)
     assert result.exit_code == BAD_INPUT
@@ -549,11 +542,11 @@ def test_many_captures_each_under_its_name(tmp_path):
         (("--to", "colmap"), "OUT"),
         (("out", "--detect"), "--detect"),
         (("out", "--to", "colmap", "--pixel-center", "1"), "--pixel-center"),
-        *((("out", "--to", "npz", "--scale", factor), "--scale") for factor in ("0", "-1", "nan", "1e-300", "1e300")),
+        *((("out", "--to", "ply", "--scale", factor), "--scale") for factor in ("0", "-1", "nan", "1e-300", "1e300")),
     ],
 )
 def test_wrong_usage(options, named, tmp_path):
-    result = nerfcli("convert", npz_of(tmp_path, capture_of([PINHOLE])), *options)
+    result = nerfcli("convert", model_of(tmp_path, capture_of([PINHOLE])), *options)
     assert result.exit_code == USAGE
     assert named in result.stderr
 

@@ -14,7 +14,7 @@ from views import BROWN, PINHOLE, capture_of
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.archive import write_npz
+from nerfcli.cameras.formats.colmap import write_colmap_text
 from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.convert import evidence
@@ -313,8 +313,8 @@ def test_sharp_photos_reveal_a_half_pixel(photographed):
 
 def test_nothing_to_judge_by(tmp_path):
     capture = replace(capture_of([PINHOLE]), points=np.zeros((0, 3)), colours=None, observations=None)
-    write_npz(capture, tmp_path / "in.npz")
-    result = nerfcli("convert", tmp_path / "in.npz", "--detect")
+    write_colmap_text(capture, tmp_path / "in")
+    result = nerfcli("convert", tmp_path / "in", "--detect")
     assert result.exit_code == BAD_INPUT
     assert "the convention cannot be detected" in error_of(result)[0]
     assert "--images" in error_of(result)[1]

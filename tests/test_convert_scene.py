@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from commands import error_of, listing, nerfcli
 from PIL import Image
-from test_convert import LIMIT_PX, farthest_px, npz_of
+from test_convert import LIMIT_PX, farthest_px, model_of
 from test_scale import photos_of, sheet_of_markers
 from views import BROWN, PINHOLE, PRISM, SQUARE, capture_of
 
 from nerfcli import scene as scenes
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.conversion import ConventionOverrides, TargetOptions, convert, load
@@ -61,6 +62,12 @@ def split_into(capture: Capture, *splits: str | None) -> Capture:
     )
 
 
+def made_scene(capture: Capture, folder: Path, *, allow_loss: bool = False) -> None:
+    """Convert a capture to a scene of nerfcli."""
+    wanted = TargetOptions(format_named("nerfcli"), allow_loss=allow_loss)
+    convert(capture, folder, source_format="made", wanted=wanted)
+
+
 def seen_upright(capture: Capture, index: int, orientation: int) -> np.ndarray:
     """Return where the photo of a frame shows the points after OpenCV has turned it upright."""
     frame = capture.frames[index]
@@ -82,9 +89,9 @@ def seen_upright(capture: Capture, index: int, orientation: int) -> np.ndarray:
 
 
 def test_a_known_distance_reaches_training_as_metres(tmp_path):
-    capture = photographed(capture_of([PINHOLE]), tmp_path / "photos")
+    capture = photographed(capture_of([PINHOLE]), tmp_path / "images")
     first, second = capture.frames[:2]
-    source = npz_of(tmp_path, capture)
+    source = model_of(tmp_path, capture)
     distance = f'"{first.name}" "{second.name}" 2.5'
     before = listing(tmp_path)
     result = nerfcli("convert", source, tmp_path / "my scene", "--to", "nerfcli", "--distance", distance, "--json")
@@ -93,17 +100,16 @@ def test_a_known_distance_reaches_training_as_metres(tmp_path):
     scene = scenes.load(tmp_path / "my scene")
     assert (scene.kind, scene.unit, scene.unit_source) == ("nerfcli", "metre", "1 known distance")
     assert scene.test_names == {first.name}
-    assert scene.frames[0].image == tmp_path / "photos" / first.name
+    assert scene.frames[0].image == tmp_path / "images" / first.name
     assert np.linalg.norm(scene.frames[0].centre - scene.frames[1].centre) == pytest.approx(2.5, rel=1e-12)
     content = json.loads((tmp_path / "my scene" / "scene.json").read_text())
-    assert content["image_folder"] == "../photos"
+    assert content["image_folder"] == "../images"
     scale = content["provenance"]["new_from_old"]["scale"]
     np.testing.assert_allclose(scene.points, scale * capture.points, rtol=0, atol=1e-12)
     assert "the unit (metre)" in json.loads(result.stdout)["verification"]["same"]
     assert json.loads(nerfcli("info", tmp_path / "my scene", "--json").stdout)["unit"] == "metre"
-    # From there the unit and its source also survive in a format that records units.
-    assert nerfcli("convert", tmp_path / "my scene", tmp_path / "again.npz", "--to", "npz").exit_code == 0
-    again = load(tmp_path / "again.npz", UserInputs(), ConventionOverrides())[2]
+    assert nerfcli("convert", tmp_path / "my scene", tmp_path / "again", "--to", "nerfcli").exit_code == 0
+    again = load(tmp_path / "again", UserInputs(), ConventionOverrides())[2]
     assert (again.unit, again.unit_source, again.pixels) == ("metre", "1 known distance", "upright")
 
 
@@ -164,7 +170,7 @@ def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
     """Projections into the stored pictures, which OpenCV turns, against the cameras that training loads."""
     orientations = {0: 6, 1: 3, 2: 8}
     capture = photographed(capture_of([camera], num_points=12), tmp_path / "images", orientations)
-    assert nerfcli("convert", npz_of(tmp_path, capture), tmp_path / "sparse/0", "--to", "colmap").exit_code == 0
+    write_colmap_binary(capture, tmp_path / "sparse/0")
     result = nerfcli("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
     assert result.exit_code == 0, result.stderr
     assert "3 photos have an EXIF orientation: their cameras refer to pixels upright" in result.stderr
@@ -188,7 +194,6 @@ def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
         ("colmap", "sparse/0"),
         ("colmap-text", "sparse/0"),
         ("transforms", "transforms.json"),
-        ("npz", "out.npz"),
         ("opensfm", "reconstruction.json"),
     ],
 )
@@ -213,14 +218,12 @@ def test_other_programs_get_cameras_for_the_pixels_as_they_are_stored(form, plac
 def test_which_pixels_can_be_chosen(tmp_path):
     capture = photographed(capture_of([PINHOLE]), tmp_path / "images", {0: 6})
     write_scene(in_pixels(capture, "upright").capture, tmp_path / "scene")
-    out = tmp_path / "out.npz"
-    assert nerfcli("convert", tmp_path / "scene", out, "--to", "npz").exit_code == 0
-    assert load(out, UserInputs(), ConventionOverrides())[2].pixels == "upright"  # npz records it
     options = ("--to", "colmap", "--pixels", "upright", "--allow-loss")
     assert nerfcli("convert", tmp_path / "scene", tmp_path / "out", *options).exit_code == 0
     assert load(tmp_path / "out", UserInputs(), ConventionOverrides())[2].frames[0].camera.width == PINHOLE.height
-    assert nerfcli("convert", out, tmp_path / "2", "--to", "nerfcli", "--pixels", "stored").exit_code == USAGE
-    assert nerfcli("convert", out, tmp_path / "2", "--to", "nerfcli", "--pixels", "lying").exit_code == USAGE
+    for pixels in ("stored", "lying"):
+        options = ("--to", "nerfcli", "--pixels", pixels)
+        assert nerfcli("convert", tmp_path / "scene", tmp_path / "2", *options).exit_code == USAGE
 
 
 def test_markers_are_sought_in_photos_as_the_scene_shows_them(tmp_path):
@@ -232,10 +235,10 @@ def test_markers_are_sought_in_photos_as_the_scene_shows_them(tmp_path):
         exif = Image.Exif()
         exif[0x0112] = 3
         Image.fromarray(pixels[::-1, ::-1]).save(frame.image, exif=exif)
-    capture = Capture(tuple(frames), np.zeros((0, 3)), (), None, "npz", pixels="upright")
+    capture = Capture(tuple(frames), np.zeros((0, 3)), (), None, "made", pixels="upright")
     write_scene(capture, tmp_path / "scene")
-    options = ("--to", "npz", "--markers", "DICT_4X4_50:0.05", "--json")
-    result = nerfcli("convert", tmp_path / "scene", tmp_path / "out.npz", *options)
+    options = ("--to", "nerfcli", "--markers", "DICT_4X4_50:0.05", "--json")
+    result = nerfcli("convert", tmp_path / "scene", tmp_path / "out", *options)
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["new_from_old"]["scale"] == pytest.approx(0.05 / 0.7, rel=1e-4)
 
@@ -254,8 +257,7 @@ def test_markers_are_sought_in_photos_as_the_scene_shows_them(tmp_path):
 )
 def test_a_split_is_kept_and_else_every_eighth_photo_is_held_out(splits, test, train, tmp_path):
     capture = split_into(photographed(capture_of([PINHOLE]), tmp_path / "images"), *splits)
-    result = nerfcli("convert", npz_of(tmp_path, capture), tmp_path / "scene", "--to", "nerfcli")
-    assert result.exit_code == 0, result.stderr
+    made_scene(capture, tmp_path / "scene")
     scene = scenes.load(tmp_path / "scene")
     names = [frame.name for frame in capture.frames]
     assert [frame.name for frame in scene.test_frames] == [names[i] for i in test]
@@ -269,10 +271,7 @@ def test_masks_and_depth_bounds_of_any_layout_are_kept(tmp_path):
     capture = photographed(capture_of([PINHOLE]), tmp_path / "images")
     capture = masked(capture, tmp_path / "some" / "masks", 1, 4)
     bounds = np.array([(1.0 + index, 9.0) for index in range(6)])
-    source = npz_of(tmp_path, replace(capture, depth_bounds=bounds))
-    result = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
-    assert result.exit_code == 0, result.stderr
-    assert "2 masks" in result.stderr
+    made_scene(replace(capture, depth_bounds=bounds), tmp_path / "scene")
     scene = scenes.load(tmp_path / "scene")
     assert [f.mask for f in scene.frames] == [f.mask for f in capture.frames]
     np.testing.assert_array_equal(scene.depth_bounds, bounds)
@@ -285,11 +284,10 @@ def test_masks_and_depth_bounds_of_any_layout_are_kept(tmp_path):
 def test_a_mask_that_lies_otherwise_is_a_loss(tmp_path):
     """Training turns masks of stored pixels if their shape reveals the turn, which it does not for half a turn."""
     capture = photographed(capture_of([PINHOLE]), tmp_path / "images", {0: 6, 1: 3})
-    source = npz_of(tmp_path, masked(capture, tmp_path / "masks", 0, 1, 2))
-    refused = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
-    assert refused.exit_code == BAD_INPUT
-    assert "1 masks of photos with an EXIF orientation" in error_of(refused)[0]
-    assert nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli", "--allow-loss").exit_code == 0
+    capture = masked(capture, tmp_path / "masks", 0, 1, 2)
+    with pytest.raises(UserError, match="1 masks of photos with an EXIF orientation"):
+        made_scene(capture, tmp_path / "scene")
+    made_scene(capture, tmp_path / "scene", allow_loss=True)
     frames = scenes.load(tmp_path / "scene").frames
     assert [frame.mask is not None for frame in frames] == [True, False, True, False, False, False]
 
@@ -297,32 +295,27 @@ def test_a_mask_that_lies_otherwise_is_a_loss(tmp_path):
 def test_photos_in_several_folders_get_their_paths_for_names(tmp_path):
     capture = capture_of([PINHOLE])
     frames = photographed(capture, tmp_path / "a").frames[:3] + photographed(capture, tmp_path / "b").frames[3:]
-    source = npz_of(tmp_path, replace(capture, frames=frames))
-    refused = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
-    assert "the names of 6 photos, which become paths relative to one folder" in error_of(refused)[0]
-    result = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli", "--allow-loss")
-    assert result.exit_code == 0, result.stderr
+    with pytest.raises(UserError, match="the names of 6 photos, which become paths relative to one folder"):
+        made_scene(replace(capture, frames=frames), tmp_path / "scene")
+    made_scene(replace(capture, frames=frames), tmp_path / "scene", allow_loss=True)
     assert [frame.name for frame in scenes.load(tmp_path / "scene").frames][2:4] == ["a/photo 02.png", "b/photo 03.png"]
 
 
 def test_views_without_photos_make_no_scene(tmp_path):
     capture = capture_of([PINHOLE])
-    before = {*listing(tmp_path), "in.npz"}
-    source = npz_of(tmp_path, capture)
-    result = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
-    assert "photo 00.png has no photo" in error_of(result)[0]
-    gone = replace(capture, frames=tuple(replace(f, image=tmp_path / "gone" / f.name) for f in capture.frames))
-    source = npz_of(tmp_path, gone)
+    source = model_of(tmp_path, capture)
     result = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
     assert result.exit_code == BAD_INPUT
-    assert "none of the 6 photos exists" in error_of(result)[0]
-    assert set(listing(tmp_path)) == before
+    assert "photo 00.png has no photo" in error_of(result)[0]
+    gone = replace(capture, frames=tuple(replace(f, image=tmp_path / "gone" / f.name) for f in capture.frames))
+    with pytest.raises(UserError, match="none of the 6 photos exists"):
+        made_scene(gone, tmp_path / "scene")
     assert not (tmp_path / "scene").exists()
 
 
 def test_a_scene_is_replaced_only_with_overwrite_and_restored_after_a_fault(tmp_path, monkeypatch):
     capture = photographed(capture_of([PINHOLE]), tmp_path / "images")
-    source = npz_of(tmp_path, capture)
+    source = model_of(tmp_path, capture)
     assert nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli").exit_code == 0
     before = listing(tmp_path)
     again = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli", "--scale", "2")
@@ -356,14 +349,14 @@ def test_a_scene_is_replaced_only_with_overwrite_and_restored_after_a_fault(tmp_
         ("transforms", {"colours": "other"}, "points have another colour"),
         ("ply", {"colours": "other"}, "its colours differ"),
         ("colmap", {"observations": "moved"}, "the observations of photo 00.png differ"),
-        ("npz", {"observations": "other"}, "the observations of photo 00.png differ"),
+        ("nerfcli", {"observations": "other"}, "the observations of photo 00.png differ"),
         ("nerfcli", {"observations": "none"}, "the observations of photo 00.png differ"),
         ("transforms", {"masks": "none"}, "photo 01.png has a mask in only one of the two"),
-        ("npz", {"masks": "other"}, "the mask of photo 01.png would be"),
+        ("nerfcli", {"masks": "other"}, "the mask of photo 01.png would be"),
         ("transforms", {"splits": "other"}, "the split of photo 00.png changed from test to train"),
         ("nerfcli", {"splits": "other"}, "the split of photo 00.png changed from test to train"),
         ("llff", {"bounds": "other"}, "its depth bounds differ"),
-        ("npz", {"unit": "other"}, "its unit is arbitrary, not metre"),
+        ("nerfcli", {"unit": "other"}, "its unit is arbitrary, not metre"),
     ],
     ids=lambda value: value if isinstance(value, str) and " " not in value else "",
 )

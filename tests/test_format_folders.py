@@ -1,6 +1,7 @@
 """Formats that fill a folder beside the photos: the same views written out by hand in each, and damaged."""
 
 import json
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -311,6 +312,24 @@ class TestNeus:
             np.savez(path, **(changed | {"world_mat_2": damaged}))
             with pytest.raises(UserError, match="world_mat_2: is not the projection of a camera"):
                 parse(tmp_path)
+        for array, what in ((np.eye(3), r"\(3, 3\) values of type float64"), (np.array([{}]), "values of type object")):
+            np.savez(path, **(changed | {"world_mat_2": array}))
+            with pytest.raises(UserError, match=f"world_mat_2: .*{what}"):
+                parse(tmp_path)
+
+    def test_fifty_corruptions_of_the_arrays_inside(self, tmp_path):
+        """Damage behind the archive's checksums."""
+        path = write_neus(tmp_path)
+        with zipfile.ZipFile(path) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+        rng, refused = np.random.default_rng(9), 0
+        for _ in range(50):
+            name = str(rng.choice([name for name in members if "world" in name]))
+            with zipfile.ZipFile(path, "w") as archive:
+                for other, data in members.items():
+                    archive.writestr(other, corrupted_binary(data, rng) if other == name else data)
+            refused += assert_refused_or_sound(lambda: parse(tmp_path)[1], path)
+        assert refused > 25
 
 
 class TestPolycam:

@@ -1,5 +1,6 @@
 """LLFF's poses_bounds.npy as a capture: what it holds and loses, depth bounds by hand, two hundred kinds of damage."""
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
 from nerfcli.cameras.formats.llff import losses_llff, parse_llff, write_llff
+from nerfcli.cameras.formats.npy import array_of_npy
 from nerfcli.cameras.frame import Capture, Observations
 from nerfcli.errors import UserError
 
@@ -123,3 +125,22 @@ def test_two_hundred_corruptions(tmp_path):
         path.write_bytes(corrupted_binary(whole, rng))
         refused += assert_refused_or_sound(lambda: parse_llff(tmp_path, list_files), path)
     assert refused > 100
+
+
+@pytest.mark.parametrize("shape", [(10**12, 3), (-1, 3), (2**62, 2**62), (0, 2**40)])
+def test_an_announced_size_is_not_believed(shape):
+    stream = io.BytesIO()
+    np.save(stream, np.zeros((5, 3)))
+    text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    data = stream.getvalue()[:10] + text.encode() + stream.getvalue()[128:]
+    with pytest.raises(ValueError, match="announces"):
+        array_of_npy(data)
+
+
+@pytest.mark.parametrize("dtype", [">f4", "<f8", "<i8"])
+def test_arrays_of_other_writers_are_read(dtype):
+    """float32, big endian, integers, by columns."""
+    stream = io.BytesIO()
+    rows = np.arange(15).reshape(5, 3)
+    np.save(stream, np.asfortranarray(rows.astype(dtype)))
+    np.testing.assert_array_equal(array_of_npy(stream.getvalue()), rows)

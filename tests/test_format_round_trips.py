@@ -7,7 +7,6 @@ import pytest
 from captures import CAMERAS, reprojection_px, ring, with_photos
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.archive import parse_npz, write_npz
 from nerfcli.cameras.formats.blender import parse_blender, write_blender
 from nerfcli.cameras.formats.colmap import parse_colmap, write_colmap_binary, write_colmap_text
 from nerfcli.cameras.formats.llff import parse_llff, write_llff
@@ -40,11 +39,6 @@ def through_llff(capture: Capture, folder: Path) -> Capture:
     return parse_llff(folder, lambda path: sorted(path.iterdir()))
 
 
-def through_npz(capture: Capture, folder: Path) -> Capture:
-    write_npz(capture, folder / "capture.npz")
-    return parse_npz(folder / "capture.npz")
-
-
 def through_text(capture: Capture, folder: Path) -> Capture:
     write_colmap_text(capture, folder / "text")
     return parse_colmap(folder / "text")
@@ -52,7 +46,6 @@ def through_text(capture: Capture, folder: Path) -> Capture:
 
 TRIPS = [
     *((through_text, camera) for camera in CAMERAS.values()),
-    *((through_npz, camera) for camera in CAMERAS.values()),
     *((through_transforms, camera) for camera in CAMERAS.values() if not lost_to_transforms(camera)),
     *((through_blender, camera) for camera in CENTRED),
     *((through_llff, camera) for camera in CENTRED),

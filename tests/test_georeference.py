@@ -16,7 +16,7 @@ from test_scale import photographed, random_similarity, with_gps
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.archive import parse_npz, write_npz
+from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.cameras.world import Origin
@@ -264,27 +264,29 @@ def test_gps_along_a_line_says_nothing_about_up():
 def test_the_command_writes_a_world_of_metres_and_says_where_it_is(tmp_path):
     frames, hidden = survey(), random_similarity(np.random.default_rng(3))
     path = control_file(tmp_path / "gcp_list.txt", frames)
-    source, out = tmp_path / "in.npz", tmp_path / "out.npz"
-    write_npz(Capture(tuple(elsewhere(frames, hidden)), hidden.apply(PLACES), (), None, "npz"), source)
-    result = nerfcli("convert", source, out, "--to", "npz", "--georeference", path, "--json")
+    for frame in frames:
+        Image.new("L", (800, 600)).save(tmp_path / frame.name)
+    source, out = tmp_path / "in", tmp_path / "out"
+    write_colmap_binary(Capture(tuple(elsewhere(frames, hidden)), hidden.apply(PLACES), (), None, "made"), source)
+    result = nerfcli("convert", source, out, "--to", "nerfcli", "--georeference", path, "--json")
     assert result.exit_code == 0, result.stderr
     record = json.loads(result.stdout)
     assert record["origin"] == {"system": UTM, "coordinates": [235280.0, 3811220.0, 12.0], "in_degrees": False}
     assert "world: x east, y north, z up; origin at 235280, 3811220, 12 in EPSG:32611" in result.stderr
-    written = parse_npz(out)
+    written = load(out)
     assert written.unit == "metre"
     assert (written.unit_source or "").endswith("; origin at 235280, 3811220, 12 in EPSG:32611")
     np.testing.assert_allclose(written.points + record["origin"]["coordinates"], PLACES + CORNER, rtol=0, atol=1e-7)
     for options, kept in (((), True), (("--origin", "1,0,0"), False), (("--world-up", "-y"), False)):
-        done = nerfcli("convert", out, tmp_path / f"{kept}.npz", "--to", "npz", "--overwrite", *options)
+        done = nerfcli("convert", out, tmp_path / f"{kept}", "--to", "nerfcli", "--overwrite", *options)
         assert done.exit_code == 0, done.stderr
-        source_of_unit = parse_npz(tmp_path / f"{kept}.npz").unit_source or ""
+        source_of_unit = load(tmp_path / f"{kept}").unit_source or ""
         assert source_of_unit.startswith("6 control points")
         assert ("origin" in source_of_unit) == kept
-    refused = nerfcli("convert", source, tmp_path / "x.npz", "--to", "npz", "--georeference", path, "--world-up", "z")
+    refused = nerfcli("convert", source, tmp_path / "x", "--to", "nerfcli", "--georeference", path, "--world-up", "z")
     assert refused.exit_code == 2
     assert "--georeference and --world-up cannot be combined" in error_of(refused)[0]
-    missing = nerfcli("convert", source, tmp_path / "x.npz", "--to", "npz", "--georeference", tmp_path / "no.txt")
+    missing = nerfcli("convert", source, tmp_path / "x", "--to", "nerfcli", "--georeference", tmp_path / "no.txt")
     assert "no.txt does not exist" in error_of(missing)[0]
 
 
@@ -294,9 +296,9 @@ def test_a_scene_keeps_its_place_until_it_is_moved(tmp_path):
     for frame in frames:
         Image.new("L", (800, 600)).save(tmp_path / frame.name)
     photos = tuple(replace(frame, image=tmp_path / frame.name) for frame in frames)
-    write_npz(Capture(photos, PLACES, (), None, "npz"), tmp_path / "in.npz")
+    write_colmap_binary(Capture(photos, PLACES, (), None, "made"), tmp_path / "in")
     place = ("--georeference", path)
-    for source, target, options in (("in.npz", "a", place), ("a", "b", ()), ("b", "c", ("--world-up", "y"))):
+    for source, target, options in (("in", "a", place), ("a", "b", ()), ("b", "c", ("--world-up", "y"))):
         done = nerfcli("convert", tmp_path / source, tmp_path / target, "--to", "nerfcli", *options)
         assert done.exit_code == 0, done.stderr
     a, b, c = (load(tmp_path / name).history.get("origin") for name in "abc")
@@ -322,12 +324,11 @@ def test_positions_in_exif_give_the_place(tmp_path):
         Image.new("RGB", (800, 600)).save(path, exif=exif)
         pose = rigid.from_parts(np.diag([1.0, -1, -1]), np.array([north, -east, 3.0]) / 10)
         frames.append(Frame(path.name, CAMERA, pose, image=path))
-    write_npz(Capture(tuple(frames), PLACES, (), None, "npz"), tmp_path / "in.npz")
-    done = nerfcli(
-        "convert", tmp_path / "in.npz", tmp_path / "out.npz", "--to", "npz", "--georeference", "gps", "--json"
-    )
+    write_colmap_binary(Capture(tuple(frames), PLACES, (), None, "made"), tmp_path / "in")
+    options = ("--to", "nerfcli", "--georeference", "gps", "--json")
+    done = nerfcli("convert", tmp_path / "in", tmp_path / "out", *options)
     assert done.exit_code == 0, done.stderr
     record = json.loads(done.stdout)
     assert record["origin"] == {"system": "WGS 84", "coordinates": [48.0, 11.0, 500.0], "in_degrees": True}
-    centres = np.array([frame.centre for frame in parse_npz(tmp_path / "out.npz").frames])
+    centres = np.array([frame.centre for frame in load(tmp_path / "out").frames])
     np.testing.assert_allclose(centres[7], [22, 22, 0], rtol=0, atol=0.2)

@@ -34,7 +34,7 @@ WRITERS: dict[str, tuple[Words, int]] = {
     "evaluate": (lambda capture, run: ("evaluate", run, "--threads", "2"), 300),
     "predictions": (lambda capture, run: ("evaluate", run, "--save-predictions", "png"), 80),
     "report": (lambda capture, run: ("report", run), 5000),
-    "convert": (lambda capture, run: ("convert", capture, run.with_name("a.npz"), "--to", "npz"), 300),
+    "convert": (lambda capture, run: ("convert", capture, run.with_name("a.json"), "--to", "transforms"), 300),
 }
 
 

@@ -117,7 +117,7 @@ def capture_named(photos: Path) -> Capture:
     return replace(capture, frames=tuple(named), missing=())
 
 
-@pytest.mark.parametrize("form", ["nerfcli", "colmap", "colmap-text", "transforms", "npz"])
+@pytest.mark.parametrize("form", ["nerfcli", "colmap", "colmap-text", "transforms"])
 def test_every_kind_of_file_gives_the_cameras_by_name(tmp_path: Path, form: str):
     """Round trip; the formats that hold a camera per frame."""
     photos = tmp_path / "images"

@@ -26,7 +26,6 @@ FORMATS_WRITTEN = (
     "opensfm",
     "tum",
     "kitti",
-    "npz",
     "ply",
 )
 # Names of programs that are accepted for the format that they read.
@@ -150,11 +149,11 @@ def convert(
     \b
     Formats read:     nerfcli, colmap, transforms (nerfstudio, instant-ngp), blender, llff, opensfm, metashape,
                       reality-capture, alicevision (Meshroom), bundler, polycam, record3d, mvsnet (also BlendedMVS),
-                      neus (also IDR), pose-files (a matrix per photo, as in ScanNet, 7-Scenes, NSVF), tum, kitti, npz,
+                      neus (also IDR), pose-files (a matrix per photo, as in ScanNet, 7-Scenes, NSVF), tum, kitti,
                       camera-path (nerfstudio's viewer), run (a folder written by nerfcli train, with its refined
                       cameras); detected from the files
     Formats written:  nerfcli (a scene folder), colmap, colmap-text, transforms (nerfstudio, instant-ngp), blender,
-                      llff, opensfm, tum, kitti, npz (everything), ply (points only)
+                      llff, opensfm, tum, kitti, ply (points only)
 
     \b
     Internally, camera axes are OpenCV's (x right, y down, z forward) and the top-left pixel's centre is (0.5, 0.5).
@@ -178,9 +177,9 @@ def convert(
       nerfcli convert fern poses.txt --to kitti --allow-loss
       nerfcli convert photos-scene-run refined-scene --to nerfcli
       nerfcli convert colmap-project statue-scene --to nerfcli --masks statue-masks
-      nerfcli convert poses.txt capture.npz --to npz --intrinsics cameras.txt
+      nerfcli convert poses.txt sparse/0 --to colmap --intrinsics cameras.txt
       nerfcli convert transforms.json opencv.json --to transforms --axes opencv --pixel-center 0
-      nerfcli convert scene/ metric.npz --to npz --world-up z --origin focus --distance "a.jpg b.jpg 1.25"
+      nerfcli convert scene metric.json --to transforms --world-up z --origin focus --scale 0.25
       nerfcli convert colmap-project metric-scene --to nerfcli --distance "a.jpg b.jpg 1.25"
       nerfcli convert photos-scene surveyed-scene --to nerfcli --georeference gcp_list.txt
       nerfcli convert strange/ --detect

@@ -25,6 +25,7 @@ class Removed(NamedTuple):
 
 
 REMOVED: tuple[Removed, ...] = (
+    Removed("convert", "--to npz", "2026-11-29", "use --to nerfcli (a scene folder), or --to colmap without photos"),
     Removed("evaluate", "--dry-run", "2026-11-29", "time three views: nerfcli render RUN --frames 0:3 -o three"),
     Removed("render", "--dry-run", "2026-11-29", "time three views: add --frames 0:3 -o three"),
 )

@@ -56,7 +56,7 @@ def read_calibration(path: Path, *, images: Path | None = None) -> Calibration:
         form, found = recognise(path)
         if form.parse is None or form.name in _WITHOUT_CAMERAS:
             raise _no_cameras(path)
-        # In scenes of nerfcli poses and in arrays the cameras may be for upright pictures; the capture then says so.
+        # Cameras of scenes and runs of nerfcli are for upright pictures; the capture says so.
         capture = form.parse(found, UserInputs(images=images))
         cameras = {index: frame.camera for index, frame in enumerate(capture.frames)}
         of_image = {frame.name: index for index, frame in enumerate(capture.frames)}

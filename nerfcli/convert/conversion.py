@@ -120,7 +120,7 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Targe
         if not form.default_name or target.suffix == Path(form.default_name).suffix
         else target / form.default_name
     )
-    turned = in_pixels(capture, _pixels(form, wanted, capture))
+    turned = in_pixels(capture, _pixels(form, wanted))
     capture = turned.capture
     off = len(turned.masks_left_out)
     turned_masks = (f"{off} masks of photos with an EXIF orientation, which have the other orientation",) if off else ()
@@ -131,7 +131,7 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Targe
     if refused and not wanted.allow_loss:
         raise UserError(
             f"{form.name} cannot hold everything in this capture; it would lose: {'; '.join(losses)}",
-            "add --allow-loss to drop that, or use another format such as npz, which holds everything",
+            "add --allow-loss to drop that, or use another format, such as nerfcli, which holds the most",
         )
     files = _files(form, path)
     there = [file for file in files if file.exists()]
@@ -149,11 +149,11 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Targe
     return Conversion(path, source_format, capture, losses, _loss_px(capture, left), verification, notes)
 
 
-def _pixels(form: Format, wanted: TargetOptions, capture: Capture) -> str:
+def _pixels(form: Format, wanted: TargetOptions) -> str:
     """Return which pixels of photos (stored or upright) the cameras of the written file refer to."""
     if form.name == "nerfcli" and wanted.pixels == STORED:
         raise UserError("the nerfcli format always uses upright photos", "remove --pixels", exit_code=2)
-    return wanted.pixels or form.pixels or capture.pixels
+    return wanted.pixels or form.pixels
 
 
 def _orientation_notes(turned: ReorientedCapture) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ from typing import Any
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats import (
     alicevision,
-    archive,
     blender,
     bundler,
     camera_path,
@@ -65,7 +64,7 @@ class Format:
         open_centre: whether principal points with other pixel centres are found in such files.
         default_name: the name of its file if the target is a folder; "" for formats that fill a folder.
         files: the names of all files that it may write, where "*" stands for that file's name without its suffix.
-        pixels: which pixels of EXIF-turned photos its cameras refer to, see `Capture`; None if the file states it.
+        pixels: which pixels of EXIF-turned photos its cameras refer to, see `Capture`.
         write, losses: None for formats that are only read.
     """
 
@@ -79,7 +78,7 @@ class Format:
     open_centre: bool = False
     default_name: str = ""
     files: tuple[str, ...] = ()
-    pixels: str | None = STORED
+    pixels: str = STORED
     write: Callable[[Capture, Path], None] | None = None
     losses: Callable[[Capture], tuple[str, ...]] | None = None
 
@@ -344,20 +343,6 @@ FORMATS = (
         files=("*.txt",),
         write=trajectories.write_kitti,
         losses=trajectories.losses_kitti,
-    ),
-    Format(
-        "npz",
-        "everything, as NumPy arrays",
-        ".npz",
-        finding.by_suffix(".npz", "capture.npz"),
-        lambda path, given: archive.parse_npz(path),
-        open_axes=True,
-        open_centre=True,
-        default_name="capture.npz",
-        files=("*.npz",),
-        pixels=None,
-        write=archive.write_npz,
-        losses=archive.losses_npz,
     ),
     Format(
         "ply",

@@ -240,45 +240,6 @@ def read_opensfm(path: Path, unstated: UnstatedFacts) -> ReadBack:
     )
 
 
-def read_npz(path: Path, unstated: UnstatedFacts) -> ReadBack:
-    """Read the arrays of an .npz file, by NumPy."""
-    with np.load(path) as arrays:
-        rotations, centres = _views_from_world_from_cam(arrays["world_from_cam"], unstated.axes)
-        lenses = []
-        for model, (width, height), params in zip(
-            arrays["camera_models"].tolist(), arrays["camera_sizes"].tolist(), arrays["camera_params"], strict=True
-        ):
-            camera = pycolmap.Camera(model=model, width=width, height=height, params=params[~np.isnan(params)])
-            shifted = np.array(camera.params)
-            shifted[list(camera.principal_point_idxs())] += 0.5 - unstated.pixel_centre
-            lenses.append(FileLens(model, width, height, tuple(shifted.tolist())))
-        return ReadBack(
-            labels=tuple(arrays["names"].tolist()),
-            cam_from_world=rotations,
-            centres=centres,
-            lenses=tuple(lenses[index] for index in arrays["camera_index"]),
-            points=arrays["points"],
-            colours=arrays.get("colours"),
-            features=_features_of_arrays(arrays, 0.5 - unstated.pixel_centre),
-            images=tuple(os.path.join(path.parent, text) if text else "" for text in arrays["images"].tolist()),
-            masks=tuple(os.path.join(path.parent, text) if text else "" for text in arrays["masks"].tolist()),
-            splits=tuple(arrays["splits"].tolist()),
-            depth_bounds=arrays.get("depth_bounds"),
-            unit=str(arrays["unit"]),
-        )
-
-
-def _features_of_arrays(arrays: Any, shift: float) -> Callable[[int], tuple[np.ndarray, np.ndarray]] | None:
-    """Return the features of each view of an .npz file."""
-    if "observation_pixels" not in arrays:
-        return None
-    frames, pixels, points = (arrays[f"observation_{name}"] for name in ("frames", "pixels", "points"))
-    order = np.argsort(frames, kind="stable")
-    cuts = np.searchsorted(frames[order], np.arange(1, len(arrays["names"])))
-    rows = np.split(order, cuts)
-    return lambda view: (pixels[rows[view]] + shift, points[rows[view]])
-
-
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Read vertices (N, 3) of a binary PLY file, its first three properties as doubles, and colours (N, 3) from the
     bytes that follow, if there are any."""
@@ -372,5 +333,4 @@ READERS = {
     "opensfm": read_opensfm,
     "tum": read_tum,
     "kitti": read_kitti,
-    "npz": read_npz,
 }

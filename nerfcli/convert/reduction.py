@@ -23,7 +23,6 @@ _HELD = (
 # Contents that each format holds besides cameras, poses and points.
 _PARTS = {
     "nerfcli": ("masks", "split", "colours", "observations", "depth bounds", "unit"),
-    "npz": ("masks", "split", "colours", "observations", "depth bounds", "unit"),
     "colmap": ("colours", "observations"),
     "colmap-text": ("colours", "observations"),
     "transforms": ("masks", "split", "colours"),

@@ -15,8 +15,8 @@ from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
-from nerfcli.cameras.formats.archive import array_from_npy
 from nerfcli.cameras.formats.limits import checked_camera, plausible, rigid_poses
+from nerfcli.cameras.formats.npy import DAMAGED, array_of_npy
 from nerfcli.cameras.formats.photo_names import ListImages
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.cameras.frame import Capture, Frame
@@ -104,12 +104,9 @@ def write_llff(capture: Capture, folder: Path) -> None:
 
 def _read_rows(path: Path) -> np.ndarray:
     try:
-        rows = array_from_npy(path.read_bytes())
+        rows = array_of_npy(path.read_bytes())
     except (OSError, ValueError) as error:
-        raise UserError(
-            f"{path} is not a readable NumPy array ({str(error)[:200]})",
-            "the file is truncated or of another kind; copy it again from the source",
-        ) from error
+        raise UserError(f"{path} is not a readable NumPy array ({str(error)[:200]})", DAMAGED) from error
     if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0 or rows.dtype.kind not in "fiu":
         raise UserError(
             f"{path}: array of shape {rows.shape}", "expected (images, 17): 3x5 pose and intrinsics, near and far depth"

@@ -13,10 +13,10 @@ import numpy as np
 from scipy.linalg import rq
 
 from nerfcli.cameras import rigid
-from nerfcli.cameras.formats.archive import Arrays
 from nerfcli.cameras.formats.fields import malformed
 from nerfcli.cameras.formats.lenses import camera_of_matrix
 from nerfcli.cameras.formats.limits import plausible
+from nerfcli.cameras.formats.npy import DAMAGED, array_of_npy, members_of_npz
 from nerfcli.cameras.formats.photo_names import ListImages
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, stored_size
@@ -42,11 +42,11 @@ def parse_neus(path: Path, measure: Measure, list_images: ListImages, *, images:
     Raises:
         UserError: the file is damaged (the array is named), or has another number of cameras than there are photos.
     """
-    arrays = Arrays(path)
+    members = members_of_npz(path)
     photos = _pictures(path.parent, (images,) if images else IMAGE_FOLDERS, list_images)
     masks = _pictures(path.parent, MASK_FOLDERS, list_images)
     count = 0
-    while f"world_mat_{count}" in arrays:
+    while f"world_mat_{count}" in members:
         count += 1
     if count == 0 or len(photos) != count:
         raise UserError(
@@ -55,7 +55,7 @@ def parse_neus(path: Path, measure: Measure, list_images: ListImages, *, images:
             "the file, or give their folder with --images",
         )
     names = [f"world_mat_{index}" for index in range(count)]
-    views = [_decomposed(arrays.numbers(name, (4, 4))[:3], f"{path}: {name}") for name in names]
+    views = [_decomposed(_projection(members[name], f"{path}: {name}"), f"{path}: {name}") for name in names]
     matrices = _without_rounding(np.array([matrix for matrix, _ in views]))
     frames = []
     for index, (image, matrix) in enumerate(zip(photos, matrices, strict=True)):
@@ -76,6 +76,17 @@ def _pictures(folder: Path, names: tuple[str | Path, ...], list_images: ListImag
     """Return the pictures in the first of these folders that there is."""
     place = next((folder / name for name in names if (folder / name).is_dir()), None)
     return [] if place is None else list_images(place)
+
+
+def _projection(data: bytes, where: str) -> np.ndarray:
+    """Return the projection (3, 4) in the bytes of an .npy file of a matrix (4, 4)."""
+    try:
+        array = array_of_npy(data)
+    except ValueError as error:
+        raise malformed(where, str(error), DAMAGED) from error
+    if array.shape != (4, 4) or array.dtype.kind not in "iuf":
+        raise malformed(where, f"{array.shape} values of type {array.dtype}", "expected 4 x 4 numbers")
+    return array[:3].astype(np.float64)
 
 
 def _decomposed(projection: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
