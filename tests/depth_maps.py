@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfcli.media.arrays import write_npy, write_npz
 from nerfcli.media.depth_pictures import DepthMeta
 from nerfcli.media.exr import write_exr
 from nerfcli.media.float_tiff import write_tiff
 from nerfcli.media.levels import write_png16
+from nerfcli.media.npy import write_npy
 
 META = DepthMeta("conditional", "ray", "arbitrary", 0.5)
 FULL_META = DepthMeta(
@@ -37,14 +37,10 @@ def write_exr_of(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
     write_exr(path, {"depth": depth}, meta)
 
 
-def write_npz_of(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
-    write_npz(path, {"depth": depth}, meta)
-
-
 def write_png_of(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
     write_png16(path, depth, meta, units_per_level=1e-3)
 
 
 Writer = Callable[[Path, np.ndarray, DepthMeta], None]
-FLOATS: dict[str, Writer] = {".tiff": write_tiff, ".exr": write_exr_of, ".npz": write_npz_of, ".npy": write_npy}
+FLOATS: dict[str, Writer] = {".tiff": write_tiff, ".exr": write_exr_of, ".npy": write_npy}
 ALL: dict[str, Writer] = {**FLOATS, ".png": write_png_of}

@@ -43,8 +43,6 @@ def read_elsewhere(path: Path) -> np.ndarray:
         case ".exr":
             with OpenEXR.File(str(path), separate_channels=True) as file:
                 return np.array(file.channels()["Z"].pixels)
-        case ".npz":
-            return np.load(path, allow_pickle=False)["depth"]
         case _:
             return np.load(path, allow_pickle=False)
 

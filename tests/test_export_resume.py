@@ -28,7 +28,6 @@ from nerfcli.export import workers
 from nerfcli.export.frames import RAYS_PER_PROCESS, Workers, automatic_workers, export_frames, export_part
 from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import Order
-from nerfcli.export.presentation import playing_order
 from nerfcli.export.settings import ExportSettings, VideoSettings
 from nerfcli.interrupts import Terminated, install_handlers
 from nerfcli.media.file_facts import description_of
@@ -38,7 +37,7 @@ from nerfcli.render.model import Model
 
 PIXELS = 10 * 8
 # A gif, since the other encoders do not promise the same bytes for the same frames.
-VIDEO = VideoSettings(layout="side-by-side", direction="ping-pong", fps=12, formats=("gif",))
+VIDEO = VideoSettings(("gif",), fps=12)
 
 
 @pytest.fixture(scope="module")
@@ -363,7 +362,7 @@ def test_processes_that_die_again_and_again_end_the_export(model, tmp_path, monk
 @pytest.mark.parametrize(
     "changes",
     [
-        {"video": replace(VIDEO, fps=30, direction="reverse")},
+        {"video": replace(VIDEO, fps=30)},
         {"colour_map": "grey"},
         {"colour_range": (1.0, 2.0)},
         {"formats": ("tiff", "png16")},
@@ -417,7 +416,7 @@ def test_the_same_order_renders_again(model, tmp_path, rendered):
 def test_a_video_says_what_it_shows(model, tmp_path):
     export(model, order(video=replace(VIDEO, formats=("mp4", "gif"))), tmp_path / "views")
     description = json.loads((tmp_path / "views/render.json").read_text())
-    for name in ("rgb+depth.mp4", "rgb+depth.gif"):
+    for name in ("depth.mp4", "depth.gif"):
         reported = description_of(tmp_path / "views" / name)
         assert reported is not None
         assert (reported["convention"], reported["axis"], reported["unit"]) == ("conditional", "z", "arbitrary")
@@ -426,29 +425,20 @@ def test_a_video_says_what_it_shows(model, tmp_path):
         assert reported["nerfcli"] == description["nerfcli"]
 
 
-def test_side_by_side_holds_colour_and_depth_in_one_picture(model, tmp_path, monkeypatch):
-    """The encoder gets the picture left of its preview, forwards and backwards without repeating the end frames."""
-    seen: list[np.ndarray] = []
+def test_a_video_gets_the_pictures_of_its_output_in_order(model, tmp_path, monkeypatch):
+    seen: dict[str, list[np.ndarray]] = {}
 
     def collect(path: Path, frames: Callable[[], Iterator[np.ndarray]], **options: Any) -> None:
-        seen.extend(frames())
+        seen[path.name] = list(frames())
         path.write_bytes(b"")
 
     monkeypatch.setattr("nerfcli.export.presentation.write_video", collect)
     export(model, order(), tmp_path / "views")
-    for frame, index in zip(seen, [0, 1, 2, 3, 2, 1], strict=True):
-        colour = read_image(tmp_path / f"views/rgb/f{index}/v.png")
-        depth = read_image(tmp_path / f"views/depth/f{index}/v.png")
-        np.testing.assert_array_equal(frame[:8, :10], colour)
-        np.testing.assert_array_equal(frame[:, 10:], depth)
-
-
-def test_orders_of_playing():
-    assert playing_order(4, "forward") == [0, 1, 2, 3]
-    assert playing_order(4, "reverse") == [3, 2, 1, 0]
-    assert playing_order(4, "ping-pong") == [0, 1, 2, 3, 2, 1]
-    assert playing_order(1, "ping-pong") == [0]
-    assert playing_order(2, "ping-pong") == [0, 1]
+    assert list(seen) == ["rgb.gif", "depth.gif"]
+    for name, frames in seen.items():
+        for index, frame in enumerate(frames):
+            np.testing.assert_array_equal(frame, read_image(tmp_path / f"views/{name[:-4]}/f{index}/v.png"))
+        assert len(frames) == 4
 
 
 def test_what_cannot_become_a_video_is_refused_before_rendering(model, tmp_path, monkeypatch):

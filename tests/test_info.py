@@ -131,7 +131,6 @@ def test_depth_of_another_program_is_shown_with_what_it_does_not_state(tmp_path)
     depth = plain_depth()
     tifffile.imwrite(tmp_path / "a.tif", depth)
     np.save(tmp_path / "a.npy", depth)
-    np.savez(tmp_path / "a.npz", depth=depth)
     Image.fromarray((np.nan_to_num(depth) * 1000).astype(np.uint16)).save(tmp_path / "a.png")
     OpenEXR.File({}, {"V": depth}).write(str(tmp_path / "a.exr"))
     for path in sorted(tmp_path.iterdir()):
@@ -146,13 +145,10 @@ def test_depth_of_another_program_is_shown_with_what_it_does_not_state(tmp_path)
 
 
 def test_arrays_that_are_not_pictures_are_described_by_their_shape(tmp_path):
-    np.savez(tmp_path / "a.npz", poses=np.zeros((5, 3, 4)), names=np.array(["a", "b"]), empty=np.zeros((0, 3)))
-    printed = json.loads(info(tmp_path / "a.npz", "--json").stdout)
-    assert {name: facts["shape"] for name, facts in printed["maps"].items()} == {
-        "poses": [5, 3, 4],
-        "names": [2],
-        "empty": [0, 3],
-    }
+    for name, array in (("poses", np.zeros((5, 3, 4))), ("names", np.array(["a", "b"])), ("empty", np.zeros((0, 3)))):
+        np.save(tmp_path / f"{name}.npy", array)
+        printed = json.loads(info(tmp_path / f"{name}.npy", "--json").stdout)
+        assert printed["maps"]["array"]["shape"] == list(array.shape)
 
 
 def test_a_preview_is_not_taken_for_numbers(tmp_path):
@@ -177,7 +173,7 @@ def test_the_comment_of_a_video_is_read_back(tmp_path):
     assert content["meaning"]["provenance"]["run"] == "a=b;c#d\\e\nf 北"
 
 
-@pytest.mark.parametrize("suffix", [".tiff", ".exr", ".npz", ".npy", ".png", ".mp4"])
+@pytest.mark.parametrize("suffix", [".tiff", ".exr", ".npy", ".png", ".mp4"])
 def test_a_damaged_file_is_reported_in_two_lines(suffix, tmp_path, capfd):
     """A file cut anywhere is refused: no half of a map, no traceback, and no messages of libraries."""
     path = tmp_path / f"a{suffix}"
@@ -256,4 +252,4 @@ def test_headers_of_arrays_that_python_cannot_parse_are_damage(tmp_path):
     path = tmp_path / "a.npy"
     np.save(path, np.zeros((2, 3)))
     path.write_bytes(path.read_bytes().replace(b"}", b"("))
-    assert f"{path} is damaged or does not contain arrays" in info(path).stderr.splitlines()[0]
+    assert f"{path} is damaged or does not contain an array" in info(path).stderr.splitlines()[0]

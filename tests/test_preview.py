@@ -12,7 +12,7 @@ from skimage.color import rgb2lab
 
 from nerfcli.media.colours import COLOUR_MAPS, levels_of
 from nerfcli.media.depth_pictures import DepthMeta
-from nerfcli.media.preview import beside, preview
+from nerfcli.media.preview import preview
 
 META = DepthMeta("conditional", "ray", "arbitrary", 0.5)
 
@@ -89,12 +89,3 @@ def test_even_maps_grow_lighter_in_even_steps(colour_map):
     lightness = rgb2lab(levels_of(colour_map)[None])[0, :, 0]
     assert (np.diff(lightness) > -0.05).all()  # a level of blue is 0.1 or less
     assert np.corrcoef(lightness, np.arange(256))[0, 1] > 0.99
-
-
-def test_pictures_beside_each_other_are_aligned_at_the_top():
-    low, high = np.full((2, 3, 3), 10, np.uint8), np.full((4, 1, 3), 20, np.uint8)
-    sheet = beside([low, high])
-    assert sheet.shape == (4, 4, 3)
-    assert (sheet[:2, :3] == 10).all()
-    assert (sheet[2:, :3] == 255).all()
-    assert (sheet[:, 3] == 20).all()

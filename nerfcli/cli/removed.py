@@ -27,7 +27,14 @@ class Removed(NamedTuple):
 REMOVED: tuple[Removed, ...] = (
     Removed("convert", "--to npz", "2026-11-29", "use --to nerfcli (a scene folder), or --to colmap without photos"),
     Removed("evaluate", "--dry-run", "2026-11-29", "time three views: nerfcli render RUN --frames 0:3 -o three"),
+    Removed("render", "--crf", "2026-11-29", "an mp4 has a constant rate factor of 16; make it smaller with ffmpeg"),
+    Removed("render", "--depth-format npz", "2026-11-29", "use exr, which also holds all outputs of a view"),
+    Removed("render", "--direction", "2026-11-29", "reverse the video: ffmpeg -i in.mp4 -vf reverse out.mp4"),
     Removed("render", "--dry-run", "2026-11-29", "time three views: add --frames 0:3 -o three"),
+    Removed("render", "--loop", "2026-11-29", "a gif repeats forever; repeat an mp4 with ffmpeg -stream_loop"),
+    Removed("render", "--video-format h265", "2026-11-29", "write mp4 (H.264), and encode it again with ffmpeg"),
+    Removed("render", "--video-format webm", "2026-11-29", "write mp4 (H.264), and encode it again with ffmpeg"),
+    Removed("render", "--video-layout", "2026-11-29", "put two videos beside each other with ffmpeg's filter hstack"),
 )
 
 

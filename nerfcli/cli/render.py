@@ -95,19 +95,7 @@ def render(
         bool, typer.Option("--video", help="Write a video of each output; same as --video-format mp4.")
     ] = False,
     video_format: Annotated[
-        str | None, typer.Option(help="Any of mp4 (H.264), h265 (in mp4), webm (VP9), gif; implies --video.")
-    ] = None,
-    video_layout: Annotated[
-        str, typer.Option(help="separate: one video per output; side-by-side: all outputs in one video.")
-    ] = "separate",
-    direction: Annotated[str, typer.Option(help="Playing direction: forward, reverse or ping-pong.")] = "forward",
-    crf: Annotated[
-        int | None,
-        typer.Option(help="Constant rate factor of videos, 0 is best.  [default: mp4 16, h265 18, webm 20]", min=0),
-    ] = None,
-    loop: Annotated[
-        int | None,
-        typer.Option(help="How often a video repeats; 0 means forever (gif only).  [default: 1, gif 0]", min=0),
+        str | None, typer.Option(help="mp4 (H.264), gif, or both with a comma between them; implies --video.")
     ] = None,
     count: Annotated[int, typer.Option(help="Number of views of orbit, ellipse, spiral and interpolate.", min=2)] = 60,
     fps: Annotated[
@@ -187,7 +175,7 @@ def render(
       nerfcli render photos-scene-run --outputs depth,coverage,parallax --min-views 2 --min-parallax 2
       nerfcli render photos-scene-run --outputs depth,depth_deviation,colour_deviation
       nerfcli render photos-scene-run --cameras orbit --count 120 --video
-      nerfcli render photos-scene-run --cameras orbit --outputs rgb,depth --video-layout side-by-side --video-format gif
+      nerfcli render photos-scene-run --cameras orbit --outputs rgb,depth --video-format mp4,gif
       nerfcli render photos-scene-run --cameras ellipse --count 1200 --frames 3/8 --jobs 4
       nerfcli render photos-scene-run --cameras interpolate --through a.jpg,k.jpg,c.jpg --video
       nerfcli render photos-scene-run --cameras camera_path.json --nerfstudio-frame dataparser_transforms.json --video
@@ -262,10 +250,6 @@ def render(
     writes_video = video or video_format is not None
     unused = {
         "--fps": (fps is not None and not (writes_video or cameras_only), "--video"),
-        "--crf": (crf is not None and not writes_video, "--video"),
-        "--loop": (loop is not None and not writes_video, "--video"),
-        "--video-layout": (video_layout != "separate" and not writes_video, "--video"),
-        "--direction": (direction != "forward" and not writes_video, "--video"),
         "--depth": (depth != "conditional" and set(chosen) <= {"rgb", "opacity"}, "--outputs depth"),
         "--background-distance": (background_distance is not None and depth != "background", "--depth background"),
         "--level": (level != DepthRequest.level and not {"lower", "upper"} & set(chosen), "--outputs lower,upper"),
@@ -281,11 +265,7 @@ def render(
             raise typer.BadParameter(f"it works with {needed}; add that, or remove it", param_hint=option)
     fps = fps or file_fps(cameras) or DEFAULT_FPS
     part = None if frames is None else render_options.frame_range(frames)
-    videos = None
-    if writes_video:
-        videos = render_options.video_settings(
-            video_format or "mp4", layout=video_layout, direction=direction, fps=fps, crf=crf, loop=loop
-        )
+    videos = render_options.video_settings(video_format or "mp4", fps) if writes_video else None
     usual = ExportSettings(
         outputs=chosen,
         depth=request,

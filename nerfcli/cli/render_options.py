@@ -43,8 +43,8 @@ Rgba = Annotated[
 DepthFormat = Annotated[
     str,
     typer.Option(
-        help="Any of tiff, exr, npy, npz (float32; exr and npz hold all outputs of a view) and png16 (16-bit integers, "
-        "in addition to float32)."
+        help="Any of tiff, exr, npy (float32; exr holds all outputs of a view) and png16 (16-bit integers, in addition "
+        "to float32)."
     ),
 ]
 DepthScale = Annotated[
@@ -121,38 +121,23 @@ def tolerance_of(text: str) -> float:
     return value
 
 
-def video_settings(
-    formats: str, *, layout: str, direction: str, fps: float, crf: int | None, loop: int | None
-) -> "VideoSettings":
-    """Return the videos selected by --video-format and related options.
+def video_settings(formats: str, fps: float) -> "VideoSettings":
+    """Return the videos selected by --video-format.
 
     Raises:
-        typer.BadParameter: a value is unknown, or does not fit the formats.
+        typer.BadParameter: a format is unknown, or cannot play so many frames per second.
     """
-    from nerfcli.export.settings import DIRECTIONS, LAYOUTS, VideoSettings
-    from nerfcli.media.video import FORMATS, GIF_FASTEST_FPS
+    from nerfcli.export.settings import VideoSettings
+    from nerfcli.media.video import ENCODERS, GIF_FASTEST_FPS
 
     chosen = tuple(dict.fromkeys(formats.split(",")))
     for name in chosen:
-        one_of(name, FORMATS, "--video-format")
-    one_of(layout, LAYOUTS, "--video-layout")
-    one_of(direction, DIRECTIONS, "--direction")
+        one_of(name, ENCODERS, "--video-format")
     if "gif" in chosen and fps > GIF_FASTEST_FPS:
         raise typer.BadParameter(
             f"{fps:g}; a gif plays at {GIF_FASTEST_FPS:g} frames per second at most", param_hint="--fps"
         )
-    if crf is not None:
-        scaled = [name for name in chosen if FORMATS[name].crf is not None]
-        if not scaled:
-            raise typer.BadParameter("gif has no quality setting; remove --crf", param_hint="--crf")
-        for name in scaled:
-            if crf > FORMATS[name].worst_crf:
-                raise typer.BadParameter(
-                    f"{crf}; the maximum of {name} is {FORMATS[name].worst_crf}", param_hint="--crf"
-                )
-    if loop == 0 and chosen != ("gif",):
-        raise typer.BadParameter("0; only a gif can repeat forever", param_hint="--loop")
-    return VideoSettings(formats=chosen, layout=layout, direction=direction, fps=fps, crf=crf, plays=loop)
+    return VideoSettings(chosen, fps)
 
 
 def colour_range_of(text: str | None, *, outputs: tuple[str, ...]) -> tuple[float, float] | None:

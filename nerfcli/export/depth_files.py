@@ -1,6 +1,6 @@
 """Depth, spread and disagreement of a picture in files of any format, each with its definition.
 
-TIFF, NPY and 16-bit PNG hold one map each; OpenEXR and NPZ hold all requested maps of a picture, and its opacity.
+TIFF, NPY and 16-bit PNG hold one map each; OpenEXR holds all requested maps of a picture, and its opacity.
 16-bit levels are computed last, from the floats, because all frames share the length of a level.
 """
 
@@ -13,13 +13,13 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.export.order import with_suffix
-from nerfcli.export.settings import FLOAT_FORMATS, LEVELS_FOLDER, TOGETHER, ExportSettings, meaning_of
-from nerfcli.media.arrays import read_arrays, write_npy, write_npz
+from nerfcli.export.settings import EXR_FOLDER, FLOAT_FORMATS, LEVELS_FOLDER, ExportSettings, meaning_of
 from nerfcli.media.depth_pictures import DepthMeta, difference_of, mixed
 from nerfcli.media.exr import CHANNELS, read_exr, write_exr
 from nerfcli.media.file_facts import depth_meta_of
 from nerfcli.media.float_tiff import read_tiff, write_tiff
 from nerfcli.media.levels import LARGEST_LEVEL, chosen_scale, write_png16
+from nerfcli.media.npy import read_npy, write_npy
 from nerfcli.media.quantiles import quantiles
 from nerfcli.render.pictures import RenderedPicture
 
@@ -32,7 +32,7 @@ def map_path(folder: Path, output: str, name: str, file_format: str) -> Path:
     """Return the path of a map of a picture."""
     if file_format == "png16":
         return with_suffix(folder / LEVELS_FOLDER / name, ".png")
-    return with_suffix(folder / (file_format if file_format in TOGETHER else output) / name, f".{file_format}")
+    return with_suffix(folder / (EXR_FOLDER if file_format == "exr" else output) / name, f".{file_format}")
 
 
 def frame_meta(
@@ -67,11 +67,10 @@ def write_maps(
     metas = {output: meaning_of(meta, settings.depth, output) for output in maps}
     written: list[Path] = []
     for file_format in settings.float_formats:
-        if file_format in TOGETHER:
+        if file_format == "exr":
             path = map_path(folder, "", name, file_format)
-            write = write_exr if file_format == "exr" else write_npz
             colour = {"rgb": picture.rgb} if "rgb" in settings.outputs else {}
-            write(path, {**colour, **maps, "opacity": picture.opacity}, _meta_of_layers(metas))
+            write_exr(path, {**colour, **maps, "opacity": picture.opacity}, _meta_of_layers(metas))
             written.append(path)
             continue
         for output, values in maps.items():
@@ -93,7 +92,7 @@ def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
     """
     path, output = _floats_of(folder, name, meaning.quantity), meaning.quantity
     found = depth_meta_of(path)
-    if found is not None and path.suffix in (".exr", ".npz"):
+    if found is not None and path.suffix == ".exr":
         layer = found.layers.get(output, {})
         found = found.of(output, opacity_floor=layer.get("opacity_floor"), convention=layer.get("convention"))
     difference = "it does not state what its values mean" if found is None else difference_of(meaning, found)
@@ -102,10 +101,8 @@ def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
     match path.suffix:
         case ".exr":
             return read_exr(path)[CHANNELS[output]]
-        case ".npz":
-            return read_arrays(path)[output]
         case ".npy":
-            return read_arrays(path)["array"]
+            return read_npy(path)
     return read_tiff(path)[0]
 
 

@@ -63,12 +63,11 @@ def export_frames(
 ) -> list[Path]:
     """Render every frame and write the ordered outputs; the folder appears when it is complete.
 
-    Layout: rgb/NAME.png, depth/NAME.tiff with depth/NAME.png to look at, opacity/NAME.png; exr/NAME.exr, npz/NAME.npz,
-    depth16/NAME.png; rgb.mp4, depth.mp4, opacity.mp4 or rgb+depth+opacity.mp4; render.json. The colours of all depth
-    previews share one range, so that a video does not flicker. Until the folder is complete, its files are in a hidden
-    folder beside it, which stays if the command ends early: the same order then renders only the missing frames. The
-    frames of a finished folder that differs only in previews and videos are reused. Memory does not grow with the
-    number of frames.
+    Layout: rgb/NAME.png, depth/NAME.tiff with depth/NAME.png to look at, opacity/NAME.png; exr/NAME.exr,
+    depth16/NAME.png; rgb.mp4, depth.mp4, opacity.mp4; render.json. The colours of all depth previews share one range,
+    so that a video does not flicker. Until the folder is complete, its files are in a hidden folder beside it, which
+    stays if the command ends early: the same order then renders only the missing frames. The frames of a finished
+    folder that differs only in previews and videos are reused. Memory does not grow with the number of frames.
 
     Args:
         folder: the folder to write; an existing folder is replaced at the end.

@@ -14,7 +14,7 @@ from nerfcli.atomic import read_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.export.settings import ExportSettings
-from nerfcli.media.video import FORMATS, check_encoders
+from nerfcli.media.video import check_encoders
 from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.model import Model
 from nerfcli.render.visibility import DepthMap
@@ -98,9 +98,7 @@ class Order:
         video = self.settings.video
         if video is None:
             return [folder / output for output in (*self.settings.outputs, *self.settings.folders_of_formats)]
-        together = ["+".join(self.settings.outputs)]
-        names = together if video.layout == "side-by-side" else self.settings.outputs
-        return [folder / f"{name}{FORMATS[form].suffix}" for form in video.formats for name in names]
+        return [folder / f"{output}.{form}" for form in video.formats for output in self.settings.outputs]
 
     def check(self) -> None:
         """Refuse an order that would fail only after the last picture is rendered.

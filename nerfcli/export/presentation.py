@@ -1,7 +1,7 @@
 """Outputs that need all frames of an order: previews with a common range of colours, and videos."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -15,9 +15,9 @@ from nerfcli.export.order import Order
 from nerfcli.export.settings import MEASURED, meaning_of
 from nerfcli.media.depth_pictures import KEY, DepthMeta
 from nerfcli.media.images import read_image, write_png
-from nerfcli.media.preview import beside, preview
+from nerfcli.media.preview import preview
 from nerfcli.media.quantiles import quantiles
-from nerfcli.media.video import FORMATS, write_video
+from nerfcli.media.video import write_video
 
 # The ends of a colour range: quantiles of all valid pixels of the clip, so that a single speck does not stretch it.
 RANGE_QUANTILES = (0.01, 0.99)
@@ -93,21 +93,17 @@ def write_videos(
     settings = order.settings.video
     if settings is None:
         return
-    names = [order.names[index] for index in playing_order(len(order.names), settings.direction)]
-    groups = [order.settings.outputs] if settings.layout == "side-by-side" else [(o,) for o in order.settings.outputs]
-    for form in (FORMATS[name] for name in settings.formats):
-        for outputs in groups:
+    for form in settings.formats:
+        for output in order.settings.outputs:
 
-            def pictures(outputs: Sequence[str] = outputs) -> Iterator[np.ndarray]:
-                for name in names:
-                    yield beside([read_image(_picture(folder, output, name))[..., :3] for output in outputs])
+            def pictures(output: str = output) -> Iterator[np.ndarray]:
+                for name in order.names:
+                    yield read_image(_picture(folder, output, name))[..., :3]
 
-            path = folder / f"{'+'.join(outputs)}{form.suffix}"
-            notify(f"encoding {path.name}, {len(names)} frames")
-            gif = form.encoder == "gif"
-            plays = (0 if gif else 1) if settings.plays is None else settings.plays
-            comment = json.dumps(_comment(order, meta, outputs, ranges), ensure_ascii=False)
-            write_video(path, pictures, form=form, fps=settings.fps, crf=settings.crf, plays=plays, comment=comment)
+            path = folder / f"{output}.{form}"
+            notify(f"encoding {path.name}, {len(order.names)} frames")
+            comment = json.dumps(_comment(order, meta, output, ranges), ensure_ascii=False)
+            write_video(path, pictures, fps=settings.fps, comment=comment)
 
 
 def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> tuple[float, float]:
@@ -122,26 +118,12 @@ def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> tuple[
     return (lo if output in ("depth", "lower", "upper") else 0.0), hi
 
 
-def playing_order(count: int, direction: str) -> list[int]:
-    """Return the indices of the frames in playing order; see `VideoSettings`."""
-    forward = list(range(count))
-    match direction:
-        case "reverse":
-            return forward[::-1]
-        case "ping-pong":
-            return forward + forward[-2:0:-1]
-    return forward
-
-
-def _comment(
-    order: Order, meta: DepthMeta, outputs: Sequence[str], ranges: dict[str, tuple[float, float]]
-) -> dict[str, Any]:
+def _comment(order: Order, meta: DepthMeta, output: str, ranges: dict[str, tuple[float, float]]) -> dict[str, Any]:
     """Return the description of a video for its container's comment."""
-    description: dict[str, Any] = {"nerfcli": __version__, "outputs": list(outputs), **order.provenance}
-    if any(output in MEASURED for output in outputs):
+    description: dict[str, Any] = {"nerfcli": __version__, "outputs": [output], **order.provenance}
+    if output in MEASURED:
         description |= meta.to_json()
-        description |= {"ranges": {output: ranges[output] for output in outputs if output in MEASURED}}
-        description |= {"colour_map": order.settings.colour_map}
+        description |= {"ranges": {output: ranges[output]}, "colour_map": order.settings.colour_map}
     return description
 
 

@@ -11,15 +11,12 @@ from nerfcli.render.pictures import Quality
 OUTPUTS = ("rgb", "depth", "opacity", *CONVENTION_OF)
 # Measured outputs, which are stored as floats, with previews in false colours.
 MEASURED = QUANTITIES
-FLOAT_FORMATS = ("tiff", "exr", "npy", "npz")
+# A file in format exr holds all requested outputs of a view.
+FLOAT_FORMATS = ("tiff", "exr", "npy")
 FORMATS = (*FLOAT_FORMATS, "png16")
-# A file in one of these formats holds all requested outputs of a view; its folder has the name of the format.
-TOGETHER = ("exr", "npz")
-LEVELS_FOLDER = "depth16"
-LAYOUTS = ("separate", "side-by-side")
+EXR_FOLDER, LEVELS_FOLDER = "exr", "depth16"
 # Background of pictures with alpha: their colours are then premultiplied and contain no background.
 BLACK = (0.0, 0.0, 0.0)
-DIRECTIONS = ("forward", "reverse", "ping-pong")
 
 
 @dataclass(frozen=True)
@@ -27,19 +24,12 @@ class VideoSettings:
     """Settings of the videos.
 
     Args:
-        formats: some of `media.video.FORMATS`; a video in each.
-        layout: one of `LAYOUTS`: a video of each output, or all outputs in one.
-        direction: one of `DIRECTIONS`; "ping-pong" runs back without repeating the ends, so that it loops evenly.
-        crf: constant quality, 0 is best; the format's default if None.
-        plays: how many times the clip is shown; 0 means forever, in a gif only. None: forever in a gif, else once.
+        formats: some of `media.video.ENCODERS`; a video of each output in each.
+        fps: frames per second.
     """
 
     formats: tuple[str, ...] = ("mp4",)
-    layout: str = "separate"
-    direction: str = "forward"
     fps: float = 24.0
-    crf: int | None = None
-    plays: int | None = None
 
 
 @dataclass(frozen=True)
@@ -95,10 +85,8 @@ class ExportSettings:
     @property
     def folders_of_formats(self) -> tuple[str, ...]:
         """Folders of files that hold all requested outputs of a view, and of 16-bit levels."""
-        if not self.measured:
-            return ()
-        together = [name for name in self.float_formats if name in TOGETHER]
-        return (*together, *([LEVELS_FOLDER] if self.in_levels else []))
+        exr = bool(self.measured) and "exr" in self.float_formats
+        return (*([EXR_FOLDER] if exr else []), *([LEVELS_FOLDER] if self.in_levels else []))
 
     @property
     def in_levels(self) -> bool:

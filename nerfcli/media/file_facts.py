@@ -8,7 +8,6 @@ import json
 import re
 import struct
 import subprocess
-import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,11 +20,11 @@ import tifffile
 from PIL import Image
 
 from nerfcli.errors import UserError
-from nerfcli.media.arrays import read_arrays
 from nerfcli.media.depth_pictures import FORMAT, KEY, DepthMeta, as_floats, entries_of_text, refuse_mixing
 from nerfcli.media.exr import CHANNELS, read_exr
 from nerfcli.media.float_tiff import read_any_tiff
 from nerfcli.media.levels import depth_of_levels
+from nerfcli.media.npy import read_npy
 from nerfcli.media.video import ffmpeg_program
 
 VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".mov", ".gif")
@@ -33,9 +32,9 @@ VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".mov", ".gif")
 # Exceptions of the readers for damaged files; no common base class is documented.
 DAMAGED = (
     *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError, NotImplementedError),
-    *(struct.error, zlib.error, zipfile.BadZipFile, tifffile.TiffFileError, Image.DecompressionBombError),
+    *(struct.error, zlib.error, tifffile.TiffFileError, Image.DecompressionBombError),
 )
-_KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".exr": "OpenEXR", ".npz": "NPZ", ".npy": "NPY", ".png": "PNG"}
+_KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".exr": "OpenEXR", ".npy": "NPY", ".png": "PNG"}
 # The file in which an export describes itself, beside the folders of its outputs.
 RENDERS = "render.json"
 NOT_STATED = (
@@ -48,7 +47,7 @@ def description_of(path: Path) -> dict[str, Any] | None:
     """Return the description in a file that nerfcli wrote, as plain values; None if a file has none.
 
     Args:
-        path: TIFF, OpenEXR, NPZ, NPY (with its .json beside it), PNG or a video.
+        path: TIFF, OpenEXR, NPY (with its .json beside it), PNG or a video.
 
     Raises:
         UserError: the file is missing, damaged, or of another kind.
@@ -105,12 +104,6 @@ def _of_exr(path: Path) -> str | None:
         return file.header().get(KEY)
 
 
-def _of_npz(path: Path) -> str | None:
-    # Opened here, because NumPy does not close a file that it cannot read.
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-        return str(archive["meta"]) if "meta" in archive.files else None
-
-
 def _of_npy(path: Path) -> str | None:
     path.stat()
     sidecar = path.with_suffix(".json")
@@ -150,7 +143,6 @@ _READERS: dict[str, Callable[[Path], str | None]] = {
     ".tif": _of_tiff,
     ".tiff": _of_tiff,
     ".exr": _of_exr,
-    ".npz": _of_npz,
     ".npy": _of_npy,
     ".png": _of_png,
     ".gif": _of_gif,
@@ -243,18 +235,15 @@ def _meta(path: Path, entries: dict[str, Any] | None) -> DepthMeta | None:
 
 def _maps(path: Path, meta: DepthMeta | None) -> dict[str, np.ndarray]:
     """Return the arrays of a file by name."""
-    match path.suffix.lower():
-        case ".exr":
-            channels = read_exr(path)
-            if meta is None:
-                return channels
-            named = {name: channels[channel] for name, channel in CHANNELS.items() if channel in channels}
-            return named | {name: channels[name] for name in ("R", "G", "B", "A") if name in channels}
-        case ".tif" | ".tiff":
-            return {meta.quantity if meta else "array": read_any_tiff(path)[0]}
-        case _:
-            arrays = read_arrays(path)
-            return {meta.quantity if meta and name == "array" else name: array for name, array in arrays.items()}
+    suffix = path.suffix.lower()
+    if suffix != ".exr":
+        values = read_npy(path) if suffix == ".npy" else read_any_tiff(path)[0]
+        return {meta.quantity if meta else "array": values}
+    channels = read_exr(path)
+    if meta is None:
+        return channels
+    named = {name: channels[channel] for name, channel in CHANNELS.items() if channel in channels}
+    return named | {name: channels[name] for name in ("R", "G", "B", "A") if name in channels}
 
 
 def _png_facts(path: Path, meta: DepthMeta | None) -> dict[str, Any]:

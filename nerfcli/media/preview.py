@@ -1,7 +1,6 @@
 """Previews of depth maps: false colours over a range of depths, with a legend that names convention, axis and unit."""
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -63,21 +62,6 @@ def coloured(depth: np.ndarray, *, lo: float, hi: float, colour_map: str) -> np.
         rows, columns = np.nonzero(~valid)
         picture[rows, columns] = _HATCH[(rows + columns) // 4 % 2]
     return picture
-
-
-def beside(sheets: Sequence[np.ndarray]) -> np.ndarray:
-    """Place pictures side by side, aligned at the top, with white below the shorter ones.
-
-    Args:
-        sheets: uint8 (height, width, 3), at least one.
-    """
-    height = max(len(sheet) for sheet in sheets)
-    filled = []
-    for sheet in sheets:
-        column = np.full((height, *sheet.shape[1:]), _PAPER, dtype=np.uint8)
-        column[: len(sheet)] = sheet
-        filled.append(column)
-    return np.concatenate(filled, axis=1)
 
 
 @lru_cache(maxsize=8)  # all frames of a clip have the same legend

@@ -1,4 +1,4 @@
-"""Videos of frames, streamed to ffmpeg: H.264 and H.265 in mp4, VP9 in webm, gif; written whole or not at all."""
+"""Videos of frames, streamed to ffmpeg: H.264 in mp4, or gif; written whole or not at all."""
 
 import os
 import re
@@ -7,8 +7,6 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import IO
 
@@ -25,6 +23,11 @@ _COLOURS = (
     "scale=out_color_matrix=bt709:out_range=tv,"
     "setparams=colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1:range=tv"
 )
+# Visually close to the pictures. Compared with preset medium: three quarters of the time, files 1 % (photos) to 15 %
+# (depth) larger, 0.05 dB less.
+_H264 = ("-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-preset", "fast", "-movflags", "+faststart")
+# Formats, which are also the suffixes of the files, and the names of their encoders in `ffmpeg -encoders`.
+ENCODERS = {"mp4": "libx264", "gif": "gif"}
 # Players treat a delay below 2 hundredths of a second as 10 hundredths.
 GIF_FASTEST_FPS = 50.0
 # Ordered dither does not crawl over static areas, as error diffusion does.
@@ -50,41 +53,8 @@ def ffmpeg_program(purpose: str, *, instead: str = "") -> str:
     return program
 
 
-@dataclass(frozen=True)
-class VideoFormat:
-    """Encoder settings of one video format.
-
-    Args:
-        suffix: suffix of the files, different for each format, so that their videos fit in one folder.
-        encoder: the name that `ffmpeg -encoders` lists.
-        crf: constant quality that is visually close to the pictures, 0 is best; None if there is no such scale.
-        worst_crf: the worst value on that scale.
-    """
-
-    suffix: str
-    encoder: str
-    crf: int | None
-    worst_crf: int
-    arguments: tuple[str, ...] = ()
-
-
-FORMATS = {
-    # Compared with preset medium: three quarters of the time, files 1 % (photos) to 15 % (depth) larger, 0.05 dB less.
-    "mp4": VideoFormat(".mp4", "libx264", 16, 51, ("-preset", "fast", "-movflags", "+faststart")),
-    # Apple's players want the tag hvc1.
-    "h265": VideoFormat(
-        *(".h265.mp4", "libx265", 18, 51),
-        ("-tag:v", "hvc1", "-x265-params", "log-level=error", "-movflags", "+faststart"),
-    ),
-    "webm": VideoFormat(
-        *(".webm", "libvpx-vp9", 20, 63), ("-b:v", "0", "-row-mt", "1", "-deadline", "good", "-cpu-used", "4")
-    ),
-    "gif": VideoFormat(".gif", "gif", None, 0),
-}
-
-
 def check_encoders(formats: Iterable[str]) -> None:
-    """Check that this machine's ffmpeg supports these of `FORMATS`, before hours of rendering.
+    """Check that this machine's ffmpeg supports these of `ENCODERS`, before hours of rendering.
 
     Raises:
         UserError: there is no ffmpeg, it does not run, or lacks an encoder.
@@ -96,38 +66,26 @@ def check_encoders(formats: Iterable[str]) -> None:
         raise UserError(f"{ffmpeg} does not run: {error}", ANOTHER_FFMPEG) from error
     there = set(re.findall(r"^ V\S+ +(\S+)", listed.stdout, flags=re.MULTILINE))
     for name in formats:
-        if FORMATS[name].encoder not in there:
-            able = ", ".join(other for other, form in FORMATS.items() if form.encoder in there) or "no videos"
+        if ENCODERS[name] not in there:
+            able = ", ".join(other for other, encoder in ENCODERS.items() if encoder in there) or "no videos"
             raise UserError(
-                f"cannot write {name} videos: {ffmpeg} has no encoder {FORMATS[name].encoder}",
+                f"cannot write {name} videos: {ffmpeg} has no encoder {ENCODERS[name]}",
                 f"it supports {able}; use one of these, or {ANOTHER_FFMPEG}",
             )
 
 
-def write_video(
-    path: Path,
-    frames: Callable[[], Iterable[np.ndarray]],
-    *,
-    form: VideoFormat,
-    fps: float,
-    crf: int | None = None,
-    plays: int = 1,
-    comment: str = "",
-) -> None:
+def write_video(path: Path, frames: Callable[[], Iterable[np.ndarray]], *, fps: float, comment: str = "") -> None:
     """Encode frames one by one, with memory independent of their number. The file appears when it is complete.
 
-    The last column or row of frames with odd width or height is doubled, because video formats store colour for pairs
-    of pixels (a gif does not, and frames stay unchanged). The same frames give the same gif; the output of the other
-    encoders may differ in a few bits on a busy machine.
+    The last column or row of frames with odd width or height is doubled, because H.264 stores colour for pairs of
+    pixels (a gif does not, and frames stay unchanged). A gif repeats forever. The same frames give the same gif; an mp4
+    may differ in a few bits on a busy machine.
 
     Args:
-        path: the file to write, with the suffix of `form`.
+        path: the file to write, .mp4 or .gif.
         frames: returns the frames from the first to the last, uint8 (height, width, 3) sRGB, all of one size; called
             for each pass over them (a gif takes one for its palette and one for its pixels).
-        form: one of `FORMATS`.
         fps: frames per second, > 0.
-        crf: constant quality from 0, best, to `form.worst_crf`; the format's default if None.
-        plays: how many times the clip is shown: repeated in the file, or stated in a gif, where 0 means forever.
 
     Raises:
         UserError: the file cannot be written, there is no ffmpeg, or it fails.
@@ -136,27 +94,21 @@ def write_video(
     if not fps > 0:
         raise ValueError(f"fps must be positive, got {fps}")
     with atomic_path(path) as partial:
-        if form.encoder == "gif":
-            _write_gif(partial, frames, fps=fps, plays=plays, comment=comment, target=path)
+        if path.suffix == ".gif":
+            _write_gif(partial, frames, fps=fps, comment=comment, target=path)
             return
-        quality = form.crf if crf is None else crf
-        arguments = [
-            *("-vf", _COLOURS, "-c:v", form.encoder, "-crf", f"{quality}", "-pix_fmt", "yuv420p"),
-            *(*form.arguments, "-metadata", f"comment={comment}"),
-        ]
-        repeated = chain.from_iterable(frames() for _ in range(plays))
-        _encode(map(_even, repeated), partial, arguments, fps=fps, target=path)
+        arguments = ["-vf", _COLOURS, *_H264, "-metadata", f"comment={comment}"]
+        _encode(map(_even, frames()), partial, arguments, fps=fps, target=path)
 
 
 def _write_gif(
-    partial: Path, frames: Callable[[], Iterable[np.ndarray]], *, fps: float, plays: int, comment: str, target: Path
+    partial: Path, frames: Callable[[], Iterable[np.ndarray]], *, fps: float, comment: str, target: Path
 ) -> None:
     """Write one palette for the clip, then the pixels: in a single pass, ffmpeg would keep all frames in memory."""
     with tempfile.TemporaryDirectory(prefix=f"{partial.name}-", dir=partial.parent) as folder:
         palette, plain = Path(folder) / "palette.png", Path(folder) / "plain.gif"
         _encode(frames(), palette, ["-vf", "palettegen=reserve_transparent=0", "-update", "1"], fps=fps, target=target)
-        # The format counts repetitions; ffmpeg takes -1 for none, 0 for forever.
-        arguments = ["-i", f"file:{palette}", "-lavfi", _DITHER, "-loop", f"{plays - 1 or -1 if plays else 0}"]
+        arguments = ["-i", f"file:{palette}", "-lavfi", _DITHER, "-loop", "0"]  # forever
         _encode(frames(), plain, arguments, fps=fps, target=target)
         _add_gif_comment(plain, partial, comment)
 
