@@ -25,7 +25,7 @@ from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats.colmap import write_colmap_binary
-from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.media.images import downscale, read_image
 
@@ -40,20 +40,17 @@ POSE_NOISE_DEG = 0.5
 # Standard deviation per axis, as a fraction of the cameras' mean distance from their centre.
 MOVE_NOISE = 0.0087
 FOCAL_ERROR = 0.02
-FEW_VIEWS = 6
-POINTS_PER_VIEW, POINT_NOISE_PX = 250, 0.4
 
 
 @dataclass(frozen=True)
 class View:
-    """A photo to be written: camera, pose, pixels uint8 (H, W, 3 or 4), whether it is held out, a mask."""
+    """A photo to be written: camera, pose, pixels uint8 (H, W, 3 or 4), whether it is held out."""
 
     name: str
     camera: Camera
     world_from_cam: np.ndarray
     pixels: np.ndarray
     test: bool
-    mask: np.ndarray | None = None
     exposure_seconds: float | None = None
 
 
@@ -221,7 +218,6 @@ def surroundings(directions: np.ndarray) -> np.ndarray:
 def ball_views(
     *,
     behind: Light | None = None,
-    moving_behind: Light | None = None,
     gloss: float = 0.0,
     views: int = VIEWS,
     finer: float = 1.0,
@@ -229,7 +225,7 @@ def ball_views(
     """Return views of the balls, every 8th held out: RGBA, or RGB in front of a background at infinity.
 
     Args:
-        behind, moving_behind: the background by directions in the world, or by directions in the camera.
+        behind: the background by directions in the world.
         gloss: fraction of `room_light` that the surfaces reflect.
         views: number of views.
         finer: factor by which the patterns are finer than those of sample_scenes/spheres.
@@ -249,15 +245,14 @@ def ball_views(
             mirrored = rays[hit] - 2 * (rays[hit] * normals).sum(-1, keepdims=True) * normals
             rgb[hit] = np.clip((1 - 0.3 * gloss) * rgb[hit] + gloss * room_light(mirrored), 0, 1)
         alpha = hit[..., None].astype(float)
-        far = behind(rays) if behind else moving_behind(bearings) if moving_behind else None
+        far = behind(rays) if behind else None
         cells = np.concatenate([rgb * alpha if far is None else np.where(alpha > 0, rgb, far), alpha], axis=-1)
         mean = cells.reshape(HEIGHT, SUBPIXELS, WIDTH, SUBPIXELS, 4).mean(axis=(1, 3))
         if far is None:
             pixels = np.concatenate([mean[..., :3] / np.maximum(mean[..., 3:], 1e-9), mean[..., 3:]], axis=-1)
         else:
             pixels = mean[..., :3]
-        covered = to_8_bit(mean[..., 3]) if moving_behind else None
-        made.append(View(f"view_{index:03d}.png", camera, pose, to_8_bit(pixels), index % 8 == 4, mask=covered))
+        made.append(View(f"view_{index:03d}.png", camera, pose, to_8_bit(pixels), index % 8 == 4))
     return made
 
 
@@ -307,51 +302,6 @@ def unbounded() -> list[View]:
     return ball_views(behind=surroundings)
 
 
-def turntable() -> list[View]:
-    """Return the object turning in front of a fixed camera, so that the background contradicts the poses.
-
-    With masks, whose black is empty space; held-out photos are RGBA.
-    """
-    clean = ball_views()
-    views = ball_views(moving_behind=surroundings)
-    return [a if a.test else b for a, b in zip(clean, views, strict=True)]
-
-
-def few() -> list[View]:
-    """Return six training photos and the held-out ones; `make` adds points and observations, as after SfM."""
-    views = ball_views(behind=surroundings)
-    kept = set(np.linspace(0, len(views) - 1, FEW_VIEWS).round().astype(int).tolist())
-    chosen = [replace(view, test=index not in kept) for index, view in enumerate(views) if index in kept or view.test]
-    return chosen
-
-
-def ball_points(views: list[View], generator: np.random.Generator) -> tuple[np.ndarray, Observations]:
-    """Return surface points seen by the training views, and their noisy observations."""
-    tracer, points = ball_tracer(), []
-    training = [view for view in views if not view.test]
-    for view in training:
-        bearings = view.camera.pixel_bearings()[0] @ view.world_from_cam[:3, :3].T
-        distance = tracer.trace(view.world_from_cam[:3, 3], bearings[None])[1][0]
-        chosen = generator.choice(np.flatnonzero(np.isfinite(distance)), POINTS_PER_VIEW, replace=False)
-        points.append(view.world_from_cam[:3, 3] + distance[chosen, None] * bearings[chosen])
-    cloud = np.concatenate(points)
-    frames, indices, pixels = [], [], []
-    for number, view in enumerate(views):
-        if view.test:
-            continue
-        offset = cloud - view.world_from_cam[:3, 3]
-        away = np.linalg.norm(offset, axis=-1)
-        first = tracer.trace(view.world_from_cam[:3, 3], (offset / away[:, None])[None])[1][0]
-        places, valid = view.camera.project(offset @ view.world_from_cam[:3, :3])
-        size = (view.camera.width, view.camera.height)
-        seen = valid & (places >= 1).all(1) & (places < np.array(size) - 1).all(1) & (np.abs(first - away) < 1e-3)
-        chosen = np.flatnonzero(seen)
-        frames.append(np.full(len(chosen), number))
-        indices.append(chosen)
-        pixels.append(places[chosen] + generator.normal(0.0, POINT_NOISE_PX, (len(chosen), 2)))
-    return cloud, Observations(np.concatenate(frames), np.concatenate(indices), np.concatenate(pixels))
-
-
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 Change = Callable[[list[View], np.random.Generator], tuple[list[View], dict[str, Any]]]
@@ -370,8 +320,6 @@ MAKERS: dict[str, tuple[Callable[[], list[View]], Change | None]] = {
     **{f"{name}-balls": (alpha, change) for name, change in CHANGES.items()},
     "glossy": (glossy, None),
     "unbounded": (unbounded, None),
-    "turntable": (turntable, None),
-    "few": (few, None),
     "scales": (scales, None),
     "moves": (desk_views, moves),
     "moves-balls": (alpha, moves),
@@ -399,23 +347,18 @@ def make(name: str, folder: Path, seed: int) -> None:
     generator = np.random.default_rng([seed, list(MAKERS).index(name)])
     take, change = MAKERS[name]
     views, truth = change(take(), generator) if change is not None else (take(), {})
-    images, masks = folder / "images", folder / "masks"
+    images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     for view in views:
         write_photo(view, images / view.name)
-        if view.mask is not None:
-            masks.mkdir(exist_ok=True)
-            Image.fromarray(np.where(view.mask > 127, np.uint8(255), np.uint8(0))).save(masks / f"{view.name}.png")
     frames = tuple(Frame(view.name, view.camera, view.world_from_cam, images / view.name) for view in views)
-    points, observations = ball_points(views, generator) if name == "few" else (np.zeros((0, 3)), None)
     model = folder / scenes.MODEL_FOLDER
     model.mkdir(parents=True, exist_ok=True)
-    write_colmap_binary(Capture(frames, points, (), None, "colmap", observations=observations), model)
+    write_colmap_binary(Capture(frames, np.zeros((0, 3)), (), None, "colmap"), model)
     scenes.save(
         folder,
         image_folder=images,
         provenance={"made_by": "benchmarks/component_scenes.py", "seed": seed},
-        masks=masks if masks.is_dir() else None,
         split={view.name: "test" if view.test else "train" for view in views},
     )
     (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")

@@ -13,7 +13,6 @@ import statistics
 import subprocess
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,22 +22,6 @@ import typer
 
 ROOT = Path(__file__).parent.parent
 BUDGETS = (5, 15, 60, 300)
-# Operations that do not start a kernel.
-VIEWS = (
-    *("view", "_unsafe_view", "expand", "slice", "select", "unsqueeze", "squeeze", "t", "transpose", "permute"),
-    *(
-        "as_strided",
-        "detach",
-        "alias",
-        "split",
-        "split_with_sizes",
-        "unbind",
-        "_reshape_alias",
-        "lift_fresh",
-        "diagonal",
-    ),
-    *("empty", "empty_like", "empty_strided", "new_empty", "_local_scalar_dense", "narrow", "is_same_size"),
-)
 
 
 @dataclass(frozen=True)
@@ -256,56 +239,6 @@ def whole_step(capture: Path, device: Any, batch: int, sizes: Sizes) -> dict[str
     return {"M samples/s": middle, "lower quartile": low, "upper quartile": high, "samples": float(result.samples)}
 
 
-def launches(capture: Path, device: Any, sizes: Sizes) -> dict[str, int]:
-    """Count the kernels of nerfcli and of torch that a step launches, and the host's waits for the device.
-
-    On a GPU, only torch's kernels of the forward pass and the optimiser are counted, as gradients are computed in
-    another thread.
-    """
-    import warnings
-
-    import torch
-    from torch.utils._python_dispatch import TorchDispatchMode
-
-    from nerfcli.kernels.triton_cuda import driver, launch
-
-    ours, operations = Counter(), Counter()
-
-    class Counting(TorchDispatchMode):
-        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-            operations[func._schema.name.split("::")[1]] += 1
-            return func(*args, **(kwargs or {}))
-
-    fitting, _ = fitting_of(capture, device, sizes.batches[0], sizes.log2_rows[0])
-    for _ in range(sizes.warm_up_steps):
-        fitting.advance(0.5)
-    # What each launch calls: in the interpreter, and on a GPU.
-    place, name = (launch, "variant_of") if device.type == "cpu" else (driver.Function, "launch")
-    original = getattr(place, name)
-
-    def counted(*arguments: Any, **named: Any) -> Any:
-        ours[name] += 1
-        return original(*arguments, **named)
-
-    setattr(place, name, counted)
-    try:
-        with Counting():
-            fitting.advance(0.6)
-    finally:
-        setattr(place, name, original)
-    ignored = (*VIEWS, "set_", "copy_") if device.type == "cpu" else VIEWS  # the interpreter causes these
-    of_torch = sum(count for name, count in operations.items() if name not in ignored)
-    found = {"kernels of nerfcli": ours.total(), "operations of torch": of_torch}
-    if device.type == "cpu":
-        return found
-    torch.cuda.set_sync_debug_mode("warn")
-    with warnings.catch_warnings(record=True) as waits:
-        warnings.simplefilter("always")
-        fitting.advance(0.6)
-    torch.cuda.set_sync_debug_mode("default")
-    return {**found, "waits": len(waits)}
-
-
 def quality(capture: Path, device: str, seconds: int, folder: Path, *, dry: bool) -> dict[str, float]:
     """Return held-out PSNR after a training of `seconds`."""
     import nerfcli
@@ -385,7 +318,6 @@ def main(
             name = f"ns per sample, {samples} samples, 2^{log2_rows} rows"
             results.measure(name, lambda n=samples, rows=log2_rows: stages(n, rows, where, sizes.repeats), needs=30)
     results.measure("losses of six steps", lambda: same_losses(capture, where, sizes), needs=60)
-    results.measure("one step", lambda: launches(capture, where, sizes), needs=30)
     for batch in sizes.batches:
         name = f"whole steps of {batch} samples"
         results.measure(name, lambda n=batch: whole_step(capture, where, n, sizes), needs=60)

@@ -36,5 +36,5 @@ def test_everything_runs_to_its_end_in_the_interpreter(tmp_path):
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
     values = json.loads((tmp_path / "results.json").read_text())
-    assert len(values) == 9
-    assert (tmp_path / "table.md").read_text().count("\n") == 11
+    assert len(values) == 8
+    assert (tmp_path / "table.md").read_text().count("\n") == 10
