@@ -19,9 +19,9 @@ from typing import Annotated
 import numpy as np
 import torch
 import typer
+from depth import desk_scene
 from rich.console import Console
 from rich.table import Table
-from uncertainty_scenes import write_capture
 
 from nerfcli import scene as scenes
 from nerfcli.cameras.frame import Frame
@@ -103,7 +103,7 @@ def main(
     settings = TrainSettings(budget_seconds=None, steps=STEPS, downscale=downscale, threads=1)
     place, rows = output / "desk" if capture == "desk" else Path(capture), []
     if capture == "desk" and not (place / "transforms.json").exists():
-        write_capture("desk", place)
+        desk_scene(place)
     frames = around(scenes.load(place).frames)
     bounds = np.linspace(0, len(frames), THIRDS + 1).astype(int)
     parts = [frames[low:high] for low, high in pairwise(bounds)]

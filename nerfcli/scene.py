@@ -82,24 +82,6 @@ class Scene:
         return tuple(frame for frame in self.frames if frame.name in self.test_names)
 
 
-def with_fraction_of_photos(scene: Scene, fraction: float, *, seed: int) -> Scene:
-    """Return the scene with a fraction of its training photos, drawn without replacement, and all held-out ones.
-
-    Args:
-        scene: the whole scene.
-        fraction: in (0, 1]; at least one photo is kept.
-        seed: seed of the draw.
-    """
-    names = [frame.name for frame in scene.train_frames]
-    left_out = len(names) - max(1, round(fraction * len(names)))
-    if left_out <= 0:
-        return scene
-    drawn = set(np.random.default_rng(seed).choice(names, left_out, replace=False).tolist())
-    kept = [index for index, frame in enumerate(scene.frames) if frame.name not in drawn]
-    bounds = None if scene.depth_bounds is None else scene.depth_bounds[kept]
-    return replace(scene, frames=tuple(scene.frames[index] for index in kept), depth_bounds=bounds)
-
-
 def is_scene(path: Path) -> bool:
     """Return True if a folder contains the files of a scene, well-formed or not."""
     files = (SCENE_FILE, *_FOREIGN_FILES)

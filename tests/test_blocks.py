@@ -369,7 +369,6 @@ def test_what_cannot_be_divided_is_refused_in_two_lines(captured, capture, finis
     assert "--contraction none" in refused(captured, "--blocks", "2", "--contraction", "none")
     for text in ("1", "0/2", "3/2", "a"):
         assert "--blocks" in refused(captured, "--blocks", text)
-    assert "--members" in refused(captured, "--blocks", "2", "--members", "2")
     assert not captured.with_name("r").exists()
 
 

@@ -216,7 +216,7 @@ def test_what_does_not_fit_into_levels_is_refused(tmp_path):
 def test_meta_refuses_an_unknown_axis_and_quantity():
     with pytest.raises(ValueError, match="axis must be one of ray, z, got y"):
         DepthMeta("median", "y", "metre", 0.5)
-    with pytest.raises(ValueError, match=r"quantity must be one of depth, .*, colour_deviation, got speed"):
+    with pytest.raises(ValueError, match=r"quantity must be one of depth, .*, confidence, got speed"):
         replace(META, quantity="speed")
 
 

@@ -45,7 +45,7 @@ def test_facts_fit_the_lines_of_a_terminal():
         "samples_per_second": 281_659,
         "field_bytes": 8_403_328,
         "occupied_share": 0.9497,
-        "settings": {"seed": 0, "steps": None, "log2_rows": 18, "fixed": ["points", "view"], "random_start": 0.0}
+        "settings": {"seed": 0, "steps": None, "log2_rows": 18, "fixed": ["points", "view"], "blocks": 0}
         | {f"setting_{i}": i for i in range(9)},
         "components": {"view": 3, "stereo": True, "points": 0.1},
         "metrics": {"psnr": 21.6765, "ssim": 0.651505, "psnr_colour_aligned": 21.7141},

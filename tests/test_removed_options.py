@@ -1,5 +1,6 @@
-"""Options that were removed say so, and what to use instead; each line of the table is tried."""
+"""Options that were removed say so, and what to use instead; runs of earlier versions are read where they can be."""
 
+import json
 import re
 from typing import Any
 
@@ -49,3 +50,18 @@ def test_a_removed_value_is_found_however_it_is_written(monkeypatch, arguments):
     for other in (["--with", "hazel"], ["haze"], ["--without", "haze"]):
         refuse_removed("train", ["scene", *other])
     refuse_removed("render", ["scene", *arguments])
+
+
+@pytest.mark.parametrize(("name", "usual", "other"), [("photo_fraction", 1.0, 0.8), ("random_start", 0.0, 0.1)])
+def test_a_run_that_was_trained_with_what_was_removed_is_refused_and_any_other_is_read(finished, name, usual, other):
+    config = finished / "config.json"
+    content = json.loads(config.read_text())
+    content.pop("sha256", None)
+    for value in (usual, other):
+        content["settings"][name] = value
+        config.write_text(json.dumps(content))
+        result = nerfcli("info", finished)
+        assert result.exit_code == (0 if value == usual else 3), result.stderr
+    error, hint = error_of(result)
+    assert f"its training had {name} {other}" in error
+    assert "train again" in hint

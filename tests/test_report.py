@@ -227,11 +227,6 @@ def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     assert f"&gt;= {highest:.3g}" in page_html(
         [facts(), other], [look, farther], depths=[_meta(), _meta()]
     )  # one range for a scene
-    # A member that was trained on a part of the photos is of the same scene.
-    part = replace(
-        other, config=replace(other.config, scene_fingerprint="y", settings=TrainSettings(photo_fraction=0.8))
-    )
-    assert f"&gt;= {highest:.3g}" in page_html([facts(), part], [look, farther], depths=[_meta(), _meta()])
     foreign = replace(other, config=RunConfig(scene_fingerprint="x"))
     assert f"&gt;= {high:.3g}" in page_html([facts(), foreign], [look, farther], depths=[_meta(), _meta()])
     assert low < high < highest

@@ -42,9 +42,6 @@ def evaluate(
         ),
     ] = None,
     seeds: Annotated[int, typer.Option(help="Train with this many seeds in total and report the spread.", min=1)] = 1,
-    members: Annotated[
-        bool, typer.Option("--members", help="Also measure the members of the run and the mean of their pictures.")
-    ] = False,
     save_predictions: Annotated[
         str | None, typer.Option(help="png: save the compared pictures in RUN/predictions; float: also unrounded.")
     ] = None,
@@ -79,7 +76,6 @@ def evaluate(
       nerfcli evaluate photos-scene-run --align pose --save-predictions png --overwrite
       nerfcli evaluate photos-scene-run --align colour --overwrite
       nerfcli evaluate photos-scene-run --seeds 3
-      nerfcli evaluate photos-scene-run --members
       nerfcli evaluate first-run second-run third-run
       nerfcli evaluate tooth-15-views-run --reference tooth-run
     """
@@ -96,8 +92,6 @@ def evaluate(
             "- cannot be combined with other runs or --seeds: runs on standard input are evaluated one by one",
             param_hint="RUNS",
         )
-    if members and (len(runs) > 1 or seeds > 1):
-        raise typer.BadParameter("--members takes a single run, without --seeds", param_hint="--members")
     if seeds > 1 and len(runs) > 1:
         raise typer.BadParameter("--seeds takes a single run and trains the other seeds itself", param_hint="--seeds")
     console = Console(quiet=quiet, json_lines=json)
@@ -128,22 +122,6 @@ def evaluate(
         console.result(evaluation.path, evaluation.metrics)
         return evaluation.metrics
 
-    def measure_members(folder: Path) -> None:
-        from nerfcli.workflows.members import evaluate_members
-
-        with console.callbacks("evaluate members") as callbacks:
-            found = evaluate_members(Run(folder), device=torch_device, threads=cores, overwrite=overwrite, **callbacks)
-        if json:
-            console.fact({"members": found})
-        rows = [
-            (name, *(_number(mean.get(measure), digits) for measure, digits in _MEASURES))
-            for name, mean in (
-                *((f"member {number}", mean) for number, mean in enumerate(found["members"], start=1)),
-                ("mean of their pictures", found["mean_picture"]),
-            )
-        ]
-        console.table(("", "PSNR", "SSIM", "LPIPS"), rows, styles={})
-
     def work(folder: Path, one_of_many: bool) -> None:
         if is_reconstruction(folder):
             measure_scan(folder)
@@ -151,8 +129,6 @@ def evaluate(
         if reference is not None:
             raise typer.BadParameter(f"{folder} is no reconstruction of a scan", param_hint="--reference")
         found = measure(folder)
-        if members:
-            measure_members(folder)
         check_requirements(Run(folder), found, requirements)
 
     if seeds == 1 and len(runs) == 1:

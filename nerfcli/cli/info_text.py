@@ -9,8 +9,8 @@ from typing import Any
 HEADINGS = ("field", "weights", "optimiser", "step keeps", "ops/sample", "B/sample", "ops/picture", "B/picture")
 _UNITS = ("", "k", "M", "G", "T", "P")
 # Units of maps that are not lengths.
-_UNITS_OF_MAPS = {"coverage": " photos", "parallax": " degrees", "confidence": "", "colour_deviation": ""}
-_LENGTHS = ("depth", "spread", "disagreement", "lower", "upper", "depth_deviation")
+_UNITS_OF_MAPS = {"coverage": " photos", "parallax": " degrees", "confidence": ""}
+_LENGTHS = ("depth", "spread", "disagreement", "lower", "upper")
 # Labels of facts whose names in JSON are not plain English.
 _LABELS = {
     "psnr": "PSNR",
@@ -28,7 +28,6 @@ _LABELS = {
     "coarsest": "cells per axis of the coarsest level",
     "finest": "of the finest",
     "first_samples_per_step": "samples of the first steps",
-    "photo_fraction": "share of the photos",
     "angles_deg": "angles in degrees",
     "pixel_at_object": "pixel at the object",
     "source_origin": "source to axis",
@@ -44,8 +43,8 @@ _LABELS = {
     "field_bytes": "size of the field",
     "occupied_share": "occupied cells",
 }
-# Settings for members and blocks, with their values in any other training, which are not listed.
-_USUAL = {"photo_fraction": 1.0, "random_start": 0.0, "blocks": 0, "block": 0}
+# Settings for blocks, with their values in any other training, which are not listed.
+_USUAL = {"blocks": 0, "block": 0}
 # Maximum number of characters per line; longer lines are wrapped, and their continuations indented.
 WIDTH = 110
 

@@ -178,7 +178,7 @@ def bytes_from_text(text: str, option: str = "--memory") -> int:
 
 
 def one_or_all(text: str | None, option: str) -> tuple[int | None, int]:
-    """Parse --blocks or --members: N for all of N, K/N for the K-th; return K (None for all) and N, 0 if not given.
+    """Parse --blocks: N for all of N, K/N for the K-th; return K (None for all) and N, 0 if not given.
 
     Raises:
         typer.BadParameter: anything else, or fewer than two.

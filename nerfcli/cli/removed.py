@@ -27,14 +27,19 @@ class Removed(NamedTuple):
 REMOVED: tuple[Removed, ...] = (
     Removed("convert", "--to npz", "2026-11-29", "use --to nerfcli (a scene folder), or --to colmap without photos"),
     Removed("evaluate", "--dry-run", "2026-11-29", "time three views: nerfcli render RUN --frames 0:3 -o three"),
+    Removed("evaluate", "--members", "2026-11-29", "train with --seed 1, --seed 2, ... and evaluate each run"),
     Removed("render", "--crf", "2026-11-29", "an mp4 has a constant rate factor of 16; make it smaller with ffmpeg"),
     Removed("render", "--depth-format npz", "2026-11-29", "use exr, which also holds all outputs of a view"),
     Removed("render", "--direction", "2026-11-29", "reverse the video: ffmpeg -i in.mp4 -vf reverse out.mp4"),
     Removed("render", "--dry-run", "2026-11-29", "time three views: add --frames 0:3 -o three"),
     Removed("render", "--loop", "2026-11-29", "a gif repeats forever; repeat an mp4 with ffmpeg -stream_loop"),
+    Removed("render", "--outputs colour_deviation", "2026-11-29", "use --outputs coverage,parallax; see docs/trust.md"),
+    Removed("render", "--outputs depth_deviation", "2026-11-29", "use --outputs coverage,lower,upper; docs/trust.md"),
     Removed("render", "--video-format h265", "2026-11-29", "write mp4 (H.264), and encode it again with ffmpeg"),
     Removed("render", "--video-format webm", "2026-11-29", "write mp4 (H.264), and encode it again with ffmpeg"),
     Removed("render", "--video-layout", "2026-11-29", "put two videos beside each other with ffmpeg's filter hstack"),
+    Removed("train", "--members", "2026-11-29", "train with --seed 1, --seed 2, ...; see docs/uncertainty.md"),
+    Removed("train", "--vary", "2026-11-29", "train with --seed 1, --seed 2, ...; see docs/uncertainty.md"),
 )
 
 
@@ -53,7 +58,7 @@ def refuse_removed(command: str, arguments: Sequence[str]) -> None:
 def _values(option: str, arguments: Sequence[str]) -> list[list[str]]:
     """Return what follows each use of an option: the items of a comma-separated list, each without "=VALUE" too."""
     found = []
-    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
+    for argument, following in zip(arguments, [*arguments, ""][1:], strict=True):
         name, joined, text = argument.partition("=")
         if name == option:
             items = (text if joined else following).split(",")

@@ -38,7 +38,7 @@ def render(
         str | None,
         typer.Option(
             help="Any of rgb, depth, opacity, spread, disagreement, coverage, parallax, lower, upper, confidence, "
-            "depth_deviation, colour_deviation, with commas between them; for scans projection, transmission, residual."
+            "with commas between them; for scans projection, transmission, residual."
             "  [default: rgb,depth,opacity; projection]"
         ),
     ] = None,
@@ -160,8 +160,7 @@ def render(
     single depth is right (edges, glass, fog). coverage is the number of training photos that see the surface (its
     median depth), parallax the largest angle between two of them. lower and upper are an interval of --level around
     that depth, measured by stereo matching of the held-out photos; confidence is the proportion of depths within
-    --depth-tolerance in the same measurement. They are NaN where no training photo sees the surface. depth_deviation
-    and colour_deviation are standard deviations between the members of a run (train --members).
+    --depth-tolerance in the same measurement. They are NaN where no training photo sees the surface.
     Every file describes its values: nerfcli info FILE.
     \b
     Writes RUN/renders/CAMERAS/. Run the same command again to resume an interrupted one. Other videos and previews of
@@ -173,7 +172,6 @@ def render(
     Examples:
       nerfcli render photos-scene-run --cameras test --outputs rgb,depth --depth median --depth-axis ray
       nerfcli render photos-scene-run --outputs depth,coverage,parallax --min-views 2 --min-parallax 2
-      nerfcli render photos-scene-run --outputs depth,depth_deviation,colour_deviation
       nerfcli render photos-scene-run --cameras orbit --count 120 --video
       nerfcli render photos-scene-run --cameras orbit --outputs rgb,depth --video-format mp4,gif
       nerfcli render photos-scene-run --cameras ellipse --count 1200 --frames 3/8 --jobs 4

@@ -55,18 +55,6 @@ def train(
         ),
     ] = None,
     holdout: options.Holdout = None,
-    members: Annotated[
-        str | None,
-        typer.Option(
-            help="Train N further fields, each with the whole budget, into RUN/members/; K/N trains one.",
-            metavar="N|K/N",
-            show_default=False,
-        ),
-    ] = None,
-    vary: Annotated[
-        str,
-        typer.Option(help="What differs between --members: seeds, photos (80 % each), prior or field."),
-    ] = "seeds",
     blocks: Annotated[
         str | None,
         typer.Option(
@@ -128,11 +116,6 @@ def train(
     voxels (a dense grid of density and spherical harmonics), mlp (one network on Fourier features: small and slow).
     The resolution of the last two is one pixel's footprint at the centre of the scene.
 
-    --members 4 trains the run and then four more fields of the same scene; render and evaluate show where they differ.
-    They differ in --vary: seeds; photos, of which each has 80 %; prior, a smooth random field that each starts from; or
-    field, where hash, voxels and mlp take turns. The same command resumes an interrupted one. Of a complete run,
-    --members 1/4, --members 2/4, ... train one each, in parallel, as tasks of an array job.
-
     --blocks 4 divides the ground of a scene with 3D points into four cells and trains a field for each, on the photos
     that see it, into RUN/blocks/; RUN renders them as one field. On a cluster, train --blocks 1/4, --blocks 2/4, ...
     in parallel, as tasks of an array job; the last one to finish joins them.
@@ -154,7 +137,6 @@ def train(
       nerfcli train photos-scene --budget 5m --model default
       nerfcli train photos-scene --without view --with distortion=0.01
       nerfcli train photos-scene --with cameras=poses
-      nerfcli train photos-scene --budget 60s --members 4 --vary photos
       nerfcli train town-scene --budget 10m --blocks 4
       nerfcli train photos-scene --field voxels --field-memory 16MB
       nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
@@ -164,26 +146,16 @@ def train(
     from nerfcli.field.kinds import KINDS
     from nerfcli.memory import default_memory_limit
     from nerfcli.runs.components import Components, choose
-    from nerfcli.runs.run import Run
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.scan import is_scan
     from nerfcli.torchrun import is_first, is_one_of_several, local_rank_and_size
     from nerfcli.workflows.blocks import block_settings, train_blocks
-    from nerfcli.workflows.members import VARIED, member_settings, train_members
-    from nerfcli.workflows.train import train_or_continue, train_scene
+    from nerfcli.workflows.train import train_scene
     from nerfcli.workflows.train_plan import plan_training
 
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
-    options.one_of(vary, VARIED, "--vary")
-    if vary != "seeds" and members is None:
-        raise typer.BadParameter("it works with --members; add that, or remove it", param_hint="--vary")
-    if members is not None and (dry_run or view):
-        option = "--dry-run" if dry_run else "--view"
-        raise typer.BadParameter(
-            f"it cannot be combined with {option}, which is about one field", param_hint="--members"
-        )
     usual = TrainSettings()
     of_hash = {
         "--log2-rows": log2_rows is not None,
@@ -193,11 +165,9 @@ def train(
     if field not in (None, "hash") and (option := next((name for name, given in of_hash.items() if given), None)):
         raise typer.BadParameter("it works with --field hash; for other fields, give --field-memory", param_hint=option)
     only, count = options.one_or_all(blocks, "--blocks")
-    member, member_count = options.one_or_all(members, "--members")
-    if count and (members is not None or view):
-        option = "--members" if members is not None else "--view"
-        raise typer.BadParameter(f"it cannot be combined with {option}", param_hint="--blocks")
-    if is_one_of_several() and (dry_run or members is not None or count or scene == STDIN or is_scan(Path(scene))):
+    if count and view:
+        raise typer.BadParameter("it cannot be combined with --view", param_hint="--blocks")
+    if is_one_of_several() and (dry_run or count or scene == STDIN or is_scan(Path(scene))):
         raise UserError("processes of torchrun train one field of photos", "use this command without torchrun", 2)
     console = Console(quiet=quiet or not is_first(), json_lines=json)
     budget_seconds = None if budget is None else options.seconds_from_text(budget)
@@ -258,39 +228,6 @@ def train(
                 return train_blocks(folder, run, photo_settings(), count=count, only=only, **common)
             return train_scene(folder, run, photo_settings(), view=view, **common).path
 
-    def train_with_members(folder: Path, run: Path) -> None:
-        if member is not None and folder.exists() and not Run(run).is_complete(photo_settings()):
-            raise UserError(
-                f"{run} is not complete, and --members {members} trains one of its members",
-                "train it first, with the same options without --members",
-            )
-        with console.callbacks(f"train {folder.name}") as callbacks:
-            train_or_continue(
-                folder,
-                run,
-                photo_settings(),
-                memory_bytes=memory_of_process(),
-                resume=resume and member is None,
-                overwrite=overwrite and member is None,
-                holdout=rule,
-                warn=console.warn,
-                **callbacks,
-            )
-        with console.callbacks(f"members of {folder.name}") as callbacks:
-            train_members(
-                Run(run),
-                member_count,
-                only=member,
-                vary=vary,
-                device=photo_settings().device,
-                threads=photo_settings().threads,
-                memory_bytes=limit or default_memory_limit(photo_settings().device),
-                resume=resume,
-                overwrite=overwrite,
-                warn=console.warn,
-                **callbacks,
-            )
-
     def plan_one_scene(folder: Path) -> None:
         on_host = photo_settings().device == "cpu"  # else --memory refers to the GPU
         resident = (limit or default_memory_limit()) if on_host else None
@@ -315,8 +252,6 @@ def train(
         elif dry_run:
             plan_one_scene(folder)
             return
-        elif member_count:
-            train_with_members(folder, run)
         else:
             run = train_field_or_blocks(folder, run)
         if is_first():
@@ -324,6 +259,5 @@ def train(
 
     if scene == STDIN or not is_scan(Path(scene)):
         # Refuse invalid options before reading anything.
-        member_settings(photo_settings(), member_count, vary=vary)
         block_settings(photo_settings(), 0, count)
     for_each_input(scene, work, command="train")

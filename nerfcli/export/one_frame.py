@@ -86,54 +86,6 @@ def removed_in_words(request: DepthRequest, facts: Sequence[Mapping[str, Any]]) 
     return f"depth removed at {100 * removed / had:.1f} % of the pixels that had one: {limits}"
 
 
-def with_deviations(
-    picture: RenderedPicture,
-    frame: Frame,
-    members: Sequence[Model],
-    *,
-    settings: ExportSettings,
-    on_rays: Callable[[int], None],
-) -> RenderedPicture:
-    """Add the standard deviations of depth and colour between members that render the same frame to a picture.
-
-    Args:
-        picture: picture of the run's own field, which is not a member.
-        members: at least two.
-    """
-    seen = [
-        render_picture(
-            member,
-            frame,
-            background=BLACK if settings.rgba else member.background,
-            depth=settings.depth,
-            quality=settings.quality,
-            on_tile=on_rays,
-        )
-        for member in members
-    ]
-    depths = np.stack([one.depth for one in seen if one.depth is not None])
-    colours = np.stack([one.rgb for one in seen])
-    variance = colours.astype(np.float64).var(axis=0, ddof=1).mean(axis=-1)
-    return replace(
-        picture,
-        depth_deviation=deviation(depths),
-        colour_deviation=np.where(picture.valid, np.sqrt(variance), np.nan).astype(np.float32),
-    )
-
-
-def deviation(values: np.ndarray) -> np.ndarray:
-    """Return the standard deviation (H, W) of the members' values (M, H, W) that are not NaN, with M - 1 as divisor.
-
-    NaN where fewer than two members have a value. Computed in float64 about the mean.
-    """
-    there = np.isfinite(values)
-    count = there.sum(axis=0)
-    mean = np.where(there, values, 0.0).sum(axis=0, dtype=np.float64) / np.maximum(count, 1)
-    squares = np.where(there, values - mean, 0.0) ** 2
-    spread = np.sqrt(squares.sum(axis=0) / np.maximum(count - 1, 1))
-    return np.where(count > 1, spread, np.nan).astype(np.float32)
-
-
 def _write_outputs(
     picture: RenderedPicture,
     folder: Path,
@@ -181,8 +133,6 @@ def render_frame(
     )
     if settings.rgba:
         picture = replace(picture, rgb=straight_rgba(picture))
-    if order.members:
-        picture = with_deviations(picture, frame, order.members, settings=settings, on_rays=on_rays)
     removed = {}
     if settings.needs_visibility:
         picture = with_visibility(picture, frame, axis=settings.depth.axis, photo_depths=order.photo_depths)

@@ -16,7 +16,6 @@ from nerfcli.errors import UserError
 from nerfcli.export.settings import ExportSettings
 from nerfcli.media.video import check_encoders
 from nerfcli.render.depth_errors import DepthErrors
-from nerfcli.render.model import Model
 from nerfcli.render.visibility import DepthMap
 
 DESCRIPTION = "render.json"
@@ -58,7 +57,6 @@ class Order:
         photo_depths: depth maps of the training photos, if `ExportSettings.needs_visibility`; the provenance names the
             photos.
         depth_errors: measured depth errors of the field, if `ExportSettings.needs_errors`.
-        members: members of the run, if `ExportSettings.needs_members`; the provenance has their hashes.
     """
 
     frames: tuple[Frame, ...]
@@ -66,7 +64,6 @@ class Order:
     provenance: dict[str, Any]
     photo_depths: tuple[DepthMap, ...] = ()
     depth_errors: DepthErrors | None = None
-    members: tuple[Model, ...] = ()
 
     @cached_property
     def names(self) -> list[str]:
@@ -74,9 +71,9 @@ class Order:
         return file_names(self.frames)
 
     def rays(self, index: int) -> int:
-        """Return the number of rays of a frame, over all fields that are rendered for it."""
+        """Return the number of rays of a frame."""
         camera = self.frames[index].camera
-        return (1 + len(self.members)) * camera.width * camera.height
+        return camera.width * camera.height
 
     def of_pictures(self) -> dict[str, Any]:
         """Return everything that determines the rendered numbers, as plain values."""

@@ -73,11 +73,6 @@ class ExportSettings:
         return bool({"lower", "upper", "confidence"} & set(self.outputs))
 
     @property
-    def needs_members(self) -> bool:
-        """True if the members of the run must also be rendered."""
-        return "depth_deviation" in self.outputs or "colour_deviation" in self.outputs
-
-    @property
     def float_formats(self) -> tuple[str, ...]:
         """The formats of floats: at least one, because previews and levels are made from them."""
         return tuple(name for name in FLOAT_FORMATS if name in self.formats) or FLOAT_FORMATS[:1]
@@ -138,10 +133,8 @@ def meaning_of(meta: DepthMeta, request: DepthRequest, output: str) -> DepthMeta
 def floor_of(request: DepthRequest, output: str) -> float:
     """Return the opacity below which a pixel has no value in a measured output."""
     match output:
-        case "depth" | "depth_deviation":
+        case "depth":
             return effective_floor(request)
-        case "colour_deviation":
-            return 0.0
         case "spread":
             return request.min_opacity
     return max(request.min_opacity, MEDIAN)  # all others need the median, too

@@ -15,8 +15,6 @@ GEOMETRY = 16
 HARMONICS = 16
 # Number of levels that learn from the start, and fraction of the budget after which all levels do.
 FIRST_LEVELS, ALL_LEVELS_FRACTION = 4, 0.5
-# Number of levels that `HashField.start_randomly` fills: those with a row for each vertex.
-RANDOM_LEVELS = 2
 # Trainings of smaller tables are too short to learn the details.
 DETAILED_LOG2_ROWS = 17
 # Weight decay. Values in rows are about 0.1; in steps of some thousand rays, their gradients have a median of 2e-8 to
@@ -86,15 +84,6 @@ class HashField(Field):
 
     def rows(self) -> nn.Parameter:
         return self.table
-
-    @torch.no_grad()
-    def start_randomly(self, deviation: float) -> None:
-        """Fill the coarsest levels with normal numbers of this standard deviation.
-
-        The log density is then a smooth random function, with details as large as the cells of the finest of these
-        levels. Where no training ray passes it stays random: rows without a gradient never change.
-        """
-        self.table[:RANDOM_LEVELS].normal_(std=deviation)
 
     def medium(self, detail: float = 1.0) -> HashGrid:
         return HashGrid(

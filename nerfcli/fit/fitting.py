@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import fresh_field
 from nerfcli.field.sizes import chosen_size
@@ -118,9 +118,6 @@ class Fitting:
                 memory_bytes=settings.field_memory_bytes,
             )
         self.field = fresh_field(size).to(device)
-        if settings.random_start:
-            assert isinstance(self.field, HashField)
-            self.field.start_randomly(settings.random_start)
         gains = torch.full((len(pool.first_pixel), 3), torch.nan) if log_gains is None else log_gains
         self.points, self.error_map, self.movers = points, error_map, movers
         self.parts = Appearance(self.components, pool, log_gains=gains, log_focal=log_focal)

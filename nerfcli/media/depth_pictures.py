@@ -29,8 +29,6 @@ CONVENTION_OF = {
     "lower": "lower",
     "upper": "upper",
     "confidence": "confidence",
-    "depth_deviation": "deviation-of-members",
-    "colour_deviation": "deviation-of-members",
 }
 QUANTITIES = ("depth", *CONVENTION_OF)
 # The unit of quantities that are not lengths.
@@ -38,7 +36,6 @@ UNIT_OF = {
     "coverage": "photos",
     "parallax": "degrees",
     "confidence": "fractions of 1",
-    "colour_deviation": "sRGB from 0 to 1",
 }
 
 _IN_WORDS = {
@@ -54,7 +51,6 @@ _IN_WORDS = {
     "upper": "measured on held-out photos by stereo matching; none where no training photo sees the surface",
     "confidence": "the proportion of depths with an error of at most {number} where as many photos see the surface, "
     "measured on held-out photos by stereo matching; none where no training photo sees the surface",
-    "deviation-of-members": "the standard deviation between fields that were trained again; not an error",
     "largest-angle": "the largest angle between the rays of two training photos that see the surface; 0 below two",
 }
 _WHAT_MUST_AGREE = (
@@ -140,8 +136,6 @@ class DepthMeta:
             "disagreement": "|median - conditional| depth",
             "coverage": "coverage: training photos that see the surface",
             "parallax": "parallax: largest angle between two of them",
-            "depth_deviation": "standard deviation of depth between members",
-            "colour_deviation": "standard deviation of colour between members",
             "lower": f"lower end of the {self._percentage} interval of depth",
             "upper": f"upper end of the {self._percentage} interval of depth",
             "confidence": f"confidence: proportion of depths with an error of at most {self._percentage}",

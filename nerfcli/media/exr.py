@@ -10,7 +10,6 @@
     coverage.V        number of training photos that see the surface
     parallax.V        largest angle between the rays of two of them, degrees
     lower.V, upper.V  interval of depth
-    depth_deviation.V, colour_deviation.V  standard deviation between the members of a run
 
 Pixels without a value are NaN. The header carries the description as JSON in the attribute "nerfcli", and a sentence
 for people in "comments". Source: https://openexr.com/en/latest/TechnicalIntroduction.html, "Channel Names".

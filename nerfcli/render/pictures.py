@@ -61,7 +61,6 @@ class RenderedPicture:
         coverage, parallax: (H, W) for the points at `median`, see `visibility`; None unless an export adds them.
         lower, upper: (H, W) bounds of an interval of depth, see `depth_errors`; None unless an export adds them.
         confidence: (H, W) fraction of depths within a tolerance, see `depth_errors`; None unless an export adds it.
-        depth_deviation, colour_deviation: (H, W) deviation between the members of a run; None unless an export adds it.
     """
 
     rgb: np.ndarray
@@ -77,8 +76,6 @@ class RenderedPicture:
     lower: np.ndarray | None = None
     upper: np.ndarray | None = None
     confidence: np.ndarray | None = None
-    depth_deviation: np.ndarray | None = None
-    colour_deviation: np.ndarray | None = None
 
 
 @torch.no_grad()

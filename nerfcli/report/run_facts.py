@@ -113,16 +113,8 @@ def captures_of(runs: Sequence[RunFacts]) -> list[list[int]]:
 
 
 def scenes_of(runs: Sequence[RunFacts]) -> list[str]:
-    """Return a scene identifier for each run; runs on a fraction of the photos get that of a run on all of them."""
-    places = [(run.config.scene, run.config.split_sha256) for run in runs]
-    whole = {
-        place: run.config.scene_fingerprint
-        for run, place in zip(runs, places, strict=True)
-        if run.config.settings.photo_fraction == 1.0
-    }
-    return [
-        whole.get(place, run.config.scene_fingerprint) or str(run.path) for run, place in zip(runs, places, strict=True)
-    ]
+    """Return a scene identifier for each run."""
+    return [run.config.scene_fingerprint or str(run.path) for run in runs]
 
 
 def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:

@@ -27,6 +27,8 @@ SAMPLES_PER_SECOND = 1e6
 # photos. The number of rows doubles at each of these numbers of samples. With 2^19 rows, the file of a field has 68 MB
 # and a step is an eighth slower than with 2^18.
 FEWEST_LOG2_ROWS, DOUBLE_ROWS_FROM = 16, (37e6, 74e6, 400e6)
+# Settings of earlier versions, with the only value that can still be read.
+_FORMER = {"photo_fraction": 1.0, "random_start": 0.0}
 
 
 @dataclass(frozen=True)
@@ -55,9 +57,6 @@ class TrainSettings:
         model: "default" uses the components as given, "auto" selects those that are not `fixed` for the scene, see
             `selection`.
         fixed: names of components that the user has chosen.
-        photo_fraction: fraction of the training photos to use, in (0, 1], drawn by the seed without replacement.
-        random_start: standard deviation of the numbers in the coarsest levels of a hash grid at the start, see
-            `HashField.start_randomly`; 0 for a field that starts as fog of density 1 everywhere.
         blocks: number of blocks that the scene is divided into, see `runs.blocks`; 0 for none.
         block: number of the block that is trained, from 1 on; 0 for the whole scene.
 
@@ -85,8 +84,6 @@ class TrainSettings:
     field_memory_bytes: int | None = None
     model: str = "default"
     fixed: tuple[str, ...] = ()
-    photo_fraction: float = 1.0
-    random_start: float = 0.0
     blocks: int = 0
     block: int = 0
 
@@ -106,14 +103,9 @@ class TrainSettings:
             raise UserError(f"invalid downscale factor {self.downscale}", "choose auto, 1, 2, 4 or 8")
         if self.field not in KINDS:
             raise UserError(f"unknown type of field: {self.field!r}", f"choose {', '.join(KINDS)}")
-        of_levels = {
-            "--with antialias": (self.components.antialias, "remove --with antialias"),
-            "--vary prior": (self.random_start, "another --vary"),
-        }
-        for option, (given, instead) in of_levels.items():
-            if given and self.field != HashFieldSettings.kind:
-                message = f"{option} does not work with --field {self.field}: it needs the levels of a hash grid"
-                raise UserError(message, f"use --field hash, or {instead}", 2)
+        if self.components.antialias and self.field != HashFieldSettings.kind:
+            message = f"--with antialias does not work with --field {self.field}: it needs the levels of a hash grid"
+            raise UserError(message, "use --field hash, or remove --with antialias", 2)
         if self.components.stereo and not self.components.points and (self.model != "auto" or "points" in self.fixed):
             raise UserError(
                 "--with stereo needs points: it adds to their pixels", "add --with points, or remove --with stereo", 2
@@ -163,7 +155,14 @@ class TrainSettings:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> "TrainSettings":
-        """Read the content that `to_json` returned; missing entries have their defaults."""
+        """Read the content that `to_json` returned, in this or an earlier version; missing entries have their defaults.
+
+        Raises:
+            UserError: an earlier version trained with a setting that this one does not have.
+        """
+        for name, value in _FORMER.items():
+            if content.get(name, value) != value:
+                raise UserError(f"its training had {name} {content[name]}", "use the version that trained it")
         names = {entry.name for entry in dataclasses.fields(cls)}
         entries: dict[str, Any] = {name: value for name, value in content.items() if name in names}
         entries["components"] = Components(**content.get("components", {}))

@@ -12,7 +12,6 @@ from nerfcli.photos.pool import pixel_footprint
 from nerfcli.render.model import Model
 from nerfcli.runs.blocks import block_path
 from nerfcli.runs.camera_moves import camera_moves
-from nerfcli.runs.members import members_in_words
 from nerfcli.runs.run import Run
 from nerfcli.train.sentinel import FAILURE_FORMAT, replay
 
@@ -31,7 +30,6 @@ def describe_run(run: Run) -> dict[str, Any]:
         "settings": {name: value for name, value in settings.items() if name != "components"},
         "components": asdict(run.components),
         "decisions": [decision.in_words() for decision in run.decisions],
-        "members": members_in_words(run),
         "versions": config.versions,
     }
     if run.log:

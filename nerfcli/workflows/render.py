@@ -10,8 +10,6 @@ from nerfcli.errors import UserError
 from nerfcli.export.frames import Workers, automatic_workers, export_frames, export_part
 from nerfcli.export.order import Order, refuse_foreign
 from nerfcli.export.settings import OUTPUTS, ExportSettings
-from nerfcli.render.model import Model
-from nerfcli.runs.members import members_of
 from nerfcli.runs.run import Run, load_run
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
@@ -92,10 +90,6 @@ def render_run(
         depths = part_of(progress, 0.0, 1.0, "depth of the held-out photos")
         errors = depth_errors(trained, model, seen, threads=cores, on_progress=depths, notify=notify)
         provenance["measured_photos"] = errors.photos
-    members: list[Model] = []
-    if settings.needs_members:
-        members = [member.model(torch_device) for member in members_of(trained)]
-        provenance["members_sha256"] = [member.sha256 for member in members]
     model = model.stretched(step)
     if settings.depth.convention == "background" and settings.depth.background_distance is None:
         farthest = model.marching.far / model.training_from_scene.scale
@@ -106,7 +100,7 @@ def render_run(
         refuse_z_depth_for_equirectangular(frames, notify=notify)
     if step != 1.0:
         provenance["step"] = step
-    order = Order(tuple(frames), settings, provenance, seen, errors, tuple(one.stretched(step) for one in members))
+    order = Order(tuple(frames), settings, provenance, seen, errors)
     chosen = range(len(frames))[part] if part is not None else range(len(frames))
     if not chosen:
         raise UserError(f"--frames: there are only {len(frames)} views", "views are counted from 0", exit_code=2)

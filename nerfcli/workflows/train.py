@@ -276,11 +276,11 @@ def other_seeds(run: Run, count: int, *, device: str, threads: int) -> dict[Path
 
 
 def scene_for(settings: TrainSettings, folder: Path, *, holdout: str | None) -> Scene:
-    """Load a scene with only the photos of the settings' block and fraction of training photos."""
+    """Load a scene with only the photos of the settings' block."""
     loaded = scenes.load(folder, holdout=holdout)
     if settings.block:
         loaded = divide(loaded, settings.blocks).scenes[settings.block - 1]
-    return scenes.with_fraction_of_photos(loaded, settings.photo_fraction, seed=settings.seed)
+    return loaded
 
 
 def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:
