@@ -8,9 +8,8 @@ Each scene is trained with the given cameras, with refined and with true cameras
 errors are root mean squares over the training photos against the truth, without alignment; translations are in per cent
 of the cameras' mean distance from their centre. "picture" is the reprojection error of points at the middle of the
 scene: raw, and after the similarity that minimizes it, which no photo can determine. Held-out PSNR is given for whole
-photos, at their true poses and at these poses mapped into the refined frame by that similarity ("mapped"); and for the
-right halves, raw and with the pose aligned on the left half (`nerfcli evaluate --align pose`). Seconds are processor
-time.
+photos, at their true poses and at these poses mapped into the refined frame by that similarity ("mapped"). Seconds are
+processor time.
 """
 
 import csv
@@ -74,8 +73,6 @@ class Trained:
     focal_percent: float
     psnr: float
     psnr_mapped: float
-    psnr_right_half: float
-    psnr_pose_aligned: float
     cpu_seconds: float
 
 
@@ -170,7 +167,7 @@ def fit(given: Scene, truth: Scene, choice: str, *, seed: int, steps: int, downs
         replace(h, frame=replace(h.frame, world_from_cam=alignment.inverse().apply_pose(h.frame.world_from_cam)))
         for h in held_out
     ]
-    mean = evaluate_model(model, held_out, on_image=lambda done, total: None, extras=Extras(align_poses=True))["mean"]
+    mean = evaluate_model(model, held_out, on_image=lambda done, total: None, extras=Extras())["mean"]
     mapped = evaluate_model(model, there, on_image=lambda done, total: None, extras=Extras())["mean"]
     turns = vector_from_rotation(np.swapaxes(pictures.truth[:, :3, :3], 1, 2) @ found[:, :3, :3])
     focal = [a.camera.focal_px / b.camera.focal_px - 1 for a, b in zip(cameras.train, truth.train_frames, strict=True)]
@@ -186,8 +183,6 @@ def fit(given: Scene, truth: Scene, choice: str, *, seed: int, steps: int, downs
         100 * float(np.abs(focal).mean()),
         mean["psnr"],
         mapped["psnr"],
-        mean["psnr_right_half"],
-        mean["psnr_pose_aligned"],
         used,
     )
 
@@ -205,8 +200,6 @@ def print_table(trained: list[Trained]) -> None:
         "focal %",
         "PSNR",
         "mapped",
-        "right",
-        "aligned",
         "CPU s",
     )
     for number, name in enumerate(heads):

@@ -1,4 +1,4 @@
-"""Colour correction, novelty of views, pose refinement, ledger, requirements, spread: cases with known answers."""
+"""Colour correction, novelty of views, ledger, requirements: cases with known answers."""
 
 import math
 from dataclasses import replace
@@ -7,34 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from examples import examples
-from fog import fog, foggy_cells
-from hypothesis import given
-from hypothesis import strategies as st
-from torch import Tensor
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.rigid import Similarity, apply, inverse, look_at, transform_from_twist
-from nerfcli.errors import UserError
+from nerfcli.cameras.rigid import look_at
 from nerfcli.evaluate import perceptual
-from nerfcli.evaluate.colour_alignment import align_gains, colour_aligned
+from nerfcli.evaluate.colour_alignment import colour_aligned
 from nerfcli.evaluate.ledger import leak_ledger, summary_line
 from nerfcli.evaluate.novelty import novelty
-from nerfcli.evaluate.pose_refinement import align_pose, halves
 from nerfcli.evaluate.requirements import known_numbers, parse_requirements, unmet
-from nerfcli.evaluate.spread import spread
-from nerfcli.field.exposure import exposed
-from nerfcli.kernels import RaysSeen
-from nerfcli.render.model import Model
-from nerfcli.render.rays import CENTRES, pixel_rays
 from nerfcli.runs.components import Components
 from nerfcli.runs.config import RunConfig
 from nerfcli.runs.decisions import Selection
 
 UP = np.array([0.0, -1.0, 0.0])
-BLACK = (0.0, 0.0, 0.0)
 
 
 # Colours
@@ -69,33 +55,6 @@ def test_saturated_pixels_have_no_say_and_too_few_change_nothing():
     few = np.zeros_like(used)
     few[0, :9] = True
     np.testing.assert_array_equal(colour_aligned(picture, photo, used=few), picture)
-
-
-GAIN = st.floats(-1.5, 1.5)
-
-
-@examples(20)
-@given(st.tuples(GAIN, GAIN, GAIN))
-def test_gains_are_found_again_from_half_of_a_photo_though_parts_of_it_are_wrong(wanted):
-    # Closed form: the photo is the picture with these gains, cut at white.
-    picture = np.random.default_rng(0).uniform(0.0, 1.0, (40, 60, 3))
-    photo = exposed(torch.from_numpy(picture), torch.tensor(wanted, dtype=torch.float64)).clamp(0, 1).numpy()
-    left, right = halves(np.ones((40, 60), dtype=bool))
-    exact = np.where(right[..., None], 0.5, photo)  # the right half is not used
-    assert align_gains(picture, exact, used=left, log_gains=(0.4,) * 3) == pytest.approx(wanted, abs=1e-9)
-    photo[::5], picture[1::5] = 1.0, 0.0  # white and black pixels are not used
-    photo[2, 1:5] = 0.5
-    assert align_gains(picture, photo, used=left, log_gains=(0.4,) * 3) == pytest.approx(wanted, abs=1e-9)
-
-
-@pytest.mark.parametrize(("shown", "level"), [(0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5)])
-def test_black_and_white_leave_the_given_gains(shown, level):
-    given = (0.2, 0.0, -0.2)
-    picture, photo, used = np.full((9, 9, 3), shown), np.full((9, 9, 3), level), np.ones((9, 9), dtype=bool)
-    assert align_gains(picture, photo, used=used, log_gains=given) == given
-    grey, nothing = np.full((9, 9, 3), 0.5), np.zeros((9, 9), dtype=bool)
-    assert align_gains(grey, grey, used=nothing, log_gains=given) == given
-    assert align_gains(grey, grey, used=used, log_gains=given) == (0.0, 0.0, 0.0)
 
 
 # Novelty
@@ -133,76 +92,6 @@ def test_distances_are_reported_in_scene_radii_whatever_the_unit():
 
 def test_one_training_view_has_no_spacing():
     assert novelty([looking("a", 1.0)], [looking("b", 0.0)])[0].spacings is None
-
-
-# Pose refinement
-
-
-class Wall:
-    """A painted wall at z = 0 in closed form, in place of the renderer; the model only sets the scale."""
-
-    def __init__(self) -> None:
-        self.model = fog(foggy_cells((0, 0, 0), (0, 0, 0)), Similarity(1 / 3, np.eye(3), np.zeros(3)))
-        self.calls = 0
-
-    def render(
-        self,
-        model: Model,
-        origins: Tensor,
-        directions: Tensor,
-        *,
-        background: Tensor,
-        cones: Tensor | None = None,
-    ) -> RaysSeen:
-        self.calls += 1
-        hit = 3.0 * (origins - directions * (origins[:, 2:] / directions[:, 2:])).double()  # scene units
-        waves = torch.stack(
-            [hit[:, 0] * 5 + hit[:, 1], hit[:, 1] * 4 - hit[:, 0], hit[:, 0] * 3 + hit[:, 1] * 3], dim=1
-        )
-        rgb = 0.5 + 0.3 * torch.sin(waves) + 0.1 * torch.cos(hit[:, :1] * hit[:, 1:2])
-        return RaysSeen(rgb.float(), *(None, None, None))  # type: ignore[arg-type]
-
-
-def test_a_pose_is_found_again_from_half_of_the_picture(monkeypatch):
-    # Closed form: a wall, seen from a pose that is off by about 2 pixels of rotation and 2 of translation.
-    wall = Wall()
-    monkeypatch.setattr("nerfcli.evaluate.pose_refinement.render_rays", wall.render)
-    pose = look_at(np.array([0.5, -0.4, -3.0]), np.array([0.2, 0.1, 0.0]), UP)
-    truth = Frame("a", Camera.pinhole(96, 72, 90.0), pose)
-    everything = np.ones((72, 96), dtype=bool)
-    rays = pixel_rays(
-        truth, wall.model.training_from_scene, pixels=np.arange(96 * 72), places=CENTRES, device=torch.device("cpu")
-    )
-    seen = wall.render(wall.model, rays.origin.expand_as(rays.directions), rays.directions, background=torch.zeros(3))
-    photo = seen.rgb.numpy().astype(np.float64).reshape(72, 96, 3)
-    off = replace(truth, world_from_cam=pose @ transform_from_twist(np.array([0.06, -0.05, 0.1, 0.02, -0.02, 0.02])))
-    left, right = halves(everything)
-    spoilt = np.where(right[..., None], 0.0, photo)  # the right half is not used
-    found = align_pose(wall.model, off, spoilt, used=left, background=BLACK)
-    assert found is not None
-    # Points of the wall seen in the right half, which the alignment did not use.
-    seen_right = rays.directions.numpy().reshape(72, 96, 3)[::8, 48::8].reshape(-1, 3).astype(np.float64)
-    on_wall = truth.centre - seen_right * (truth.centre[2] / seen_right[:, 2:])
-    shifts = [
-        np.linalg.norm(truth.camera.project(apply(inverse(frame.world_from_cam), on_wall))[0] - pixels, axis=1).max()
-        for pixels in [truth.camera.project(apply(inverse(pose), on_wall))[0]]
-        for frame in (off, found.frame)
-    ]
-    assert shifts[0] > 2
-    assert shifts[1] < 0.05
-    assert found.error_after < 1e-6 < 1e-3 < found.error_before
-    assert found.rotation_deg == pytest.approx(math.degrees(math.sqrt(3) * 0.02), rel=0.05)
-    assert wall.calls < 100
-    again = align_pose(wall.model, off, spoilt, used=left, background=BLACK)
-    assert again is not None
-    np.testing.assert_array_equal(again.frame.world_from_cam, found.frame.world_from_cam)
-    assert align_pose(wall.model, off, photo, used=np.zeros_like(left), background=BLACK) is None
-
-
-def test_halves_share_no_pixel_and_leave_none():
-    left, right = halves(np.ones((3, 7), dtype=bool))
-    assert (left.sum(), right.sum()) == (9, 12)
-    assert not (left & right).any()
 
 
 # Ledger
@@ -254,21 +143,6 @@ def test_registered_is_the_share_of_photos_with_a_pose():
     config = RunConfig(history={"registered": 9, "total": 12})
     assert known_numbers(metrics, config)["registered"] == 0.75
     assert known_numbers(metrics, RunConfig(history={"from": "llff"}))["registered"] is None
-
-
-# Spread
-
-
-def test_spread_in_closed_form_and_only_of_what_can_be_compared():
-    runs = [{"protocol": "p: 3, at 4x4", "mean": {"psnr": value, "lpips": None}} for value in (20.0, 21.0, 25.0)]
-    found = spread(runs, ["a", "b", "c"])
-    assert found["psnr"]["mean"] == 22
-    assert found["psnr"]["standard_deviation"] == pytest.approx(math.sqrt((4 + 1 + 9) / 2))
-    assert (found["psnr"]["lowest"], found["psnr"]["highest"]) == (20, 25)
-    assert "lpips" not in found
-    other = {"protocol": "p: 3, at 8x8", "mean": {"psnr": 1.0}}
-    with pytest.raises(UserError, match="b and a cannot be compared: 'at 8x8' instead of 'at 4x4'"):
-        spread([runs[0], other], ["a", "b"])
 
 
 # LPIPS

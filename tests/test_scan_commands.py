@@ -314,7 +314,7 @@ def test_hounsfield_units_of_water_and_air(tmp_path: Path, bean_run: Path) -> No
         (("train", "SCAN", "--blocks", "2"), "--blocks"),
         (("render", "RUN", "--video"), "--video"),
         (("render", "RUN", "--lens", "fisheye"), "--lens"),
-        (("evaluate", "RUN", "--align", "pose"), "--align"),
+        (("evaluate", "RUN", "--save-predictions", "png"), "--save-predictions"),
         (("export", "RUN", "--to", "volume", "--box", "0,0,0,1,1,1"), "--box"),
         (("export", "RUN", "--to", "volume", "--faces", "5"), "--faces"),
     ],

@@ -1,6 +1,5 @@
-"""nerfcli evaluate: metrics of a run on its held-out photos, and their spread between seeds."""
+"""nerfcli evaluate: metrics of runs on their held-out photos."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,9 +18,6 @@ _COLUMNS = {
     "as rendered": "",
     "unrounded": "_float",
     "colours aligned": "_colour_aligned",
-    "right half": "_right_half",
-    "right half, pose aligned": "_pose_aligned",
-    "right half, gains aligned": "_gains_aligned",
 }
 _MEASURES = (("psnr", 2), ("ssim", 4), ("lpips", 4))
 
@@ -34,14 +30,6 @@ def evaluate(
     runs: Annotated[
         list[str], typer.Argument(help="Run folders written by train, or - to read paths from standard input.")
     ],
-    align: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="pose: also refine each pose on the left half of the photo and measure on the right half; colour: the "
-            "same with a gain per channel. Can be given twice."
-        ),
-    ] = None,
-    seeds: Annotated[int, typer.Option(help="Train with this many seeds in total and report the spread.", min=1)] = 1,
     save_predictions: Annotated[
         str | None, typer.Option(help="png: save the compared pictures in RUN/predictions; float: also unrounded.")
     ] = None,
@@ -62,8 +50,7 @@ def evaluate(
 
     Writes RUN/metrics.json: PSNR, SSIM and LPIPS per photo and their means, for 8-bit and for unrounded pictures and
     after a colour correction; training and render time; the distance of each view from the nearest training view; and
-    which stages have used held-out photos. With several runs of one scene, or with --seeds, also prints mean and spread
-    over the runs.
+    which stages have used held-out photos.
 
     Of a reconstruction from a scan: held-out projections (rms, dB, chi-square against the counting noise), the true
     volume where the scan names one, and filtered back-projection and SART from the same views beside it.
@@ -73,9 +60,7 @@ def evaluate(
       nerfcli evaluate photos-scene-run
       nerfcli evaluate photos-scene-run --json | jq .mean.psnr
       nerfcli evaluate photos-scene-run --require "psnr>=25,registered>=0.9"
-      nerfcli evaluate photos-scene-run --align pose --save-predictions png --overwrite
-      nerfcli evaluate photos-scene-run --align colour --overwrite
-      nerfcli evaluate photos-scene-run --seeds 3
+      nerfcli evaluate photos-scene-run --save-predictions png --overwrite
       nerfcli evaluate first-run second-run third-run
       nerfcli evaluate tooth-15-views-run --reference tooth-run
     """
@@ -85,25 +70,12 @@ def evaluate(
     from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run
 
-    aligned = {one_of(kind, ("pose", "colour"), "--align") for kind in align or ()}
     one_of(save_predictions, KINDS, "--save-predictions")
-    if STDIN in runs and (len(runs) > 1 or seeds > 1):
-        raise typer.BadParameter(
-            "- cannot be combined with other runs or --seeds: runs on standard input are evaluated one by one",
-            param_hint="RUNS",
-        )
-    if seeds > 1 and len(runs) > 1:
-        raise typer.BadParameter("--seeds takes a single run and trains the other seeds itself", param_hint="--seeds")
+    if STDIN in runs and len(runs) > 1:
+        raise typer.BadParameter("- cannot be combined with other runs", param_hint="RUNS")
     console = Console(quiet=quiet, json_lines=json)
     requirements = requirements_of(require)
     cores, torch_device = thread_count(threads), device_name(device)
-    how: dict[str, Any] = {
-        "device": torch_device,
-        "threads": cores,
-        "align_poses": "pose" in aligned,
-        "align_colours": "colour" in aligned,
-        "predictions": save_predictions,
-    }
 
     def measure_scan(folder: Path) -> None:
         from nerfcli.cli.scans import print_scan_numbers, refuse_photo_options
@@ -117,7 +89,14 @@ def evaluate(
 
     def measure(folder: Path) -> dict[str, Any]:
         with console.callbacks("evaluate") as callbacks:
-            evaluation = evaluate_run(folder, overwrite=overwrite, **how, **callbacks)
+            evaluation = evaluate_run(
+                folder,
+                device=torch_device,
+                threads=cores,
+                overwrite=overwrite,
+                predictions=save_predictions,
+                **callbacks,
+            )
         print_numbers(folder, evaluation, console)
         console.result(evaluation.path, evaluation.metrics)
         return evaluation.metrics
@@ -131,21 +110,11 @@ def evaluate(
         found = measure(folder)
         check_requirements(Run(folder), found, requirements)
 
-    if seeds == 1 and len(runs) == 1:
+    if len(runs) == 1:
         for_each_input(runs[0], work, command="evaluate")
         return
-    folders = [Path(run) for run in runs]
-    if seeds > 1:
-        from nerfcli.workflows.train import other_seeds, train_again
-
-        first = Run(folders[0])
-        others = other_seeds(first, seeds - 1, device=torch_device, threads=cores)
-        with console.callbacks(f"train {seeds - 1} more seeds") as callbacks:
-            train_again(first, others, warn=console.warn, **callbacks)
-        folders += others
-    measured = [measure(folder) for folder in folders]
-    print_spread(folders, measured, console)
-    for folder, metrics in zip(folders, measured, strict=True):
+    measured = {folder: measure(folder) for folder in map(Path, runs)}
+    for folder, metrics in measured.items():
         check_requirements(Run(folder), metrics, requirements)
 
 
@@ -196,26 +165,6 @@ def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None
     console.note(summary_line([Entry(**entry) for entry in metrics["ledger"]]))
     for text in metrics["warnings"]:
         console.warn(text)
-
-
-def print_spread(folders: Sequence[Path], measured: Sequence[dict[str, Any]], console: Console) -> None:
-    """Print mean and spread over runs: a table, and with --json one more line.
-
-    Raises:
-        UserError: see `spread`.
-    """
-    from nerfcli.evaluate.spread import spread
-
-    found = spread(measured, [str(folder) for folder in folders])
-    if console.json_lines:
-        console.fact({"spread": found})
-    rows = [
-        (name, *(_number(found[name][key], 4) for key in ("mean", "standard_deviation", "lowest", "highest")))
-        for name in found
-        if name != "runs"
-    ]
-    columns = (f"{len(folders)} runs", "mean", "standard deviation", "lowest", "highest")
-    console.table(columns, rows, styles={})
 
 
 def _number(value: float | None, digits: int) -> str:

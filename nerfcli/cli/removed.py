@@ -26,8 +26,10 @@ class Removed(NamedTuple):
 
 REMOVED: tuple[Removed, ...] = (
     Removed("convert", "--to npz", "2026-11-29", "use --to nerfcli (a scene folder), or --to colmap without photos"),
+    Removed("evaluate", "--align", "2026-11-29", "psnr_colour_aligned in metrics.json is after a colour correction"),
     Removed("evaluate", "--dry-run", "2026-11-29", "time three views: nerfcli render RUN --frames 0:3 -o three"),
     Removed("evaluate", "--members", "2026-11-29", "train with --seed 1, --seed 2, ... and evaluate each run"),
+    Removed("evaluate", "--seeds", "2026-11-29", "train with --seed 1, --seed 2, ... and evaluate each run"),
     Removed("render", "--crf", "2026-11-29", "an mp4 has a constant rate factor of 16; make it smaller with ffmpeg"),
     Removed("render", "--depth-format npz", "2026-11-29", "use exr, which also holds all outputs of a view"),
     Removed("render", "--direction", "2026-11-29", "reverse the video: ffmpeg -i in.mp4 -vf reverse out.mp4"),

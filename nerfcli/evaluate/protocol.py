@@ -13,13 +13,12 @@ import torch
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.billboards import Billboards, GeometryComparison, GeometryEvidence
-from nerfcli.evaluate.colour_alignment import align_gains, colour_aligned
+from nerfcli.evaluate.colour_alignment import colour_aligned
 from nerfcli.evaluate.metrics import as_float, psnr, ssim, to_8_bit, whole_windows
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.evaluate.outliers import outlier_warnings
 from nerfcli.evaluate.perceptual import NAME as LPIPS_NAME
 from nerfcli.evaluate.perceptual import SMALLEST, Perceptual
-from nerfcli.evaluate.pose_refinement import align_pose, halves
 from nerfcli.field.background import Background
 from nerfcli.field.exposure import exposed
 from nerfcli.render.model import Model
@@ -73,16 +72,12 @@ class Extras:
         training: the training views, to measure the novelty of the held-out ones.
         perceptual: LPIPS, if available.
         billboards: a model without geometry to compare the field with.
-        align_poses: whether each held-out pose is also refined; it costs a render and about 60 times 2048 pixels.
-        align_colours: whether gains are also fitted to the left half of each held-out photo.
         keep: called with each compared pair.
     """
 
     training: Sequence[Frame] = ()
     perceptual: Perceptual | None = None
     billboards: Billboards | None = None
-    align_poses: bool = False
-    align_colours: bool = False
     keep: Callable[[ComparedImages], None] = lambda compared: None
 
 
@@ -96,9 +91,7 @@ def evaluate_model(
     """Compare the model with every held-out photo: metrics per photo, means, and render time.
 
     Per photo: psnr, ssim and lpips of the 8-bit picture; psnr_float and ssim_float of the picture before rounding;
-    *_colour_aligned after `colour_aligned`. With `align_poses` or `align_colours`, *_right_half are measured on
-    the right half of the photo; *_pose_aligned the same with the pose fitted to the left half, *_gains_aligned with
-    the gains fitted to it. Unknown values are None.
+    *_colour_aligned after `colour_aligned`. Unknown values are None.
 
     Args:
         held_out: the photos, at least one.
@@ -115,8 +108,7 @@ def evaluate_model(
             "this run has no held-out photos to evaluate on",
             "by default every 8th photo is held out; check the split with nerfcli info RUN",
         )
-    renders = 2 if extras.align_poses else 1
-    total = renders * sum(photo.pixels.shape[0] * photo.pixels.shape[1] for photo in held_out)
+    total = sum(photo.pixels.shape[0] * photo.pixels.shape[1] for photo in held_out)
     done = 0
 
     def on_tile(rays: int) -> None:
@@ -142,12 +134,6 @@ def evaluate_model(
             **_counted(photo, picture, compared),
             "exposure": {"from": photo.gains_from, "log_gains": list(photo.log_gains)},
         }
-        if extras.align_poses or extras.align_colours:
-            entry |= _right_half(compared, compared.rendered, suffix="_right_half")
-        if extras.align_colours:
-            entry |= _gains_aligned(picture.rgb, compared, photo.log_gains)
-        if extras.align_poses:
-            entry |= _pose_aligned(model, compared, photo.log_gains, background=background, on_tile=on_tile)
         if views is not None:
             entry["view"] = asdict(views[index])
         images.append(entry | {"seconds": seconds[-1]})
@@ -265,46 +251,6 @@ def _counted(photo: HeldOutPhoto, picture: RenderedPicture, compared: ComparedIm
     }
 
 
-def _pose_aligned(
-    model: Model,
-    compared: ComparedImages,
-    log_gains: tuple[float, ...],
-    *,
-    background: Background,
-    on_tile: Callable[[int], None],
-) -> dict[str, Any]:
-    left, _ = halves(compared.used)
-    truth = as_float(compared.photo)
-    found = align_pose(model, compared.frame, truth, used=left, background=background, log_gains=log_gains)
-    if found is None:
-        return dict.fromkeys(("psnr_pose_aligned", "ssim_pose_aligned", "pose_alignment"))
-    again = render_picture(model, found.frame, background=background, on_tile=on_tile)
-    return {
-        **_right_half(compared, as_exposed(again.rgb, log_gains), suffix="_pose_aligned"),
-        "pose_alignment": found.to_json(),
-    }
-
-
-def _gains_aligned(rgb: np.ndarray, compared: ComparedImages, log_gains: tuple[float, ...]) -> dict[str, Any]:
-    """Measure the model's own colours (H, W, 3) with gains fitted to the left half of the photo."""
-    if compared.on_white:
-        return dict.fromkeys(("psnr_gains_aligned", "ssim_gains_aligned", "gain_alignment"))
-    left, _ = halves(compared.used)
-    found = align_gains(rgb, as_float(compared.photo), used=left, log_gains=log_gains)
-    return {
-        **_right_half(compared, as_exposed(rgb, found), suffix="_gains_aligned"),
-        "gain_alignment": {"log_gains": list(found)},
-    }
-
-
-def _right_half(compared: ComparedImages, rendered: np.ndarray, *, suffix: str) -> dict[str, float | None]:
-    """Measure a picture on the right half of the photo; None if no pixel of it counts."""
-    _, right = halves(compared.used)
-    if not right.any():
-        return {f"psnr{suffix}": None, f"ssim{suffix}": None}
-    return _close(to_8_bit(rendered), compared.photo, used=right, suffix=suffix)
-
-
 def _kinds(images: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return the means over the views of each kind, interpolation and extrapolation."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
@@ -321,15 +267,9 @@ def _protocol_name(held_out: Sequence[HeldOutPhoto], extras: Extras) -> str:
     exposures = f", exposures by {' or '.join(sorted(sources))}" if sources else ""
     alpha = ", RGBA on white" if any(photo.pixels.shape[-1] == 4 for photo in held_out) else ""
     lpips = f"{LPIPS_NAME} (torchmetrics)" if extras.perceptual is not None else "no LPIPS"
-    pose = ", pose_aligned: refined on the left half, measured on the right" if extras.align_poses else ""
-    gains = (
-        ", gains_aligned: median gain per channel in linear light of the left half, measured on the right"
-        if extras.align_colours
-        else ""
-    )
     return (
         f"{PROTOCOL}: {len(held_out)} held-out photos (names sha256 {names}) at {' '.join(sizes)}, area-averaged, "
         f"sRGB 8 bit{alpha}{exposures}, mean of per-image values; PSNR; SSIM with Gaussian window 1.5, 11 x 11, of "
         f"windows inside the picture that hold no masked pixel (scikit-image); {lpips}; float: before rounding; "
-        f"colour_aligned: quadratic colour correction fitted to the held-out photo (multinerf){pose}{gains}"
+        f"colour_aligned: quadratic colour correction fitted to the held-out photo (multinerf)"
     )

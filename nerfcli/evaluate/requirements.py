@@ -9,20 +9,15 @@ from typing import Any
 from nerfcli.runs.config import RunConfig
 
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
-_ALIGNED = ("", "_colour_aligned", "_pose_aligned", "_gains_aligned")
 # Metrics that may be required: the means in metrics.json, the fraction of photos with a pose, and the run's times.
 NAMES = (
-    *(f"{measure}{aligned}" for measure in ("psnr", "ssim") for aligned in (*_ALIGNED, "_float", "_right_half")),
+    *(f"{measure}{version}" for measure in ("psnr", "ssim") for version in ("", "_colour_aligned", "_float")),
     *("lpips", "lpips_colour_aligned", "registered", "training_seconds", "seconds_per_image"),
 )
 # Why a number may be absent, and what to do.
 WHY_ABSENT = {
     "registered": "only scenes of nerfcli poses say how many photos were registered; leave this requirement out",
     "lpips": "LPIPS needs pip install 'nerfcli[lpips]'; then evaluate again with --overwrite",
-    "psnr_pose_aligned": "evaluate with --align pose",
-    "ssim_pose_aligned": "evaluate with --align pose",
-    "psnr_gains_aligned": "evaluate with --align colour",
-    "ssim_gains_aligned": "evaluate with --align colour",
 }
 
 

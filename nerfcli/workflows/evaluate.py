@@ -47,8 +47,6 @@ def evaluate_run(
     device: str = "auto",
     threads: int = 0,
     overwrite: bool = False,
-    align_poses: bool = False,
-    align_colours: bool = False,
     predictions: str | None = None,
     notify: Notify = silent,
     progress: Progress = no_progress,
@@ -65,15 +63,13 @@ def evaluate_run(
         device: "auto", "cpu", "cuda" or "cuda:1".
         threads: number of CPU threads; 0 for all.
         overwrite: measure again.
-        align_poses: also refine each pose on the left half of its photo and measure on the right half.
-        align_colours: also fit gains on the left half of each photo and measure on the right half.
         predictions: "png" saves the compared pictures in RUN/predictions, "float" also unrounded ones; None saves none.
         notify: called with lines for the user.
         progress: called with the fraction of the rays that is done, and a short text.
 
     Raises:
         UserError: the folder is not a run, its split is not the one it was trained with, a photo cannot be read, or
-            existing metrics are of another checkpoint or lack a requested measurement.
+            existing metrics are of another checkpoint or lack the predictions.
     """
     trained = Run(Path(run))
     cores, torch_device = thread_count(threads), device_name(device)
@@ -84,13 +80,7 @@ def evaluate_run(
     checkpoint = model.sha256
     assert checkpoint is not None
     if trained.metrics_path.exists() and not overwrite:
-        metrics = _kept(
-            trained.metrics_path,
-            checkpoint,
-            align_poses=align_poses,
-            align_colours=align_colours,
-            predictions=predictions,
-        )
+        metrics = _kept(trained.metrics_path, checkpoint, predictions=predictions)
         made_by = metrics["protocol"].split(":")[0]
         older = "" if made_by == PROTOCOL else f" (by {made_by})"
         notify(f"{trained.metrics_path} is kept{older}: it is up to date; add --overwrite to evaluate again")
@@ -110,7 +100,7 @@ def evaluate_run(
             model,
             held_out,
             on_image=lambda done, total: progress(done / total, f"of {total} rays"),
-            extras=Extras(trained.cameras.train, perceptual, billboards, align_poses, align_colours, keep),
+            extras=Extras(trained.cameras.train, perceptual, billboards, keep),
         )
     metrics["training"] = asdict(summary)
     metrics["ledger"] = [asdict(entry) for entry in leak_ledger(trained.config)]
@@ -162,22 +152,13 @@ def saved_predictions(
         write_json(folder / INFO, {"checkpoint_sha256": checkpoint, "kind": kind, "files": stems})
 
 
-def _kept(
-    path: Path, checkpoint: str, *, align_poses: bool, align_colours: bool, predictions: str | None
-) -> dict[str, Any]:
-    """Return existing metrics; raise if they are of another checkpoint or lack a requested measurement."""
+def _kept(path: Path, checkpoint: str, *, predictions: str | None) -> dict[str, Any]:
+    """Return existing metrics; raise if they are of another checkpoint or lack the predictions."""
     metrics = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to evaluate again")
     if metrics.get("checkpoint_sha256") != checkpoint:
         raise UserError(f"{path} belongs to an earlier checkpoint of this run", "add --overwrite to replace it")
-    lacks = []
-    if align_poses and "psnr_pose_aligned" not in metrics["mean"]:
-        lacks.append("refined poses")
-    if align_colours and "psnr_gains_aligned" not in metrics["mean"]:
-        lacks.append("fitted gains")
     if predictions is not None and not predictions_are_there(
         path.with_name(PREDICTIONS), predictions, checkpoint=checkpoint
     ):
-        lacks.append("saved predictions")
-    if lacks:
-        raise UserError(f"{path} was written without {' and '.join(lacks)}", "add --overwrite to evaluate again")
+        raise UserError(f"{path} was written without saved predictions", "add --overwrite to evaluate again")
     return metrics

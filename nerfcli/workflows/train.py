@@ -1,6 +1,5 @@
 """Train a scene, keep an existing run, resume one, or refuse to overwrite another one."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from nerfcli.errors import UserError, listed, several
 from nerfcli.exclusive import exclusive
 from nerfcli.runs.blocks import divide
 from nerfcli.runs.config import split_hash
-from nerfcli.runs.files import BLOCKS, CONFIG, LOCK, METRICS, STATE
+from nerfcli.runs.files import CONFIG, LOCK, METRICS, STATE
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene, describe_unused_masks
@@ -172,59 +171,6 @@ def was_interrupted(scene: Path, run: Path, settings: TrainSettings, *, holdout:
     return trained.is_trained_from(loaded, settings) and not trained.is_complete(settings)
 
 
-def train_again(
-    run: Run,
-    others: Mapping[Path, TrainSettings],
-    *,
-    memory_bytes: int | None = None,
-    resume: bool = False,
-    overwrite: bool = False,
-    notify: Notify = silent,
-    warn: Notify = warn_python,
-    progress: Progress = no_progress,
-) -> None:
-    """Train the scene of a run again with other settings, one training after the other.
-
-    Complete runs are kept and interrupted ones are resumed.
-
-    Args:
-        run: a complete run.
-        others: the folders to write, and the settings of each.
-        resume: also continue complete runs to the budget or step count of their settings.
-        memory_bytes, notify, warn, progress: see `train_scene`.
-
-    Raises:
-        UserError: the scene no longer exists or has changed, or the run joins blocks.
-    """
-    config = run.config
-    folder = config.scene
-    if not folder.exists():
-        raise UserError(
-            f"the scene of {run.path} is missing: {folder}",
-            "run the command from the folder in which the run was trained, or train again",
-        )
-    loaded = scene_for(config.settings, folder, holdout=config.holdout)
-    if scenes.fingerprint(loaded) != config.scene_fingerprint:
-        raise UserError(f"{folder} has changed since {run.path} was trained on it", "train again with --overwrite")
-    if config.settings.blocks and not config.settings.block:
-        raise UserError(
-            f"{run.path} joins blocks, which are trained one by one", f"give a block: {run.path / BLOCKS / '1'}"
-        )
-    for path, settings in others.items():
-        train_or_continue(
-            folder,
-            path,
-            settings,
-            memory_bytes=memory_bytes,
-            resume=resume,
-            overwrite=overwrite,
-            holdout=config.holdout,
-            notify=notify,
-            warn=warn,
-            progress=progress,
-        )
-
-
 def train_or_continue(
     folder: Path,
     path: Path,
@@ -260,19 +206,6 @@ def train_or_continue(
     except KeyboardInterrupt:
         notify("what is complete is kept; the same command continues")
         raise
-
-
-def other_seeds(run: Run, count: int, *, device: str, threads: int) -> dict[Path, TrainSettings]:
-    """Return the folders RUN/seeds/SEED, each with the settings of a run but another seed.
-
-    Args:
-        run: a complete run.
-        count: number of seeds, which follow the run's own.
-        device, threads: as for `TrainSettings`.
-    """
-    first = replace(run.config.settings, device=device, threads=threads)
-    seeds = range(first.seed + 1, first.seed + 1 + count)
-    return {run.path / "seeds" / str(seed): replace(first, seed=seed) for seed in seeds}
 
 
 def scene_for(settings: TrainSettings, folder: Path, *, holdout: str | None) -> Scene:
