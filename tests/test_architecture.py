@@ -106,15 +106,7 @@ CONFINED = {
     "safetensors": {"field"},
     "numba": {"kernels"},
     "triton": {"kernels"},
-    "pycolmap": {
-        "poses",
-        "poses.engine",
-        "poses.judge",
-        "poses.model",
-        "cameras",
-        "convert",
-        "surface",
-    },  # convert: the independent reader of a verification
+    "pycolmap": {"poses", "poses.engine", "poses.judge", "poses.model", "cameras", "surface"},
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"media"},

@@ -186,7 +186,6 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --depth-tolerance 0.1 --outputs lower", "--depth-tolerance: it works with --outputs confidence"),
         ("render x --outputs depth --rgba", "--rgba: it works with --outputs rgb"),
         ("render x --outputs rgb --depth median", "--depth: it works with --outputs depth"),
-        ("convert x y --to ply --no-verify --tolerance 1", "--tolerance: nothing is compared with --no-verify"),
         ("render x --count 20", "--count: it works with --cameras orbit, ellipse, spiral, interpolate"),
         ("train x --field voxels --levels 4", "--levels: it works with --field hash"),
         ("train x --field mlp --log2-rows 12", "--log2-rows: it works with --field hash"),

@@ -112,7 +112,6 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
 
 def parse(folder: Path, given: UserInputs = UserInputs()) -> tuple[str, Capture]:
     form, found = recognise(folder)
-    assert form.parse is not None
     return form.name, form.parse(found, given)
 
 
@@ -167,7 +166,6 @@ def test_photos_in_another_folder(tmp_path, name):
 def test_a_hundred_damaged_files_are_refused_or_sound(tmp_path, name):
     path = WRITERS[name](tmp_path)
     form, found = recognise(tmp_path)
-    assert form.parse is not None
     parse_found = form.parse
     damage = {".txt": corrupted_text, ".json": corrupted_json, ".npz": corrupted_binary}[path.suffix]
     data, rng, refused = path.read_bytes(), np.random.default_rng(0), 0

@@ -547,7 +547,6 @@ def test_a_log_line_that_a_kill_cut_short_is_left_out(tmp_path):
 def as_convert_reads(run: Path) -> Capture:
     """Read the cameras of a run as `nerfcli convert` does."""
     form, found = recognise(run)
-    assert form.parse is not None
     return form.parse(found, UserInputs())
 
 

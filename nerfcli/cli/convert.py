@@ -1,4 +1,4 @@
-"""nerfcli convert: convert cameras between formats and verify the result; detect conventions."""
+"""nerfcli convert: convert cameras between formats; detect conventions."""
 
 import inspect
 from pathlib import Path
@@ -13,7 +13,6 @@ from nerfcli.cli.options import Holdout, Json, Overwrite, Quiet, one_of
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
-    from nerfcli.convert.conversion import Conversion
     from nerfcli.convert.detect import Detection, HypothesisScore, Question
 
 FORMATS_WRITTEN = (
@@ -128,8 +127,6 @@ def convert(
     allow_loss: Annotated[
         bool, typer.Option("--allow-loss", help="Drop what the format cannot hold (it is listed).")
     ] = False,
-    verify: Annotated[bool, typer.Option(help="Read OUT back with other code and compare.")] = True,
-    tolerance: Annotated[float, typer.Option(help="Maximum residual, in pixels.", min=0)] = 1e-6,
     photons: Photons = None,
     unit: Unit = None,
     mirrored: Mirrored = False,
@@ -139,10 +136,10 @@ def convert(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Convert a capture to another format and verify the result.
+    """Convert a capture to another format.
 
-    The written cameras, poses and points are read back with other code (pycolmap, OpenCV, SciPy), every 3D point is
-    projected with both, and the largest residual is reported; above --tolerance nothing is kept and the exit code is 7.
+    What was written is read back, and its points and the rays of its pixels are compared with the capture; if they
+    differ, nothing is kept and the exit code is 7.
     Anything that the format cannot hold is listed, and the conversion is refused without --allow-loss (2D features are
     optional). Photos are not changed.
 
@@ -224,8 +221,6 @@ def convert(
             raise typer.BadParameter(f"{given_text}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
         if target is None:
             raise typer.BadParameter("missing; give the file or folder to write", param_hint="OUT")
-        if not verify and tolerance != TargetOptions.tolerance_px:
-            raise typer.BadParameter("nothing is compared with --no-verify; remove it", param_hint="--tolerance")
         one_of(pixels, ("stored", "upright"), "--pixels")
         world = WorldFrame(world_up, origin, scale, markers, tuple(distance or ()), georeference)
         wanted = TargetOptions(
@@ -234,8 +229,6 @@ def convert(
             pixel_centre=_pixel_centre(pixel_center, "--pixel-center"),
             allow_loss=allow_loss,
             overwrite=overwrite,
-            verified=verify,
-            tolerance_px=tolerance,
             pixels=pixels,
         )
 
@@ -251,7 +244,8 @@ def convert(
                 notify=console.note,
                 warn=console.warn,
             )
-            _print_verification(done, console)
+            off = f", {done.check.rays} rays are off by at most {done.check.max_px:.2g} px" if done.check.rays else ""
+            console.note(f"{done.path}: read back{off}")
             console.result(done.path, record)
 
     def either(path: Path, one_of_many: bool) -> None:
@@ -263,25 +257,6 @@ def convert(
             work(path, one_of_many)
 
     for_each_input(source, either, command="convert")
-
-
-def _print_verification(done: "Conversion", console: Console) -> None:
-    checked = done.verification
-    if checked is None:
-        console.warn(f"{done.path}: not verified")
-        return
-    against = "the remaining capture" if done.losses else "the capture"
-    points = f"{checked.num_points} points" if checked.num_points else "synthetic points"
-    if not checked.num_projections:
-        console.note(f"{done.path}: verified, its {checked.num_points} points equal those of {against}")
-        return
-    console.note(
-        f"{done.path}: verified, {checked.num_projections} projections of {points} in "
-        f"{checked.num_views} images compared with {against}; largest residual {checked.max_px:.2g} px "
-        f"(tolerance {checked.tolerance_px:.2g} px), rotation {checked.max_deg:.2g} degrees, "
-        f"centre {checked.max_centre_shift:.2g} of the scene's size"
-        + (f"; also equal: {', '.join(checked.parts)}" if checked.parts else "")
-    )
 
 
 def _table(found: "Detection") -> list[str]:

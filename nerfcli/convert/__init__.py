@@ -1,1 +1,1 @@
-"""Conversion between formats of captures: formats, losses, conventions, verification."""
+"""Conversion between formats of captures: formats, losses, conventions."""

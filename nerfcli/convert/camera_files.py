@@ -12,8 +12,6 @@ from nerfcli.convert.stored_pixels import UPRIGHT
 from nerfcli.errors import UserError
 from nerfcli.scene import MODEL_FOLDER, SCENE_FILE
 
-# Formats that hold only poses: their cameras were given, or belong to views without a photo.
-_WITHOUT_CAMERAS = ("tum", "kitti", "camera-path")
 _CAMERAS_FILES = ("cameras.bin", "cameras.txt")
 
 
@@ -54,7 +52,7 @@ def read_calibration(path: Path, *, images: Path | None = None) -> Calibration:
         upright = _is_own(cameras_file.parent)
     else:
         form, found = recognise(path)
-        if form.parse is None or form.name in _WITHOUT_CAMERAS:
+        if "cameras" in form.lacks:
             raise _no_cameras(path)
         # Cameras of scenes and runs of nerfcli are for upright pictures; the capture says so.
         capture = form.parse(found, UserInputs(images=images))

@@ -1,4 +1,4 @@
-"""Convert a capture: parse, apply corrections, refuse or accept losses, write, verify, keep."""
+"""Convert a capture: parse, apply corrections, refuse or accept losses, write, read back and compare, keep."""
 
 import os
 import shutil
@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture
-from nerfcli.convert.axes import NAMED_AXES, Convention, expressed, opencv_from_axes, reinterpreted
+from nerfcli.convert.axes import Convention, expressed, opencv_from_axes, reinterpreted
+from nerfcli.convert.check import Check, check, differs
 from nerfcli.convert.formats import Format, UserInputs, recognise, with_masks, with_photos
-from nerfcli.convert.probes import probes_of, projected
-from nerfcli.convert.readback import READERS, UnstatedFacts, read_ply
-from nerfcli.convert.reduction import reduced
 from nerfcli.convert.stored_pixels import STORED, ReorientedCapture, in_pixels
-from nerfcli.convert.verify import TOLERANCE_PX, Verification, listed_order, unreadable, verify, verify_points
 from nerfcli.errors import GATE_NOT_MET, UserError
 
 
@@ -48,8 +46,6 @@ class TargetOptions:
     pixel_centre: float | None = None
     allow_loss: bool = False
     overwrite: bool = False
-    verified: bool = True
-    tolerance_px: float = TOLERANCE_PX
     pixels: str | None = None
 
 
@@ -61,6 +57,7 @@ class Conversion:
         capture: the capture before losses.
         losses: its contents that the format cannot hold, which were dropped.
         loss_px: the largest shift of a pixel by the dropped lens terms.
+        check: the comparison of the written file with the capture.
     """
 
     path: Path
@@ -68,7 +65,7 @@ class Conversion:
     capture: Capture
     losses: tuple[str, ...]
     loss_px: float
-    verification: Verification | None
+    check: Check
     notes: tuple[str, ...] = ()
 
 
@@ -82,7 +79,6 @@ def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tup
         UserError: there is no capture, it is damaged, or the given axes are invalid.
     """
     form, found = recognise(source)
-    assert form.parse is not None
     capture = form.parse(found, given)
     if given.images is not None:
         capture = with_photos(capture, given.images)
@@ -100,9 +96,10 @@ def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tup
 
 
 def convert(capture: Capture, target: Path, *, source_format: str, wanted: TargetOptions) -> Conversion:
-    """Write a capture in another format, and verify that nothing but the accepted losses was lost.
+    """Write a capture in another format, read it back, and compare.
 
-    The file is kept only if the content read back from it agrees; otherwise the previous files are restored.
+    The file is kept only if cameras, poses and points agree, but for accepted losses; otherwise the previous files are
+    restored.
 
     Args:
         target: the file; or the folder, for formats that fill one and for a file with the format's usual name.
@@ -137,16 +134,10 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Targe
     there = [file for file in files if file.exists()]
     if there and not wanted.overwrite:
         raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another output path")
-    left = reduced(capture, form.name)
-    verification = None
     with _kept_on_success(path, there, files):
         form.write(expressed(capture, convention, written_axes=form.axes), path)
-        if wanted.verified:
-            verification = _verification(left, path, form, convention, wanted.tolerance_px)
-            if not verification.holds:
-                raise _does_not_hold(path, verification)
-    notes = _orientation_notes(turned)
-    return Conversion(path, source_format, capture, losses, _loss_px(capture, left), verification, notes)
+        checked, loss_px = _checked(capture, path, form, convention)
+    return Conversion(path, source_format, capture, losses, loss_px, checked, _orientation_notes(turned))
 
 
 def _pixels(form: Format, wanted: TargetOptions) -> str:
@@ -185,41 +176,28 @@ def _convention(form: Format, wanted: TargetOptions) -> Convention:
     return Convention(axes, pixel_centre=pixel_centre)
 
 
-def _verification(left: Capture, path: Path, form: Format, convention: Convention, tolerance_px: float) -> Verification:
-    if form.name == "ply":
-        return verify_points(left, *read_ply(path), tolerance_px=tolerance_px)
-    listed = listed_order(left, form.name)
-    sizes = tuple((left.frames[index].camera.width, left.frames[index].camera.height) for index in listed)
-    letters = NAMED_AXES.get(convention.axes, convention.axes)
+def _checked(capture: Capture, path: Path, form: Format, convention: Convention) -> tuple[Check, float]:
+    """Compare the written file with the capture; return also the largest shift of a pixel by lost lens terms.
+
+    Raises:
+        UserError: with exit code 7, the file cannot be read back, or does not hold the capture.
+    """
+    assert form.losses is not None
+    ideal = {frame.camera: Camera.pinhole(*frame.camera.size, frame.camera.width) for frame in capture.frames}
+    without_lenses = replace(capture, frames=tuple(replace(f, camera=ideal[f.camera]) for f in capture.frames))
+    lenses_lost = bool(set(form.losses(capture)) - set(form.losses(without_lenses)))
     try:
-        back = READERS[form.name](path, UnstatedFacts(letters, convention.pixel_centre, sizes))
-    except (KeyError, IndexError, TypeError, ValueError, RuntimeError, OSError) as error:
-        return unreadable(left, f"it cannot be read back ({type(error).__name__}: {error})", tolerance_px=tolerance_px)
-    return verify(left, back, listed=listed, tolerance_px=tolerance_px)
-
-
-def _does_not_hold(path: Path, verification: Verification) -> UserError:
-    what = verification.fault or (
-        f"a point of {verification.worst} is off by {verification.max_px:.3g} px "
-        f"(rotations by {verification.max_deg:.3g} degrees, "
-        f"centres by {verification.max_centre_shift:.3g} of the scene's size); "
-        f"tolerance {verification.tolerance_px:.3g} px"
-    )
-    return UserError(
-        f"{path} failed verification: {what}",
-        "nothing was kept; this is a bug in nerfcli, please report it (--no-verify writes the file anyway)",
-        exit_code=GATE_NOT_MET,
-    )
-
-
-def _loss_px(capture: Capture, left: Capture) -> float:
-    """Return the largest distance, in pixels, between projections of a point by a capture and by its reduced form."""
-    if all(one.camera == other.camera for one, other in zip(capture.frames, left.frames, strict=True)):
-        return 0.0
-    probes = probes_of(capture)
-    return float(
-        np.linalg.norm(projected(left, probes.frame_index, probes.points)[0] - probes.pixels, axis=1).max(initial=0.0)
-    )
+        again = form.parse(path, UserInputs(camera=capture.frames[0].camera))
+        if convention != Convention(form.axes):
+            again = reinterpreted(again, convention, parsed_axes=form.axes)
+        checked = check(capture, again, form, own_lenses=lenses_lost or "cameras" in form.lacks)
+        lossy = check(capture, again, form, own_lenses="cameras" in form.lacks) if lenses_lost else None
+    except UserError as error:
+        message = f"{path} was not kept, as reading it back fails: {error.message}"
+        raise UserError(message, error.hint, exit_code=GATE_NOT_MET) from error
+    if checked.max_px > checked.tolerance_px:
+        raise differs(f"a ray is off by {checked.max_px:.3g} px; tolerance {checked.tolerance_px:.3g} px")
+    return checked, 0.0 if lossy is None else lossy.max_px
 
 
 def _files(form: Format, path: Path) -> list[Path]:

@@ -4,7 +4,7 @@ Each kind of evidence computes one error for every item, from the poses and from
 depend only on the intrinsics. An item behind a camera has an infinite error.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -14,7 +14,6 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.convert.axes import Convention, for_picture, shifted
-from nerfcli.convert.probes import rows_of_each
 from nerfcli.errors import UserError
 from nerfcli.multiview.epipolar import fundamental_matrix, sampson_angles
 from nerfcli.multiview.features import Features, Matches, find_features, mutual_matches
@@ -222,7 +221,7 @@ class FrustumEvidence:
         cam_from_world = rigid.inverse(world_from_cam)[self.groups]
         in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], self._points) + cam_from_world[:, :3, 3]
         shown = np.zeros(len(self.groups), dtype=bool)
-        for camera, rows in rows_of_each(self._cameras, self.groups):
+        for camera, rows in _rows_of_each(self._cameras, self.groups):
             shown[rows] = camera.shows(in_camera[rows])
         return np.where(shown, 0.0, np.inf)
 
@@ -233,8 +232,16 @@ def _directions(
     """Return the unit viewing directions (M, 3) of pixels of frames, their validity, and pixels per radian."""
     directions, valid = np.zeros((len(pixels), 3)), np.zeros(len(pixels), dtype=bool)
     focal_px = np.zeros(len(pixels))
-    for camera, rows in rows_of_each(cameras, frame_index):
+    for camera, rows in _rows_of_each(cameras, frame_index):
         corrected = for_picture(shifted(camera, 0.5 - convention.pixel_centre), convention.intrinsics_scale)
         directions[rows], valid[rows] = corrected.bearings(pixels[rows])
         focal_px[rows] = corrected.focal_px
     return directions, valid, focal_px
+
+
+def _rows_of_each(cameras: Sequence[Camera], index: np.ndarray) -> Iterator[tuple[Camera, np.ndarray]]:
+    """Yield each distinct camera, in the order of first appearance, and the rows of `index` (M,) that refer to it."""
+    places: dict[Camera, int] = {}
+    labels = np.array([places.setdefault(camera, len(places)) for camera in cameras], dtype=np.int64)[index]
+    order = np.argsort(labels, kind="stable")
+    yield from zip(places, np.split(order, np.searchsorted(labels[order], np.arange(1, len(places)))), strict=True)

@@ -27,7 +27,7 @@ from nerfcli.cameras.formats import (
     transforms,
 )
 from nerfcli.cameras.formats.scene_json import SCENE_FILE
-from nerfcli.cameras.frame import Capture
+from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.convert import finding
 from nerfcli.convert.scene_folder import SCENE_FILES, losses_scene, parse_model, parse_scene, write_scene
 from nerfcli.convert.stored_pixels import STORED, UPRIGHT, measure
@@ -56,15 +56,17 @@ class Format:
     """A format of captures.
 
     Args:
-        looked_for: what it is recognised by, in a few words for people.
+        looked_for: what it is recognised by, in a few words for people; "" for formats that are only written.
         find: returns where such a capture is in a file or folder; None if there is none.
-        parse: reads what `find` found; None for formats that are only written.
+        parse: reads what `find` found, or what `write` wrote.
         axes: the camera axes of its poses, as three letters or a name.
         open_axes: whether poses with other axes are found in such files, so that --axes makes sense.
         open_centre: whether principal points with other pixel centres are found in such files.
         default_name: the name of its file if the target is a folder; "" for formats that fill a folder.
         files: the names of all files that it may write, where "*" stands for that file's name without its suffix.
         pixels: which pixels of EXIF-turned photos its cameras refer to, see `Capture`.
+        lacks: which of "cameras", "poses" and "points" it has no place for.
+        listed_by: the order of frames in its files, as a key to sort by; by default, that of the capture.
         write, losses: None for formats that are only read.
     """
 
@@ -72,13 +74,15 @@ class Format:
     title: str
     looked_for: str
     find: Callable[[Path], Path | None]
-    parse: Callable[[Path, UserInputs], Capture] | None
+    parse: Callable[[Path, UserInputs], Capture]
     axes: str = "opencv"
     open_axes: bool = False
     open_centre: bool = False
     default_name: str = ""
     files: tuple[str, ...] = ()
     pixels: str = STORED
+    lacks: tuple[str, ...] = ()
+    listed_by: Callable[[Frame], Any] = lambda frame: 0
     write: Callable[[Capture, Path], None] | None = None
     losses: Callable[[Capture], tuple[str, ...]] | None = None
 
@@ -93,11 +97,11 @@ def recognise(path: Path) -> tuple[Format, Path]:
         raise UserError(f"{path} does not exist", "give a file or folder of cameras")
     for form in FORMATS:
         found = form.find(path)
-        if found is not None and form.parse is not None:
+        if found is not None:
             return form, found
     if path.is_dir() and list_images(path):
         raise UserError(f"{path} contains photos but no cameras", f"estimate them with: nerfcli poses {in_shell(path)}")
-    looked_for = ", ".join(dict.fromkeys(form.looked_for for form in FORMATS if form.parse is not None))
+    looked_for = ", ".join(dict.fromkeys(form.looked_for for form in FORMATS if form.looked_for))
     raise UserError(f"{path} contains no capture in a supported format", f"looked for {looked_for}")
 
 
@@ -202,6 +206,7 @@ FORMATS = (
         lambda path, given: camera_path.parse_camera_path(path),
         axes="opengl",
         open_axes=True,
+        lacks=("cameras", "points"),
     ),
     Format(
         "alicevision",
@@ -229,10 +234,12 @@ FORMATS = (
         "transforms_{train,val,test}.json of NeRF's Blender scenes",
         "transforms_train.json",
         finding.find_blender,
-        lambda path, given: blender.parse_blender(path, measure, images=given.images),
+        lambda path, given: blender.parse_blender(path, measure, images=given.images, camera=given.camera),
         axes="opengl",
         open_axes=True,
         files=("transforms_train.json", "transforms_val.json", "transforms_test.json"),
+        lacks=("points",),
+        listed_by=lambda frame: transforms.SPLITS.index(frame.split or "train"),
         write=blender.write_blender,
         losses=blender.losses_blender,
     ),
@@ -245,6 +252,8 @@ FORMATS = (
         axes="llff",
         open_axes=True,
         files=("poses_bounds.npy",),
+        lacks=("points",),
+        listed_by=lambda frame: Path(frame.name).name,
         write=llff.write_llff,
         losses=llff.losses_llff,
     ),
@@ -329,6 +338,7 @@ FORMATS = (
         open_axes=True,
         default_name="trajectory.txt",
         files=("*.txt",),
+        lacks=("cameras", "points"),
         write=trajectories.write_tum,
         losses=trajectories.losses_tum,
     ),
@@ -341,6 +351,7 @@ FORMATS = (
         open_axes=True,
         default_name="poses.txt",
         files=("*.txt",),
+        lacks=("cameras", "points"),
         write=trajectories.write_kitti,
         losses=trajectories.losses_kitti,
     ),
@@ -349,9 +360,10 @@ FORMATS = (
         "the points only (written)",
         "",
         lambda path: None,
-        None,
+        lambda path, given: Capture((), ply.read_ply_points(path)[0], (), None, "ply"),
         default_name="points.ply",
         files=("*.ply",),
+        lacks=("cameras", "poses"),
         write=ply.write_ply,
         losses=ply.losses_ply,
     ),

@@ -48,16 +48,6 @@ def losses_scene(capture: Capture) -> tuple[str, ...]:
     return (f"the names of {renamed} photos, which become paths relative to one folder",) if renamed else ()
 
 
-def named_for_scene(capture: Capture) -> Capture:
-    """Return the capture with the names and the split that its photos get in a scene."""
-    _, names = _named(capture)
-    split = _split(dict(zip(names, (frame.split for frame in capture.frames), strict=True)))
-    frames = tuple(
-        replace(frame, name=name, split=split[name]) for frame, name in zip(capture.frames, names, strict=True)
-    )
-    return replace(capture, frames=frames)
-
-
 def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any] | None = None) -> None:
     """Write a capture, whose cameras are for upright photos, as a scene into a folder.
 
@@ -69,13 +59,15 @@ def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any]
     Raises:
         UserError: a frame has no photo, no photo is on disk, or the folder cannot be written.
     """
-    image_folder, _ = _named(capture)
+    image_folder, names = _named(capture)
     if not any(frame.has_photo for frame in capture.frames):
         raise UserError(
             f"none of the {len(capture.frames)} photos exists, such as {capture.frames[0].image}",
             "a scene needs its photos; give their folder with --images",
         )
-    capture = named_for_scene(capture)
+    capture = replace(
+        capture, frames=tuple(replace(frame, name=name) for frame, name in zip(capture.frames, names, strict=True))
+    )
     write_colmap_binary(capture, folder / scene.MODEL_FOLDER)
     bounds = None
     if capture.depth_bounds is not None:
@@ -88,7 +80,7 @@ def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any]
         unit=capture.unit,
         unit_source=capture.unit_source,
         masks={frame.name: frame.mask for frame in capture.frames if frame.mask is not None},
-        split={frame.name: frame.split for frame in capture.frames},
+        split=_split({frame.name: frame.split for frame in capture.frames}),
         depth_bounds=bounds,
     )
 

@@ -1,4 +1,4 @@
-"""Convert a capture and verify it, or detect its convention."""
+"""Convert a capture, or detect its convention."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -9,6 +9,7 @@ from nerfcli.cameras.frame import Capture
 from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.cameras.world import Origin
 from nerfcli.convert import detect
+from nerfcli.convert.check import TOLERANCE_PX
 from nerfcli.convert.conversion import ConventionOverrides, Conversion, TargetOptions, convert, load
 from nerfcli.convert.formats import Format, UserInputs, recording
 from nerfcli.convert.stored_pixels import STORED, in_pixels, other_sizes
@@ -37,7 +38,7 @@ def convert_capture(
         overrides: conventions of the source that differ from those of its format.
 
     Raises:
-        UserError: the capture cannot be read or written, the format cannot hold it, or the verification fails.
+        UserError: the capture cannot be read or written, the format cannot hold it, or what was written differs.
     """
     to = wanted.form.name
     form, found, capture = load(source, given, overrides)
@@ -70,7 +71,7 @@ def convert_capture(
         notify("the photos are HEIC, which many other programs cannot read")
     for loss in done.losses:
         warn(f"{to} cannot hold {loss}")
-    if done.loss_px > wanted.tolerance_px:
+    if done.loss_px > TOLERANCE_PX:
         warn(f"dropping lens parameters shifts pixels by up to {done.loss_px:.3g} px")
     return done, _record(done, to) | frame
 
@@ -172,7 +173,6 @@ def contents(capture: Capture) -> str:
 
 
 def _record(done: Conversion, to: str) -> dict[str, Any]:
-    checked = done.verification
     return {
         "from": done.source_format,
         "to": to,
@@ -181,16 +181,5 @@ def _record(done: Conversion, to: str) -> dict[str, Any]:
         "points": len(done.capture.points),
         "losses": list(done.losses),
         "loss_px": done.loss_px,
-        "verification": None
-        if checked is None
-        else {
-            "projections": checked.num_projections,
-            "points": checked.num_points,
-            "max_px": checked.max_px,
-            "max_deg": checked.max_deg,
-            "max_centre_shift": checked.max_centre_shift,
-            "max_point_shift": checked.max_point_shift,
-            "tolerance_px": checked.tolerance_px,
-            "same": list(checked.parts),
-        },
+        "read_back": asdict(done.check),
     }

@@ -114,7 +114,7 @@ def _describe_capture(path: Path) -> dict[str, Any] | None:
         return None
     for form in map(format_named, _CAPTURES):
         found = form.find(path)
-        if found is not None and form.parse is not None:
+        if found is not None:
             capture = form.parse(found, UserInputs())
             there = sum(frame.image is not None and frame.image.is_file() for frame in capture.frames)
             return {

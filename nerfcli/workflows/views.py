@@ -228,7 +228,6 @@ def _frames_of(path: Path, nerfstudio_frame: Path | None) -> tuple[Frame, ...]:
             f"give test, train, {', '.join(PATHS)}, or a file or folder of cameras that nerfcli convert reads",
         )
     form, found = recognise(path)
-    assert form.parse is not None
     if path.is_dir() and form.name in SCENES:
         frames = scenes.load(path).frames
     else:

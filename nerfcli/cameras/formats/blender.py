@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from nerfcli.atomic import write_json
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.transforms import (
@@ -48,13 +49,16 @@ def read_blender(folder: Path, measure: Measure) -> Capture:
     return capture_on_disk(_file(folder, "train"), frames, missing, rescaled=rescaled, kind="blender")
 
 
-def parse_blender(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
+def parse_blender(
+    folder: Path, measure: Measure, *, images: Path | None = None, camera: Camera | None = None
+) -> Capture:
     """Read all views of a Blender capture, from the file of every split that exists.
 
     Args:
         measure: returns an image's upright size and EXIF orientation, which the files do not give. An image that is not
             on disk gets the size of the other images in its file.
         images: folder of the images, if they are not where the files say: under the listed paths, or their last parts.
+        camera: its picture size is taken for images that are not on disk if none of their file is.
 
     Raises:
         UserError: a file is malformed or lists no image that is on disk, or there is no file.
@@ -63,7 +67,8 @@ def parse_blender(folder: Path, measure: Measure, *, images: Path | None = None)
     for split in SPLITS:
         path = _file(folder, split)
         if path.exists():
-            listed = listed_frames(path, read_json_object(path), measure, suffix=".png", images=images)
+            content, size = read_json_object(path), None if camera is None else camera.size
+            listed = listed_frames(path, content, measure, suffix=".png", images=images, size=size)
             frames += [replace(frame, split=split) for frame in listed]
     if not frames:
         raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")

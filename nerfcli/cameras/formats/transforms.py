@@ -182,6 +182,7 @@ def listed_frames(
     *,
     suffix: str = "",
     images: Path | None = None,
+    size: Size | None = None,
 ) -> list[Frame]:
     """Return all frames of a file as listed; frames with equal intrinsics share one camera.
 
@@ -190,6 +191,7 @@ def listed_frames(
             size of the other images, if they all have the same.
         suffix: appended to a file_path without a suffix if no such image is on disk, as the format does.
         images: a folder where images are looked for first: under the paths that the file lists, or their last parts.
+        size: of the images, if the file does not give it and none is on disk.
     """
     records = records_of(path, content)
     poses = _poses(path, records)
@@ -209,7 +211,7 @@ def listed_frames(
             ending = suffix if found is None else found.suffix
         names.append(_name_of(listed, where, suffix=ending))
         places.append(given or path.parent / (plain if plain.endswith(ending) else plain + ending))
-    sizes = _sizes(merged, places, wheres, measure=measure)
+    sizes = _sizes(merged, places, wheres, measure=measure, default=size)
     cameras: dict[Camera, Camera] = {}
     frames = []
     for record, where, size, name, image, pose in zip(merged, wheres, sizes, names, places, poses, strict=True):
@@ -228,16 +230,21 @@ def relative_path(frame: Frame, folder: Path) -> str:
 
 
 def _sizes(
-    records: list[dict[str, Any]], images: list[Path], wheres: list[str], *, measure: Measure | None
-) -> list[tuple[int, int]]:
-    """Return the width and height of each frame's picture: given, else measured, else the only given size."""
+    records: list[dict[str, Any]],
+    images: list[Path],
+    wheres: list[str],
+    *,
+    measure: Measure | None,
+    default: Size | None,
+) -> list[Size]:
+    """Return the width and height of each frame's picture: given, else measured, else the only such size or default."""
     sizes = [given_size(record, where) for record, where in zip(records, wheres, strict=True)]
     if measure is not None:
         sizes = [
             stored_size(image, measure) if size is None and image.is_file() else size
             for size, image in zip(sizes, images, strict=True)
         ]
-    given = {size for size in sizes if size is not None}
+    given = {size for size in sizes if size is not None} or ({default} if default else set[Size]())
     result = []
     for size, where, image in zip(sizes, wheres, images, strict=True):
         if size is None and len(given) != 1:
