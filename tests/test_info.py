@@ -45,12 +45,11 @@ def test_facts_fit_the_lines_of_a_terminal():
         "samples_per_second": 281_659,
         "field_bytes": 8_403_328,
         "occupied_share": 0.9497,
-        "settings": {"seed": 0, "steps": None, "log2_rows": 18, "fixed": ["points", "view"], "blocks": 0}
+        "settings": {"seed": 0, "steps": None, "log2_rows": 18, "fixed": ["points", "view"]}
         | {f"setting_{i}": i for i in range(9)},
         "components": {"view": 3, "stereo": True, "points": 0.1},
         "metrics": {"psnr": 21.6765, "ssim": 0.651505, "psnr_colour_aligned": 21.7141},
         "low": [-3.550517134718522, 1.0],
-        "blocks": [{"block": 1, "field_bytes": 8_403_328, "psnr": None}],
         "decisions": ["view=0: kept", "points=0.1: " + "not kept " * 30],
         "angles_deg": {"from": 0.0, "to": 352.5},
         "rescaled": [],
@@ -72,8 +71,6 @@ def test_facts_fit_the_lines_of_a_terminal():
         "low:",
         "  -3.55052",
         "  1",
-        "blocks:",
-        "  block 1, size of the field 8.40 MB",
         "decisions:",
         "  view=0: kept",
         "  points=0.1: " + "not kept " * 30,

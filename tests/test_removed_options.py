@@ -52,7 +52,9 @@ def test_a_removed_value_is_found_however_it_is_written(monkeypatch, arguments):
     refuse_removed("render", ["scene", *arguments])
 
 
-@pytest.mark.parametrize(("name", "usual", "other"), [("photo_fraction", 1.0, 0.8), ("random_start", 0.0, 0.1)])
+@pytest.mark.parametrize(
+    ("name", "usual", "other"), [("photo_fraction", 1.0, 0.8), ("random_start", 0.0, 0.1), ("blocks", 0, 4)]
+)
 def test_a_run_that_was_trained_with_what_was_removed_is_refused_and_any_other_is_read(finished, name, usual, other):
     config = finished / "config.json"
     content = json.loads(config.read_text())

@@ -43,8 +43,6 @@ _LABELS = {
     "field_bytes": "size of the field",
     "occupied_share": "occupied cells",
 }
-# Settings for blocks, with their values in any other training, which are not listed.
-_USUAL = {"blocks": 0, "block": 0}
 # Maximum number of characters per line; longer lines are wrapped, and their continuations indented.
 WIDTH = 110
 
@@ -64,7 +62,7 @@ def lines_of(facts: dict[str, Any]) -> list[str]:
         elif isinstance(value, list):
             lines += [
                 f"{name}:",
-                *(f"  {_listed(entry) if isinstance(entry, dict) else _plain(entry)}" for entry in value),
+                *(f"  {_plain(entry)}" for entry in value),
             ]
         elif key == "components":
             lines += _folded(f"{name}: {', '.join(f'{part}={_plain(choice)}' for part, choice in value.items())}")
@@ -82,7 +80,7 @@ def _name(key: str) -> str:
 
 
 def _listed(facts: dict[str, Any]) -> str:
-    shown = {key: value for key, value in facts.items() if value not in (None, []) and _USUAL.get(key) != value}
+    shown = {key: value for key, value in facts.items() if value not in (None, [])}
     return ", ".join(f"{_name(key)} {_with_unit(key, value)}" for key, value in shown.items())
 
 

@@ -177,22 +177,6 @@ def bytes_from_text(text: str, option: str = "--memory") -> int:
     return size
 
 
-def one_or_all(text: str | None, option: str) -> tuple[int | None, int]:
-    """Parse --blocks: N for all of N, K/N for the K-th; return K (None for all) and N, 0 if not given.
-
-    Raises:
-        typer.BadParameter: anything else, or fewer than two.
-    """
-    if text is None:
-        return None, 0
-    match = re.fullmatch(r"(?:(\d+)/)?(\d+)", text.strip())
-    number, count = (int(part) if part else None for part in match.groups()) if match else (None, None)
-    if count is None or count < 2 or (number is not None and not 1 <= number <= count):
-        message = f"{text!r}; write a number, at least 2, or K/N for one of them, such as 1/4"
-        raise typer.BadParameter(message, param_hint=option)
-    return number, count
-
-
 def holdout_rule(holdout: str | None) -> str | None:
     """Parse --holdout, with the path of a file made absolute; None if it is not given.
 

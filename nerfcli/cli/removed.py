@@ -43,6 +43,7 @@ REMOVED: tuple[Removed, ...] = (
     Removed("render", "--video-format h265", "2026-11-29", "write mp4 (H.264), and encode it again with ffmpeg"),
     Removed("render", "--video-format webm", "2026-11-29", "write mp4 (H.264), and encode it again with ffmpeg"),
     Removed("render", "--video-layout", "2026-11-29", "put two videos beside each other with ffmpeg's filter hstack"),
+    Removed("train", "--blocks", "2026-11-29", "train one field; see docs/many-captures.md for what it bears"),
     Removed("train", "--members", "2026-11-29", "train with --seed 1, --seed 2, ...; see docs/uncertainty.md"),
     Removed("train", "--vary", "2026-11-29", "train with --seed 1, --seed 2, ...; see docs/uncertainty.md"),
 )

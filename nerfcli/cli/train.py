@@ -3,7 +3,7 @@
 import functools
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -55,14 +55,6 @@ def train(
         ),
     ] = None,
     holdout: options.Holdout = None,
-    blocks: Annotated[
-        str | None,
-        typer.Option(
-            help="Divide a large scene into N blocks of ground, each trained with the whole budget; K/N trains one.",
-            metavar="N|K/N",
-            show_default=False,
-        ),
-    ] = None,
     resume: Annotated[
         bool,
         typer.Option("--resume", help="Continue from the last checkpoint to the new total; without one, start."),
@@ -116,10 +108,6 @@ def train(
     voxels (a dense grid of density and spherical harmonics), mlp (one network on Fourier features: small and slow).
     The resolution of the last two is one pixel's footprint at the centre of the scene.
 
-    --blocks 4 divides the ground of a scene with 3D points into four cells and trains a field for each, on the photos
-    that see it, into RUN/blocks/; RUN renders them as one field. On a cluster, train --blocks 1/4, --blocks 2/4, ...
-    in parallel, as tasks of an array job; the last one to finish joins them.
-
     An X-ray scan, as `nerfcli convert` writes it, is reconstructed as a volume: Poisson likelihood and total variation,
     --field voxels (of --voxel-size; the default, and better) or hash. Its components are tv (the weight of total
     variation), centre (columns between the centre of rotation and where the scan says), tilt (degrees of the detector
@@ -137,7 +125,6 @@ def train(
       nerfcli train photos-scene --budget 5m --model default
       nerfcli train photos-scene --without view --with distortion=0.01
       nerfcli train photos-scene --with cameras=poses
-      nerfcli train town-scene --budget 10m --blocks 4
       nerfcli train photos-scene --field voxels --field-memory 16MB
       nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
     """
@@ -150,7 +137,6 @@ def train(
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.scan import is_scan
     from nerfcli.torchrun import is_first, is_one_of_several, local_rank_and_size
-    from nerfcli.workflows.blocks import block_settings, train_blocks
     from nerfcli.workflows.train import train_scene
     from nerfcli.workflows.train_plan import plan_training
 
@@ -164,10 +150,7 @@ def train(
     }
     if field not in (None, "hash") and (option := next((name for name, given in of_hash.items() if given), None)):
         raise typer.BadParameter("it works with --field hash; for other fields, give --field-memory", param_hint=option)
-    only, count = options.one_or_all(blocks, "--blocks")
-    if count and view:
-        raise typer.BadParameter("it cannot be combined with --view", param_hint="--blocks")
-    if is_one_of_several() and (dry_run or count or scene == STDIN or is_scan(Path(scene))):
+    if is_one_of_several() and (dry_run or scene == STDIN or is_scan(Path(scene))):
         raise UserError("processes of torchrun train one field of photos", "use this command without torchrun", 2)
     console = Console(quiet=quiet or not is_first(), json_lines=json)
     budget_seconds = None if budget is None else options.seconds_from_text(budget)
@@ -214,29 +197,26 @@ def train(
         on_gpu = photo_settings().device != "cpu"
         return shared if shared is None or on_gpu else shared // local_rank_and_size()[1]
 
-    def train_field_or_blocks(folder: Path, run: Path) -> Path:
+    def train_one_scene(folder: Path, run: Path) -> None:
         with console.callbacks(f"train {folder.name}") as callbacks:
-            common: dict[str, Any] = {
-                "memory_bytes": memory_of_process(),
-                "resume": resume,
-                "overwrite": overwrite,
-                "holdout": rule,
-                "warn": console.warn,
+            train_scene(
+                folder,
+                run,
+                photo_settings(),
+                memory_bytes=memory_of_process(),
+                resume=resume,
+                overwrite=overwrite,
+                holdout=rule,
+                view=view,
+                warn=console.warn,
                 **callbacks,
-            }
-            if count:
-                return train_blocks(folder, run, photo_settings(), count=count, only=only, **common)
-            return train_scene(folder, run, photo_settings(), view=view, **common).path
+            )
 
     def plan_one_scene(folder: Path) -> None:
         on_host = photo_settings().device == "cpu"  # else --memory refers to the GPU
         resident = (limit or default_memory_limit()) if on_host else None
-        for number in [only] if only else range(1, count + 1) if count else [0]:
-            settings = block_settings(photo_settings(), number, count) if count else photo_settings()
-            plan = plan_training(folder, settings, memory_bytes=resident, holdout=rule)
-            of_block = f", block {number} of {count}" if number else ""
-            content = {**({"block": number} if number else {}), **asdict(plan)}
-            console.facts(folder, content, f"{folder}{of_block}: {plan.describe()}")
+        plan = plan_training(folder, photo_settings(), memory_bytes=resident, holdout=rule)
+        console.facts(folder, asdict(plan), f"{folder}: {plan.describe()}")
 
     def work(folder: Path, one_of_many: bool) -> None:
         run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
@@ -253,11 +233,10 @@ def train(
             plan_one_scene(folder)
             return
         else:
-            run = train_field_or_blocks(folder, run)
+            train_one_scene(folder, run)
         if is_first():
             console.result(run)
 
     if scene == STDIN or not is_scan(Path(scene)):
-        # Refuse invalid options before reading anything.
-        block_settings(photo_settings(), 0, count)
+        photo_settings()  # refuses invalid options before anything is read
     for_each_input(scene, work, command="train")

@@ -1,12 +1,11 @@
 """Storage and work, by arithmetic: what a field costs before anything is run."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 from torch import nn
 
-from nerfcli.field.blocks_field import BlocksFieldSettings
 from nerfcli.field.fourier_field import FourierFieldSettings
 from nerfcli.field.hash_field import GEOMETRY, HARMONICS, HashFieldSettings
 from nerfcli.field.interface import FieldSettings
@@ -83,9 +82,6 @@ def work(settings: FieldSettings) -> Work:
             return _voxels(settings)
         case FourierFieldSettings():
             return _network(settings)
-        case BlocksFieldSettings():
-            parts = [work(block.field) for block in settings.blocks]
-            return replace(parts[0], parameters=sum(part.parameters for part in parts))
         case _:
             raise ValueError(f"the cost of {type(settings).__name__} is unknown")
 

@@ -8,7 +8,6 @@ import numpy as np
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.fit.normalisation import (
     NARROW_SPREAD,
-    block_frame,
     box_frame,
     contracted_frame,
     has_narrow_baseline,
@@ -105,12 +104,12 @@ def choose_extent(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -
         return Extent(contraction, *object_frame(scene))
     if contraction == "none":
         return Extent(contraction, *box_frame(scene))
-    if not settings.block and has_narrow_baseline(scene):
+    if has_narrow_baseline(scene):
         return Extent(contraction, *narrow_frame(scene), parallax=NARROW_SPREAD)
-    similarity, marching = block_frame(scene) if settings.block else contracted_frame(scene)
+    similarity, marching = contracted_frame(scene)
     farthest = max(float(np.linalg.norm(similarity.apply(frame.centre))) for frame in scene.frames)
     return Extent(contraction, similarity, marching, farthest + BALLS_BEFORE_BACKGROUND)
 
 
 def _contraction(settings: TrainSettings, fills_frame: bool) -> str:
-    return settings.contraction or ("l2" if fills_frame or settings.block else "none")
+    return settings.contraction or ("l2" if fills_frame else "none")

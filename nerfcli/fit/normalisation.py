@@ -38,8 +38,6 @@ LEAST_POINTS = 50
 # A box is trimmed by this percentile at each end, where wrong points are, and then enlarged by this fraction.
 BOX_PERCENTILE = 0.5
 BOX_MARGIN = 0.1
-# Percentile for the ball of a block: at the edge of a scene, the points of a block reach as far as one can see.
-BLOCK_PERCENTILE = 5.0
 
 
 def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
@@ -57,7 +55,10 @@ def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
     radius = max(float(np.median(_distances(scene, centre))), 1e-12)
     if depths is not None:
         radius = max(radius, BALL_PER_DEPTH * float(np.median(depths[:, 1])))
-    return _ball(scene, centre, radius, depths)
+    near = NEAREST * 5 if depths is None else _near_part(scene) * float(depths[:, 0].min()) / radius
+    near = min(max(near, NEAREST), MOST_NEAR)
+    similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
+    return similarity, Marching(near=near, far=FARTHEST, shortest_step=1 / 256, growth=1 / 128)
 
 
 def has_narrow_baseline(scene: Scene) -> bool:
@@ -89,14 +90,6 @@ def narrow_frame(scene: Scene) -> tuple[Similarity, Marching, float]:
     return similarity, Marching(near=_near_part(scene), far=FARTHEST, shortest_step=1 / 256, growth=1 / 128), background
 
 
-def block_frame(scene: Scene) -> tuple[Similarity, Marching]:
-    """Return similarity and steps for a block: the unit ball is centred in its points and as wide as their box.
-
-    Cameras may be outside. Space beyond the ball is contracted and holds the rest of the scene.
-    """
-    return _ball(scene, *_box(scene, BLOCK_PERCENTILE), _typical_depths(scene))
-
-
 def object_frame(scene: Scene) -> tuple[Similarity, Marching]:
     """Return similarity and steps for photos with alpha: an object in the middle, and nothing else.
 
@@ -126,29 +119,14 @@ def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
             f"the extent of {scene.root} cannot be estimated from its {len(scene.points)} points",
             "use --contraction l2",
         )
-    centre, radius = _box(scene, BOX_PERCENTILE)
+    low, high = np.percentile(scene.points, (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
+    centre, radius = (low + high) / 2, max(float((high - low).max()) / 2 * (1 + BOX_MARGIN), 1e-12)
     reach = math.sqrt(3.0)  # the cube's corners
     depths = _typical_depths(scene)
     near = NEAREST if depths is None else max(NEAR_IN_BOX * float(depths[:, 0].min()) / radius, NEAREST)
     far = float(_distances(scene, centre).max()) / radius + reach
     similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
     return similarity, Marching(near=near, far=far, shortest_step=2 * reach / 512, growth=0.0)
-
-
-def _ball(scene: Scene, centre: np.ndarray, radius: float, depths: np.ndarray | None) -> tuple[Similarity, Marching]:
-    """Return similarity and steps for a unit ball in contracted space; `depths` as from `_typical_depths`."""
-    near = NEAREST * 5 if depths is None else _near_part(scene) * float(depths[:, 0].min()) / radius
-    near = min(max(near, NEAREST), MOST_NEAR)
-    similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
-    return similarity, Marching(near=near, far=FARTHEST, shortest_step=1 / 256, growth=1 / 128)
-
-
-def _box(scene: Scene, percentile: float) -> tuple[np.ndarray, float]:
-    """Return the centre of the box around the scene's points, trimmed by a percentile at each end, and half of its
-    longest side with the margin.
-    """
-    low, high = np.percentile(scene.points, (percentile, 100 - percentile), axis=0)
-    return (low + high) / 2, max(float((high - low).max()) / 2 * (1 + BOX_MARGIN), 1e-12)
 
 
 def _near_part(scene: Scene) -> float:

@@ -12,11 +12,9 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from nerfcli.field.blocks_field import BlocksField
 from nerfcli.kernels import March, Rays, RaysSeen
 from nerfcli.kernels.interface import UNSEEN
 from nerfcli.render.model import Marching, Model
-from nerfcli.render.spans import trace_in_spans
 
 # The default: a quarter of a grey level.
 TOLERANCE = 1 / 1020
@@ -58,8 +56,6 @@ def render_rays(
     march = March(edges, model.occupied, model.contraction, deepest(tolerance))
     # All negligible samples of a ray together use at most the rest of the tolerance.
     negligible = (1.0 - STOP_FRACTION) * tolerance / UNSEEN
-    if isinstance(field, BlocksField):
-        return trace_in_spans(field, rays, march, background=background, fractions=fractions, negligible=negligible)
     return field.backend.trace_rays(
         rays,
         march,

@@ -6,8 +6,6 @@ from typing import Any
 
 from nerfcli.pages.tables import table
 from nerfcli.report.run_facts import RunFacts, captures_of
-from nerfcli.runs.blocks import block_path
-from nerfcli.runs.run import Run
 
 _MEGA = 1e6
 
@@ -80,13 +78,6 @@ def last_logged(key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts],
 def _size(run: RunFacts) -> str:
     cameras = {(frame.camera.width, frame.camera.height) for frame in (*run.frames.train, *run.frames.test)}
     return ", ".join(f"{width} x {height}" for width, height in sorted(cameras)[:4])
-
-
-def _blocks(run: RunFacts) -> str:
-    numbers = range(1, run.config.settings.blocks + 1) if run.config.settings.block == 0 else ()
-    trained = [block for block in (Run(block_path(run.path, number)) for number in numbers) if block.is_trained]
-    photos = ", ".join(str(len(block.cameras.train)) for block in trained)
-    return f"{len(numbers)}, of {photos} training photos" if trained else ""
 
 
 def _unit(run: RunFacts) -> str:
@@ -224,7 +215,6 @@ _CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
     ("format", lambda run: run.config.scene_kind or ""),
     ("training photos", lambda run: str(len(run.frames.train))),
     ("held-out photos", lambda run: str(len(run.frames.test))),
-    ("blocks", _blocks),
     ("size", _size),
     ("unit of length", _unit),
     ("poses found", registered),

@@ -15,7 +15,7 @@ from nerfcli.cameras.world import Origin
 from nerfcli.errors import UserError, in_shell
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
-from nerfcli.runs.files import BLOCKS, CONFIG, RECONSTRUCTION
+from nerfcli.runs.files import CONFIG, RECONSTRUCTION
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene, fingerprint, is_scene, photo_folder
 from nerfcli.sealed import read_sealed, write_sealed
@@ -175,11 +175,6 @@ def no_run(path: Path) -> UserError:
         return UserError(
             f"{path} is the reconstruction of an X-ray scan, not a run of photos",
             "evaluate, render, export and info work with it",
-        )
-    if (path / BLOCKS).is_dir():
-        return UserError(
-            f"the blocks of {path} are not complete",
-            f"train them: nerfcli train SCENE --blocks N -o {in_shell(path)}, with the options of the first ones",
         )
     if photos := photo_folder(path):
         return UserError(

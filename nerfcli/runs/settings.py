@@ -11,7 +11,7 @@ from nerfcli.errors import UserError
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import KINDS
 from nerfcli.kernels import CONTRACTIONS
-from nerfcli.runs.components import LEARNED_BACKGROUNDS, Components
+from nerfcli.runs.components import Components
 
 DOWNSCALES = (1, 2, 4, 8)
 # `--downscale auto` takes the largest pictures whose longer side is at most this many pixels.
@@ -28,7 +28,7 @@ SAMPLES_PER_SECOND = 1e6
 # and a step is an eighth slower than with 2^18.
 FEWEST_LOG2_ROWS, DOUBLE_ROWS_FROM = 16, (37e6, 74e6, 400e6)
 # Settings of earlier versions, with the only value that can still be read.
-_FORMER = {"photo_fraction": 1.0, "random_start": 0.0}
+_FORMER = {"photo_fraction": 1.0, "random_start": 0.0, "blocks": 0, "block": 0}
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,6 @@ class TrainSettings:
         model: "default" uses the components as given, "auto" selects those that are not `fixed` for the scene, see
             `selection`.
         fixed: names of components that the user has chosen.
-        blocks: number of blocks that the scene is divided into, see `runs.blocks`; 0 for none.
-        block: number of the block that is trained, from 1 on; 0 for the whole scene.
 
     Raises:
         UserError: no limit or a non-positive one, or another setting that is invalid or cannot be combined.
@@ -84,8 +82,6 @@ class TrainSettings:
     field_memory_bytes: int | None = None
     model: str = "default"
     fixed: tuple[str, ...] = ()
-    blocks: int = 0
-    block: int = 0
 
     def __post_init__(self) -> None:
         if min(self.levels, self.width) < 1 or not 4 <= (self.log2_rows or 4) <= 24:
@@ -109,18 +105,6 @@ class TrainSettings:
         if self.components.stereo and not self.components.points and (self.model != "auto" or "points" in self.fixed):
             raise UserError(
                 "--with stereo needs points: it adds to their pixels", "add --with points, or remove --with stereo", 2
-            )
-        refused = {
-            "--contraction none": self.contraction == "none",
-            "--with antialias": self.components.antialias,
-            "--with exposure": self.components.exposure != "none",
-            "--with cameras": self.components.cameras != "fixed",
-            f"--with background={self.components.background}": self.components.background in LEARNED_BACKGROUNDS,
-        }
-        if self.blocks and any(refused.values()):
-            option = next(name for name in refused if refused[name])
-            raise UserError(
-                f"{option} does not work with --blocks: each block is trained without the others", f"remove {option}", 2
             )
         if self.contraction not in (None, *CONTRACTIONS):
             raise UserError(f"unknown contraction {self.contraction!r}", f"choose auto, {', '.join(CONTRACTIONS)}")

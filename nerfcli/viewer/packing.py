@@ -13,7 +13,6 @@ from torch import Tensor
 
 from nerfcli.errors import UserError
 from nerfcli.field.background import SphereBackground
-from nerfcli.field.blocks_field import BlocksField
 from nerfcli.field.hash_field import GEOMETRY, HARMONICS, HashField
 from nerfcli.field.voxel_field import VoxelField
 from nerfcli.kernels import CONTRACTIONS
@@ -140,11 +139,6 @@ def _numbers(model: Model) -> tuple[tuple[int, ...], Tensor, np.ndarray, dict[st
         more = {"kind": "voxels", "width": 0, "antialias": False, "harmonics": sizes.harmonics}
         networks = np.zeros((0, FOUR, FOUR), np.float32)
         return (sizes.resolution,) * sizes.layers, field.table.detach().cpu(), networks, more
-    if isinstance(field, BlocksField):
-        raise UserError(
-            "the page cannot render several blocks together",
-            "give one of them, RUN/blocks/1, or look at all together, rendered by the CPU: nerfcli view RUN",
-        )
     raise UserError(
         f"the page cannot render a field of type {field.settings.kind}: its network is too large for a shader",
         "train with --field hash or --field voxels, or render pictures and videos: nerfcli render RUN",

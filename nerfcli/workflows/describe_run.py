@@ -4,13 +4,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from nerfcli.field.blocks_field import BlocksField
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.comparison import described_cost, other_kinds_with_equal_storage
 from nerfcli.field.cost import field_bytes
 from nerfcli.photos.pool import pixel_footprint
 from nerfcli.render.model import Model
-from nerfcli.runs.blocks import block_path
 from nerfcli.runs.camera_moves import camera_moves
 from nerfcli.runs.run import Run
 from nerfcli.train.sentinel import FAILURE_FORMAT, replay
@@ -43,33 +41,12 @@ def describe_run(run: Run) -> dict[str, Any]:
             "contraction": model.contraction,
             "cost": costs_of_run(run, model),
         }
-        if isinstance(model.field, BlocksField):
-            content["field"]["blocks"] = len(model.field.settings.blocks)
-            content["blocks"] = _blocks(run, model.field)
         if run.components.cameras != "fixed":
             radius = 1.0 / model.training_from_scene.scale
             content["cameras_moved"] = camera_moves(run.given_cameras.train, cameras.train, radius=radius)
     if (metrics := run.metrics()) is not None:
         content["metrics"] = metrics["mean"]
     return content
-
-
-def _blocks(run: Run, field: BlocksField) -> list[dict[str, Any]]:
-    """Return photos, bytes and PSNR of each block of a run, with None for what is missing."""
-    blocks = []
-    for number, own in enumerate(field.fields, start=1):
-        block = Run(block_path(run.path, number))
-        photos, metrics = (block.cameras, block.metrics()) if block.is_trained else (None, None)
-        blocks.append(
-            {
-                "block": number,
-                "photos": None if photos is None else len(photos.train),
-                "held_out": None if photos is None else len(photos.test),
-                "field_bytes": field_bytes(own),
-                "psnr": None if metrics is None else metrics["mean"]["psnr"],
-            }
-        )
-    return blocks
 
 
 def costs_of_run(run: Run, model: Model) -> dict[str, dict[str, Any]]:

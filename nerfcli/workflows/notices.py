@@ -22,11 +22,6 @@ def part_of(progress: Progress, start: float, end: float, words: str) -> Callabl
     return lambda fraction: progress(start + (end - start) * fraction, words)
 
 
-def one_of_several(progress: Progress, place: int, count: int, title: str) -> Progress:
-    """Return the progress of one of several equal pieces of work, counted from 0; the title precedes its words."""
-    return lambda fraction, words: progress((place + fraction) / count, f"{title}  {words}")
-
-
 def warn_python(text: str) -> None:
     """Issue a Python warning with `warnings.warn`."""
     warnings.warn(text, stacklevel=3)

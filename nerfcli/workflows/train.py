@@ -8,7 +8,6 @@ from nerfcli.atomic import clear_leftovers
 from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.errors import UserError, listed, several
 from nerfcli.exclusive import exclusive
-from nerfcli.runs.blocks import divide
 from nerfcli.runs.config import split_hash
 from nerfcli.runs.files import CONFIG, LOCK, METRICS, STATE
 from nerfcli.runs.run import Run
@@ -93,17 +92,17 @@ def _trained(
     run: Path,
     settings: TrainSettings,
     *,
+    memory_bytes: int | None,
     resume: bool,
     overwrite: bool,
     holdout: str | None,
+    view: bool,
     notify: Notify,
     warn: Notify,
     progress: Progress,
-    memory_bytes: int | None = None,
-    view: bool = False,
 ) -> Run:
     """See `train_scene`."""
-    loaded = scene_for(settings, folder, holdout=holdout)
+    loaded = scenes.load(folder, holdout=holdout)
     if loaded.missing:
         names = listed(loaded.missing, NAMES_SHOWN)
         warn(f"{several(len(loaded.missing), 'missing photo')} of {folder} skipped: {names}")
@@ -167,53 +166,8 @@ def was_interrupted(scene: Path, run: Path, settings: TrainSettings, *, holdout:
     trained = Run(run)
     if not trained.is_trained:
         return False
-    loaded = scene_for(settings, scene, holdout=holdout)
+    loaded = scenes.load(scene, holdout=holdout)
     return trained.is_trained_from(loaded, settings) and not trained.is_complete(settings)
-
-
-def train_or_continue(
-    folder: Path,
-    path: Path,
-    settings: TrainSettings,
-    *,
-    memory_bytes: int | None,
-    resume: bool,
-    overwrite: bool,
-    holdout: str | None,
-    notify: Notify,
-    warn: Notify,
-    progress: Progress,
-) -> None:
-    """Train one of several runs: keep a complete one, resume an interrupted one, else start; see `train_scene`.
-
-    Args:
-        resume: also continue a complete run if the settings have a larger budget.
-    """
-    interrupted = was_interrupted(folder, path, settings, holdout=holdout)
-    try:
-        _trained(
-            folder,
-            path,
-            settings,
-            memory_bytes=memory_bytes,
-            resume=interrupted or (resume and Run(path).is_trained),
-            overwrite=overwrite,
-            holdout=holdout,
-            notify=notify,
-            warn=warn,
-            progress=progress,
-        )
-    except KeyboardInterrupt:
-        notify("what is complete is kept; the same command continues")
-        raise
-
-
-def scene_for(settings: TrainSettings, folder: Path, *, holdout: str | None) -> Scene:
-    """Load a scene with only the photos of the settings' block."""
-    loaded = scenes.load(folder, holdout=holdout)
-    if settings.block:
-        loaded = divide(loaded, settings.blocks).scenes[settings.block - 1]
-    return loaded
 
 
 def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:

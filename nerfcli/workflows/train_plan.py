@@ -7,7 +7,6 @@ from pathlib import Path
 from nerfcli import scene as scenes
 from nerfcli.photos.storage import InFiles, field_bytes, needs_of, storage_for
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
-from nerfcli.workflows.train import scene_for
 
 # The field (1), the state with both moments of the optimiser (3), and the previous state until the next is written (3).
 _FIELDS_ON_DISK = 7
@@ -62,7 +61,7 @@ def plan_training(
     Raises:
         UserError: the scene cannot be read, has no training photo, or does not fit into memory.
     """
-    loaded = scene_for(settings, Path(scene), holdout=holdout)
+    loaded = scenes.load(Path(scene), holdout=holdout)
     scenes.refuse_without_training_photos(loaded)
     first = loaded.train_frames[0].camera
     factor = settings.downscale or automatic_downscale(first)
