@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo test test-slow clean
 
 demo: .venv/installed
-	$(BIN)/nerfcli run sample_scenes/desk/images -o demo --budget 90s --downscale 2 --count 48 --max-size 400
+	$(BIN)/nerfcli run sample_scenes/desk/images -o demo --budget 90s --downscale 2
 	@printf '%s\n' '' 'Have a look at:' \
 	    '  demo/run/renders/orbit-conditional-z/rgb.mp4     a flight around the desk' \
 	    '  demo/run/renders/orbit-conditional-z/depth.mp4   the same flight in depth' \

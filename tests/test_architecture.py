@@ -41,7 +41,7 @@ MAY_IMPORT = {
     "poses.judge": {"multiview", "poses.model", "poses.input"},
     "poses.engine": {"multiview", "poses.judge", "poses.model", "poses.input", "media"},
     "poses": {
-        *("poses.engine", "poses.judge", "poses.model", "poses.input", "scene", "holdout", "media"),
+        *("poses.engine", "poses.judge", "poses.model", "poses.input", "scene", "holdout", "cameras", "media"),
     },
     "scale": {"cameras", "media"},
     "doctor": {

@@ -189,7 +189,6 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --count 20", "--count: it works with --cameras orbit, ellipse, spiral, interpolate"),
         ("train x --field voxels --levels 4", "--levels: it works with --field hash"),
         ("train x --field mlp --log2-rows 12", "--log2-rows: it works with --field hash"),
-        ("report x --depth expected", "'expected'; choose conditional, moment, max-weight, median or quantile:Q"),
         ("export x --to page --faces 100", "--faces: it is for meshes"),
         ("export x --to page --voxel-size 0.1", "--voxel-size: it is for all but pages"),
         ("export x --to volume --max-size 64", "--max-size: it is for all but pages and volumes"),
@@ -795,8 +794,7 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
 
     monkeypatch.setattr(poses_workflow, "estimate_poses", known_poses)
     monkeypatch.setattr(settings, "FEWEST_LOG2_ROWS", 10)
-    arguments = ["run", capture, "-o", tmp_path / "all", "--budget", "0.2s", "--count", "2", "--max-size", "16"]
-    arguments += ["--downscale", "4"]
+    arguments = ["run", capture, "-o", tmp_path / "all", "--budget", "0.2s", "--downscale", "4"]
 
     def interrupted(*args: Any, on_progress: Callable[[Progress], None], **more: Any) -> None:
         def stop_at_the_first_step(progress: Progress) -> None:

@@ -190,10 +190,9 @@ def test_held_out_errors_cross_the_edge_of_a_panorama(scene):
     assert np.allclose(held_out.errors_px(model, moved), held_out.errors_px(model, held), atol=1e-6)
 
 
-@pytest.mark.parametrize("use", ["fixed", "prior"])
-def test_given_panorama_cameras_are_fixed(photos, tmp_path, use):
+def test_given_panorama_cameras_are_fixed(photos, tmp_path):
     (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 768 384 768 384\n")
-    given = given_intrinsics(tmp_path / "cameras.txt", photos, use=use)
+    given = given_intrinsics(tmp_path / "cameras.txt", photos)
     assert given is not None
     (group,) = group_by_given(find_photos(photos), given).groups
     assert (group.model, group.params, group.fixed, group.is_panorama) == (PANORAMA, (768.0, 384.0), True, True)

@@ -30,8 +30,8 @@ from nerfcli.finite import finite
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.engine import worker
 from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.engine.largest_component import describe_components
 from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
-from nerfcli.poses.engine.selected_component import describe_components
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.judge import acceptance, examine
@@ -170,7 +170,7 @@ def test_a_result_that_is_not_finite_is_written_as_null(job: Job, monkeypatch: p
     # There are no photos: their features are in the database already.
     monkeypatch.setattr(worker, "extract", lambda job, report: None)
     monkeypatch.setattr(worker, "with_object_masks", lambda job, training, tell: (job, None))
-    worker.solve(job, lambda *progress: None, lambda note: None)
+    worker.solve(replace(job, seed=1), lambda *progress: None, lambda note: None)
     content = json.loads((Path(job.folder) / "result.json").read_text(encoding="utf-8"))["content"]
     assert set(content["pose_blur_px"].values()) == {None}
     assert content["not_finite"]["pose_blur_px.0"] == "inf"
@@ -327,17 +327,6 @@ def test_a_refused_model_stays_and_can_be_accepted(
 
 
 @pytest.mark.usefixtures("same_process")
-@pytest.mark.parametrize("component", [2, 3])
-def test_a_component_that_is_not_there_is_bad_input(
-    photos: Path, estimated: tuple[Path, PosesReport], tmp_path: Path, component: int
-):
-    settings = replace(ONE_THREAD, component=component)
-    shutil.copytree(estimated[0], tmp_path / "scene")
-    with pytest.raises(UserError, match=rf"there is no component {component}: the photos of .* form 1 \(\d+ photos\)"):
-        estimate(photos, tmp_path / "scene", settings)
-
-
-@pytest.mark.usefixtures("same_process")
 def test_after_the_time_limit_in_a_check_only_the_checks_are_left(photos: Path, mapped: Path, tmp_path: Path):
     """The first call is ended in its first check, after mapping; the next call maps nothing."""
     scene = shutil.copytree(mapped, tmp_path / "scene")
@@ -358,7 +347,7 @@ def test_closing_notes_name_components_and_checks(estimated: tuple[Path, PosesRe
         not_computed={"pose uncertainty": "ValueError: singular"},
     )
     assert closing_notes(two) == [
-        "component 2 has 2 photos (x.jpg ... y.jpg): no photo of it matches; use it with --component 2",
+        "2 photos (x.jpg ... y.jpg) form a model of their own: no photo of it matches; estimate their poses separately",
         "could not compute a check (pose uncertainty): ValueError: singular",
     ]
 
@@ -387,7 +376,7 @@ def test_photos_without_features_and_a_failing_search_for_motions_end_nothing(
     monkeypatch.setattr(worker, "extract", lambda job, report: None)
     monkeypatch.setattr(worker, "with_object_masks", broken)
     notes: list[str] = []
-    worker.solve(replace(job, component=2), lambda *progress: None, notes.append)
+    worker.solve(replace(job, seed=1), lambda *progress: None, notes.append)
     why = "IndexError: tuple index out of range"
     assert f"could not check for an object moving in front of a static background: {why}" in notes
 
@@ -426,12 +415,3 @@ def test_only_parts_that_are_large_enough_are_worth_processing(photos: Path, est
 
     assert hint(3, 3) == "take photos that connect the parts"
     assert hint(5, 4) == "take photos that connect the parts, or process each part separately"
-
-
-def test_a_smaller_component_needs_no_share_of_all_photos(photos: Path, estimated: tuple[Path, PosesReport]):
-    """4 of 20 photos: too few for the scene of all, enough for the component that was asked for."""
-    _, report = estimated
-    few = replace(report, registered=4, total=20)
-    assert refusal(few, photos) is not None
-    assert refusal(replace(few, settings=replace(few.settings, component=2)), photos) is None
-    assert refusal(replace(few, registered=3, settings=replace(few.settings, component=2)), photos) is not None

@@ -7,17 +7,16 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import WIDE, Noise, View
 
-from nerfcli.poses.engine import second_chance, selected_component
+from nerfcli.poses.engine import largest_component
 from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.engine.largest_component import choose_model
 from nerfcli.poses.engine.mapped import MappedModels
 from nerfcli.poses.engine.second_chance import ChosenModel
-from nerfcli.poses.engine.selected_component import choose_component
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.examine import examine
 
@@ -54,61 +53,17 @@ def misled(apart: tuple[list[View], MappedModels], tmp_path: Path) -> MappedMode
     return MappedModels(wrong, job, [{"what": "default thresholds", "models": [10, 9]}], seconds=1000.0)
 
 
-def choose(mapped: MappedModels, component: int) -> tuple[ChosenModel, list[str]]:
+def choose(mapped: MappedModels) -> tuple[ChosenModel, list[str]]:
     notes: list[str] = []
-    found = choose_component(mapped, lambda *progress: None, notes.append, component=component, checks=Checks)
-    return found, notes
-
-
-def worst_rotation_deg(model: pycolmap.Reconstruction, views: list[View]) -> float:
-    """Return the largest rotation error of a model's photos, relative to its first one."""
-    truth = synthetic.true_model(views)
-    first, *others = sorted(model.reg_image_ids())
-    turned = [
-        [m.image(i).cam_from_world().rotation * m.image(first).cam_from_world().rotation.inverse() for i in others]
-        for m in (model, truth)
-    ]
-    return max(float(np.degrees((one * other.inverse()).angle())) for one, other in zip(*turned, strict=True))
-
-
-@pytest.mark.parametrize("failing", [(), ("_regrown", "_all_at_once")])
-def test_a_smaller_component_gets_a_second_chance_of_its_own(
-    apart: tuple[list[View], MappedModels],
-    misled: MappedModels,
-    monkeypatch: pytest.MonkeyPatch,
-    failing: tuple[str, ...],
-):
-    """Its three photos that were off by 40 degrees come out within 0.4 degrees; the largest, which is right, stays."""
-    for name in failing:
-        monkeypatch.setattr(second_chance, name, lambda *arguments: None)
-    views, right = apart
-    found, notes = choose(replace(misled, models=[right.models[0], misled.models[1]]), 2)
-    assert notes[0] == "component 1 is checked first, as the others are numbered after it"
-    assert "mapping the photos of component 2 again, for at most 16 min" in notes[1]
-    assert found.examined.verdict.accepted
-    assert found.examined.model is not None
-    assert sorted(found.examined.model.reg_image_ids()) == SECOND
-    assert worst_rotation_deg(found.examined.model, views) < 0.4
-    assert [sorted(model.reg_image_ids()) for model in found.mapped.models] == [FIRST, SECOND]
-    assert found.mapped.models[0] is right.models[0]
-    assert found.mapped.job == misled.job  # with all pairs of photos
+    return choose_model(mapped, lambda *progress: None, notes.append, checks=Checks), notes
 
 
 def test_a_model_is_not_grown_over_photos_that_match_none_of_its_own(
     apart: tuple[list[View], MappedModels], misled: MappedModels
 ):
-    found, notes = choose(replace(misled, models=apart[1].models), 1)
+    found, notes = choose(replace(misled, models=apart[1].models))
     assert [sorted(model.reg_image_ids()) for model in found.mapped.models] == [FIRST, SECOND]
     assert notes == []
-
-
-def test_components_keep_the_numbers_that_were_reported(misled: MappedModels):
-    listed, _ = choose(misled, 1)
-    assert [sorted(model.reg_image_ids()) for model in listed.mapped.models] == [FIRST, SECOND]
-    again, notes = choose(misled, 2)
-    assert not any("component 1" in note for note in notes)
-    assert [sorted(model.reg_image_ids()) for model in again.mapped.models] == [FIRST, SECOND]
-    assert again.mapped.models[0].num_points3D() == listed.mapped.models[0].num_points3D()
 
 
 @pytest.mark.parametrize(("taken", "components"), [(16, [16]), (14, [14, 9])])
@@ -129,8 +84,6 @@ def test_a_component_has_most_of_its_photos_for_itself(
     def chance(mapped: MappedModels, *arguments: object, **options: object) -> ChosenModel:
         return ChosenModel(replace(mapped, models=[grown]), accepted)
 
-    monkeypatch.setattr(selected_component, "second_chance", chance)
-    found, _ = choose(misled, 1)
+    monkeypatch.setattr(largest_component, "second_chance", chance)
+    found, _ = choose(misled)
     assert [model.num_reg_images() for model in found.mapped.models] == components
-    last, _ = choose(misled, len(components) + 1)
-    assert last.examined.model is None

@@ -28,7 +28,6 @@ from nerfcli.convert.camera_files import read_calibration
 from nerfcli.convert.formats import format_named
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses.input.settings import PoseSettings
-from nerfcli.poses.model.cameras import GivenIntrinsics
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
 
@@ -38,7 +37,7 @@ TRUE = Camera("OPENCV", 960, 720, (2 * FOCAL_PX, 2 * FOCAL_PX, 480, 360, 0, 0, 0
 
 
 def estimate(
-    photos: Path, scene: Path, given: GivenIntrinsics | None, notify: Callable[[str], None] = lambda note: None
+    photos: Path, scene: Path, given: Calibration | None, notify: Callable[[str], None] = lambda note: None
 ) -> PosesReport:
     with worker_in_this_process():
         return estimate_poses(
@@ -76,7 +75,7 @@ def test_fixed_intrinsics_stay_to_the_last_bit_and_only_mapping_is_done_again(
 ):
     """Synthetic truth, rescaled exactly to each photo size; the poses are better than without given intrinsics."""
     scene, notes = shutil.copytree(unaided, tmp_path / "scene"), []
-    given = GivenIntrinsics(Calibration(tmp_path / "cameras.txt", (TRUE,), {}), "fixed")
+    given = Calibration(tmp_path / "cameras.txt", (TRUE,), {})
     assert not is_same_scene(scene, photos, ONE_THREAD, given=given)
     report = estimate(photos, scene, given, notes.append)
     for table, key in (("descriptors", "image_id"), ("matches", "pair_id")):
@@ -93,20 +92,9 @@ def test_fixed_intrinsics_stay_to_the_last_bit_and_only_mapping_is_done_again(
     assert report.intrinsics is not None
     assert [one["photos"] for one in report.intrinsics["cameras"]] == [5, 2]
     made = json.loads((scene / "scene.json").read_text())["provenance"]["intrinsics"]
-    assert made == {"file": str(tmp_path / "cameras.txt"), "use": "fixed", "key": given.calibration.key}
+    assert made == {"file": str(tmp_path / "cameras.txt"), "key": given.key}
     assert is_same_scene(scene, photos, ONE_THREAD, given=given)
-    assert not is_same_scene(scene, photos, ONE_THREAD, given=replace(given, use="prior"))
     assert not is_same_scene(scene, photos, ONE_THREAD)
-
-
-def test_a_prior_is_where_the_adjustment_starts(photos: Path, unaided: Path, tmp_path: Path):
-    """Synthetic truth: the focal length starts 4 % too long and ends within 1 %; the lens model is the given one."""
-    scene = shutil.copytree(unaided, tmp_path / "scene")
-    camera = Camera("SIMPLE_PINHOLE", 480, 360, (1.04 * FOCAL_PX, 240, 180))
-    report = estimate(photos, scene, GivenIntrinsics(Calibration(tmp_path / "c.txt", (camera,), {}), "prior"))
-    assert {camera["model"] for camera in report.cameras} == {"SIMPLE_PINHOLE"}
-    for camera in report.cameras:
-        assert camera["params"][0] == pytest.approx(FOCAL_PX * camera["width"] / 480, rel=0.01)
 
 
 def capture_named(photos: Path) -> Capture:
@@ -228,17 +216,15 @@ def test_files_that_are_of_no_use_are_bad_input(tmp_path: Path, name: str, conte
 def test_a_dry_run_says_which_cameras_are_used(tmp_path: Path):
     photos = write_photos(tmp_path / "photos", 4)
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 128 96 100 100 64 48\n")
-    result = nerfcli("poses", photos, "--dry-run", "--intrinsics", tmp_path / "cameras.txt", "--intrinsics-as", "prior")
+    result = nerfcli("poses", photos, "--dry-run", "--intrinsics", tmp_path / "cameras.txt")
     said = " ".join(result.stderr.split())
-    assert "(prior): 1 camera for 4 photos, 4 by size" in said
+    assert "cameras.txt: 1 camera for 4 photos, 4 by size" in said
     assert "4 photos are 64x48, but the intrinsics are for 128x96: rescaled" in said
 
 
 @pytest.mark.parametrize(
     ("line", "named"),
     [
-        ("--intrinsics-as prior", "needs --intrinsics"),
-        ("--intrinsics c.txt --intrinsics-as loose", "'loose'; choose fixed or prior"),
         ("--intrinsics c.txt --camera-model OPENCV", "remove --camera-model"),
     ],
 )

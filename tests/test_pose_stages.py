@@ -30,7 +30,7 @@ from nerfcli.poses.input.settings import Limits, PoseSettings
 from nerfcli.poses.input.stages import read_stage, write_stage
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene, plan_poses
-from nerfcli.poses.workspace import database_bytes, drop_database, workspace
+from nerfcli.poses.workspace import database_bytes, workspace
 
 # A fixed lens model: choosing one would only add adjustments.
 ONE_THREAD = PoseSettings(max_features=200, max_image_size=192, threads=1, camera_model="SIMPLE_RADIAL")
@@ -93,7 +93,7 @@ def unpublished(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scene folder of a call that ended after the worker's last file and before the scene's."""
     scene = tmp_path_factory.mktemp("unpublished") / "scene"
 
-    def interrupted(scene_dir: Path, describe: Callable[[], None], *, keep_models: bool) -> None:
+    def interrupted(scene_dir: Path, describe: Callable[[], None]) -> None:
         raise KilledError
 
     with pytest.MonkeyPatch.context() as patched:
@@ -275,7 +275,8 @@ def test_the_database_is_one_that_colmap_reads_with_the_users_photos(whole: Path
 
 
 def test_without_its_database_a_scene_is_still_a_scene(photos: Path, again: Path):
-    drop_database(again)
+    (again / "database.db").unlink()
+    shutil.rmtree(again / "work")
     assert {path.name for path in again.iterdir()} == {"sparse", "scene.json", "poses_report.json"}
     assert is_same_scene(again, photos, ONE_THREAD)
     assert not is_same_scene(again, photos, replace(ONE_THREAD, max_features=700))

@@ -24,10 +24,10 @@ from nerfcli.poses.engine import second_chance as chances
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.engine.features import match
 from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.engine.largest_component import choose_model
 from nerfcli.poses.engine.mapped import MappedModels
 from nerfcli.poses.engine.mapping import MapperOptions, map_photos
 from nerfcli.poses.engine.second_chance import grow, is_contradicted, second_chance
-from nerfcli.poses.engine.selected_component import choose_component
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge import acceptance
 from nerfcli.poses.judge.acceptance import Failure, Verdict, judge
@@ -205,9 +205,9 @@ def in_two_parts(solved: Solved, tmp_path: Path) -> MappedModels:
 def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(solved: Solved, tmp_path: Path):
     """Synthetic truth: of a right model in two parts, the larger takes in the three photos of the smaller one."""
     mapped = in_two_parts(solved, tmp_path)
-    notes: list[str] = []
     for _ in range(2):  # the second time, from what was kept
-        found = choose_component(mapped, lambda *progress: None, notes.append, component=1, checks=Checks)
+        notes: list[str] = []
+        found = choose_model(mapped, lambda *progress: None, notes.append, checks=Checks)
         assert found.examined.verdict.accepted
         assert [model.num_reg_images() for model in found.mapped.models] == [10]
         assert found.examined.model is not None
@@ -218,10 +218,10 @@ def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(solved: Solved, 
                 for model in (found.examined.model, truth)
             ]
             assert np.degrees((relative[0].rotation * relative[1].rotation.inverse()).angle()) < 0.4
-    assert notes == [
-        "3 photos in smaller models, next: from the accepted model (about 5 min)",
-        "from the accepted model: 10 of 10 photos registered, accepted",
-    ]
+        assert notes == [
+            "3 photos in smaller models, next: from the accepted model (about 5 min)",
+            "from the accepted model: 10 of 10 photos registered, accepted",
+        ]
 
 
 def test_an_accepted_model_grows_with_the_lens_that_was_chosen_for_it(solved: Solved, tmp_path: Path):
@@ -244,7 +244,7 @@ def test_a_model_that_grows_into_one_that_is_refused_stays_as_it_was(
     mapped = in_two_parts(solved, tmp_path)
     monkeypatch.setattr(chances, "map_photos", lambda *_, **__: [synthetic.bent(solved.model, 8)])
     notes: list[str] = []
-    found = choose_component(mapped, lambda *progress: None, notes.append, component=1, checks=Checks)
+    found = choose_model(mapped, lambda *progress: None, notes.append, checks=Checks)
     assert found.examined.verdict.accepted
     assert [model.num_reg_images() for model in found.mapped.models] == [7, 4]
     assert notes[-1].startswith("from the accepted model: 10 of 10 photos registered, the poses contradict")
@@ -258,7 +258,7 @@ def test_a_model_that_takes_in_no_further_photo_is_not_checked_again(
     monkeypatch.setattr(chances, "map_photos", lambda *_, **__: [pycolmap.Reconstruction(mapped.models[0])])
     monkeypatch.delattr(chances, "examine")
     notes: list[str] = []
-    found = choose_component(mapped, lambda *progress: None, notes.append, component=1, checks=Checks)
+    found = choose_model(mapped, lambda *progress: None, notes.append, checks=Checks)
     assert [model.num_reg_images() for model in found.mapped.models] == [7, 4]
     assert notes[-1] == "from the accepted model: no further photo registered"
 

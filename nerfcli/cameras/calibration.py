@@ -38,6 +38,10 @@ class Calibration:
         content = [[camera.to_json() for camera in self.cameras], sorted(self.of_image.items()), self.upright]
         return hashlib.blake2b(json.dumps(content).encode(), digest_size=16).hexdigest()
 
+    def to_json(self) -> dict[str, str]:
+        """Return {"file", "key"}, the record of the calibration that a scene keeps."""
+        return {"file": str(self.path.absolute()), "key": self.key}
+
 
 @dataclass(frozen=True)
 class Picture:

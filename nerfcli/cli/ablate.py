@@ -34,18 +34,14 @@ def ablate(
             callback=options.split_at_commas,
         ),
     ] = None,
-    include: options.Include = None,
-    exclude: options.Exclude = None,
     whole: Annotated[
         bool,
         typer.Option(
             "--whole", help="Measure whole held-out photos with SSIM, as `evaluate` does, instead of random pixels."
         ),
     ] = False,
-    model: Annotated[str, typer.Option(help="Reference model: auto (selected for this scene) or default.")] = "auto",
     downscale: options.Downscale = "auto",
     holdout: options.Holdout = None,
-    memory: options.DeviceMemory = None,
     device: options.Device = "auto",
     seed: options.Seed = 0,
     threads: options.Threads = 0,
@@ -71,11 +67,12 @@ def ablate(
     Examples:
       nerfcli ablate photos-scene
       nerfcli ablate photos-scene --only view,exposure --budget 30s
-      nerfcli ablate photos-scene --model default --seeds 5 --whole -o paper/ablation
+      nerfcli ablate photos-scene --seeds 5 --whole -o paper/ablation
     """
     from nerfcli.ablate.results import COLUMNS, ResultRow, table_of
     from nerfcli.cli.scans import refuse_scan
-    from nerfcli.runs.components import CHOICES, Components, choose
+    from nerfcli.memory import default_memory_limit
+    from nerfcli.runs.components import CHOICES
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.workflows.ablate import ablate_scene
 
@@ -92,12 +89,10 @@ def ablate(
         seed=seed,
         device=torch_device,
         threads=thread_count(threads),
-        components=choose(Components(), included=include or (), excluded=exclude or ()),
-        model=options.one_of(model, ("auto", "default"), "--model"),
-        fixed=options.named_components(include, exclude),
+        model="auto",
         **sizes_for(torch_device),
     )
-    rule, limit = options.holdout_rule(holdout), options.memory_limit(memory, torch_device)
+    rule, limit = options.holdout_rule(holdout), default_memory_limit(torch_device)
 
     def work(path: Path, one_of_many: bool) -> None:
         refuse_scan(path, "ablate")

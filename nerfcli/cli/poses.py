@@ -18,12 +18,8 @@ Frames = Annotated[
 Intrinsics = Annotated[
     Path | None,
     typer.Option(
-        help="File with the intrinsics of the cameras: COLMAP's cameras.txt or .bin, a scene, transforms.json..."
+        help="File with intrinsics of the cameras, which are kept: COLMAP's cameras.txt, a scene, transforms.json..."
     ),
-]
-IntrinsicsAs = Annotated[
-    str | None,
-    typer.Option(help="fixed: keep the given intrinsics; prior: use them as initial values.  [default: fixed]"),
 ]
 Subfolders = Annotated[
     bool,
@@ -61,13 +57,9 @@ def poses(
         str, typer.Option(help="auto, or a COLMAP camera model: SIMPLE_RADIAL, OPENCV, EQUIRECTANGULAR...")
     ] = "auto",
     intrinsics: Intrinsics = None,
-    intrinsics_as: IntrinsicsAs = None,
     holdout: options.Holdout = None,
     strict: options.Strict = False,
     min_registered: Annotated[float, typer.Option(help="Fraction of photos that must register.", min=0, max=1)] = 0.5,
-    component: Annotated[
-        int, typer.Option(help="Which model to use if the photos form several; 1 is the largest.", min=1)
-    ] = 1,
     accept_refused: Annotated[
         bool, typer.Option("--accept-refused", help="Write the scene even if the checks refuse the poses.")
     ] = False,
@@ -77,9 +69,6 @@ def poses(
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show what would be done and how long it would take.")
-    ] = False,
-    drop_database: Annotated[
-        bool, typer.Option("--drop-database", help="Delete features and matches when the scene is complete.")
     ] = False,
     seed: options.Seed = 0,
     threads: options.Threads = 0,
@@ -106,12 +95,12 @@ def poses(
       nerfcli poses statue/ --masks statue-masks/
       nerfcli poses stereo-rig/ --subfolders
       nerfcli poses photos/kitchen --intrinsics calibration/cameras.txt
-      nerfcli poses photos/flat -o second-room --component 2
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
     from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.poses.input.pairs import PAIRINGS
     from nerfcli.poses.input.settings import CAMERA_MODELS, Limits, PoseSettings
+    from nerfcli.poses.workspace import database_bytes
     from nerfcli.workflows.poses import (
         estimate_poses,
         folder_of_photos,
@@ -125,7 +114,6 @@ def poses(
     options.one_of(pairing, PAIRINGS, "--pairing")
     if pairs is not None and pairing != "auto":
         raise typer.BadParameter("cannot be combined with --pairs; remove --pairing", param_hint="--pairing")
-    use = use_of(intrinsics, intrinsics_as)
     if intrinsics is not None and camera_model != "auto":
         raise typer.BadParameter(
             "cannot be combined with --intrinsics, which gives the camera models; remove --camera-model",
@@ -145,7 +133,6 @@ def poses(
         masks=str(masks.resolve()) if masks else None,
         holdout=options.holdout_rule(holdout) or DEFAULT_HOLDOUT,
         strict=strict,
-        component=component,
         accept_refused=accept_refused,
         subfolders=subfolders,
     )
@@ -158,14 +145,14 @@ def poses(
         scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
         if dry_run:
             folder = folder_with_frames(source, scene)
-            given = given_intrinsics(intrinsics, folder, use=use)
+            given = given_intrinsics(intrinsics, folder)
             with console.callbacks(f"poses {folder.name}") as callbacks:
                 plan = plan_scene(folder, settings, intrinsics=given, **callbacks)
             console.facts(source, plan.to_json(), f"{source}: {plan.describe()}")
             return
         with console.callbacks(f"extract frames of {source.name}") as callbacks:
             folder = folder_of_photos(source, scene, frames=frames, overwrite=overwrite, **callbacks)
-        given = given_intrinsics(intrinsics, folder, use=use)
+        given = given_intrinsics(intrinsics, folder)
         with console.callbacks(f"poses {folder.name}") as callbacks:
             estimate_poses(
                 folder,
@@ -177,7 +164,9 @@ def poses(
                 warn=console.warn,
                 **callbacks,
             )
-        print_database(scene, drop=drop_database, console=console)
+        if size := database_bytes(scene):
+            path = scene / "database.db"
+            console.note(f"{path} keeps features and matches ({size / 1e6:.0f} MB) so that other settings run faster")
         console.result(scene)
 
     for_each_input(photos, work, command="poses")
@@ -192,30 +181,3 @@ def sizes_of(quality: str) -> tuple[int, int]:
     from nerfcli.poses.input.settings import QUALITIES
 
     return QUALITIES[options.one_of(quality, QUALITIES, "--quality")]
-
-
-def use_of(intrinsics: Path | None, intrinsics_as: str | None) -> str:
-    """Return the use of intrinsics selected by --intrinsics-as.
-
-    Raises:
-        typer.BadParameter: there is no such use, or --intrinsics is not given.
-    """
-    from nerfcli.poses.model.cameras import USES
-
-    options.one_of(intrinsics_as, USES, "--intrinsics-as")
-    if intrinsics_as is not None and intrinsics is None:
-        raise typer.BadParameter("needs --intrinsics", param_hint="--intrinsics-as")
-    return intrinsics_as or USES[0]
-
-
-def print_database(scene: Path, *, drop: bool, console: Console) -> None:
-    """Delete the database of features and matches, or print a note about its size and purpose."""
-    from nerfcli.poses.workspace import database_bytes, drop_database
-
-    if drop:
-        drop_database(scene)
-    elif size := database_bytes(scene):
-        console.note(
-            f"{scene / 'database.db'} keeps features and matches ({size / 1000000.0:.0f} MB) so that other settings "
-            "run faster; --drop-database deletes it"
-        )

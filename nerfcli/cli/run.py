@@ -8,7 +8,7 @@ import typer
 from nerfcli.cli import options
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.poses import Frames, Intrinsics, IntrinsicsAs, Quality, Subfolders, sizes_of, use_of
+from nerfcli.cli.poses import Frames, Intrinsics, Quality, Subfolders, sizes_of
 from nerfcli.workflows.machine import device_name, thread_count
 
 
@@ -20,17 +20,8 @@ def run(
     subfolders: Subfolders = False,
     quality: Quality = "default",
     intrinsics: Intrinsics = None,
-    intrinsics_as: IntrinsicsAs = None,
     budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h.")] = "2m",
-    include: options.Include = None,
-    exclude: options.Exclude = None,
-    model: options.ModelChoice = "auto",
     downscale: options.Downscale = "auto",
-    count: Annotated[int, typer.Option(help="Number of views of the orbit video.", min=2)] = 60,
-    max_size: Annotated[
-        int | None,
-        typer.Option(help="Maximum longer side of the video, in pixels.  [default: training resolution]", min=8),
-    ] = None,
     holdout: options.Holdout = None,
     strict: options.Strict = False,
     require: options.Require = None,
@@ -44,15 +35,13 @@ def run(
     """Run all stages: poses, train, evaluate, render, video, report.
 
     Writes PHOTOS-scene/ and PHOTOS-scene-run/ next to the photos, or scene/ and run/ inside --output. Completed stages
-    are kept: run the same command again to resume an interrupted run. For the components of --with and --without see
-    `nerfcli train --help`.
+    are kept: run the same command again to resume an interrupted run. For other settings, run the stages one by one.
 
     \b
     Examples:
       nerfcli run photos/kitchen
       nerfcli run photos/kitchen -o kitchen --budget 5m
       nerfcli run photos/kitchen --intrinsics calibration/cameras.txt
-      nerfcli run photos/kitchen --with exposure --without view
       nerfcli run kitchen.mp4
       nerfcli run photos/kitchen --require "psnr>=25,registered>=0.9"
     """
@@ -61,7 +50,6 @@ def run(
     from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.memory import default_memory_limit
     from nerfcli.poses.input.settings import Limits, PoseSettings
-    from nerfcli.runs.components import Components, choose
     from nerfcli.runs.run import load_run
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run
@@ -75,7 +63,6 @@ def run(
     requirements, rule = requirements_of(require), options.holdout_rule(holdout)
     cores, torch_device = thread_count(threads), device_name(device)
     max_image_size, max_features = sizes_of(quality)
-    use = use_of(intrinsics, intrinsics_as)
     pose_settings = PoseSettings(
         max_image_size=max_image_size,
         max_features=max_features,
@@ -91,9 +78,7 @@ def run(
         seed=seed,
         device=torch_device,
         threads=cores,
-        components=choose(Components(), included=include or (), excluded=exclude or ()),
-        model=options.one_of(model, ("auto", "default"), "--model"),
-        fixed=options.named_components(include, exclude),
+        model="auto",
         **sizes_for(torch_device),
     )
 
@@ -110,7 +95,7 @@ def run(
                 scene,
                 pose_settings,
                 limits=Limits(memory_bytes=default_memory_limit()),
-                intrinsics=given_intrinsics(intrinsics, folder, use=use),
+                intrinsics=given_intrinsics(intrinsics, folder),
                 overwrite=overwrite,
                 warn=console.warn,
                 **callbacks,
@@ -134,7 +119,7 @@ def run(
         console.result(field)
         console.result(evaluation.path, evaluation.metrics)
         for cameras, video in (("test", False), ("orbit", True)):
-            views = Views(cameras, count, max_size=max_size if video else None)
+            views = Views(cameras)
             settings = ExportSettings(
                 outputs=OUTPUTS[: 2 if video else 3],
                 depth=usual_depth(load_run(field), views),

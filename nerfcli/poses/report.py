@@ -42,7 +42,7 @@ class PosesReport:
     sizes of all models found, the kept one first. attempts: the result of each rung of the ladder. matching: the rule
     for pairs, and their number. points: number of points of the kept model. intrinsics: the given intrinsics, see
     `cameras.PhotoGroups`. strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components:
-    each model's photos and why it is not joined to the largest, ordered by size, as `--component` counts them.
+    each model's photos and why it is not joined to the largest, ordered by size.
     not_computed: checks that could not be computed, and why. not_finite: where the report has null for a number that
     was not finite.
     cut_short: what was stopped because it took far longer than planned.
@@ -134,14 +134,14 @@ def closing_notes(report: PosesReport) -> list[str]:
     if len(report.parts) > 1 and report.registered < report.total:
         sizes = " + ".join(str(size) for size in report.parts)
         notes.append(f"the photos form parts with few verified matches between them: {sizes} photos")
-    for number, component in enumerate(report.components, start=1):
-        if number == report.settings.component or placed.issuperset(component["photos"]):
+    for component in report.components[1:]:
+        if placed.issuperset(component["photos"]):
             continue
         names = component["photos"]
         some = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
         why = f": {component['apart']}" if component["apart"] else ""
         notes.append(
-            f"component {number} has {component['size']} photos ({some}){why}; use it with --component {number}"
+            f"{component['size']} photos ({some}) form a model of their own{why}; estimate their poses separately"
         )
     weak = [camera for camera in report.cameras if (camera.get("uncertainty") or {}).get("weak")]
     if weak:
@@ -173,9 +173,7 @@ def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:
     It states the contradicting evidence, or the most frequent reason why photos are missing.
     """
     failures = report.verdict["failures"]
-    # A user who requests a smaller model knows that it has few of the photos.
-    least_fraction = report.settings.min_registered if report.settings.component == 1 else 0.0
-    enough = report.registered >= max(MIN_PHOTOS, least_fraction * report.total)
+    enough = report.registered >= max(MIN_PHOTOS, report.settings.min_registered * report.total)
     if failures and (enough or "baseline" in failures[0]["kind"]):
         first = failures[0]
         text = f"the poses of {photos_dir} cannot be trusted: {first['kind']}: {first['evidence']}"

@@ -15,6 +15,7 @@ from typing import Any
 
 from nerfcli import scene
 from nerfcli.atomic import write_json
+from nerfcli.cameras.calibration import Calibration
 from nerfcli.errors import UserError
 from nerfcli.holdout import names_held_out
 from nerfcli.media.images import list_photos, name_in
@@ -30,7 +31,7 @@ from nerfcli.poses.input.settings import Limits, PoseSettings, check_settings, f
 from nerfcli.poses.input.stages import file_key
 from nerfcli.poses.input.work_photos import lay_out
 from nerfcli.poses.judge.checks import UNDERWAY
-from nerfcli.poses.model.cameras import GivenIntrinsics, PhotoGroups, group_by_given, group_photos
+from nerfcli.poses.model.cameras import PhotoGroups, group_by_given, group_photos
 from nerfcli.poses.report import PosesReport, closing_notes, make_report, refusal
 from nerfcli.poses.workspace import POINTS_FILE, is_under_construction, keep_refused, publish, workspace
 
@@ -44,7 +45,7 @@ def estimate_poses(
     progress: Callable[[str, int, int], None],
     limits: Limits = Limits(),
     planned: Callable[[Plan], None] = lambda plan: None,
-    given: GivenIntrinsics | None = None,
+    given: Calibration | None = None,
 ) -> PosesReport:
     """Estimate where the photos of a folder were taken, and write a scene.
 
@@ -82,8 +83,6 @@ def estimate_poses(
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
         matching = {"rule": pairing.rule, "pairs": result["pairs"], **_file_keys(settings)}
         report = make_report(photos, settings, result=result, matching=matching, intrinsics=grouped.given)
-        if settings.component > max(len(report.components), 1):
-            raise _no_such_component(report, photos_dir)
         if error := refusal(report, photos_dir):
             if not (settings.accept_refused and report.models):
                 raise _refused(advised(error, report.moving_foreground), report, scene_dir)
@@ -103,7 +102,7 @@ def estimate_poses(
                 split=_split(report, settings.holdout),
             )
 
-        publish(scene_dir, describe, keep_models=len(report.models) > 1)
+        publish(scene_dir, describe)
     for note in closing_notes(report):
         notify(note)
     return report
@@ -114,7 +113,7 @@ def plan_poses(
     *,
     settings: PoseSettings,
     progress: Callable[[str, int, int], None],
-    given: GivenIntrinsics | None = None,
+    given: Calibration | None = None,
 ) -> tuple[Photos, PhotoGroups, Pairing, Plan]:
     """Read the photos, choose cameras and pairs, and estimate how long the work will take; nothing is written.
 
@@ -143,7 +142,7 @@ def photo_notes(photos: Photos, grouped: PhotoGroups) -> list[str]:
 
 
 def is_same_scene(
-    scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: GivenIntrinsics | None = None
+    scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: Calibration | None = None
 ) -> bool:
     """Return whether `scene_dir` was made from the current photos in `photos_dir` with these settings.
 
@@ -155,7 +154,7 @@ def is_same_scene(
         return False
 
 
-def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: GivenIntrinsics | None) -> bool:
+def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: Calibration | None) -> bool:
     report = _read_json(scene_dir / "poses_report.json")
     made = scene_dir.resolve() / _read_json(scene_dir / scene.SCENE_FILE)["image_folder"]
     names = [name_in(photos_dir, path) for path in list_photos(photos_dir, subfolders=settings.subfolders)]
@@ -163,7 +162,7 @@ def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given
     wanted_settings: dict[str, Any] = asdict(settings)
     for name in ("threads", "accept_refused"):
         del wanted_settings[name]
-    if (earlier and (earlier["use"], earlier["key"])) != (given and (given.use, given.calibration.key)):
+    if (earlier and earlier["key"]) != (given and given.key):
         return False
     made_with = asdict(PoseSettings()) | report["settings"]  # settings newer than the report had their defaults
     return (
@@ -241,7 +240,6 @@ def _prepare(
         threads=settings.threads,
         masks=lay_out_masks(photos, files, masks, folder=work / "masks", notify=notify) if masks else (),
         held_out=tuple(sorted(photos.names.index(name) for name in held_out)),
-        component=settings.component,
     )
     return held_out_last(job)
 
@@ -295,15 +293,6 @@ def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserErro
         f"{POINTS_FILE} in a mesh viewer), and --accept-refused uses it anyway"
     )
     return UserError(error.message, hint, error.exit_code)
-
-
-def _no_such_component(report: PosesReport, photos_dir: Path) -> UserError:
-    sizes = " + ".join(str(component["size"]) for component in report.components) or "no"
-    count = len(report.components)
-    return UserError(
-        f"there is no component {report.settings.component}: the photos of {photos_dir} form {count} ({sizes} photos)",
-        f"use --component 1 to {count}" if count else "remove --component",
-    )
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from pathlib import Path
 
 from nerfcli.atomic import atomic_folder, clear_leftovers
 from nerfcli.exclusive import exclusive
-from nerfcli.poses.engine.mapped import COMPONENTS, FIRST
 from nerfcli.poses.input.job import database_path
 from nerfcli.scene import SCENE_FILE
 
@@ -46,11 +45,10 @@ def is_under_construction(scene_dir: Path) -> bool:
     return (scene_dir / "work" / _LOCK).is_file()
 
 
-def publish(scene_dir: Path, describe: Callable[[], None], *, keep_models: bool) -> None:
+def publish(scene_dir: Path, describe: Callable[[], None]) -> None:
     """Copy the worker's model into the scene; then `describe` writes the report and, last, scene.json.
 
-    Until then the folder is not a scene, and another call continues from the complete model. With `keep_models`, the
-    mapped models stay in the work folder, for another --component later.
+    Until then the folder is not a scene, and another call continues from the complete model.
     """
     work = scene_dir / "work"
     (scene_dir / SCENE_FILE).unlink(missing_ok=True)
@@ -58,9 +56,8 @@ def publish(scene_dir: Path, describe: Callable[[], None], *, keep_models: bool)
         shutil.copytree(work / "sparse" / "0", sparse / "0")
     describe()
     shutil.rmtree(scene_dir / REFUSED, ignore_errors=True)
-    kept = {FIRST, COMPONENTS} if keep_models else set()
     for path in work.iterdir():
-        if path.name in kept or (path.suffix in (".json", ".lock") and path.stem not in ("job", "result")):
+        if path.suffix in (".json", ".lock") and path.stem not in ("job", "result"):
             continue
         shutil.rmtree(path) if path.is_dir() else path.unlink()
 
@@ -80,11 +77,3 @@ def database_bytes(scene_dir: Path) -> int:
     """Return the size of the database of features and matches, 0 if there is none."""
     path = database_path(scene_dir / "work")
     return path.stat().st_size if path.exists() else 0
-
-
-def drop_database(scene_dir: Path) -> None:
-    """Delete features and matches. The scene stays; estimating it again starts from scratch."""
-    for path in scene_dir.glob(database_path(scene_dir / "work").name + "*"):
-        path.unlink()
-    if is_under_construction(scene_dir):
-        shutil.rmtree(scene_dir / "work")

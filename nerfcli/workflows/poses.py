@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
+from nerfcli.cameras.calibration import Calibration
 from nerfcli.convert.camera_files import read_calibration
 from nerfcli.errors import UserError, duration
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.input.plan import Plan, TimeEstimate
 from nerfcli.poses.input.settings import Limits, PoseSettings
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
-from nerfcli.poses.model.cameras import USES, GivenIntrinsics
 from nerfcli.poses.structure_from_motion import is_same_scene, photo_notes, plan_poses
 from nerfcli.scene import SCENE_FILE
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
@@ -38,7 +38,7 @@ def estimate_poses(
     settings: PoseSettings = PoseSettings(),
     *,
     limits: Limits = Limits(),
-    intrinsics: GivenIntrinsics | None = None,
+    intrinsics: Calibration | None = None,
     overwrite: bool = False,
     notify: Notify = silent,
     warn: Notify = warn_python,
@@ -114,7 +114,7 @@ def plan_scene(
     folder: Path,
     settings: PoseSettings,
     *,
-    intrinsics: GivenIntrinsics | None = None,
+    intrinsics: Calibration | None = None,
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> Plan:
@@ -177,10 +177,10 @@ def folder_with_frames(source: Path, scene: Path) -> Path:
     return folder
 
 
-def given_intrinsics(file: Path | None, photos: Path, *, use: str = USES[0]) -> GivenIntrinsics | None:
+def given_intrinsics(file: Path | None, photos: Path) -> Calibration | None:
     """Read the intrinsics of the photos in a folder from a file; None without a file.
 
     Raises:
         UserError: see `read_calibration`.
     """
-    return None if file is None else GivenIntrinsics(read_calibration(file, images=photos), use)
+    return None if file is None else read_calibration(file, images=photos)

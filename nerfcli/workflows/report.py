@@ -10,7 +10,6 @@ from nerfcli.errors import UserError
 from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.export.settings import depth_meta
 from nerfcli.pages.page import is_made_from, refuse_foreign, write_page
-from nerfcli.render.depth import DepthRequest
 from nerfcli.report.page import mark_of, origin_of, page_html
 from nerfcli.report.run_facts import captures_of, labels_of, read_facts
 from nerfcli.report.views import common_names, look_at
@@ -21,16 +20,14 @@ from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, si
 from nerfcli.workflows.photo_depths import photo_depths
 from nerfcli.workflows.views import Views, usual_depth
 
-# Default of the maximum number of held-out photos on a page.
-VIEWS = 8
+# A page shows at most this many held-out photos of each capture, from the worst to the best.
+MOST_VIEWS = 8
 
 
 def report_runs(
     runs: Sequence[Path],
     page: Path | None = None,
     *,
-    views: int = VIEWS,
-    depth: DepthRequest | None = None,
     device: str = "auto",
     threads: int = 0,
     overwrite: bool = False,
@@ -43,8 +40,6 @@ def report_runs(
     Args:
         runs: folders that training wrote, at least one.
         page: the file to write; by default RUN/report.html, or report.html beside the first of several runs.
-        views: maximum number of held-out photos to show per capture, from the worst to the best.
-        depth: the depth to show; `usual_depth` of the first run by default.
         device, threads: to render with; 0 threads for all.
         overwrite: replace any existing file, even if it is not a report on these runs.
         keep: keep a page that was made from the same files with the same options.
@@ -65,14 +60,14 @@ def report_runs(
         opened.append(run)
         hashes.append(run.checkpoint_sha256())
         facts.append(read_facts(run, label, checkpoint_sha256=hashes[-1]))
-    depth = usual_depth(opened[0], Views("test")) if depth is None else depth
-    origin = origin_of(facts, hashes, views=views, depth=depth)
+    depth = usual_depth(opened[0], Views("test"))
+    origin = origin_of(facts, hashes, views=MOST_VIEWS, depth=depth)
     if keep and not overwrite and is_made_from(target, origin):
         notify(f"{target} is kept: it is up to date; add --overwrite to write it again")
         return target
     names = [[] for _ in runs]
     for capture in captures_of(facts):
-        shared = common_names([facts[index] for index in capture], views)
+        shared = common_names([facts[index] for index in capture], MOST_VIEWS)
         for index in capture:
             names[index] = shared
     looks, meanings = [], []

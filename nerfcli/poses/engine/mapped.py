@@ -21,8 +21,6 @@ from nerfcli.poses.input.stages import file_key, read_stage, stage_key, write_st
 
 # Stage with the models of the ladder's attempts.
 FIRST = "mapped"
-# Stage with the models after the second chance of the largest one.
-COMPONENTS = "components"
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,6 @@ def read_mapped(job: Job, key: str, *, name: str = FIRST) -> MappedModels | None
         folder=job.folder,
         originals=job.originals,
         threads=job.threads,
-        component=job.component,
         skipped_checks=job.skipped_checks,
     )
     if not there.database.exists():
@@ -93,7 +90,7 @@ def read_models(folder: Path, key: str) -> tuple[list[pycolmap.Reconstruction], 
 def mapping_key(job: Job) -> str:
     """Return a hash of everything that the models of a job depend on."""
     content: dict[str, Any] = asdict(job)
-    for name in ("folder", "originals", "threads", "component", "skipped_checks"):
+    for name in ("folder", "originals", "threads", "skipped_checks"):
         del content[name]
     return stage_key(content, nerfcli.__version__, pycolmap.__version__)
 

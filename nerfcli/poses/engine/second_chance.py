@@ -22,7 +22,6 @@ from nerfcli.poses.engine.mapping import (
     map_globally,
     map_photos,
     mapper_limit_seconds,
-    photo_numbers,
 )
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import capture_order
@@ -66,7 +65,6 @@ def second_chance(
     tell: Tell,
     *,
     checks: Callable[[], Checks],
-    component: int = 1,
 ) -> ChosenModel:
     """Map again under one hypothesis after the other until the checks accept a model.
 
@@ -74,7 +72,6 @@ def second_chance(
         mapped: the model that the checks refused, and the smaller ones.
         first: the result of these checks.
         checks: makes a check runner for one more model.
-        component: the number of this model for the user. From 2 on, its photos are mapped again by themselves.
 
     Returns:
         The first accepted model; else the largest consistent part of the first model, if accepted; else the given one.
@@ -84,13 +81,9 @@ def second_chance(
     against = f"{pairs['contradicting']} of {pairs['judged']} pairs of photos contradict the poses"
     if not pairs["contradicting"]:
         against = first.verdict.failures[0].evidence
-    which = "" if component == 1 else f" the photos of component {component}"
     scratch = mapped.seconds
     most = _MOST_TIME * scratch
-    tell(f"{against}: mapping{which} again, for at most {duration(most)}")
-    if component > 1:
-        mapped = replace(mapped, job=_job_of(mapped.models[0], mapped.job))
-    names = "second-chance" if component == 1 else f"component-{component}-second-chance"
+    tell(f"{against}: mapping again, for at most {duration(most)}")
     attempts = list(mapped.attempts)
     core = _core(mapped.models[0], mapped.job)
     at_once: list[MappedModels] = []  # result of the global mapper, to extend later
@@ -122,7 +115,7 @@ def second_chance(
         tell(f"next: {what}" + (f" (about {duration(takes)})" if takes else ""))
         runner = checks()
         limit = max(left, _LEAST_LIMIT_SECONDS) if what == _ALL_AT_ONCE else _mapping_limit_seconds(mapped.job)
-        found = _tried(what, make, mapped.job, tell, name=f"{names}-{number}", runner=runner, seconds=limit)
+        found = _tried(what, make, mapped.job, tell, name=f"second-chance-{number}", runner=runner, seconds=limit)
         if found is None:
             continue
         if what == _ALL_AT_ONCE:
@@ -221,12 +214,6 @@ def _match(some: set[int], others: set[int], job: Job) -> bool:
         for one, other, count in count_matches(job.database)
         if count >= MIN_MATCHES
     )
-
-
-def _job_of(model: pycolmap.Reconstruction, job: Job) -> Job:
-    """Return the job with only the pairs of photos that the model places."""
-    photos = set(photo_numbers(model, job))
-    return replace(job, pairs=tuple(pair for pair in job.pairs if photos.issuperset(pair)))
 
 
 def is_contradicted(verdict: Verdict) -> bool:

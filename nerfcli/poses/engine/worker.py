@@ -26,10 +26,10 @@ from nerfcli.finite import finite
 from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.engine.largest_component import choose_model, describe_components
 from nerfcli.poses.engine.mapped import MappedModels, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
 from nerfcli.poses.engine.retrieval import with_neighbours
-from nerfcli.poses.engine.selected_component import choose_component, describe_components
 from nerfcli.poses.engine.strict import place_held_out, training_part
 from nerfcli.poses.engine.turntable import recalled, with_object_masks
 from nerfcli.poses.input.job import Job, Report, Tell, read_job
@@ -85,7 +85,7 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
 
 def result_key(job: Job) -> str:
     """Return a hash of all that the result depends on."""
-    return stage_key(mapping_key(job), job.component, job.skipped_checks, _RESULT_VERSION)
+    return stage_key(mapping_key(job), job.skipped_checks, _RESULT_VERSION)
 
 
 def _looked_at(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> tuple[Job, dict[str, Any] | None]:
@@ -124,9 +124,8 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     mapped = _mapped(job, report, tell, seconds=seconds)
     checks = partial(_checks, job)
     with _timed(seconds, "check"):
-        chosen = choose_component(mapped, report, tell, component=job.component, checks=checks)
+        chosen = choose_model(mapped, report, tell, checks=checks)
     mapped, examined = chosen.mapped, chosen.examined
-    others = [*mapped.models[: job.component - 1], *mapped.models[job.component :]]
     model = examined.model
     placed = [] if model is None else photo_numbers(model, job)
     lacking = examined.details["not_computed"]  # of this model; ended mapping hypotheses are skipped too
@@ -140,7 +139,7 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
         "evidence": evidence(mapped.job),
         "pairs": len(mapped.job.pairs),
         "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
-        "models": [placed, *(photo_numbers(other, job) for other in others)] if mapped.models else [],
+        "models": [placed, *(photo_numbers(other, job) for other in mapped.models[1:])] if mapped.models else [],
         "left_out": {str(number): reason for number, reason in examined.left_out.items()},
         "pose_blur_px": {str(number): px for number, px in examined.blur_px.items()},
         "verdict": examined.verdict.to_json(),

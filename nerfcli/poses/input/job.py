@@ -69,8 +69,7 @@ class Job:
     pairs. rung: "" or the name of an attempt with other features, which has its own database and stages:
     `replace(job, rung="full-size", max_image_size=...)`. masks: one per photo, or none at all for a capture without
     masks; their pictures are in mask_folder. held_out: photos that are placed last, with everything else fixed.
-    component: which of the models becomes the scene, 1 for the largest. skipped_checks: (name, reason) of checks that
-    ended an earlier process. The other fields are as in `PoseSettings`.
+    skipped_checks: (name, reason) of checks that ended an earlier process. The other fields are as in `PoseSettings`.
     """
 
     folder: str
@@ -88,7 +87,6 @@ class Job:
     masks: tuple[WorkMask, ...] = ()
     rung: str = ""
     held_out: tuple[int, ...] = ()
-    component: int = 1
     skipped_checks: tuple[tuple[str, str], ...] = ()
 
     @property

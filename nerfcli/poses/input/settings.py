@@ -37,9 +37,9 @@ class PoseSettings:
     min_registered: the fraction of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a
     text file with two names per line, only these pairs are matched. masks: a folder of masks, see `media.masks`.
     holdout: the rule by which photos are held out, see `nerfcli.holdout`. strict: whether held-out photos are placed
-    afterwards, with the result of the other photos fixed, see `strict`. component: which of the separate models becomes
-    the scene, 1 for the largest. accept_refused: whether a model that the checks refuse becomes the scene anyway.
-    subfolders: whether photos in subfolders are used, those of each as of a camera of their own.
+    afterwards, with the result of the other photos fixed, see `strict`. accept_refused: whether a model that the checks
+    refuse becomes the scene anyway. subfolders: whether photos in subfolders are used, those of each as of a camera of
+    their own.
     """
 
     max_image_size: int = QUALITIES["default"][0]
@@ -53,7 +53,6 @@ class PoseSettings:
     masks: str | None = None
     holdout: str = DEFAULT_HOLDOUT
     strict: bool = False
-    component: int = 1
     accept_refused: bool = False
     subfolders: bool = False
 
@@ -85,7 +84,5 @@ def check_settings(settings: PoseSettings) -> None:
         raise ValueError(f"camera_model must be one of {', '.join(CAMERA_MODELS)}, got {settings.camera_model}")
     if not 0 <= settings.min_registered <= 1:
         raise ValueError(f"min_registered must be within 0...1, got {settings.min_registered}")
-    if settings.component < 1:
-        raise ValueError(f"component must be 1 or more, got {settings.component}")
     if settings.pairing not in PAIRINGS:
         raise ValueError(f"pairing must be one of {', '.join(PAIRINGS)}, got {settings.pairing}")

@@ -15,22 +15,8 @@ from nerfcli.poses.input.job import CameraGroup
 from nerfcli.poses.input.photos import Photo, Photos, camera_groups
 from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL
 
-# Uses of given intrinsics: kept fixed, or as the start of the adjustment.
-USES = ("fixed", "prior")
 # Up to this many cameras are listed one by one.
 _MOST_LISTED = 4
-
-
-@dataclass(frozen=True)
-class GivenIntrinsics:
-    """Given intrinsics and their use, one of `USES`."""
-
-    calibration: Calibration
-    use: str = "fixed"
-
-    def to_json(self) -> dict[str, Any]:
-        """Return {"file", "use", "key"}; the key is a hash of the cameras and of the photo names in the file."""
-        return {"file": str(self.calibration.path.absolute()), "use": self.use, "key": self.calibration.key}
 
 
 @dataclass(frozen=True)
@@ -96,7 +82,7 @@ def _panoramas(photos: tuple[int, ...], first: Photo) -> CameraGroup:
     return CameraGroup(photos, PANORAMA, first.width, first.height, params=size, fixed=True)
 
 
-def group_by_given(photos: Photos, given: GivenIntrinsics) -> PhotoGroups:
+def group_by_given(photos: Photos, calibration: Calibration) -> PhotoGroups:
     """Group photos by the cameras of a file. Photos that it does not list share a camera only if their EXIF agrees.
 
     Raises:
@@ -106,7 +92,6 @@ def group_by_given(photos: Photos, given: GivenIntrinsics) -> PhotoGroups:
         Picture(photos.folder / photo.name, photo.width, photo.height, photo.exif.orientation or 1)
         for photo in photos.photos
     ]
-    calibration = given.calibration
     found = calibrated(calibration, pictures)
     for one in found:
         if one.camera.is_spherical and one.camera.width != 2 * one.camera.height:
@@ -126,7 +111,7 @@ def group_by_given(photos: Photos, given: GivenIntrinsics) -> PhotoGroups:
             width=camera.width,
             height=camera.height,
             params=camera.params,
-            fixed=given.use == "fixed" or camera.is_spherical,
+            fixed=True,
         )
         for (_, camera, *_), numbers in members.items()
     )
@@ -134,7 +119,7 @@ def group_by_given(photos: Photos, given: GivenIntrinsics) -> PhotoGroups:
         {"photos": len(numbers), "matched_by": "name" if by_name else "size", **camera.to_json()}
         for (_, camera, by_name, _), numbers in members.items()
     ]
-    return PhotoGroups(groups, _notes(given, found), given.to_json() | {"cameras": described})
+    return PhotoGroups(groups, _notes(calibration, found), calibration.to_json() | {"cameras": described})
 
 
 def start_model(exif: Exif) -> str:
@@ -184,14 +169,10 @@ def _photos(count: int, more: str = "") -> str:
     return f"{count} {more}photo{'' if count == 1 else 's'}"
 
 
-def _notes(given: GivenIntrinsics, found: Sequence[PhotoCalibration]) -> tuple[str, ...]:
-    calibration = given.calibration
+def _notes(calibration: Calibration, found: Sequence[PhotoCalibration]) -> tuple[str, ...]:
     named = sum(one.by_name for one in found)
     ways = [f"{count} by {how}" for count, how in ((named, "name"), (len(found) - named, "size")) if count]
     used = len({one.number for one in found})
-    first = (
-        f"intrinsics of {calibration.path} ({given.use}): {several(used, 'camera')} for "
-        f"{len(found)} photos, {' and '.join(ways)}"
-    )
+    first = f"intrinsics of {calibration.path}: {several(used, 'camera')} for {len(found)} photos, {' and '.join(ways)}"
     other_sizes = counted(rescaling(calibration.cameras[one.number], one.camera) for one in found)
     return (first, *describe_rescaling(other_sizes))
