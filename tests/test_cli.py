@@ -542,18 +542,16 @@ def test_masks_of_an_earlier_training_are_removed_unless_the_scene_has_them(capt
     run, masked = capture.with_name("spheres-run"), tmp_path / "masked"
     assert nerfcli("train", capture, *QUICK).exit_code == 0
     first = scene.load(capture).train_frames[0]
-    for folder in ("occluders", "movers"):
-        write_masks(run / folder, {first.name: np.zeros((first.camera.height, first.camera.width), bool)})
+    write_masks(run / "occluders", {first.name: np.zeros((first.camera.height, first.camera.width), bool)})
     converted = nerfcli("convert", capture, masked, "--to", "nerfcli", "--masks", run / "occluders")
     assert converted.exit_code == 0, converted.stderr
     for option in ("--overwrite", "--resume"):
         refused = nerfcli("train", masked, *QUICK, "-o", run, option)
         assert refused.exit_code == BAD_INPUT
         assert "holds masks that this scene uses, such as" in error_of(refused)[0]
-    assert len(list(run.glob("*/**/*.png"))) == 2
+    assert len(list(run.glob("*/**/*.png"))) == 1
     assert nerfcli("train", capture, *QUICK, "--overwrite").exit_code == 0
     assert not (run / "occluders").exists()
-    assert not (run / "movers").exists()
 
 
 @pytest.mark.parametrize("left", [None, (), ("cameras.json", "config.json")])

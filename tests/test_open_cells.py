@@ -42,8 +42,8 @@ class Slab:
         return torch.where(coordinates[:, 0] < 0.5, 20.0, 0.0)
 
 
-def cells_of(field: Any, covered: Tensor | None = None) -> OpenCells:
-    return OpenCells(field, CPU, covered=covered)
+def cells_of(field: Any) -> OpenCells:
+    return OpenCells(field, CPU)
 
 
 def refresh(cells: OpenCells, step: int, ranks: SingleProcess = ALONE) -> None:
@@ -202,17 +202,6 @@ def test_a_field_without_detail_has_the_coarse_cells_alone():
     assert cells.visits is None
     assert cells.at(1) is cells.coarse
     assert set(cells.state()) == {"optical_depth", "occupied"}
-
-
-def test_cells_that_may_not_be_filled_stay_closed():
-    covered = torch.ones((OCCUPANCY_SIDE,) * 3, dtype=torch.bool)
-    covered[0, 0, 0] = False
-    cells = cells_of(Slab(), covered)
-    for step in (0, REFRESH_EVERY):
-        refresh(cells, step)
-        assert not cells.coarse[0, 0, 0]
-        assert not cells.at(1)[:2, :2, :2].any()
-        assert cells.at(1)[:2, :2, 2].all()
 
 
 def test_the_samples_of_every_rank_count():

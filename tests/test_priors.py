@@ -16,7 +16,7 @@ from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
-from nerfcli.fit.losses import distance_losses, opacity_entropy
+from nerfcli.fit.losses import distance_losses
 from nerfcli.fit.point_depth import PointRays, fading, point_depths
 from nerfcli.kernels import reference
 from nerfcli.multiview.camera_check import CameraCheck
@@ -252,18 +252,6 @@ def test_points_of_a_narrow_baseline_fade_with_the_steps_of_a_training(
     assert losses[1] - losses[0] == pytest.approx(0.1 * weight * 4.0, rel=1e-4)
 
 
-def test_undecided_rays_have_the_largest_entropy_and_decided_ones_no_infinite_slope():
-    assert opacity_entropy(torch.tensor([0.5])).item() == pytest.approx(math.log(2))
-    fraction = torch.tensor([0.3, 0.9, 0.02], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(opacity_entropy, (fraction,))
-    extremes = torch.tensor([0.0, 1.0], requires_grad=True)
-    values = opacity_entropy(extremes)
-    values.sum().backward()
-    assert values.max().item() < 2e-3
-    assert extremes.grad is not None
-    assert extremes.grad.isfinite().all()
-
-
 def test_black_of_a_mask_is_ignored_or_is_empty_space(capture):
     one = Similarity(1.0, np.eye(3), np.zeros(3))
     ignored, empty = (pool_of(capture, masks, similarity=one) for masks in ("ignore", "empty"))
@@ -277,7 +265,7 @@ def test_black_of_a_mask_is_ignored_or_is_empty_space(capture):
 
 def test_training_takes_all_of_them_at_once(capture, tmp_path):
     # Equal seeds give equal losses, which are finite with every prior on.
-    components = Components(masks="empty", points=0.1, entropy=0.01)
+    components = Components(masks="empty", points=0.1)
     settings = TrainSettings(
         budget_seconds=None, steps=4, first_samples_per_step=2**9, samples_per_step=2**9, components=components
     )

@@ -37,7 +37,7 @@ SPHERES = Path(__file__).parents[1] / "sample_scenes" / "spheres"
 VARIANTS = {
     "": (200, 34),
     "exposure,background=black": (200, 34),
-    "pixels=error,points,entropy,movers,occluders": (100, 24),
+    "points,occluders": (100, 24),
     "cameras=all": (100, 14),
 }
 SMALL = TrainSettings(
@@ -229,12 +229,11 @@ def test_every_pixel_of_a_step_is_one_rank_s_and_points_stay_last(count):
     numbers, points = torch.arange(23), 5
     origins, directions, colours = torch.rand(3, 23, 3)
     point_pixels = numbers[-points:]
-    whole = PixelBatch(origins, directions, colours, numbers, point_pixels / 10, point_pixels / 20, torch.rand(23))
+    whole = PixelBatch(origins, directions, colours, numbers, point_pixels / 10, point_pixels / 20)
     parts = [whole.every(rank, count) for rank in range(count)]
     assert sorted(torch.cat([part.numbers for part in parts]).tolist()) == list(range(23))
     for part in parts:
         assert torch.equal(part.colours, whole.colours[part.numbers])
-        assert torch.equal(part.weights, whole.weights[part.numbers])
         point_pixels = part.numbers[len(part.numbers) - len(part.distances) :]
         assert torch.equal(part.distances, point_pixels / 10)
         assert torch.equal(part.trust, point_pixels / 20)

@@ -53,17 +53,22 @@ def test_a_removed_value_is_found_however_it_is_written(monkeypatch, arguments):
 
 
 @pytest.mark.parametrize(
-    ("name", "usual", "other"), [("photo_fraction", 1.0, 0.8), ("random_start", 0.0, 0.1), ("blocks", 0, 4)]
+    ("name", "usual", "other"),
+    [
+        *(("photo_fraction", 1.0, 0.8), ("random_start", 0.0, 0.1), ("blocks", 0, 4)),
+        *(("overlap", False, True), ("entropy", 0.0, 0.01), ("pixels", "anywhere", "error"), ("movers", False, True)),
+    ],
 )
 def test_a_run_that_was_trained_with_what_was_removed_is_refused_and_any_other_is_read(finished, name, usual, other):
     config = finished / "config.json"
     content = json.loads(config.read_text())
     content.pop("sha256", None)
+    components = content["settings"]["components"]
     for value in (usual, other):
-        content["settings"][name] = value
+        (content["settings"] if name in ("photo_fraction", "random_start", "blocks") else components)[name] = value
         config.write_text(json.dumps(content))
         result = nerfcli("info", finished)
         assert result.exit_code == (0 if value == usual else 3), result.stderr
     error, hint = error_of(result)
-    assert f"its training had {name} {other}" in error
+    assert f"its training had {name}={str(other).lower()}" in error
     assert "train again" in hint

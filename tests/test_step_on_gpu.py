@@ -19,7 +19,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 pytest.importorskip("triton", reason="Triton is for Linux")
 
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.fit.error_map import ErrorMap
 from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.point_depth import PointDepths, PointRays
 from nerfcli.kernels.triton_cuda import launch
@@ -133,8 +132,8 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
     ("components", "most"),
     [
         (Components(), 1),
-        (Components(exposure="learned", background="sphere", entropy=1e-3, antialias=True), 1),
-        (Components(points=0.1, pixels="error"), 1),
+        (Components(exposure="learned", background="sphere", antialias=True), 1),
+        (Components(points=0.1), 1),
         (Components(cameras="poses"), 1),
         (Components(cameras="all"), 2),  # the host computes the directions of pixels through a lens that learns
     ],
@@ -150,7 +149,6 @@ def test_a_step_waits_once_for_the_device(components, most, waits, spheres: Scen
     fitting = Fitting(
         pool, Marching(0.1, 4.0, 0.05, 0.0), contraction="l2", settings=settings,
         points=PointRays(depths, pool) if components.points else None,
-        error_map=ErrorMap(pool) if components.pixels == "error" else None,
     )  # fmt: skip
     fitting.field.backend = TritonBackend(GPU)
     for step in range(20):

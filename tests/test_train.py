@@ -35,7 +35,6 @@ from nerfcli.photos.loading import load_photos
 from nerfcli.photos.pool import PixelBatch, PixelPool
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import DepthRequest, render_picture
-from nerfcli.runs.components import Components
 from nerfcli.runs.config import read_config
 from nerfcli.runs.log import LogEntry, append_log, read_log
 from nerfcli.runs.run import Run
@@ -233,23 +232,6 @@ def test_fields_of_other_kinds_train_and_resume_bit_for_bit(kind, views, tmp_pat
     assert load_model(tmp_path / "parts" / "field.safetensors", "cpu").field.settings.kind == kind
     with pytest.raises(UserError, match="was trained with another field"):
         fit(views, tmp_path / "parts", replace(settings, field="hash"), resume=True)
-
-
-def test_pixels_drawn_by_their_error_resume_bit_for_bit(views, tmp_path):
-    def stop(progress: Progress) -> None:
-        if progress.step == 5:
-            raise KeyboardInterrupt
-
-    settings = replace(FEW, steps=10, components=Components(pixels="error"))
-    straight = fit(views, tmp_path / "straight", settings)
-    with pytest.raises(KeyboardInterrupt):
-        fit(views, tmp_path / "parts", settings, on_progress=stop)
-    second = fit(views, tmp_path / "parts", settings, resume=True)
-    assert [progress.loss for progress in second] == [progress.loss for progress in straight[5:]]
-    assert weights(tmp_path / "parts") == weights(tmp_path / "straight")
-    anywhere = fit(views, tmp_path / "anywhere", replace(settings, components=Components()))
-    assert [progress.loss for progress in anywhere[:2]] == [progress.loss for progress in straight[:2]]
-    assert anywhere[-1].loss != straight[-1].loss
 
 
 @pytest.mark.parametrize("steps", [1, 600, 1800, 1801, 9000])

@@ -28,6 +28,10 @@ REMOVED: tuple[Removed, ...] = (
     Removed("ablate", "--memory", "2026-11-29", "the default, 4/5 of the memory, is used"),
     Removed("ablate", "--model", "2026-11-29", "the variants are of the model that is selected for the scene"),
     Removed("ablate", "--with", "2026-11-29", "name the components to vary with --only"),
+    Removed("ablate", "--with entropy", "2026-11-29", "use --with distortion, which also clears haze"),
+    Removed("ablate", "--with movers", "2026-11-29", "mask what moves; occluders are left out without it"),
+    Removed("ablate", "--with overlap", "2026-11-29", "use --with points and --with near, which is on by default"),
+    Removed("ablate", "--with pixels", "2026-11-29", "leave it out: pixels are drawn anywhere"),
     Removed("ablate", "--without", "2026-11-29", "name the components to vary with --only"),
     Removed("convert", "--no-verify", "2026-11-29", "remove it: every file is read back and compared"),
     Removed("convert", "--to npz", "2026-11-29", "use --to nerfcli (a scene folder), or --to colmap without photos"),
@@ -62,6 +66,10 @@ REMOVED: tuple[Removed, ...] = (
     Removed("train", "--blocks", "2026-11-29", "train one field; see docs/many-captures.md for what it bears"),
     Removed("train", "--members", "2026-11-29", "train with --seed 1, --seed 2, ...; see docs/uncertainty.md"),
     Removed("train", "--vary", "2026-11-29", "train with --seed 1, --seed 2, ...; see docs/uncertainty.md"),
+    Removed("train", "--with entropy", "2026-11-29", "use --with distortion, which also clears haze"),
+    Removed("train", "--with movers", "2026-11-29", "mask what moves; occluders are left out without it"),
+    Removed("train", "--with overlap", "2026-11-29", "use --with points and --with near, which is on by default"),
+    Removed("train", "--with pixels", "2026-11-29", "leave it out: pixels are drawn anywhere"),
 )
 
 

@@ -89,13 +89,9 @@ def train(
       masks       ignore, empty: whether black in masks is unknown or empty space
       points      a weight: surfaces at the 3D points of matched features
       stereo      true, false: with points, also at depths from stereo matching of the training photos
-      overlap     true, false: empty space near a camera that no other photo sees
-      entropy     a weight: favour rays that are either opaque or transparent
       near        true, false: smaller gradients near cameras
       distortion  a weight: concentrate the density along each ray
       antialias   true, false: fade out details smaller than a pixel; for photos from near and far
-      pixels      anywhere, error: sample more pixels where the error is large
-      movers      true, false: leave out people, cars and leaves that other photos do not show
       occluders   true, false: leave out what hides, in one photo, a surface that others see
 
     Unless they are set with --with or --without, points, stereo, occluders, exposure, cameras, background and view are

@@ -106,7 +106,7 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
                 (patch.matches, photos[photo].name, f"at {across:.0f} % across, {down:.0f} % down{stays}"),
             )
     fraction = len(moving_photos) / len(photos)
-    advice = "mask it, or train --with movers: moving objects become fog, and disturb poses"
+    advice = "mask it: moving objects become fog, and disturb poses"
     if still:
         advice += "; content fixed in the image is a watermark, a strap, or the background of a turntable"
     return Finding(

@@ -13,9 +13,7 @@ from nerfcli.field.kinds import fresh_field
 from nerfcli.field.sizes import chosen_size
 from nerfcli.fit.appearance import Appearance
 from nerfcli.fit.delayed import Delayed
-from nerfcli.fit.error_map import BEGINS, ErrorMap
-from nerfcli.fit.losses import colour_losses, distance_losses, opacity_entropy
-from nerfcli.fit.movers import Movers
+from nerfcli.fit.losses import colour_losses, distance_losses
 from nerfcli.fit.open_cells import OpenCells
 from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.fit.point_depth import PointRays, fading
@@ -66,9 +64,6 @@ class Fitting:
         log_focal: logarithm of the initial factor of focal lengths, if these are learned.
         cameras_from: the fraction of the budget after which cameras learn.
         points: pixels whose distance is known.
-        error_map: error of blocks of pixels, if pixels are drawn by it.
-        movers: blocks in which something moves, if these are left out of the loss.
-        covered: the cells that may be filled, see `coverage.covered_cells`; None for all.
         sky: (pixels,) bool, the pixels of the pool that show a sky to be learned; None if none are known.
         size: of the field; by default, `sizes.chosen_size` for the settings and the pool.
         ranks: the processes that train this field together, each with its own copy of this state.
@@ -86,9 +81,6 @@ class Fitting:
         log_focal: float = 0.0,
         cameras_from: float = 0.0,
         points: PointRays | None = None,
-        error_map: ErrorMap | None = None,
-        movers: Movers | None = None,
-        covered: Tensor | None = None,
         sky: Tensor | None = None,
         size: FieldSettings | None = None,
         ranks: SingleProcess = ALONE,
@@ -119,10 +111,10 @@ class Fitting:
             )
         self.field = fresh_field(size).to(device)
         gains = torch.full((len(pool.first_pixel), 3), torch.nan) if log_gains is None else log_gains
-        self.points, self.error_map, self.movers = points, error_map, movers
+        self.points = points
         self.parts = Appearance(self.components, pool, log_gains=gains, log_focal=log_focal)
         self._cameras_from = cameras_from
-        self.cells = OpenCells(self.field, device, covered=covered)
+        self.cells = OpenCells(self.field, device)
         if sky is not None:
             self.parts.show_sky(sky)
         self.ray_steps = RaySteps(marching, self.field.settings, parallax=parallax, device=device)
@@ -187,8 +179,7 @@ class Fitting:
             ranks=self.ranks,
         )
         rays = min(self._most_rays, max(64, round(settings.samples_at(self.step) / max(1.0, self.samples_per_ray))))
-        source = self.pool if self.error_map is None or self.largest_fraction < BEGINS else self.error_map
-        drawn = source.draw(rays, self.generator)
+        drawn = self.pool.draw(rays, self.generator)
         if self.points is None or fraction >= 1.0:
             return drawn
         return self.points.added_to(drawn, self.generator)
@@ -236,17 +227,9 @@ class Fitting:
         )
         rendered, measured = self.parts.compared(seen.rgb, seen.transmittance, drawn, behind=background)
         losses = colour_losses(rendered, measured)
-        if self.movers is not None:
-            residuals = self.ranks.joined((rendered - measured).detach(), count)
-            self.movers.learn(whole.numbers, residuals, fraction=self.largest_fraction, step=self.step)
-            losses = losses * self.movers.weights(drawn.numbers)
-        if self.error_map is not None:
-            self.error_map.learn(whole.numbers, self.ranks.joined(losses.detach(), count))
-        loss = (losses * drawn.weights if len(drawn.weights) else losses).sum() / count
+        loss = losses.sum() / count
         if components.distortion:
             loss = loss + components.distortion * (seen.distortion.sum() / count)
-        if components.entropy:
-            loss = loss + components.entropy * (opacity_entropy(seen.transmittance).sum() / count)
         if len(whole.distances):
             losses_of_distances = drawn.trust * distance_losses(seen.off_target, fraction=fraction)
             weight = components.points * fading(fraction, step=self.step, parallax=self.parallax)
@@ -359,10 +342,6 @@ class Fitting:
         }
         tensors.update({f"parts.{name}": value for name, value in self.parts.state_dict().items()})
         tensors.update(self.parts_optimiser.state())
-        if self.error_map is not None:
-            tensors["error_map"] = self.error_map.errors
-        if self.movers is not None:
-            tensors["movers"], tensors["moving"] = self.movers.sums, self.movers.moving
         return tensors, {
             "field": self.field.settings.to_json(),
             "step": self.step,
@@ -385,10 +364,6 @@ class Fitting:
         self.optimiser.restore(tensors)
         self.parts.load_state_dict({name: tensors[f"parts.{name}"] for name in self.parts.state_dict()})
         self.parts_optimiser.restore(tensors)
-        if self.error_map is not None:
-            self.error_map.errors = tensors["error_map"]
-        if self.movers is not None:
-            self.movers.sums, self.movers.moving = tensors["movers"], tensors["moving"]
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]
         self.rate_factor, self.rollbacks = description["rate_factor"], description["rollbacks"]

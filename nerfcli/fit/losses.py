@@ -46,21 +46,6 @@ def distance_losses(off_target: Tensor, *, fraction: float) -> Tensor:
     return -most * torch.log1p(-off_target / most)
 
 
-def opacity_entropy(transmittance: Tensor) -> Tensor:
-    """Return the entropy of rays between opaque and clear, in nats.
-
-    -T log T - (1 - T) log(1 - T), with T kept inside [1e-4, 1 - 1e-4], where its gradient is at most 9.3
-
-    Args:
-        transmittance: (R,) in [0, 1].
-
-    Returns:
-        (R,) in (0, log 2]. Differentiable.
-    """
-    fraction = transmittance.clamp(1e-4, 1.0 - 1e-4)
-    return -(fraction * fraction.log() + (1.0 - fraction) * torch.log1p(-fraction))
-
-
 def over_background(colours: Tensor, background: Tensor) -> Tensor:
     """Return measured colours over `background` (R, 3): alpha * rgb + (1 - alpha) * background for RGBA.
 

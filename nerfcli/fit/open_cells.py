@@ -32,13 +32,10 @@ class OpenCells:
     The coarse grid is filled from random points of the field, see `Occupancy`. Surfaces are much thinner than its
     cells. The fine grid holds the optical depths of the samples that the training takes anyway, and closes the cells in
     which these samples were empty; a coarse cell is open as long as they find something in one of its fine cells.
-
-    Args:
-        covered: the coarse cells that may be filled, see `coverage.covered_cells`; None for all.
     """
 
-    def __init__(self, field: Field, device: torch.device, *, covered: Tensor | None):
-        self._field, self._covered = field, covered
+    def __init__(self, field: Field, device: torch.device):
+        self._field = field
         self._occupancy = Occupancy(OCCUPANCY_SIDE, device)
         # Fine cells: the largest optical depth of the samples since the last refresh, and the value up to then.
         self.visits: Tensor | None = None
@@ -115,9 +112,6 @@ class OpenCells:
             found = torch.where(self._depths.isinf(), UNVISITED, self._depths)
             largest = max_pool3d(found[None], parts)[0]
             self.coarse |= largest > least
-        if self._covered is not None:
-            self.coarse &= self._covered
-        if self.visits is not None:
             fine = self._depths > least
             # Only the two outer axes are expanded by broadcasting: whole rows of fine cells are fast, pairs are not.
             rows = self.coarse.repeat_interleave(parts, dim=2)[:, None, :, None]

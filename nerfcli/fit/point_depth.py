@@ -72,10 +72,7 @@ class PointRays:
         count = max(1, len(drawn.numbers) // PIXELS_PER_POINT // len(self.sets))
         chosen = reduce(PointDepths.joined, [depths.draw(count, generator) for depths in self.sets])
         both = self._pool.rays_of(torch.cat([drawn.numbers, chosen.numbers]))
-        weights = drawn.weights
-        if len(weights):
-            weights = torch.cat([weights, torch.ones_like(chosen.distances)])
-        return both._replace(distances=chosen.distances, trust=chosen.trust, weights=weights)
+        return both._replace(distances=chosen.distances, trust=chosen.trust)
 
 
 def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarity) -> PointDepths:

@@ -39,10 +39,6 @@ class SingleProcess:
         """Return the sum of a number over all ranks."""
         return number
 
-    def joined(self, rows: Tensor, count: int) -> Tensor:
-        """Return all `count` rows; each rank passes its `own`."""
-        return rows
-
     def gathered(self, value: Any) -> list[Any]:
         """Return the values of all ranks, in order of rank."""
         return [value]
@@ -106,12 +102,6 @@ class Ranks(SingleProcess):
         summed = torch.tensor(number)
         self.add_up(summed)
         return int(summed)
-
-    def joined(self, rows: Tensor, count: int) -> Tensor:
-        every = rows.new_zeros(count, *rows.shape[1:])
-        every[self.own] = rows
-        self.add_up(every)
-        return every
 
     def gathered(self, value: Any) -> list[Any]:
         values: list[Any] = [None] * self.count

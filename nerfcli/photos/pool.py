@@ -80,7 +80,6 @@ class PixelBatch(NamedTuple):
         colours: (N, 3 or 4) float32 in [0, 1].
         numbers: (N,) int64 indices of the pixels, counted through all photos.
         distances, trust: (K,) of the last K pixels, whose surface depth is known; see `point_depth.PointDepths`.
-        weights: (N,) weight of each pixel in the loss; empty if all are equal.
     """
 
     origins: Tensor
@@ -89,7 +88,6 @@ class PixelBatch(NamedTuple):
     numbers: Tensor
     distances: Tensor
     trust: Tensor
-    weights: Tensor
 
     def every(self, first: int, step: int) -> "PixelBatch":
         """Return the pixels `first`, `first + step`, ...; those with known surface depth remain the last ones."""
@@ -255,7 +253,7 @@ class PixelPool:
         pixels = PixelTable(self.first_pixel, bearings.first, bearings.values, self.poses, self.colours, bearings.grids)
         origins, directions, colours = self._backend.pixel_rays(numbers, pixels)
         none = torch.zeros(0, device=numbers.device)
-        return PixelBatch(origins, directions, colours, numbers, distances=none, trust=none, weights=none)
+        return PixelBatch(origins, directions, colours, numbers, distances=none, trust=none)
 
     def photo_of(self, numbers: Tensor) -> Tensor:
         """Return the photo index of each pixel (N,)."""

@@ -4,7 +4,7 @@ A component is a field of `Components`. `CHOICES` gives for each component the v
 that `--with NAME` stands for, and the values that `--with NAME=VALUE` allows.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -20,7 +20,8 @@ EXPOSURES = ("none", "exif", "matched", "learned")
 CAMERAS = ("fixed", "poses", "focal", "all")
 # Meaning of black in a mask: unknown, or empty space.
 MASKS = ("ignore", "empty")
-PIXELS = ("anywhere", "error")
+# Components of earlier versions, each with the value that switched it off.
+_FORMER = {"overlap": False, "entropy": 0.0, "pixels": "anywhere", "movers": False}
 # Spherical harmonics up to this degree: 16 of them.
 MOST_DEGREES = 3
 
@@ -42,14 +43,10 @@ class Components:
         points: weight of known distances, see `fit.losses.distance_losses`.
         stereo: whether the points include pixels of training photos with a depth from stereo matching, see
             `multiview.stereo`.
-        overlap: whether space near a camera that no other photo looks into stays empty; see `fit.coverage`.
-        entropy: weight of `losses.opacity_entropy`.
         near: whether gradients near a camera are scaled down; see `reference.scale_gradients`.
         distortion: weight of `kernels.RaySums.distortion`; 0.05 is best or as good as any on real and synthetic
             captures.
         antialias: whether details smaller than a pixel fade out of its view; see `reference.hash_encode`.
-        pixels: sampling of pixels: uniform ("anywhere"), or half of them where the "error" is large; see `error_map`.
-        movers: whether pixels that show moving things are left out of the loss; see `fit.movers`.
         occluders: whether pixels are left out where something hides a surface that other photos see; see
             `multiview.occluders`.
     """
@@ -61,14 +58,36 @@ class Components:
     masks: str = "ignore"
     points: float = 0.0
     stereo: bool = False
-    overlap: bool = False
-    entropy: float = 0.0
     near: bool = True
     distortion: float = 0.05
     antialias: bool = False
-    pixels: str = "anywhere"
-    movers: bool = False
     occluders: bool = False
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "Components":
+        """Read the components of a run of this or an earlier version; missing ones have their defaults.
+
+        Raises:
+            UserError: see `without_former`.
+            TypeError: a component is unknown.
+        """
+        return cls(**without_former(content, _FORMER))
+
+
+def without_former(content: Mapping[str, Any], former: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of a run without those that only earlier versions had.
+
+    Args:
+        former: names of these, each with the only value that can still be read.
+
+    Raises:
+        UserError: one has another value.
+    """
+    for name, value in former.items():
+        if content.get(name, value) != value:
+            had = f"{name}={str(content[name]).lower()}"
+            raise UserError(f"its training had {had}, unknown to this version", "use the version that trained it")
+    return {name: value for name, value in content.items() if name not in former}
 
 
 @dataclass(frozen=True)
@@ -113,13 +132,9 @@ CHOICES = {
     "masks": Choice("ignore", "empty", MASKS),
     "points": Choice(0.0, 0.1, None),
     "stereo": Choice(False, True, (False, True)),
-    "overlap": Choice(False, True, (False, True)),
-    "entropy": Choice(0.0, 0.01, None),
     "near": Choice(False, True, (False, True)),
     "distortion": Choice(0.0, 0.05, None),
     "antialias": Choice(False, True, (False, True)),
-    "pixels": Choice("anywhere", "error", PIXELS),
-    "movers": Choice(False, True, (False, True)),
     "occluders": Choice(False, True, (False, True)),
 }
 assert tuple(CHOICES) == tuple(field.name for field in fields(Components))

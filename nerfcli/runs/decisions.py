@@ -92,7 +92,7 @@ class Selection:
         """Read the content that `to_json` returned, without exposures; `wanted` are the components if it has none."""
         chosen = content.get("components")
         return cls(
-            components=Components(**chosen) if chosen else wanted,
+            components=Components.from_json(chosen) if chosen else wanted,
             decisions=tuple(Decision.from_json(one) for one in content.get("decisions", ())),
             seconds=content.get("seconds", 0.0),
         )

@@ -11,7 +11,7 @@ from nerfcli.errors import UserError
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import KINDS
 from nerfcli.kernels import CONTRACTIONS
-from nerfcli.runs.components import Components
+from nerfcli.runs.components import Components, without_former
 
 DOWNSCALES = (1, 2, 4, 8)
 # `--downscale auto` takes the largest pictures whose longer side is at most this many pixels.
@@ -142,14 +142,12 @@ class TrainSettings:
         """Read the content that `to_json` returned, in this or an earlier version; missing entries have their defaults.
 
         Raises:
-            UserError: an earlier version trained with a setting that this one does not have.
+            UserError: see `without_former`.
         """
-        for name, value in _FORMER.items():
-            if content.get(name, value) != value:
-                raise UserError(f"its training had {name} {content[name]}", "use the version that trained it")
         names = {entry.name for entry in dataclasses.fields(cls)}
-        entries: dict[str, Any] = {name: value for name, value in content.items() if name in names}
-        entries["components"] = Components(**content.get("components", {}))
+        given = without_former(content, _FORMER)
+        entries: dict[str, Any] = {name: value for name, value in given.items() if name in names}
+        entries["components"] = Components.from_json(content.get("components", {}))
         entries["fixed"] = tuple(content.get("fixed", ()))
         return cls(**entries)
 

@@ -19,10 +19,8 @@ from torch import Tensor
 
 from nerfcli.errors import UserError
 from nerfcli.field.hash_field import HashField
-from nerfcli.fit.error_map import ErrorMap
 from nerfcli.fit.extent import Extent
 from nerfcli.fit.fitting import Fitting
-from nerfcli.fit.movers import Movers
 from nerfcli.fit.point_depth import PointDepths, PointRays
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.pool import PixelPool
@@ -248,8 +246,6 @@ class Trials:
             cameras_from=cameras_from,
             points=self._points if components.points else None,
             sky=sky,
-            error_map=ErrorMap(self._pool) if components.pixels == "error" else None,
-            movers=Movers(self._pool) if components.movers else None,
         )
 
     def _take_up(self, fitting: Fitting, start: TrialStart) -> None:

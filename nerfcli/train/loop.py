@@ -25,7 +25,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
 from nerfcli.train.following import END, SETTLE, TIMED_STEPS, WAIT, describe_efficiency, start_others
-from nerfcli.train.left_out import MOVERS, OCCLUDERS, remove_left_out, write_left_out
+from nerfcli.train.left_out import remove_left_out, write_left_out
 from nerfcli.train.live import LiveTraining
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
@@ -98,7 +98,7 @@ def train(
         _clear(run)
     if prepared.occluders is not None:
         named = zip(prepared.pool.frames, prepared.occluders, strict=True)
-        write_left_out(run / OCCLUDERS, {frame.name: ~mask for frame, mask in named}, notify=notify)
+        write_left_out(run, {frame.name: ~mask for frame, mask in named}, notify=notify)
     _describe(scene, run, settings, prepared, resume=resume)
     checkpoints = Checkpoints(run, fitting, totals, prepared=prepared, scene=scene)
     checkpoints.write_cameras()
@@ -140,8 +140,6 @@ def train(
         live.end(seconds=_LAST_LOOK_SECONDS)
     if fitting.rollbacks:
         notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
-    if fitting.movers is not None:
-        write_left_out(run / MOVERS, fitting.movers.masks(), notify=notify)
     measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)
     if ranks.count > 1 and seconds:
         notify(describe_efficiency(fitting, seconds))

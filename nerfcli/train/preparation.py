@@ -6,7 +6,6 @@ Of held-out photos, only the image sizes of their cameras are read here.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +13,9 @@ import torch
 from torch import Tensor
 
 from nerfcli.errors import UserError, reason_of
-from nerfcli.fit.coverage import covered_cells
-from nerfcli.fit.error_map import ErrorMap
 from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
 from nerfcli.fit.fitting import Fitting
-from nerfcli.fit.movers import Movers
-from nerfcli.fit.open_cells import OCCUPANCY_SIDE
-from nerfcli.fit.point_depth import PointDepths, PointRays
+from nerfcli.fit.point_depth import PointRays
 from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.memory import default_memory_limit
 from nerfcli.multiview.camera_check import CameraCheck, check_cameras
@@ -106,19 +101,9 @@ class Prepared:
             log_gains=self.log_gains,
             log_focal=self.log_focal,
             points=self.points,
-            error_map=ErrorMap(self.pool) if self.settings.components.pixels == "error" else None,
-            movers=Movers(self.pool) if self.settings.components.movers else None,
-            covered=self.covered(),
             sky=self.sky,
             ranks=ranks,
         )
-
-    def covered(self) -> Tensor | None:
-        """Return the grid cells that may be filled; None for all."""
-        if not self.settings.components.overlap:
-            return None
-        depths = reduce(PointDepths.joined, self.points.sets) if self.points is not None else None
-        return covered_cells(self.pool, OCCUPANCY_SIDE, self.extent.contraction, depths)
 
 
 def load_training_photos(

@@ -15,7 +15,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene, describe_unused_masks
 from nerfcli.train import loop
 from nerfcli.train.following import follow
-from nerfcli.train.left_out import MOVERS, OCCLUDERS
+from nerfcli.train.left_out import OCCLUDERS
 from nerfcli.train.ranks import joined_ranks
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.workflows.view_worker import viewer_beside
@@ -173,10 +173,9 @@ def was_interrupted(scene: Path, run: Path, settings: TrainSettings, *, holdout:
 def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:
     """Return whether the run at `path` is complete with these settings; raise if it may not be replaced otherwise."""
     run = Run(path)
-    rewritten = [(path / folder).resolve() for folder in (OCCLUDERS, MOVERS)]
     masks = {frame.mask.parent: frame.mask for frame in scene.frames if frame.mask is not None}  # one of each folder
     for parent, mask in masks.items():
-        if any(parent.resolve().is_relative_to(folder) for folder in rewritten):
+        if parent.resolve().is_relative_to((path / OCCLUDERS).resolve()):
             raise UserError(
                 f"{path} holds masks that this scene uses, such as {mask}; training would delete them",
                 "choose another folder with -o",
