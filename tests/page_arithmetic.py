@@ -55,10 +55,7 @@ class PageField:
         """Return coordinates in the unit cube, and the factor by which widths shrink there."""
         if self.field["contraction"] == 0:
             return points * F(0.5) + F(0.5), np.full(len(points), F(0.5))
-        if self.field["contraction"] == 1:
-            norm = np.sqrt(np.maximum((points * points).sum(-1), F(1)))
-        else:
-            norm = np.maximum(np.abs(points).max(-1), F(1))
+        norm = np.sqrt(np.maximum((points * points).sum(-1), F(1)))
         scale = (F(2) - F(1) / norm) / norm * F(0.25)
         return points * scale[:, None] + F(0.5), scale
 

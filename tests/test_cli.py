@@ -187,7 +187,6 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --outputs depth --rgba", "--rgba: it works with --outputs rgb"),
         ("render x --outputs rgb --depth median", "--depth: it works with --outputs depth"),
         ("render x --count 20", "--count: it works with --cameras orbit, ellipse, spiral, interpolate"),
-        ("train x --field voxels --levels 4", "--levels: it works with --field hash"),
         ("train x --field mlp --log2-rows 12", "--log2-rows: it works with --field hash"),
         ("export x --to page --faces 100", "--faces: it is for meshes"),
         ("export x --to page --voxel-size 0.1", "--voxel-size: it is for all but pages"),

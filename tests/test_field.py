@@ -16,7 +16,7 @@ from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity, rotation_from_quaternion
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
-from nerfcli.field.contraction import training_points, uncontract, uncontract_from_cube
+from nerfcli.field.contraction import training_points, uncontract
 from nerfcli.field.cost import field_bytes
 from nerfcli.field.fourier_field import fourier_features
 from nerfcli.field.hash_field import HashField, HashFieldSettings
@@ -108,32 +108,15 @@ def test_uncontract_is_the_inverse_of_contract_across_magnitudes():
     assert uncontract(torch.tensor([[2.0, 2.0, 2.0]])).norm().item() == pytest.approx(1e6, rel=1e-6)
 
 
-def test_contraction_to_a_cube_keeps_the_inside_and_brings_infinity_to_its_faces():
-    """Independent: a loop over single numbers, from 1e-12 to 1e5, and back; 1e38 does not overflow."""
-    g = torch.Generator().manual_seed(0)
-    directions = torch.rand(400, 3, generator=g, dtype=torch.float64) * 2 - 1
-    points = directions * torch.logspace(-12, 5, 400, dtype=torch.float64)[:, None]
-    contracted = kernels.contract_to_cube(points)
-    for point, actual in zip(points.tolist(), contracted.tolist(), strict=True):
-        largest = max(map(abs, point))
-        expected = point if largest <= 1 else [(2 - 1 / largest) * x / largest for x in point]
-        assert actual == pytest.approx(expected, rel=1e-14)
-    torch.testing.assert_close(uncontract_from_cube(contracted), points, rtol=1e-9, atol=0)
-    assert torch.equal(kernels.contract_to_cube(torch.tensor([[1e38, 0.0, -1e37]])), torch.tensor([[2.0, 0.0, -0.2]]))
-    assert uncontract_from_cube(torch.tensor([[2.0, 1.0, -2.0]])).tolist() == [[1e6, 5e5, -1e6]]
-
-
-def test_contraction_to_a_cube_has_the_gradient_of_its_formula():
+def test_coordinates_move_by_at_most_a_quarter():
+    """The kernel for skipping empty space relies on it."""
     g = torch.Generator().manual_seed(0)
     points = (
         torch.randn(60, 3, generator=g, dtype=torch.float64) * torch.logspace(-2, 2, 60, dtype=torch.float64)[:, None]
     )
-    assert torch.autograd.gradcheck(kernels.contract_to_cube, points.requires_grad_())
-    # Coordinates move by at most the bound that the kernel for skipping empty space relies on.
-    for contraction, most in (("l2", 0.25), ("linf", 0.25 * 1.025)):
-        near = points.detach() + 1e-6 * torch.randn(60, 3, generator=g, dtype=torch.float64)
-        moved = kernels.grid_coordinates(near, contraction) - kernels.grid_coordinates(points.detach(), contraction)
-        assert (moved.abs().amax(-1) <= most * (near - points.detach()).norm(dim=-1) * (1 + 1e-6)).all()
+    near = points + 1e-6 * torch.randn(60, 3, generator=g, dtype=torch.float64)
+    moved = kernels.grid_coordinates(near, "l2") - kernels.grid_coordinates(points, "l2")
+    assert (moved.abs().amax(-1) <= 0.25 * (near - points).norm(dim=-1) * (1 + 1e-6)).all()
 
 
 def test_an_unknown_contraction_is_refused():

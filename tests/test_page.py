@@ -99,10 +99,10 @@ def hash_settings(contraction: str, *, antialias: bool = False, view_degree: int
     [
         (HashField(hash_settings("none")), False),
         (HashField(hash_settings("l2")), True),
-        (HashField(hash_settings("linf", antialias=True, view_degree=1)), False),
+        (HashField(hash_settings("l2", antialias=True, view_degree=1)), False),
         (VoxelField(VoxelFieldSettings(contraction="l2", view_degree=2, log2_vertices=11)), True),
     ],
-    ids=["none", "l2 with a sky", "linf, antialiased, degree 1", "voxels"],
+    ids=["none", "l2 with a sky", "l2, antialiased, degree 1", "voxels"],
 )
 def test_the_numbers_in_the_page_render_what_the_kernels_render(field, sky):
     """Against an independent implementation of the shader, applied to the page's own text."""
@@ -344,10 +344,10 @@ def test_the_browser_shows_how_many_photos_see_the_surface(opened, spheres_run):
 @pytest.mark.parametrize(
     ("field", "sky"),
     [
-        (HashField(hash_settings("linf", antialias=True, view_degree=1)), True),
+        (HashField(hash_settings("l2", antialias=True, view_degree=1)), True),
         (VoxelField(VoxelFieldSettings(contraction="none", view_degree=2, log2_vertices=11)), False),
     ],
-    ids=["linf, antialiased, a sky", "voxels, no contraction"],
+    ids=["l2, antialiased, a sky", "voxels, no contraction"],
 )
 def test_the_browser_draws_other_fields(field, sky, browser, tmp_path):
     page = tmp_path / "other.html"

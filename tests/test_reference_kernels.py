@@ -224,8 +224,7 @@ def test_hash_encode_fades_levels_finer_than_a_pixel():
 @pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
 @pytest.mark.parametrize("radius", [1e-3, 0.9, 1.1, 30.0, 1e6])
 def test_widths_are_those_of_a_short_line_across(contraction, radius):
-    # Against `grid_coordinates` of both ends of a line across the direction from the centre, along an axis, where the
-    # cube's norm does not change along the line.
+    # Against `grid_coordinates` of both ends of a line across the direction from the centre.
     point = torch.tensor([[0.0, -radius, 0.0]], dtype=torch.float64)
     across = torch.tensor([[radius * 1e-6, 0.0, 0.0]], dtype=torch.float64)
     ends = [kernels.grid_coordinates(point + half * across, contraction) for half in (-0.5, 0.5)]

@@ -36,7 +36,7 @@ def test_the_table_and_the_commands_agree(removed):
     option, _, value = removed.name.partition(" ")
     assert (option in options_of(removed.command)) == bool(value)
     every = set().union(*map(options_of, COMMANDS))
-    assert set(re.findall(r"--[a-z][a-z-]+", removed.instead)) <= every
+    assert set(re.findall(r"--[a-z][a-z0-9-]+", removed.instead)) <= every
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_a_removed_value_is_found_however_it_is_written(monkeypatch, arguments):
 @pytest.mark.parametrize(
     ("name", "usual", "other"),
     [
-        *(("photo_fraction", 1.0, 0.8), ("random_start", 0.0, 0.1), ("blocks", 0, 4)),
+        *(("photo_fraction", 1.0, 0.8), ("random_start", 0.0, 0.1), ("blocks", 0, 4), ("width", 32, 64)),
         *(("overlap", False, True), ("entropy", 0.0, 0.01), ("pixels", "anywhere", "error"), ("movers", False, True)),
     ],
 )
@@ -63,9 +63,9 @@ def test_a_run_that_was_trained_with_what_was_removed_is_refused_and_any_other_i
     config = finished / "config.json"
     content = json.loads(config.read_text())
     content.pop("sha256", None)
-    components = content["settings"]["components"]
+    is_component = name in ("overlap", "entropy", "pixels", "movers")
     for value in (usual, other):
-        (content["settings"] if name in ("photo_fraction", "random_start", "blocks") else components)[name] = value
+        (content["settings"]["components"] if is_component else content["settings"])[name] = value
         config.write_text(json.dumps(content))
         result = nerfcli("info", finished)
         assert result.exit_code == (0 if value == usual else 3), result.stderr

@@ -217,10 +217,10 @@ def test_what_comes_from_outside_stays_text(seen):
 
 def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     look, _ = seen
-    other = facts("another", config=replace(facts().config, settings=TrainSettings(width=64)))
+    other = facts("another", config=replace(facts().config, settings=TrainSettings(log2_rows=14)))
     text = page_html([facts(), other], [look, look], depths=[_meta(), _meta()])
-    assert "differs: settings.width" in text
-    assert text.index("differs: settings.width") < text.index(">settings.seed<")
+    assert "differs: settings.log2_rows" in text
+    assert text.index("differs: settings.log2_rows") < text.index(">settings.seed<")
     assert "another: rendered" in text
     farther = [replace(view, depth=view.depth + 1) for view in look]
     (low, high), (_, highest) = depth_range(look), depth_range([*look, *farther])

@@ -255,9 +255,7 @@ def exactly(rays: Rays, march: March) -> tuple[Rays, March]:
     return plain, march._replace(edges=march.edges.cpu().double(), occupied=march.occupied.cpu())
 
 
-@pytest.mark.parametrize(
-    ("count", "contraction"), [(0, "l2"), (1, "l2"), (5, "linf"), (5, "none"), (123, "l2"), (123, "linf")]
-)
+@pytest.mark.parametrize(("count", "contraction"), [(0, "l2"), (1, "l2"), (5, "none"), (123, "l2")])
 def test_occupied_samples(count, contraction, generator):
     given = rays_and_march(count, contraction, generator)
     fast, exact = marching.occupied_samples(*given), reference.occupied_samples(*exactly(*given))

@@ -40,11 +40,11 @@ const PARTS = {
       ["PSNR, held-out pixels", `${p.psnr.toFixed(2)} dB`], ["quadrature error", `${short(p.quadrature_levels)} levels rms`],
       ["peak memory", megabytes(p.peak_memory_bytes)], ["field", megabytes(p.field_bytes)],
       [`picture of ${p.render_size.join(" x ")}`, seconds(p.render_seconds)],
-      ["kernels", p.compiled === null ? "as in this run" : p.compiled ? "compiled" : "plain torch: none compiled for this size"],
+      ["kernels", p.compiled === null ? "as in this run" : p.compiled ? "compiled" : "plain torch"],
       ["", pareto(p)]],
     command: (p) => (p.options === null ? null : `nerfcli train SCENE --budget ${Math.round(p.seconds.median)}s ${p.options}`.trim()),
     colours: (p) => ({ default: ["default and its seeds", 6], seed: ["default and its seeds", 6], time: ["training time", 0], rows: ["rows of a table", 1],
-      levels: ["levels", 2], width: ["width", 3], batch: ["batch", 4], run: ["this run", 5] })[p.group],
+      batch: ["batch", 4], run: ["this run", 5] })[p.group],
     xs: [
       { name: "training time", label: "seconds of training", log: true, of: (p) => p.seconds.median },
       { name: "field size", label: "size of the field, MB", log: true, of: (p) => p.field_bytes / 1e6 },

@@ -76,7 +76,7 @@ class TrainSetting:
     """One training.
 
     Args:
-        group: the parameter that is varied: "default", "seed", "time", "rows", "levels", "width" or "batch".
+        group: the parameter that is varied: "default", "seed", "time", "rows" or "batch".
         fraction: training time relative to the planned time of one point.
         changed: values that differ from the defaults of `TrainSettings`, by name.
     """
@@ -97,8 +97,6 @@ class TrainSetting:
                 return f"{self.fraction:g} x time"
             case "rows":
                 return f"2^{values['log2_rows']} rows"
-            case "levels" | "width":
-                return f"{self.group} {values[self.group]}"
             case "batch":
                 return f"batch {values['samples_per_step']}"
         return "default"
@@ -118,7 +116,7 @@ class TrainSetting:
     @property
     def options(self) -> str:
         """Options of `nerfcli train` that select this setting, besides the budget."""
-        names = {"log2_rows": "--log2-rows", "levels": "--levels", "width": "--width", "samples_per_step": "--batch"}
+        names = {"log2_rows": "--log2-rows", "samples_per_step": "--batch"}
         seed = [f"--seed {self.seed}"] if self.seed else []
         return " ".join([*(f"{names[name]} {value}" for name, value in self.changed), *seed])
 
@@ -154,14 +152,10 @@ def train_settings() -> list[TrainSetting]:
         TrainSetting("batch", changed=(("samples_per_step", 2**15),)),
         TrainSetting("batch", changed=(("samples_per_step", 2**17),)),
         TrainSetting("time", 0.5),
-        TrainSetting("levels", changed=(("levels", 4),)),
-        TrainSetting("width", changed=(("width", 64),)),
         TrainSetting("rows", changed=(("log2_rows", 14),)),
         TrainSetting("rows", changed=(("log2_rows", 18),)),
         TrainSetting("time", 4.0),
         TrainSetting("batch", changed=(("samples_per_step", 2**14),)),
-        TrainSetting("levels", changed=(("levels", 12),)),
-        TrainSetting("width", changed=(("width", 16),)),
     ]
 
 

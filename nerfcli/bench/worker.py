@@ -104,7 +104,7 @@ def _train_and_measure(job: dict[str, Any], send: Callable[[dict[str, Any]], Non
     held_out = held_out_photos_of(trained.config, scene.test_frames, model, threads=settings.threads)
     return {
         **training_record(trained),
-        "compiled": settings.device == "cpu" and _has_compiled(settings),
+        "compiled": settings.device == "cpu" and kernels.has_compiled(),
         **measure_model(
             model,
             held_out,
@@ -115,11 +115,6 @@ def _train_and_measure(job: dict[str, Any], send: Callable[[dict[str, Any]], Non
         ),
         "wall_seconds": time.perf_counter() - began,
     }
-
-
-def _has_compiled(settings: TrainSettings) -> bool:
-    """Return whether the CPU kernels have code for a field of this size."""
-    return kernels.has_compiled() and (settings.levels, settings.width) == (TrainSettings.levels, TrainSettings.width)
 
 
 if __name__ == "__main__":

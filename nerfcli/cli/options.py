@@ -84,9 +84,7 @@ FieldMemory = Annotated[
 ]
 Contraction = Annotated[
     str,
-    typer.Option(
-        help="Map distant space into a ball (l2) or a cube (linf), or not at all (none); auto: none with alpha."
-    ),
+    typer.Option(help="Map distant space into a ball (l2), or not at all (none); auto: none with alpha."),
 ]
 Memory = Annotated[str | None, typer.Option(help="Memory limit: 4GB, 500MB.  [default: 4/5 of the machine's memory]")]
 DeviceMemory = Annotated[
@@ -159,8 +157,8 @@ def named_components(included: list[str] | None, excluded: list[str] | None) -> 
 
 
 def contraction_name(contraction: str) -> str | None:
-    """Parse --contraction: none, l2 or linf; None for auto."""
-    one_of(contraction, ("auto", "none", "l2", "linf"), "--contraction")
+    """Parse --contraction: none or l2; None for auto."""
+    one_of(contraction, ("auto", "none", "l2"), "--contraction")
     return None if contraction == "auto" else contraction
 
 

@@ -44,8 +44,6 @@ def train(
             show_default=False,
         ),
     ] = None,
-    levels: Annotated[int, typer.Option(help="Levels of the hash grid; values other than 8 are slow.", min=1)] = 8,
-    width: Annotated[int, typer.Option(help="Width of the network layers; values other than 32 are slow.", min=1)] = 32,
     batch: Annotated[
         int | None,
         typer.Option(
@@ -138,14 +136,9 @@ def train(
 
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
-    usual = TrainSettings()
-    of_hash = {
-        "--log2-rows": log2_rows is not None,
-        "--levels": levels != usual.levels,
-        "--width": width != usual.width,
-    }
-    if field not in (None, "hash") and (option := next((name for name, given in of_hash.items() if given), None)):
-        raise typer.BadParameter("it works with --field hash; for other fields, give --field-memory", param_hint=option)
+    if field not in (None, "hash") and log2_rows is not None:
+        message = "it works with --field hash; for other fields, give --field-memory"
+        raise typer.BadParameter(message, param_hint="--log2-rows")
     if is_one_of_several() and (dry_run or scene == STDIN or is_scan(Path(scene))):
         raise UserError("processes of torchrun train one field of photos", "use this command without torchrun", 2)
     console = Console(quiet=quiet or not is_first(), json_lines=json)
@@ -181,9 +174,7 @@ def train(
             fixed=options.named_components(include, exclude),
             first_samples_per_step=min(sized.first_samples_per_step, largest),
             samples_per_step=largest,
-            levels=levels,
             log2_rows=log2_rows or sized.log2_rows,
-            width=width,
             field=options.one_of(field or "hash", KINDS, "--field"),
             field_memory_bytes=field_bytes,
         )

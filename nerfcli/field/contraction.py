@@ -22,24 +22,8 @@ def uncontract(points: Tensor) -> Tensor:
     return points / norm * radius
 
 
-def uncontract_from_cube(points: Tensor) -> Tensor:
-    """Return the inverse of `kernels.contract_to_cube`.
-
-    x = y for m <= 1, else y / m / (2 - m),  m = the largest of |y_1|, |y_2|, |y_3|
-
-    Args:
-        points: (..., 3); a point with m of 2 or more is infinitely far, and its m becomes 1e6.
-
-    Returns:
-        (..., 3), with the same relative error as `uncontract`.
-    """
-    largest = points.abs().amax(-1, keepdim=True).clamp_min(1.0)
-    return points / largest / (2.0 - largest).clamp_min(1.0 / LARGEST_RADIUS)
-
-
 def training_points(coordinates: Tensor, contraction: str) -> Tensor:
     """Return the inverse of `kernels.grid_coordinates`: unit cube to training frame."""
     if contraction == "none":
         return (coordinates - 0.5) * 2.0
-    back = {"l2": uncontract, "linf": uncontract_from_cube}[contraction]
-    return back((coordinates - 0.5) * 4.0)
+    return uncontract((coordinates - 0.5) * 4.0)

@@ -22,7 +22,7 @@ from nerfcli.scene import Scene
 # Radius, in unit balls, of the ball that a learned background surrounds: anything nearer shows parallax.
 BALLS_BEFORE_BACKGROUND = 1.5
 
-_IN_WORDS = {"none": "bounded scene", "l2": "unbounded scene", "linf": "unbounded scene (linf)"}
+_IN_WORDS = {"none": "bounded scene", "l2": "unbounded scene"}
 
 
 @dataclass(frozen=True)

@@ -100,9 +100,7 @@ class Fitting:
                 settings.field,
                 hash_grid=HashFieldSettings(
                     contraction=contraction,
-                    levels=settings.levels,
                     log2_rows=settings.chosen_log2_rows,
-                    width=settings.width,
                     view_degree=self.components.view,
                     antialias=self.components.antialias,
                 ),

@@ -14,7 +14,7 @@ import torch
 from nerfcli.errors import UserError
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.kernels.composition import Backend
-from nerfcli.kernels.contraction import CONTRACTIONS, contract, contract_to_cube, grid_coordinates
+from nerfcli.kernels.contraction import CONTRACTIONS, contract, grid_coordinates
 from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import (
     AdamStep,
@@ -50,7 +50,6 @@ __all__ = [
     "Targets",
     "backend_for",
     "contract",
-    "contract_to_cube",
     "driver_version",
     "gpu_launcher",
     "grid_coordinates",

@@ -1,11 +1,7 @@
 """Contraction of space into the unit cube of the field's grids: none, or with distant space mapped into it.
 
-    none    only the cube [-1, 1]^3 of the training frame is represented
-    l2      the unit ball is unchanged; everything beyond it is mapped into the ball of radius 2
-    linf    the cube [-1, 1]^3 is unchanged; everything beyond it is mapped into the cube [-2, 2]^3
-
-The ball wastes the corners of the grid's cube, almost half of it; the cube bends straight lines at its edges, and pulls
-points along its diagonals nearer.
+none    only the cube [-1, 1]^3 of the training frame is represented
+l2      the unit ball is unchanged; everything beyond it is mapped into the ball of radius 2
 """
 
 import torch
@@ -14,7 +10,7 @@ from torch import Tensor
 from nerfcli.kernels.interface import Rays
 
 # The names, in the order of their numbers in compiled kernels.
-CONTRACTIONS = ("none", "l2", "linf")
+CONTRACTIONS = ("none", "l2")
 
 
 def contract(points: Tensor) -> Tensor:
@@ -39,24 +35,6 @@ def contract(points: Tensor) -> Tensor:
     return (2.0 - shrink / norm) * (small / norm)
 
 
-def contract_to_cube(points: Tensor) -> Tensor:
-    """Map all of space into the cube [-2, 2]^3, leaving the cube [-1, 1]^3 unchanged.
-
-    contract_to_cube(x) = x for m <= 1, else (2 - 1/m) x / m,  m = the largest of |x_1|, |x_2|, |x_3|
-
-    Args:
-        points: (..., 3) finite.
-
-    Returns:
-        (..., 3) with components within 2.
-
-    Differentiable except where two components tie for the largest, and at m = 1: there, autograd's choice holds.
-    Source: the contraction of Mip-NeRF 360 with the norm that nerfacto uses (Tancik et al. 2023, arXiv:2302.04264).
-    """
-    largest = points.abs().amax(-1, keepdim=True).clamp_min(1.0)
-    return (2.0 - 1.0 / largest) * (points / largest)
-
-
 def grid_coordinates(points: Tensor, contraction: str) -> Tensor:
     """Convert points of the training frame to coordinates of the unit cube that holds the field's grids.
 
@@ -75,8 +53,6 @@ def grid_coordinates(points: Tensor, contraction: str) -> Tensor:
             return points / 2.0 + 0.5
         case "l2":
             return contract(points) / 4.0 + 0.5
-        case "linf":
-            return contract_to_cube(points) / 4.0 + 0.5
         case _:
             raise ValueError(f"contraction must be one of {CONTRACTIONS}, got {contraction!r}")
 
@@ -85,7 +61,7 @@ def cube_widths(points: Tensor, widths: Tensor, contraction: str) -> Tensor:
     """Compute the width of a pixel's footprint at points, in coordinates of the cube of `grid_coordinates`.
 
     Widths are scaled as lengths across the line from the centre, along which distant points are seen: by 1/2 without
-    contraction, else by 1/4 of (2 - 1/m) / m, where m is the norm of the contraction, at least 1.
+    contraction, else by 1/4 of (2 - 1/m) / m, where m is the norm of the point, at least 1.
 
     Args:
         points: (N, 3) training frame.
@@ -97,8 +73,7 @@ def cube_widths(points: Tensor, widths: Tensor, contraction: str) -> Tensor:
     """
     if contraction == "none":
         return widths / 2.0
-    norm = points.norm(dim=-1) if contraction == "l2" else points.abs().amax(-1)
-    norm = norm.clamp_min(1.0)
+    norm = points.norm(dim=-1).clamp_min(1.0)
     return widths * ((2.0 - 1.0 / norm) / norm / 4.0)
 
 

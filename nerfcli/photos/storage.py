@@ -67,7 +67,7 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
 
 def field_bytes(settings: TrainSettings) -> int:
     """Estimate the memory of one copy of a field's parameters."""
-    hash_rows = 16 * settings.levels * 2**settings.chosen_log2_rows
+    hash_rows = 8 * 16 * 2**settings.chosen_log2_rows  # 8 levels of 4 float32
     return settings.field_memory_bytes or (hash_rows if settings.field == "hash" else _LARGEST_FIELD_BYTES)
 
 

@@ -28,7 +28,7 @@ SAMPLES_PER_SECOND = 1e6
 # and a step is an eighth slower than with 2^18.
 FEWEST_LOG2_ROWS, DOUBLE_ROWS_FROM = 16, (37e6, 74e6, 400e6)
 # Settings of earlier versions, with the only value that can still be read.
-_FORMER = {"photo_fraction": 1.0, "random_start": 0.0, "blocks": 0, "block": 0}
+_FORMER = {"photo_fraction": 1.0, "random_start": 0.0, "blocks": 0, "block": 0, "levels": 8, "width": 32}
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,7 @@ class TrainSettings:
             determines the number of rays. Small steps learn more per sample, large ones cost less per sample.
         learning_rate, final_learning_rate: learning rate of Adam at the start and at the end of the budget.
         warmup_steps: steps over which the learning rate rises from 0.
-        levels, log2_rows, width: size of a hash grid, see `HashFieldSettings`. There are compiled kernels for 8 levels
-            and width 32, on a GPU also 64; other sizes train in plain torch, many times slower. log2_rows is None for
-            automatic, see `chosen_log2_rows`.
+        log2_rows: size of a hash grid, see `HashFieldSettings`; None for automatic, see `chosen_log2_rows`.
         components: components of the model and of its loss.
         field: kind of field, one of `kinds.KINDS`.
         field_memory_bytes: memory limit of the field's numbers; None for the default of the kind, see
@@ -74,9 +72,7 @@ class TrainSettings:
     learning_rate: float = 1e-2
     final_learning_rate: float = 1e-3
     warmup_steps: int = 50
-    levels: int = 8
     log2_rows: int | None = None
-    width: int = 32
     components: Components = dataclasses.field(default_factory=Components)
     field: str = HashFieldSettings.kind
     field_memory_bytes: int | None = None
@@ -84,11 +80,8 @@ class TrainSettings:
     fixed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if min(self.levels, self.width) < 1 or not 4 <= (self.log2_rows or 4) <= 24:
-            sizes = f"levels {self.levels}, log2-rows {self.log2_rows}, width {self.width}"
-            raise UserError(
-                f"invalid size of the field: {sizes}", "levels and width must be at least 1, log2-rows between 4 and 24"
-            )
+        if not 4 <= (self.log2_rows or 4) <= 24:
+            raise UserError(f"invalid size of the field: log2-rows {self.log2_rows}", "it must be between 4 and 24")
         if self.budget_seconds is None and self.steps is None:
             raise UserError(
                 "no stopping criterion: neither --budget nor --steps is given", "give --budget, --steps, or both"

@@ -45,11 +45,7 @@ vec3 cube(vec3 p) {
 #if CONTRACTION == 0
   return p * 0.5 + 0.5;
 #else
-#if CONTRACTION == 1
   float norm = sqrt(max(dot(p, p), 1.0));
-#else
-  float norm = max(max(abs(p.x), abs(p.y)), max(abs(p.z), 1.0));
-#endif
   return p * ((2.0 - 1.0 / norm) / norm * 0.25) + 0.5;
 #endif
 }
@@ -59,11 +55,7 @@ float stretch(vec3 p) {
 #if CONTRACTION == 0
   return 0.5;
 #else
-#if CONTRACTION == 1
   float norm = sqrt(max(dot(p, p), 1.0));
-#else
-  float norm = max(max(abs(p.x), abs(p.y)), max(abs(p.z), 1.0));
-#endif
   return (2.0 - 1.0 / norm) / norm * 0.25;
 #endif
 }

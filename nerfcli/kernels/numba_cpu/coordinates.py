@@ -25,8 +25,7 @@ def _back_from_cube(x: Any, y: Any, z: Any, contraction: Any, a: Any, b: Any, c:
     half, quarter, one, two = np.float32(0.5), np.float32(0.25), np.float32(1), np.float32(2)
     if contraction == 0:
         return a * half, b * half, c * half
-    largest = max(max(abs(x), abs(y)), abs(z))
-    norm = np.sqrt(x * x + y * y + z * z) if contraction == 1 else largest
+    norm = np.sqrt(x * x + y * y + z * z)
     if norm <= one:
         return a * quarter, b * quarter, c * quarter
     inverse = one / norm
@@ -34,10 +33,6 @@ def _back_from_cube(x: Any, y: Any, z: Any, contraction: Any, a: Any, b: Any, c:
     # In units of the norm, as squares of distant coordinates would overflow.
     u, v, w = x * inverse, y * inverse, z * inverse
     along = two * inverse * (inverse - one) * (u * a + v * b + w * c)
-    if contraction == 2:  # the gradient of the largest component is its sign
-        u = np.sign(x) if abs(x) == largest else np.float32(0)
-        v = np.sign(y) if abs(y) == largest and u == 0 else np.float32(0)
-        w = np.sign(z) if abs(z) == largest and u == 0 and v == 0 else np.float32(0)
     return (
         (scale * a + along * u) * quarter,
         (scale * b + along * v) * quarter,

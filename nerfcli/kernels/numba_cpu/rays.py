@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.kernels.numba_cpu.steps import steps_in_ball, steps_in_contracted_cube, steps_in_cube
+from nerfcli.kernels.numba_cpu.steps import steps_in_ball, steps_in_cube
 from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.vector import LANES
 
@@ -24,8 +24,7 @@ def cube(x: Any, y: Any, z: Any, contraction: Any) -> Any:
     half, quarter, one, two = np.float32(0.5), np.float32(0.25), np.float32(1), np.float32(2)
     if contraction == 0:
         return x * half + half, y * half + half, z * half + half
-    largest = max(max(abs(x), abs(y)), max(abs(z), one))
-    norm = np.sqrt(max(x * x + y * y + z * z, one)) if contraction == 1 else largest
+    norm = np.sqrt(max(x * x + y * y + z * z, one))
     scale = (two - one / norm) / norm * quarter
     return x * scale + half, y * scale + half, z * scale + half
 
@@ -47,10 +46,8 @@ def look_ahead(
     """
     if contraction == 0:
         steps_in_cube(origins, directions, ray, edges, jitter[ray], first, side, places, cells)
-    elif contraction == 1:
-        steps_in_ball(origins, directions, ray, edges, jitter[ray], first, side, places, cells)
     else:
-        steps_in_contracted_cube(origins, directions, ray, edges, jitter[ray], first, side, places, cells)
+        steps_in_ball(origins, directions, ray, edges, jitter[ray], first, side, places, cells)
 
 
 def padded(edges: Tensor) -> np.ndarray:

@@ -35,22 +35,13 @@ def _unit_cube(builder: Any, points: list[Any]) -> list[Any]:
     return [builder.fadd(builder.fmul(along, floats(0.5)), floats(0.5)) for along in points]
 
 
-def _contracted(builder: Any, points: list[Any], norm: Any) -> list[Any]:
-    shrink = builder.fdiv(builder.fsub(floats(2.0), builder.fdiv(floats(1.0), norm)), norm)
-    scale = builder.fmul(shrink, floats(0.25))
-    return [builder.fadd(builder.fmul(along, scale), floats(0.5)) for along in points]
-
-
 def _ball(builder: Any, points: list[Any]) -> list[Any]:
     x, y, z = (builder.fmul(along, along) for along in points)
     square = builder.fadd(builder.fadd(x, y), z)
-    return _contracted(builder, points, of_each(builder, "llvm.sqrt", _larger(builder, square, floats(1.0))))
-
-
-def _cube(builder: Any, points: list[Any]) -> list[Any]:
-    x, y, z = (of_each(builder, "llvm.fabs", along) for along in points)
-    largest = _larger(builder, _larger(builder, x, y), _larger(builder, z, floats(1.0)))
-    return _contracted(builder, points, largest)
+    norm = of_each(builder, "llvm.sqrt", _larger(builder, square, floats(1.0)))
+    shrink = builder.fdiv(builder.fsub(floats(2.0), builder.fdiv(floats(1.0), norm)), norm)
+    scale = builder.fmul(shrink, floats(0.25))
+    return [builder.fadd(builder.fmul(along, scale), floats(0.5)) for along in points]
 
 
 def _cells(builder: Any, coordinates: list[Any], side: Any) -> Any:
@@ -119,4 +110,3 @@ def _steps(cube_of: Callable[[Any, list[Any]], list[Any]]) -> Any:
 # See `_steps`; one for each of `CONTRACTIONS`.
 steps_in_cube = _steps(_unit_cube)
 steps_in_ball = _steps(_ball)
-steps_in_contracted_cube = _steps(_cube)

@@ -81,8 +81,7 @@ def _may_hold_something(
     """Return whether an interval of a ray may cross an occupied cell.
 
     If both its ends are within a block's width of its midpoint, the midpoint's block and its neighbours contain all of
-    it: coordinates of the cube change by at most 1/2 per unit of distance, 1/4 where space is contracted to a ball, and
-    1/4 times 1.025 where it is contracted to a cube.
+    it: coordinates of the cube change by at most 1/2 per unit of distance, 1/4 where space is contracted.
     """
     if end - start > reach:
         return True
@@ -104,8 +103,7 @@ def _stretch(origins: Any, directions: Any, ray: Any, t: Any, contraction: Any) 
         return np.float32(0.5)
     x, y = origins[ray, 0] + directions[ray, 0] * t, origins[ray, 1] + directions[ray, 1] * t
     z = origins[ray, 2] + directions[ray, 2] * t
-    largest = max(max(abs(x), abs(y)), max(abs(z), one))
-    norm = np.sqrt(max(x * x + y * y + z * z, one)) if contraction == 1 else largest
+    norm = np.sqrt(max(x * x + y * y + z * z, one))
     return (two - one / norm) / norm * quarter
 
 

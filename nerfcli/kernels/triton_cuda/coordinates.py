@@ -24,19 +24,12 @@ def _back_from_cube(x, y, z, a, b, c, CONTRACTION: tl.constexpr):
     if CONTRACTION == 0:
         return a * 0.5, b * 0.5, c * 0.5
     else:
-        norm = contracted_norm(x, y, z, CONTRACTION)
+        norm = contracted_norm(x, y, z)
         inverse = 1.0 / norm
         scale = (2.0 - inverse) * inverse
         # In units of the norm, as squares of distant coordinates would overflow.
         u, v, w = x * inverse, y * inverse, z * inverse
         along = 2.0 * inverse * (inverse - 1.0) * (u * a + v * b + w * c)
-        if CONTRACTION == 2:  # the gradient of the largest component is its sign
-            first = tl.abs(x) >= norm
-            second = (tl.abs(y) >= norm) & (first == 0)
-            third = (tl.abs(z) >= norm) & (first == 0) & (second == 0)
-            u = tl.where(first, tl.where(x > 0.0, 1.0, -1.0), 0.0)
-            v = tl.where(second, tl.where(y > 0.0, 1.0, -1.0), 0.0)
-            w = tl.where(third, tl.where(z > 0.0, 1.0, -1.0), 0.0)
         return (scale * a + along * u) * 0.25, (scale * b + along * v) * 0.25, (scale * c + along * w) * 0.25
 
 

@@ -20,15 +20,12 @@ def blocks_of(rays: int) -> tuple[int]:
 
 
 @jit
-def contracted_norm(x, y, z, CONTRACTION: tl.constexpr):
-    """Return the norm of a point that the contraction uses, raised to at least 1."""
+def contracted_norm(x, y, z):
+    """Return the norm of a point, raised to at least 1."""
     largest = tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z))
-    if CONTRACTION == 1:
-        shrink = tl.where(largest > FAR, SHRINK, 1.0)
-        u, v, w = x * shrink, y * shrink, z * shrink
-        return tl.maximum(tl.sqrt(u * u + v * v + w * w) / shrink, 1.0)
-    else:
-        return tl.maximum(largest, 1.0)
+    shrink = tl.where(largest > FAR, SHRINK, 1.0)
+    u, v, w = x * shrink, y * shrink, z * shrink
+    return tl.maximum(tl.sqrt(u * u + v * v + w * w) / shrink, 1.0)
 
 
 @jit
@@ -37,7 +34,7 @@ def cube(x, y, z, CONTRACTION: tl.constexpr):
     if CONTRACTION == 0:
         return x * 0.5 + 0.5, y * 0.5 + 0.5, z * 0.5 + 0.5
     else:
-        norm = contracted_norm(x, y, z, CONTRACTION)
+        norm = contracted_norm(x, y, z)
         scale = (2.0 - 1.0 / norm) * 0.25
         return x / norm * scale + 0.5, y / norm * scale + 0.5, z / norm * scale + 0.5
 

@@ -24,7 +24,7 @@ def warm_up(device: torch.device) -> None:
     grid = HashGrid(table, (2,) * 8, layers)
     edges, occupied = torch.linspace(0.0, 0.5, 6, device=device), torch.ones(2, 2, 2, dtype=torch.bool, device=device)
     sink, first, second = (torch.zeros(8, 16, 4, device=device) for _ in range(3))
-    for contraction in ("none", "l2", "linf"):
+    for contraction in ("none", "l2"):
         march = March(edges, occupied, contraction, 7.0)
         for learn in (False, True):
             rays = Rays(origins.clone(), directions.clone(), torch.zeros(2, device=device))
