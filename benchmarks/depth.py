@@ -35,7 +35,7 @@ from nerfcli.cameras.formats.run_cameras import read_cameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.render.depth import CONVENTIONS, DepthRequest, requested
 from nerfcli.render.model import Model, load_model
-from nerfcli.render.rays import CENTRES, pixel_rays
+from nerfcli.render.rays import pixel_rays
 from nerfcli.render.tracing import render_rays
 from nerfcli.runs.files import FIELD
 
@@ -132,9 +132,7 @@ def depths(model: Model, frame: Frame, *, min_opacity: float) -> dict[str, np.nd
     """Render every depth along z once, at the centres of every `STRIDE`-th pixel: (H / STRIDE, W / STRIDE) each."""
     width, height = frame.camera.width, frame.camera.height
     pixels = np.arange(width * height).reshape(height, width)[::STRIDE, ::STRIDE]
-    rays = pixel_rays(
-        frame, model.training_from_scene, pixels=pixels.ravel(), places=CENTRES, device=torch.device("cpu")
-    )
+    rays = pixel_rays(frame, model.training_from_scene, pixels=pixels.ravel(), device=torch.device("cpu"))
     scale = model.training_from_scene.scale
     requests = [DepthRequest(name, "z", min_opacity, model.marching.far / scale) for name in DEPTHS]
     columns: dict[str, list[torch.Tensor]] = {name: [] for name in DEPTHS}

@@ -28,7 +28,8 @@ from nerfcli.fit.fitting import Fitting
 from nerfcli.photos.loading import load_photos
 from nerfcli.photos.pool import PixelPool
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.pictures import Quality, RenderedPicture, render_picture
+from nerfcli.render.pictures import RenderedPicture, render_picture
+from nerfcli.render.tracing import TOLERANCE
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.workflows.views import Views, chosen_frames
@@ -93,17 +94,17 @@ def step(
     Console(width=100).print(table)
 
 
-def first_view(folder: Path, *, tolerance: float = Quality.tolerance, repeats: int = 1) -> tuple[RenderedPicture, str]:
+def first_view(folder: Path, *, tolerance: float = TOLERANCE, repeats: int = 1) -> tuple[RenderedPicture, str]:
     """Return the first held-out view of a run with its depth, and median and range of the seconds that it takes."""
     run = Run(folder)
     model = run.model()
     frame = chosen_frames(run, Views("test"), depth_hint=1.0)[0]
     how = {"background": model.background, "depth": DepthRequest("median", "z", 0.5, None)}
-    picture = render_picture(model, frame, **how, quality=Quality(tolerance))  # the first may compile
+    picture = render_picture(model, frame, **how, tolerance=tolerance)  # the first may compile
     seconds = []
     for _ in range(repeats):
         began = time.perf_counter()
-        render_picture(model, frame, **how, quality=Quality(tolerance))
+        render_picture(model, frame, **how, tolerance=tolerance)
         seconds.append(time.perf_counter() - began)
     return picture, f"{statistics.median(seconds):.3f} ({min(seconds):.3f} to {max(seconds):.3f})"
 

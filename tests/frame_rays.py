@@ -5,10 +5,10 @@ import torch
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.render.rays import CENTRES, PictureRays, pixel_rays
+from nerfcli.render.rays import PictureRays, pixel_rays
 
 
 def frame_rays(frame: Frame, training_from_scene: Similarity, device: torch.device) -> PictureRays:
     """Return the rays of all pixel centres of a frame, row by row."""
     pixels = np.arange(frame.camera.width * frame.camera.height)
-    return pixel_rays(frame, training_from_scene, pixels=pixels, places=CENTRES, device=device)
+    return pixel_rays(frame, training_from_scene, pixels=pixels, device=device)

@@ -153,20 +153,6 @@ def test_a_picture_is_what_the_reference_gives_in_float64(name, count):
             )
 
 
-@pytest.mark.parametrize("wanted", ["numba_cpu", "reference"])
-@pytest.mark.parametrize("count", [0, 1, 5, 123])
-def test_where_the_light_of_samples_ends_is_what_the_reference_gives_in_float64(wanted, count):
-    field = field_of("compiled sizes", torch.float32, wanted)
-    rays, march = rays_and_march(count, torch.float32)
-    samples = field.backend.trace_rays(rays, march, field.medium(), background=torch.zeros(3)).intervals
-    *spans, offsets = samples
-    exact = reference.light_ends(*(values.double() for values in spans), offsets=offsets, fractions=(0.25, 0.5))
-    light = field.backend.light_ends(samples, fractions=(0.25, 0.5))
-    for key, expected in exact._asdict().items():
-        value = getattr(light, key).double()
-        torch.testing.assert_close(value, expected, rtol=1e-6, atol=1e-6, equal_nan=True, msg=key)
-
-
 @pytest.mark.parametrize("negligible", [1e-3, 0.05, 0.5])
 def test_compiled_pictures_stay_within_their_bound(negligible):
     """More rays than a thread handles at a time; some of these rays traced alone give the same bits."""

@@ -184,7 +184,8 @@ def test_every_setting_has_one_name_and_says_how_to_ask_for_it():
         assert len({setting.name for setting in found}) == len(found)
     assert render_settings(8)[0].name == train_settings()[0].name == "default"
     assert {setting.threads for setting in render_settings(8)} == {1, 2, 4, 8}
-    assert RenderSetting(2, step=2.0, tolerance=1 / 255).options == "--step 2 --tolerance 1/255"
+    assert RenderSetting(2, tolerance=1 / 255).options == "--tolerance 1/255"
+    assert RenderSetting(2, step=2.0, tolerance=1 / 255).options is None
     assert RenderSetting(2, stored_in="float16").options is None
     assert ThreadSetting(1).options == "--threads 1"
     assert as_text(1 / 1020) == "1/1020"

@@ -18,7 +18,6 @@ from nerfcli.cameras.formats.camera_path import (
     is_camera_path,
     losses_camera_path,
     parse_camera_path,
-    read_normalisation,
     read_path,
     write_camera_path,
 )
@@ -167,26 +166,6 @@ def test_what_the_format_cannot_hold_is_reported(tmp_path):
     with pytest.raises(UserError, match="there are no views to write"):
         write_camera_path(Capture((), np.zeros((0, 3)), (), None, "x"), tmp_path / "none.json")
     assert not (tmp_path / "none.json").exists()
-
-
-def test_nerfstudios_normalisation_is_a_similarity(tmp_path):
-    """scale * (transform @ point), and for cameras the same with a rigid result."""
-    rotation = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()
-    transform = np.concatenate([rotation, [[1.0], [2.0], [3.0]]], axis=1)
-    path = written(tmp_path, {"transform": transform.tolist(), "scale": 0.25})
-    point = np.array([5.0, -6.0, 7.0])
-    expected = 0.25 * (rotation @ point + [1, 2, 3])
-    np.testing.assert_allclose(read_normalisation(path).apply(point), expected, rtol=0, atol=1e-14)
-    for broken, what in (
-        ({"transform": transform.tolist()}, "scale is None"),
-        ({"transform": transform.tolist(), "scale": 0}, "scale is 0"),
-        ({"transform": transform[:2].tolist(), "scale": 1}, "transform is"),
-        ({"transform": transform[:, :3].tolist(), "scale": 1}, "transform has 9 numbers"),
-        ({"transform": (2 * transform).tolist(), "scale": 1}, "is not a rotation"),
-    ):
-        with pytest.raises(UserError, match=what) as caught:
-            read_normalisation(written(tmp_path, broken))
-        assert "path.json" in caught.value.message
 
 
 @pytest.mark.parametrize(

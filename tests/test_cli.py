@@ -182,8 +182,6 @@ def test_all_threads_are_the_processors_of_this_process():
         ("train x --seed 4294967296", "'4294967296' is too large; give at most 4294967295"),
         ("render x --fps 5", "--fps: it works with --video"),
         ("render x --background-distance 5", "it works with --depth background"),
-        ("render x --level 0.8", "--level: it works with --outputs lower,upper"),
-        ("render x --depth-tolerance 0.1 --outputs lower", "--depth-tolerance: it works with --outputs confidence"),
         ("render x --outputs depth --rgba", "--rgba: it works with --outputs rgb"),
         ("render x --outputs rgb --depth median", "--depth: it works with --outputs depth"),
         ("render x --count 20", "--count: it works with --cameras orbit, ellipse, spiral, interpolate"),
@@ -207,7 +205,6 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --outputs rgb,normals", "'normals'; choose from rgb, depth, opacity"),
         ("render x --outputs=", "''; choose from rgb"),
         ("render x --min-opacity 1.5", "--min-opacity"),
-        ("render x --colour-map jet", "'jet'; choose turbo, viridis or grey"),
         ("render x --video-format avi", "'avi'; choose mp4 or gif"),
         ("render x --video-format gif --fps 60", "60; a gif plays at 50 frames per second at most"),
         ("render x --frames 200:100", "'200:100'; write START:STOP"),
@@ -759,27 +756,8 @@ def test_views_are_not_written_over_or_where_nothing_can_be(finished, tmp_path):
     assert "cannot write" in error_of(result)[0]
 
 
-def test_a_path_in_the_world_of_a_nerfstudio_run_comes_home(finished, tmp_path):
-    arguments = ("render", finished, "--cameras", "orbit", "--count", "2", "--max-size", "10")
-    assert nerfcli(*arguments, "--cameras-only", "-o", tmp_path).exit_code == 0
-    # nerfstudio_from_world: x -> 2 (x + (1, 0, 0)).
-    (tmp_path / "dataparser_transforms.json").write_text(
-        json.dumps({"transform": [[1, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 2.0})
-    )
-    frame = ("--nerfstudio-frame", tmp_path / "dataparser_transforms.json")
-    given = ("render", finished, "--cameras", tmp_path / "camera_path.json", "--outputs", "rgb")
-    assert nerfcli(*given, "-o", tmp_path / "a").exit_code == 0
-    assert nerfcli(*given, *frame, "-o", tmp_path / "b").exit_code == 0
-    for one, other in zip(views_of(tmp_path / "a"), views_of(tmp_path / "b"), strict=True):
-        shifted = 2 * (np.array(other["world_from_cam"])[:3, 3] + [1, 0, 0])
-        np.testing.assert_allclose(np.array(one["world_from_cam"])[:3, 3], shifted, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "options", [("--through", "r_001.png"), ("--cameras", "orbit", "--nerfstudio-frame", "dataparser_transforms.json")]
-)
-def test_options_of_views_that_do_not_fit_are_wrong_usage(options, finished):
-    assert nerfcli("render", finished, *options).exit_code == 2
+def test_photos_of_a_path_are_wrong_usage_for_other_views(finished):
+    assert nerfcli("render", finished, "--through", "r_001.png").exit_code == 2
 
 
 @pytest.mark.usefixtures("coarse_steps")
@@ -893,44 +871,20 @@ def test_ctrl_c_and_sigterm_save_a_checkpoint_and_say_how_to_go_on(stopped, exit
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(os.name != "posix", reason="a terminal is made with the pty module")
-@pytest.mark.parametrize("exit_code", [INTERRUPTED, TERMINATED])
-def test_a_signal_to_all_processes_of_a_command_leaves_none_and_no_half_file(exit_code, finished, tmp_path):
-    """Ctrl-C on a terminal also reaches the processes of --jobs, like SIGTERM from `timeout`, systemd or schedulers."""
-    ours, theirs = os.openpty()
-    program = "import os, signal; os.open(os.ttyname(0), os.O_RDWR); "  # makes it the terminal of this session
-    program += "signal.signal(signal.SIGINT, signal.default_int_handler); from nerfcli.cli import main; main()"
-    words = ("render", finished, "--cameras", "orbit", "--count", "2000", "--max-size", "64", "--jobs", "2", "--quiet")
-    command = [sys.executable, "-c", program, *map(str, words), "-o", str(tmp_path / "out")]
-    process = subprocess.Popen(
-        command, stdin=theirs, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    os.close(theirs)
+@pytest.mark.parametrize(("sent", "exit_code"), [(signal.SIGINT, INTERRUPTED), (signal.SIGTERM, TERMINATED)])
+def test_a_signal_to_a_rendering_leaves_no_half_file(sent, exit_code, finished, tmp_path):
+    words = ("render", finished, "--cameras", "orbit", "--count", "2000", "--max-size", "64", "--threads", "2")
+    process = started(*words, "--quiet", "-o", tmp_path / "out")
     deadline = time.monotonic() + 240
     while not list(tmp_path.glob(".out.*/.frames/done/*.json")) and time.monotonic() < deadline:
         assert process.poll() is None
         time.sleep(0.05)
-    if exit_code == INTERRUPTED:
-        os.write(ours, b"\x03")
-    else:
-        os.killpg(process.pid, signal.SIGTERM)
+    process.send_signal(sent)
     stdout, stderr = process.communicate(timeout=120)
     assert (process.returncode, stdout) == (exit_code, ""), stderr
     assert not any(word in stderr for word in ("Traceback", "stack trace"))
-    while _group_lives(process.pid) and time.monotonic() < deadline:  # multiprocessing's helper process ends by itself
-        time.sleep(0.05)
-    assert not _group_lives(process.pid)
     assert not list(tmp_path.rglob("*partial*"))
     assert not (tmp_path / "out").exists()
-    os.close(ours)
-
-
-def _group_lives(leader: int) -> bool:
-    try:
-        os.killpg(leader, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 def test_errors_and_results_go_to_their_own_streams(tmp_path):

@@ -162,31 +162,6 @@ def test_the_fast_kernel_agrees_with_the_definition_in_float64(counts, low, high
         )  # fmt: skip
 
 
-@pytest.mark.parametrize("module", [depth, numba_cpu])
-def test_quantiles_of_a_mixture_of_rays(module):
-    # Two rays: a wall at 1 and one at 3. The light of both together ends half here, half there.
-    density, starts = torch.tensor([1e6, 1e6]), torch.tensor([1.0, 3.0])
-    pair = {"offsets": torch.tensor([0, 1, 2]), "rays_per_pixel": 2}
-    for fraction, wanted in ((0.25, 1.0), (0.49, 1.0), (0.51, 3.0), (0.75, 3.0)):
-        value = module.mixture_quantile(density, starts, starts + 0.5, fraction=fraction, **pair)
-        torch.testing.assert_close(value, torch.tensor([wanted]), rtol=1e-5, atol=0)
-    # A wall beside nothing: half of the light passes.
-    lone = {"offsets": torch.tensor([0, 0, 1]), "rays_per_pixel": 2}
-    assert module.mixture_quantile(density[1:], starts[1:], starts[1:] + 0.5, fraction=0.6, **lone).isnan().all()
-
-
-@pytest.mark.parametrize("rays_per_pixel", [1, 4])
-def test_the_fast_quantile_of_a_mixture_agrees_with_the_definition(rays_per_pixel):
-    density, starts, ends, offsets = many_rays(5, [3, 0, 9, 1, 4, 4, 20, 6], low=-2, high=1)
-    group = {"offsets": offsets, "rays_per_pixel": rays_per_pixel, "fraction": 0.3}
-    fast = numba_cpu.mixture_quantile(density, starts, ends, **group)
-    exact = depth.mixture_quantile(density.double(), starts.double(), ends.double(), **group)
-    torch.testing.assert_close(fast.double(), exact, rtol=1e-6, atol=0, equal_nan=True)
-    if rays_per_pixel == 1:  # a mixture of one ray is that ray
-        alone = depth.quantile(density.double(), starts.double(), ends.double(), offsets=offsets, fraction=0.3)
-        torch.testing.assert_close(exact, alone, rtol=1e-9, atol=0, equal_nan=True)
-
-
 def test_median_crossing_in_a_later_interval_and_through_a_gap():
     density = torch.tensor([0.2, 0.0, 1.0], dtype=torch.float64)
     starts = torch.tensor([1.0, 2.0, 5.0], dtype=torch.float64)

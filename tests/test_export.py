@@ -18,7 +18,6 @@ from nerfcli.export.frames import export_frames
 from nerfcli.export.order import Order, file_names
 from nerfcli.export.presentation import value_range
 from nerfcli.export.settings import ExportSettings, VideoSettings
-from nerfcli.media.colours import levels_of
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
 from nerfcli.media.preview import preview
@@ -155,20 +154,6 @@ def test_previews_share_one_range_over_all_frames(model, tmp_path):
     for name, (depth, meta) in zip(("near", "far"), depths, strict=True):
         expected = preview(depth, meta, lo=lo, hi=hi)
         np.testing.assert_array_equal(read_image(tmp_path / f"views/depth/{name}.png"), expected)
-
-
-def test_depth_is_shown_on_the_range_that_is_given(model, tmp_path):
-    """The colours of each pixel by the formula of the preview; spread keeps a range of its own."""
-    export(model, [frame("a.png")], tmp_path / "views", outputs=("depth", "spread"), colour_range=(0.5, 8.0))
-    ranges = json.loads((tmp_path / "views/render.json").read_text())["ranges"]
-    assert ranges["depth"] == [0.5, 8.0]
-    assert ranges["spread"][0] == 0
-    depth, _ = read_tiff(tmp_path / "views/depth/a.tiff")
-    shown = read_image(tmp_path / "views/depth/a.png")
-    y, x = np.argwhere(np.isfinite(depth))[0]
-    expected = levels_of("turbo")[round((float(depth[y, x]) - 0.5) / 7.5 * 255)]
-    left = (shown.shape[1] - depth.shape[1]) // 2
-    np.testing.assert_array_equal(shown[y, left + x], expected)
 
 
 def test_one_video_per_output_with_every_frame_in_it(model, tmp_path):

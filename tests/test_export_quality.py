@@ -1,4 +1,4 @@
-"""Tolerance, alpha and samples per pixel in the files that are written, and the options that ask for them."""
+"""Tolerance and alpha in the files that are written, and the options that ask for them."""
 
 import json
 
@@ -18,7 +18,6 @@ from nerfcli.export.settings import ExportSettings
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.pictures import Quality
 
 VIEW = Frame(
     "a.png", Camera.pinhole(10, 8, 8.0), look_at(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
@@ -27,10 +26,8 @@ VIEW = Frame(
 
 @pytest.fixture
 def views(tmp_path):
-    """The export of one view on alpha, with three samples per pixel and a tolerance of 1/100."""
-    settings = ExportSettings(
-        ("rgb", "depth"), DepthRequest("conditional", "z", 0.1), quality=Quality(0.01, 3), rgba=True
-    )
+    """The export of one view on alpha, with a tolerance of 1/100."""
+    settings = ExportSettings(("rgb", "depth"), DepthRequest("conditional", "z", 0.1), tolerance=0.01, rgba=True)
     cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     model = fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
     order = Order((VIEW,), settings, {"run": "a run"})
@@ -61,7 +58,7 @@ def test_every_file_states_the_error_of_its_rendering(views):
     with Image.open(views / "rgb/a.png") as picture:
         assert picture.info["background"] == "none: straight alpha"
         assert float(picture.info["error truncation_of_colour_max"]) == facts["truncation_of_colour_max"]
-    assert description["settings"]["quality"] == {"tolerance": 0.01, "samples_per_pixel": 3}
+    assert description["settings"]["tolerance"] == 0.01
 
 
 @pytest.mark.parametrize(("text", "value"), [("1/255", 1 / 255), ("0.001", 0.001), ("1e-6", 1e-6), (" 1 ", 1.0)])

@@ -1,17 +1,13 @@
-"""Exports that end early resume with the missing frames; parts and processes leave the same files as a single run."""
+"""Exports that end early resume with the missing frames; parts and threads leave the same files as a single run."""
 
 import hashlib
 import json
-import multiprocessing
 import shutil
-import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, as_completed
 from dataclasses import replace
-from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +19,11 @@ from fog import fog, foggy_cells
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.export import workers
-from nerfcli.export.frames import RAYS_PER_PROCESS, Workers, automatic_workers, export_frames, export_part
+from nerfcli.errors import UserError
+from nerfcli.export.frames import export_frames, export_part
 from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import Order
 from nerfcli.export.settings import ExportSettings, VideoSettings
-from nerfcli.interrupts import Terminated, install_handlers
 from nerfcli.media.file_facts import description_of
 from nerfcli.media.images import read_image
 from nerfcli.render.depth import DepthRequest
@@ -174,27 +168,10 @@ def test_parts_are_put_together_without_rendering(model, tmp_path, in_one_go):
     assert contents(folder) == in_one_go
 
 
-@pytest.mark.parametrize(
-    ("rays", "thread_safe", "threads", "jobs"),
-    [
-        (0, False, 2, 1),
-        (2 * RAYS_PER_PROCESS - 1, False, 8, 1),
-        (2 * RAYS_PER_PROCESS, False, 8, 2),
-        (100 * RAYS_PER_PROCESS, False, 1, 1),
-        (100 * RAYS_PER_PROCESS, False, 64, 4),
-        (100 * RAYS_PER_PROCESS, True, 64, 1),
-    ],
-)
-def test_processes_are_started_where_threads_cannot_share_the_work(rays, thread_safe, threads, jobs):
-    assert automatic_workers(rays, threads=threads, thread_safe=thread_safe) == Workers(jobs, threads)
-
-
 def test_threads_leave_the_same_files(model, tmp_path, in_one_go):
     done: list[int] = []
     before = torch.get_num_threads()
-    export_frames(
-        *(model, order(), tmp_path / "views"), on_rays=done.append, notify=lambda text: None, workers=Workers(threads=3)
-    )
+    export_frames(*(model, order(), tmp_path / "views"), on_rays=done.append, notify=lambda text: None, threads=3)
     assert done == [PIXELS] * 4
     assert contents(tmp_path / "views") == in_one_go
     assert torch.get_num_threads() == before
@@ -203,7 +180,6 @@ def test_threads_leave_the_same_files(model, tmp_path, in_one_go):
 def test_frames_in_progress_render_in_threads_of_their_own(model, tmp_path):
     """Two frames wait for each other in the middle of their rendering."""
     meeting = threading.Barrier(2, timeout=60)
-    workers = Workers(threads=2)
     met = []
 
     def on_rays(rays: int) -> None:
@@ -215,9 +191,7 @@ def test_frames_in_progress_render_in_threads_of_their_own(model, tmp_path):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nerfcli.export.frames.render_frame", render)
-        export_frames(
-            *(model, order(2), tmp_path / "views"), on_rays=on_rays, notify=lambda text: None, workers=workers
-        )
+        export_frames(*(model, order(2), tmp_path / "views"), on_rays=on_rays, notify=lambda text: None, threads=2)
     assert len(set(met)) == 2
     assert threading.get_ident() not in met
 
@@ -229,7 +203,7 @@ def test_an_error_in_a_thread_ends_the_others_and_keeps_what_is_complete(model, 
             *(model, order(8), tmp_path / "views"),
             on_rays=stop_in_frame(3, KeyboardInterrupt()),
             notify=lambda text: None,
-            workers=Workers(threads=2),
+            threads=2,
         )
     (unfinished,) = tmp_path.glob(".views.unfinished-*")
     assert 2 <= len(list(unfinished.rglob("done/**/*.json"))) <= 4
@@ -245,131 +219,30 @@ def test_threads_stop_before_the_main_thread_hears_of_an_error(model, tmp_path, 
             time.sleep(1.0)
             yield future
 
-    monkeypatch.setattr(workers, "as_completed", late)
+    monkeypatch.setattr("nerfcli.export.frames.as_completed", late)
     with pytest.raises(KeyboardInterrupt):
         export_frames(
             *(model, order(8), tmp_path / "views"),
             on_rays=stop_in_frame(1, KeyboardInterrupt()),
             notify=lambda text: None,
-            workers=Workers(threads=2),
+            threads=2,
         )
     (unfinished,) = tmp_path.glob(".views.unfinished-*")
     assert len(list(unfinished.rglob("done/**/*.json"))) <= 3
 
 
-def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in_one_go, monkeypatch):
-    """One of two processes is killed with its first frame: another renders its frame, and each frame is reported."""
-    start = multiprocessing.get_context("spawn").Process.start
-    started: list[Any] = []
-    reported: list[str] = []
-    done: list[int] = []
-
-    def start_and_kill_the_first(process: Any) -> None:
-        start(process)
-        if not started:
-            process.kill()  # before it has loaded torch, which takes long
-        started.append(process)
-
-    monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start_and_kill_the_first)
-    export_frames(
-        *(model, order(), tmp_path / "views"),
-        on_rays=done.append,
-        notify=reported.append,
-        workers=Workers(jobs=2, threads=2),
-    )
-    assert done == [PIXELS] * 4
-    assert contents(tmp_path / "views") == in_one_go
-    (death,) = [text for text in reported if "process" in text]
-    assert "was ended by signal 9 (SIGKILL) while rendering" in death
-    assert len(started) == 3
-    assert not multiprocessing.active_children()
-
-
-@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals cannot be kept for later here")
-@pytest.mark.parametrize(("sent", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
-def test_ctrl_c_or_sigterm_while_a_process_starts_is_kept_and_ends_it(sent, raised, model, tmp_path, monkeypatch):
-    start = multiprocessing.get_context("spawn").Process.start
-    started: list[Any] = []
-
-    def start_and_interrupt(process: Any) -> None:
-        """Start it with nothing to load, neither torch nor the model: it waits until its connection is closed."""
-        signal.raise_signal(sent)
-        monkeypatch.setattr(process, "_target", methodcaller("poll", None))
-        monkeypatch.setattr(process, "_args", process._args[:1])
-        start(process)
-        started.append(process)
-
-    monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start_and_interrupt)
-    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in background suites
-    install_handlers()
-    try:
-        with pytest.raises(raised):
-            export_frames(
-                *(model, order(), tmp_path / "views"),
-                on_rays=lambda rays: None,
-                notify=lambda text: None,
-                workers=Workers(jobs=2, threads=2),
-            )
-    finally:
-        signal.signal(signal.SIGINT, before)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    assert len(started) == 1
-    assert not started[0].is_alive()
-    assert not (tmp_path / "views").exists()
-
-
-@pytest.mark.slow
-def test_errors_of_a_child_process_are_reported_as_without_one(model, tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        export(model, order(), tmp_path / "views", on_rays=stop_in_frame(0, KeyboardInterrupt()))
-    (unfinished,) = tmp_path.glob(".views.unfinished-*")
-    (unfinished / "depth").write_text("in the way of a folder")
-    with pytest.raises(UserError, match=r"cannot write .*depth"):
-        export_frames(
-            *(model, order(), tmp_path / "views"),
-            on_rays=lambda rays: None,
-            notify=lambda text: None,
-            workers=Workers(jobs=2, threads=2),
-        )
-    assert not multiprocessing.active_children()
-
-
-@pytest.mark.slow
-def test_processes_that_die_again_and_again_end_the_export(model, tmp_path, monkeypatch):
-    start = multiprocessing.get_context("spawn").Process.start
-
-    def start_and_kill(process: Any) -> None:
-        start(process)
-        process.kill()
-
-    monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start_and_kill)
-    reported: list[str] = []
-    with pytest.raises(UserError, match=f"keep failing on f[01]/v: .* signal {signal.SIGKILL:d}") as caught:
-        export_frames(
-            *(model, order(), tmp_path / "views"),
-            on_rays=lambda rays: None,
-            notify=reported.append,
-            workers=Workers(jobs=2, threads=2),
-        )
-    assert caught.value.exit_code == OUT_OF_MEMORY
-    assert "retrying it" in reported[0]
-
-
-# Videos, previews and levels from existing pictures
+# Videos and levels from existing pictures
 
 
 @pytest.mark.parametrize(
     "changes",
     [
         {"video": replace(VIDEO, fps=30)},
-        {"colour_map": "grey"},
-        {"colour_range": (1.0, 2.0)},
         {"formats": ("tiff", "png16")},
     ],
-    ids=["video", "colours", "range", "levels"],
+    ids=["video", "levels"],
 )
-def test_other_videos_and_colours_of_a_finished_folder_are_made_without_rendering(model, tmp_path, changes, rendered):
+def test_other_videos_and_levels_of_a_finished_folder_are_made_without_rendering(model, tmp_path, changes, rendered):
     """The files are the same as if this order had been rendered from the start."""
     changed = replace(order(), settings=replace(order().settings, **changes))
     export(model, changed, tmp_path / "other")

@@ -12,7 +12,7 @@ from skimage.color import rgb2lab
 
 from nerfcli.media.colours import COLOUR_MAPS, levels_of
 from nerfcli.media.depth_pictures import DepthMeta
-from nerfcli.media.preview import preview
+from nerfcli.media.preview import coloured, preview
 
 META = DepthMeta("conditional", "ray", "arbitrary", 0.5)
 
@@ -77,10 +77,10 @@ def test_preview_refuses_a_range_out_of_order():
 
 
 @pytest.mark.parametrize("colour_map", COLOUR_MAPS)
-def test_previews_have_the_colours_of_matplotlib(colour_map):
+def test_false_colours_are_those_of_matplotlib(colour_map):
     depth = np.linspace(0, 1, 256, dtype=np.float32).repeat(2)[None]
     expected = colormaps[COLOUR_MAPS[colour_map]](np.arange(256))[:, :3] * 255
-    assert np.abs(preview(depth, META, lo=0.0, hi=1.0, colour_map=colour_map)[0, ::2] - expected).max() <= 0.5
+    assert np.abs(coloured(depth, lo=0.0, hi=1.0, colour_map=colour_map)[0, ::2] - expected).max() <= 0.5
 
 
 @pytest.mark.parametrize("colour_map", ["viridis", "grey"])

@@ -69,7 +69,7 @@ def test_every_textbook_formula_breaks_a_bound_somewhere(all_rows, own_rows):
 
 def test_every_kernel_has_rows_in_every_arithmetic_that_it_is_made_for(all_rows):
     tried = {(row.operation, row.precision) for row in all_rows}
-    depths = ("light_ends", "optical_depth_before", "mixture_quantile")
+    depths = ("light_ends", "optical_depth_before")
     for operation in ("composite", "distortion", "hash_encode", "pixel_rays", "project", "visible_samples", *depths):
         assert {(operation, name) for name in ("float64", "float32", "compiled")} <= tried
     assert {("hash_encode", "float16"), ("composite", "bfloat16")} <= tried
@@ -78,7 +78,7 @@ def test_every_kernel_has_rows_in_every_arithmetic_that_it_is_made_for(all_rows)
 
 def test_a_depth_has_a_gradient_or_says_why_not(all_rows):
     for row in all_rows:
-        if row.operation in ("light_ends", "mixture_quantile", "optical_depth_before"):
+        if row.operation in ("light_ends", "optical_depth_before"):
             assert (row.errors.gradient is None) == bool(row.no_gradient), row
 
 

@@ -27,7 +27,7 @@ from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
 from nerfcli.field.cost import field_bytes
 from nerfcli.render.accuracy import TIGHT
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import RAYS_PER_TILE, Quality, RenderedPicture, render_picture
+from nerfcli.render.pictures import RAYS_PER_TILE, RenderedPicture, render_picture
 
 MOST_PHOTOS = 3
 LEAST_ROUNDS, MOST_ROUNDS = 3, 9
@@ -136,9 +136,7 @@ def _converged(model: Model, photos: Sequence[HeldOutPhoto], *, session: Session
         if not path.exists() or photo.frame.name not in measured:
             session.say("rendering the converged pictures")
             background = background_of(model, photo)
-            fine = render_picture(
-                model.stretched(1 / FINER), photo.frame, background=background, quality=Quality(tolerance=TIGHT)
-            )
+            fine = render_picture(model.stretched(1 / FINER), photo.frame, background=background, tolerance=TIGHT)
             with atomic_path(path) as partial:
                 np.save(partial, fine.rgb)
             compared = compare(photo, fine)
@@ -201,7 +199,7 @@ def _render(model: Model, photo: HeldOutPhoto, setting: RenderSetting) -> Render
         model.stretched(setting.step),
         photo.frame,
         background=background_of(model, photo),
-        quality=Quality(tolerance=setting.tolerance),
+        tolerance=setting.tolerance,
         rays_per_tile=None if setting.rays_per_tile == RAYS_PER_TILE else setting.rays_per_tile,
     )
 

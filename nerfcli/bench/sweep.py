@@ -26,7 +26,7 @@ class RenderSetting:
 
     Args:
         step: length of the steps along rays, relative to those of the training.
-        tolerance: see `render.pictures.Quality`.
+        tolerance: see `render.pictures.render_picture`.
         rays_per_tile: number of rays rendered at a time; the default suits the device.
         stored_in: one of `STORED_IN`.
     """
@@ -52,7 +52,7 @@ class RenderSetting:
         """Return the differences from the defaults, each with the option that selects it, "" if there is none."""
         changes = {}
         if self.step != 1.0:
-            changes[f"step {self.step:g}"] = f"--step {self.step:g}"
+            changes[f"step {self.step:g}"] = ""
         if self.tolerance != TOLERANCE:
             changes[f"tolerance {as_text(self.tolerance)}"] = f"--tolerance {as_text(self.tolerance)}"
         if self.rays_per_tile != RAYS_PER_TILE:

@@ -1,8 +1,9 @@
 """nerfcli render: render pictures, depth maps and videos of a run."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,9 +14,10 @@ from nerfcli.cli.scans import is_of_scan, refuse_photo_options, slices_of
 from nerfcli.errors import UserError
 from nerfcli.workflows.machine import device_name, thread_count
 
+if TYPE_CHECKING:
+    from nerfcli.workflows.views import Views
+
 DEFAULT_FPS = 24.0
-
-
 # Parameters for reconstructions of X-ray scans.
 _OF_SCANS = "run output outputs slices cameras device threads overwrite json quiet"
 
@@ -29,10 +31,6 @@ def render(
     ] = "test",
     through: Annotated[
         str | None, typer.Option(help="Photos a.jpg,b.jpg,... that define the path, in this order.")
-    ] = None,
-    nerfstudio_frame: Annotated[
-        Path | None,
-        typer.Option(help="dataparser_transforms.json of the nerfstudio run whose coordinates --cameras FILE uses."),
     ] = None,
     outputs: Annotated[
         str | None,
@@ -68,29 +66,12 @@ def render(
             max=180,
         ),
     ] = 0.0,
-    level: Annotated[
-        float, typer.Option(help="Level of the interval of depth between lower and upper.", min=0.5, max=0.99)
-    ] = 0.9,
-    depth_tolerance: Annotated[
-        float,
-        typer.Option(help="Relative depth error up to which confidence counts a depth as right.", min=0.001, max=1),
-    ] = 0.02,
     background_distance: Annotated[
         float | None, typer.Option(help="Distance of light that passes, for --depth background, in scene units.", min=0)
     ] = None,
     depth_format: render_options.DepthFormat = "tiff",
-    depth_scale: render_options.DepthScale = "auto",
     tolerance: render_options.Tolerance = "1/1020",
-    step: render_options.Step = 1.0,
-    samples_per_pixel: render_options.SamplesPerPixel = 1,
     rgba: render_options.Rgba = False,
-    colour_map: Annotated[str, typer.Option(help="Colour map of depth previews: turbo, viridis or grey.")] = "turbo",
-    colour_range: Annotated[
-        str | None,
-        typer.Option(
-            help="LOW:HIGH, depths of the first and last colour.  [default: 1st to 99th percentile of all pixels]"
-        ),
-    ] = None,
     video: Annotated[
         bool, typer.Option("--video", help="Write a video of each output; same as --video-format mp4.")
     ] = False,
@@ -108,9 +89,6 @@ def render(
             help="START:STOP[:STEP], counted from 0, or K/N, every N-th from K: render only these; no videos."
         ),
     ] = None,
-    jobs: Annotated[
-        int, typer.Option(help="Number of processes, which divide views and --threads; 0 chooses automatically.", min=0)
-    ] = 0,
     cameras_only: Annotated[
         bool,
         typer.Option("--cameras-only", help="Render nothing; only write cameras.json and camera_path.json."),
@@ -158,13 +136,13 @@ def render(
       quantile:0.05  distance at which 5 % of all light is absorbed        (NaN if less is)
     spread is the standard deviation of that distance, disagreement |median - conditional|: both are large where no
     single depth is right (edges, glass, fog). coverage is the number of training photos that see the surface (its
-    median depth), parallax the largest angle between two of them. lower and upper are an interval of --level around
-    that depth, measured by stereo matching of the held-out photos; confidence is the proportion of depths within
-    --depth-tolerance in the same measurement. They are NaN where no training photo sees the surface.
+    median depth), parallax the largest angle between two of them. lower and upper are a 90 % interval around that
+    depth, measured by stereo matching of the held-out photos; confidence is the proportion of depths that were right
+    within 2 % in the same measurement. They are NaN where no training photo sees the surface.
     Every file describes its values: nerfcli info FILE.
     \b
-    Writes RUN/renders/CAMERAS/. Run the same command again to resume an interrupted one. Other videos and previews of
-    views that were already rendered are made without rendering again (add --overwrite to replace existing ones).
+    Writes RUN/renders/CAMERAS/. Run the same command again to resume an interrupted one. Other videos of views
+    that were already rendered are made without rendering again (add --overwrite to replace existing ones).
     On a cluster, render --frames 1/8, --frames 2/8, ... in parallel, as tasks of an array job; the same command without
     --frames then assembles the videos.
 
@@ -174,9 +152,9 @@ def render(
       nerfcli render photos-scene-run --outputs depth,coverage,parallax --min-views 2 --min-parallax 2
       nerfcli render photos-scene-run --cameras orbit --count 120 --video
       nerfcli render photos-scene-run --cameras orbit --outputs rgb,depth --video-format mp4,gif
-      nerfcli render photos-scene-run --cameras ellipse --count 1200 --frames 3/8 --jobs 4
+      nerfcli render photos-scene-run --cameras ellipse --count 1200 --frames 3/8
       nerfcli render photos-scene-run --cameras interpolate --through a.jpg,k.jpg,c.jpg --video
-      nerfcli render photos-scene-run --cameras camera_path.json --nerfstudio-frame dataparser_transforms.json --video
+      nerfcli render photos-scene-run --cameras camera_path.json --video
       nerfcli render photos-scene-run --cameras ellipse --count 240 --cameras-only -o ellipse/
       nerfcli render photos-scene-run --cameras orbit --lens equirectangular --width 2048 --video
       nerfcli render photos-scene-run --cameras test --width 1920 --height 1080 --crop 480,270,960,540
@@ -185,117 +163,54 @@ def render(
     """
     values = dict(locals())
     from nerfcli.export.settings import OUTPUTS, ExportSettings
-    from nerfcli.media.colours import COLOUR_MAPS
-    from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
-    from nerfcli.render.pictures import Quality
-    from nerfcli.runs.run import Run, load_run
-    from nerfcli.tomography.result import OUTPUTS as SCAN_OUTPUTS
+    from nerfcli.runs.run import load_run
     from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.render import RENDERS, folder_name, render_run
-    from nerfcli.workflows.views import PATHS, Views, chosen_frames, file_fps, usual_axis, write_frames
+    from nerfcli.workflows.views import Views, file_fps, usual_axis
 
     console = Console(quiet=quiet, json_lines=json)
-
-    def render_one_scan(folder: Path, one_of_many: bool) -> None:
-        from nerfcli.workflows.tomography_files import render_scan
-
-        if not is_reconstruction(folder):
-            option = "--slices" if slices else f"--outputs {outputs}"
-            raise UserError(f"{folder} is not a reconstruction of a scan; {option} is for those", f"remove {option}", 2)
-        refuse_photo_options(folder, render, values, of_scans=_OF_SCANS)
-        chosen = options.some_of("projection" if outputs is None else outputs, SCAN_OUTPUTS, "--outputs")
-        options.one_of(cameras, ("test", "train"), "--cameras")
-        cuts = slices_of(slices or [])
-        target = folder / RENDERS if output is None else output / folder.name if one_of_many else output
-        with console.callbacks("render") as callbacks:
-            where = {"threads": thread_count(threads), "overwrite": overwrite}
-            for path in render_scan(folder, target, outputs=chosen, views=cameras, slices=cuts, **where, **callbacks):
-                console.result(path)
-
     if is_of_scan(run, outputs=outputs, slices=slices):
-        for_each_input(run, render_one_scan, command="render")
+        for_each_input(run, partial(_render_scan, given=values, console=console), command="render")
         return
     chosen = options.some_of("rgb,depth,opacity" if outputs is None else outputs, OUTPUTS, "--outputs")
-    if not is_convention(depth):
-        choices = f"{', '.join(CONVENTIONS)} or quantile:Q with 0 < Q < 1"
-        raise typer.BadParameter(f"{depth!r}; choose {choices}", param_hint="--depth")
-    options.one_of(depth_axis, ("ray", "z"), "--depth-axis")
-    formats = render_options.depth_formats(depth_format, outputs=chosen, convention=depth)
-    scale = render_options.level_scale(depth_scale, formats=formats)
-    render_options.finite(background_distance, "--background-distance")
-    render_options.finite(min_opacity, "--min-opacity")
-    render_options.finite(step, "--step")
-    render_options.finite(min_parallax, "--min-parallax")
-    render_options.finite(level, "--level")
-    render_options.finite(depth_tolerance, "--depth-tolerance")
-    if (min_views or min_parallax) and "depth" not in chosen:
-        hint = "--min-views" if min_views else "--min-parallax"
-        raise typer.BadParameter("it removes depth; add depth to --outputs", param_hint=hint)
-    request = DepthRequest(
-        convention=depth,
-        axis=depth_axis or "z",
+    request = render_options.depth_request(
+        depth,
+        depth_axis,
+        outputs=chosen,
         min_opacity=min_opacity,
         background_distance=background_distance,
         min_views=min_views,
         min_parallax_deg=min_parallax,
-        level=level,
-        depth_tolerance=depth_tolerance,
     )
-    options.one_of(colour_map, COLOUR_MAPS, "--colour-map")
+    formats = render_options.depth_formats(depth_format, outputs=chosen, convention=depth)
     if max_size is not None and (width is not None or height is not None):
         raise typer.BadParameter("cannot be combined with --width or --height", param_hint="--max-size")
     look = render_options.look_of(width, height, lens=lens, fov_deg=fov, crop=crop)
     writes_video = video or video_format is not None
-    unused = {
-        "--fps": (fps is not None and not (writes_video or cameras_only), "--video"),
-        "--depth": (depth != "conditional" and set(chosen) <= {"rgb", "opacity"}, "--outputs depth"),
-        "--background-distance": (background_distance is not None and depth != "background", "--depth background"),
-        "--level": (level != DepthRequest.level and not {"lower", "upper"} & set(chosen), "--outputs lower,upper"),
-        "--depth-tolerance": (
-            depth_tolerance != DepthRequest.depth_tolerance and "confidence" not in chosen,
-            "--outputs confidence",
-        ),
-        "--rgba": (rgba and "rgb" not in chosen, "--outputs rgb"),
-        "--count": (count != Views.count and cameras not in PATHS, f"--cameras {', '.join(PATHS)}"),
-    }
-    for option, (is_unused, needed) in unused.items():
-        if is_unused:
-            raise typer.BadParameter(f"it works with {needed}; add that, or remove it", param_hint=option)
+    _refuse_unused(values, outputs=chosen, writes_video=writes_video)
     fps = fps or file_fps(cameras) or DEFAULT_FPS
     part = None if frames is None else render_options.frame_range(frames)
-    videos = render_options.video_settings(video_format or "mp4", fps) if writes_video else None
     usual = ExportSettings(
         outputs=chosen,
         depth=request,
         formats=formats,
-        depth_scale=scale,
-        colour_map=colour_map,
-        colour_range=render_options.colour_range_of(colour_range, outputs=chosen),
-        video=videos,
-        quality=Quality(render_options.tolerance_of(tolerance), samples_per_pixel),
+        video=render_options.video_settings(video_format or "mp4", fps) if writes_video else None,
+        tolerance=render_options.tolerance_of(tolerance),
         rgba=rgba,
     )
-    if rgba and videos is not None:
-        raise typer.BadParameter(
-            "videos have no alpha channel; remove --rgba or the video options", param_hint="--rgba"
-        )
-    views = Views(cameras, count, through, nerfstudio_frame, max_size, look)
+    views = Views(cameras, count, through, max_size, look)
 
     def work(folder: Path, one_of_many: bool) -> None:
         if is_reconstruction(folder):
-            render_one_scan(folder, one_of_many)
+            _render_scan(folder, one_of_many, given=values, console=console)
             return
-        axis = depth_axis or usual_axis(load_run(folder), views)
-        settings = replace(usual, depth=replace(request, axis=axis))
+        settings = replace(usual, depth=replace(request, axis=depth_axis or usual_axis(load_run(folder), views)))
         name = f"{views.name}-cameras" if cameras_only else folder_name(views, settings)
         target = folder / RENDERS / name
         if output is not None:
             target = output / folder.name if one_of_many else output
         if cameras_only:
-            of = Run(folder)
-            chosen_views = chosen_frames(of, views, depth_hint=1.0 / of.model().training_from_scene.scale)
-            write_frames(chosen_views, target, fps=fps, overwrite=overwrite, warn=console.warn)
-            console.result(target)
+            _write_cameras(folder, target, views, fps=fps, overwrite=overwrite, console=console)
             return
         with console.callbacks(f"render {views.name}") as callbacks:
             written = render_run(
@@ -305,8 +220,6 @@ def render(
                 settings=settings,
                 device=device_name(device),
                 threads=thread_count(threads),
-                step=step,
-                jobs=jobs,
                 part=part,
                 overwrite=overwrite,
                 **callbacks,
@@ -315,3 +228,75 @@ def render(
             console.result(path)
 
     for_each_input(run, work, command="render")
+
+
+def _render_scan(folder: Path, one_of_many: bool, *, given: dict[str, Any], console: Console) -> None:
+    """Write projections, residuals and slices of a reconstruction; `given` has the values of all parameters, by name.
+
+    Raises:
+        UserError: it is no reconstruction, or an option is for photos.
+        typer.BadParameter: scans do not have such outputs, views or slices.
+    """
+    from nerfcli.tomography.result import OUTPUTS, is_reconstruction
+    from nerfcli.workflows.render import RENDERS
+    from nerfcli.workflows.tomography_files import render_scan
+
+    outputs, output = given["outputs"], given["output"]
+    if not is_reconstruction(folder):
+        option = "--slices" if given["slices"] else f"--outputs {outputs}"
+        raise UserError(f"{folder} is not a reconstruction of a scan; {option} is for those", f"remove {option}", 2)
+    refuse_photo_options(folder, render, given, of_scans=_OF_SCANS)
+    chosen = options.some_of("projection" if outputs is None else outputs, OUTPUTS, "--outputs")
+    options.one_of(given["cameras"], ("test", "train"), "--cameras")
+    cuts = slices_of(given["slices"] or [])
+    target = folder / RENDERS if output is None else output / folder.name if one_of_many else output
+    with console.callbacks("render") as callbacks:
+        for path in render_scan(
+            folder,
+            target,
+            outputs=chosen,
+            views=given["cameras"],
+            slices=cuts,
+            threads=thread_count(given["threads"]),
+            overwrite=given["overwrite"],
+            **callbacks,
+        ):
+            console.result(path)
+
+
+def _refuse_unused(given: dict[str, Any], *, outputs: tuple[str, ...], writes_video: bool) -> None:
+    """Refuse options that nothing would use, and alpha in videos; `given` has the values of all parameters, by name.
+
+    Raises:
+        typer.BadParameter: there is one.
+    """
+    from nerfcli.workflows.views import PATHS, Views
+
+    rgba, depth, background = given["rgba"], given["depth"], given["background_distance"]
+    unused = {
+        "--fps": (given["fps"] is not None and not (writes_video or given["cameras_only"]), "--video"),
+        "--depth": (depth != "conditional" and set(outputs) <= {"rgb", "opacity"}, "--outputs depth"),
+        "--background-distance": (background is not None and depth != "background", "--depth background"),
+        "--rgba": (rgba and "rgb" not in outputs, "--outputs rgb"),
+        "--count": (given["count"] != Views.count and given["cameras"] not in PATHS, f"--cameras {', '.join(PATHS)}"),
+    }
+    for option, (is_unused, needed) in unused.items():
+        if is_unused:
+            raise typer.BadParameter(f"it works with {needed}; add that, or remove it", param_hint=option)
+    if rgba and writes_video:
+        raise typer.BadParameter(
+            "videos have no alpha channel; remove --rgba or the video options", param_hint="--rgba"
+        )
+
+
+def _write_cameras(
+    folder: Path, target: Path, views: "Views", *, fps: float, overwrite: bool, console: Console
+) -> None:
+    """Write only the cameras of the views; see `workflows.views.write_frames`."""
+    from nerfcli.runs.run import Run
+    from nerfcli.workflows.views import chosen_frames, write_frames
+
+    run = Run(folder)
+    frames = chosen_frames(run, views, depth_hint=1.0 / run.model().training_from_scene.scale)
+    write_frames(frames, target, fps=fps, overwrite=overwrite, warn=console.warn)
+    console.result(target)

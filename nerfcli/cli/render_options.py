@@ -1,4 +1,4 @@
-"""Options of `nerfcli render`: depth files, rendering quality, videos, frames and lenses."""
+"""Options of `nerfcli render`: depth and its files, tolerance, videos, frames and lenses."""
 
 import math
 import re
@@ -11,9 +11,8 @@ from nerfcli.cli.options import one_of, some_of
 
 if TYPE_CHECKING:
     from nerfcli.export.settings import VideoSettings
+    from nerfcli.render.depth import DepthRequest
     from nerfcli.workflows.views import PictureOptions
-
-MOST_SAMPLES = 256
 
 Tolerance = Annotated[
     str,
@@ -21,18 +20,6 @@ Tolerance = Annotated[
         help="Maximum error of a colour channel due to early stopping of rays, such as 1/255 or 0.001. It concerns the "
         "rendering, not how accurate the field is."
     ),
-]
-Step = Annotated[
-    float,
-    typer.Option(
-        help="Step length along rays relative to training: 2 is faster, 0.5 more accurate.",
-        min=1 / 64,
-        max=64,
-    ),
-]
-SamplesPerPixel = Annotated[
-    int,
-    typer.Option(help="Rays per pixel, for antialiasing; depth uses all of them together.", min=1, max=MOST_SAMPLES),
 ]
 Rgba = Annotated[
     bool,
@@ -45,13 +32,6 @@ DepthFormat = Annotated[
     typer.Option(
         help="Any of tiff, exr, npy (float32; exr holds all outputs of a view) and png16 (16-bit integers, in addition "
         "to float32)."
-    ),
-]
-DepthScale = Annotated[
-    str,
-    typer.Option(
-        help="Scene units per level of png16; auto: the finest of 1, 2, 5 times a power of ten that covers twice the "
-        "99.9th percentile of depth, but at least a millimetre in metric scenes."
     ),
 ]
 
@@ -75,23 +55,34 @@ def depth_formats(text: str, *, outputs: tuple[str, ...], convention: str) -> tu
     return chosen
 
 
-def level_scale(text: str, *, formats: tuple[str, ...]) -> float | None:
-    """Parse --depth-scale: scene units per level; None for auto.
+def depth_request(
+    convention: str,
+    axis: str | None,
+    *,
+    outputs: tuple[str, ...],
+    min_opacity: float,
+    background_distance: float | None,
+    min_views: int,
+    min_parallax_deg: float,
+) -> "DepthRequest":
+    """Return the definition of depth that the options select; along z where no axis is given.
 
     Raises:
-        typer.BadParameter: not a positive number, or png16 is not one of the formats.
+        typer.BadParameter: a value is unknown or not finite, or limits are given without depth.
     """
-    if text == "auto":
-        return None
-    if "png16" not in formats:
-        raise typer.BadParameter("only used with --depth-format png16", param_hint="--depth-scale")
-    try:
-        scale = float(text)
-    except ValueError:
-        scale = math.nan
-    if not 0 < scale < math.inf:
-        raise typer.BadParameter(f"{text!r}; write auto or a positive number", param_hint="--depth-scale")
-    return scale
+    from nerfcli.render.depth import AXES, CONVENTIONS, DepthRequest, is_convention
+
+    if not is_convention(convention):
+        choices = f"{', '.join(CONVENTIONS)} or quantile:Q with 0 < Q < 1"
+        raise typer.BadParameter(f"{convention!r}; choose {choices}", param_hint="--depth")
+    one_of(axis, AXES, "--depth-axis")
+    finite(background_distance, "--background-distance")
+    finite(min_opacity, "--min-opacity")
+    finite(min_parallax_deg, "--min-parallax")
+    if (min_views or min_parallax_deg) and "depth" not in outputs:
+        hint = "--min-views" if min_views else "--min-parallax"
+        raise typer.BadParameter("it removes depth; add depth to --outputs", param_hint=hint)
+    return DepthRequest(convention, axis or "z", min_opacity, background_distance, min_views, min_parallax_deg)
 
 
 def finite(value: float | None, option: str) -> None:
@@ -138,26 +129,6 @@ def video_settings(formats: str, fps: float) -> "VideoSettings":
             f"{fps:g}; a gif plays at {GIF_FASTEST_FPS:g} frames per second at most", param_hint="--fps"
         )
     return VideoSettings(chosen, fps)
-
-
-def colour_range_of(text: str | None, *, outputs: tuple[str, ...]) -> tuple[float, float] | None:
-    """Parse LOW:HIGH; None if not given.
-
-    Raises:
-        typer.BadParameter: anything else, or no depth is requested.
-    """
-    if text is None:
-        return None
-    if "depth" not in outputs:
-        raise typer.BadParameter("is for depth; add depth to --outputs", param_hint="--colour-range")
-    try:
-        low, high = map(float, text.split(":"))
-    except ValueError:
-        low = high = math.nan
-    if not -math.inf < low < high < math.inf:
-        message = f"{text!r}; write LOW:HIGH in scene units, for example 0.5:4"
-        raise typer.BadParameter(message, param_hint="--colour-range")
-    return low, high
 
 
 def frame_range(text: str) -> slice:

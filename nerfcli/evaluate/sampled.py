@@ -11,7 +11,7 @@ from nerfcli.evaluate.metrics import psnr, to_8_bit
 from nerfcli.evaluate.protocol import PROTOCOL, HeldOutPhoto, as_exposed, background_of, over_white
 from nerfcli.field.background import colours_behind
 from nerfcli.render.model import Model
-from nerfcli.render.rays import CENTRES, pixel_rays
+from nerfcli.render.rays import pixel_rays
 from nerfcli.render.tracing import TOLERANCE, render_rays, uniform_cuts
 
 SAMPLED_PIXELS = 2**14
@@ -74,7 +74,7 @@ def render_sampled(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return colours (N, 3) in [0, 1] at pixel centres, in the field's precision, and which of them have a ray."""
     dtype = next(model.field.parameters()).dtype
-    rays = pixel_rays(photo.frame, model.training_from_scene, pixels=pixels, places=CENTRES, device=model.device)
+    rays = pixel_rays(photo.frame, model.training_from_scene, pixels=pixels, device=model.device)
     directions, origin = rays.directions.to(dtype), rays.origin.to(dtype)
     behind = colours_behind(background_of(model, photo), directions)
     colours = [

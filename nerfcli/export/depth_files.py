@@ -114,10 +114,10 @@ class Levels:
     pixels_beyond: int
 
 
-def write_levels(folder: Path, names: Sequence[str], *, settings: ExportSettings, meaning: DepthMeta) -> Levels:
+def write_levels(folder: Path, names: Sequence[str], *, meaning: DepthMeta) -> Levels:
     """Write the depth of all frames as 16-bit levels of one length, computed from the float files.
 
-    If the length is chosen here, levels reach to twice the 99.9 % quantile of all depths, or to the largest depth if
+    Levels reach to twice the 99.9 % quantile of all depths, or to the largest depth if
     that is less: otherwise a few rays that end far away would make all levels coarse. Depths beyond are left out of
     these files.
 
@@ -128,18 +128,16 @@ def write_levels(folder: Path, names: Sequence[str], *, settings: ExportSettings
         The length of a level in scene units, and the number of pixels that did not fit.
 
     Raises:
-        UserError: a depth does not fit into levels of the given length, or a file cannot be written.
+        UserError: a depth is so small that it would read as no depth, or a file cannot be written.
     """
 
     def depths() -> Iterator[np.ndarray]:
         for name in names:
             yield read_map(folder, name, meaning)
 
-    scale, reach, pixels_beyond = settings.depth_scale, np.inf, 0
-    if scale is None:
-        typical, largest = quantiles(depths, (_TYPICAL, 1.0)) or (0.0, 0.0)
-        scale = chosen_scale(min(_HEADROOM * typical, largest), meaning.unit)
-        reach = LARGEST_LEVEL * scale * (1 + 1e-9)
+    typical, largest = quantiles(depths, (_TYPICAL, 1.0)) or (0.0, 0.0)
+    scale = chosen_scale(min(_HEADROOM * typical, largest), meaning.unit)
+    reach, pixels_beyond = LARGEST_LEVEL * scale * (1 + 1e-9), 0
     for name, depth in zip(names, depths(), strict=True):
         beyond = depth > reach
         pixels_beyond += int(beyond.sum())

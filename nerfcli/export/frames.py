@@ -1,9 +1,13 @@
 """Export of all frames of an order: render the missing ones, then write the outputs that need all of them."""
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+
+import torch
 
 from nerfcli.atomic import write_json
 from nerfcli.exclusive import exclusive
@@ -13,43 +17,13 @@ from nerfcli.export.order import DESCRIPTION, Order
 from nerfcli.export.presentation import write_previews, write_videos
 from nerfcli.export.settings import depth_meta
 from nerfcli.export.unfinished import UnfinishedFrames, take_over, unfinished_of
-from nerfcli.export.workers import render_in_processes, render_in_threads
 from nerfcli.media.levels import scale_in_words
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.model import Model
 
-# A process takes seconds to start: it must have at least this many rays to render, about 20 s of work for a core.
-RAYS_PER_PROCESS = 2**22
-# Each process holds the model, a picture, and a few hundred megabytes of libraries. More threads with a picture each
-# would wait for Python's lock.
-MOST_PROCESSES = 4
+# Frames in progress at a time, each in threads of its own: some steps of a picture use one thread. More would wait for
+# Python's lock.
 MOST_AT_A_TIME = 4
-
-
-@dataclass(frozen=True)
-class Workers:
-    """Number of processes and threads to render with.
-
-    Args:
-        jobs: number of processes, each with one frame at a time; 1 renders in this process, on CPUs a frame per thread.
-        threads: number of threads of all processes together.
-    """
-
-    jobs: int = 1
-    threads: int = 1
-
-
-def automatic_workers(rays: int, *, threads: int, thread_safe: bool) -> Workers:
-    """Return one process, or several if its threads cannot render different frames and there is enough work.
-
-    One picture per thread is faster than several threads per picture, because some steps of a picture use one thread.
-
-    Args:
-        thread_safe: see `Model.thread_safe`; also True for a GPU, which is used by one process.
-    """
-    if thread_safe:
-        return Workers(1, threads)
-    return Workers(max(1, min(threads, MOST_PROCESSES, rays // RAYS_PER_PROCESS)), threads)
 
 
 def export_frames(
@@ -59,7 +33,7 @@ def export_frames(
     *,
     on_rays: Callable[[int], None],
     notify: Callable[[str], None],
-    workers: Workers = Workers(),
+    threads: int = 1,
 ) -> list[Path]:
     """Render every frame and write the ordered outputs; the folder appears when it is complete.
 
@@ -72,13 +46,13 @@ def export_frames(
     Args:
         folder: the folder to write; an existing folder is replaced at the end.
         on_rays: called with numbers of finished rays, including those of frames that already exist.
-        workers: processes and threads to render with; the files do not depend on them.
+        threads: number of threads; the files do not depend on it.
 
     Returns:
         The paths to show, see `Order.results`.
 
     Raises:
-        UserError: the folder cannot be written, a video cannot be made, or processes die repeatedly.
+        UserError: the folder cannot be written, or a video cannot be made.
     """
     order.check()
     unfinished = unfinished_of(order, folder)
@@ -87,13 +61,13 @@ def export_frames(
             take_over(unfinished, order, folder)
         everything = range(len(order.frames))
         _render_missing(
-            model, order, everything, unfinished=unfinished, on_rays=on_rays, notify=notify, workers=workers
+            model, order, everything, unfinished=unfinished, on_rays=on_rays, notify=notify, threads=threads
         )
         meta = depth_meta(model, order.settings.depth)
-        ranges = write_previews(unfinished.folder, order, meta, threads=workers.threads)
+        ranges = write_previews(unfinished.folder, order, meta, threads=threads)
         levels = {}
         if order.settings.in_levels:
-            written = write_levels(unfinished.folder, order.names, settings=order.settings, meaning=meta)
+            written = write_levels(unfinished.folder, order.names, meaning=meta)
             levels = {"depth16": asdict(written)}
             notify(f"16-bit files: {scale_in_words(replace(meta, units_per_level=written.units_per_level))}")
             if written.pixels_beyond:
@@ -126,7 +100,7 @@ def export_part(
     *,
     on_rays: Callable[[int], None],
     notify: Callable[[str], None],
-    workers: Workers = Workers(),
+    threads: int = 1,
 ) -> Path:
     """Render some frames of an order, which `export_frames` then finds; the other arguments are the same.
 
@@ -138,7 +112,7 @@ def export_part(
     """
     order.check()
     unfinished = unfinished_of(order, folder)
-    _render_missing(model, order, part, unfinished=unfinished, on_rays=on_rays, notify=notify, workers=workers)
+    _render_missing(model, order, part, unfinished=unfinished, on_rays=on_rays, notify=notify, threads=threads)
     there = sum(map(unfinished.has, order.names))
     notify(f"{there} of {len(order.names)} frames are complete; the same command without --frames renders the others")
     return unfinished.folder
@@ -152,7 +126,7 @@ def _render_missing(
     unfinished: UnfinishedFrames,
     on_rays: Callable[[int], None],
     notify: Callable[[str], None],
-    workers: Workers,
+    threads: int,
 ) -> None:
     held = {index for index in part if unfinished.has(order.names[index])}
     missing = [index for index in part if index not in held]
@@ -160,12 +134,58 @@ def _render_missing(
         notify(f"resuming: {len(held)} of {len(part)} frames are already in {unfinished.folder}")
         on_rays(sum(map(order.rays, held)))
     render_one = partial(render_frame, model, order, unfinished=unfinished)
-    jobs, threads = min(workers.jobs, len(missing)), workers.threads
     at_a_time = min(threads, MOST_AT_A_TIME, len(missing))
-    if jobs > 1:
-        render_in_processes(render_one, order, missing, jobs=jobs, threads=threads, on_rays=on_rays, notify=notify)
-    elif at_a_time > 1 and model.thread_safe:
-        render_in_threads(render_one, missing, at_a_time=at_a_time, threads=threads, on_rays=on_rays)
+    if at_a_time > 1 and model.thread_safe:
+        _render_in_threads(render_one, missing, at_a_time=at_a_time, threads=threads, on_rays=on_rays)
     else:
         for index in missing:
             render_one(index, on_rays=on_rays)
+
+
+def _render_in_threads(
+    render_one: Callable[..., None],
+    indices: Sequence[int],
+    *,
+    at_a_time: int,
+    threads: int,
+    on_rays: Callable[[int], None],
+) -> None:
+    """Render frames on the CPU, several at a time.
+
+    The first exception stops all threads after their current tile; complete frames are kept.
+
+    Args:
+        at_a_time: number of frames in progress.
+        threads: number of threads of all frames together; each frame has at least one.
+        on_rays: called with the number of rays of each tile, by one thread at a time.
+    """
+    stopped, lock, before = threading.Event(), threading.Lock(), torch.get_num_threads()
+
+    def count(rays: int) -> None:
+        if stopped.is_set():
+            raise CancelledError
+        with lock:
+            on_rays(rays)
+
+    def render(index: int) -> None:
+        if stopped.is_set():
+            return
+        try:
+            render_one(index, on_rays=count)
+        except CancelledError:
+            return  # because of another frame's exception, which is raised below
+        except BaseException:
+            stopped.set()  # here, since the main thread may hear of it only after the others have rendered more
+            raise
+
+    each = max(1, threads // at_a_time)
+    with ThreadPoolExecutor(at_a_time, initializer=torch.set_num_threads, initargs=(each,)) as pool:
+        try:
+            for future in as_completed([pool.submit(render, index) for index in indices]):
+                future.result()
+        except BaseException:
+            stopped.set()  # Ctrl-C arrives in this thread
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        finally:
+            torch.set_num_threads(before)

@@ -46,12 +46,12 @@ def with_visibility(
     return replace(picture, coverage=coverage.reshape(shape), parallax=parallax.reshape(shape))
 
 
-def with_measured_errors(picture: RenderedPicture, errors: DepthErrors, request: DepthRequest) -> RenderedPicture:
+def with_measured_errors(picture: RenderedPicture, errors: DepthErrors) -> RenderedPicture:
     """Add an interval of depth and a confidence in each pixel to a picture that has median and coverage."""
     assert picture.median is not None
     assert picture.coverage is not None
-    lower, upper = errors.bounds(picture.median, picture.coverage, level=request.level)
-    confidence = errors.confidence(picture.coverage, tolerance=request.depth_tolerance)
+    lower, upper = errors.bounds(picture.median, picture.coverage)
+    confidence = errors.confidence(picture.coverage)
     return replace(picture, lower=lower, upper=upper, confidence=confidence)
 
 
@@ -120,7 +120,7 @@ def render_frame(
 ) -> None:
     """Render a frame and write its files to the unfinished folder.
 
-    The files depend only on the model and the order, not on other frames or on the process that renders them.
+    The files depend only on the model and the order, not on other frames or on threads.
 
     Raises:
         UserError: a file cannot be written.
@@ -129,7 +129,7 @@ def render_frame(
     wanted = settings.depth if settings.measured else None
     background = BLACK if settings.rgba else model.background
     picture = render_picture(
-        model, frame, background=background, depth=wanted, quality=settings.quality, on_tile=on_rays
+        model, frame, background=background, depth=wanted, tolerance=settings.tolerance, on_tile=on_rays
     )
     if settings.rgba:
         picture = replace(picture, rgb=straight_rgba(picture))
@@ -137,11 +137,10 @@ def render_frame(
     if settings.needs_visibility:
         picture = with_visibility(picture, frame, axis=settings.depth.axis, photo_depths=order.photo_depths)
         if order.depth_errors is not None:
-            picture = with_measured_errors(picture, order.depth_errors, settings.depth)
+            picture = with_measured_errors(picture, order.depth_errors)
         picture, removed = without_unseen_depth(picture, settings.depth)
-    tolerance = settings.quality.tolerance
-    measured = measure_error(model, frame, depth=wanted, tolerance=tolerance)
-    facts = truncation_bounds(picture, tolerance) | measured.to_json()
+    measured = measure_error(model, frame, depth=wanted, tolerance=settings.tolerance)
+    facts = truncation_bounds(picture, settings.tolerance) | measured.to_json()
     bounds = {**facts, "meaning": ERROR_IN_WORDS}
     meta = frame_meta(depth_meta(model, settings.depth), frame, provenance=order.provenance, error_bounds=bounds)
     files = _write_outputs(picture, unfinished.folder, name, settings=settings, meta=meta, background=model.background)

@@ -19,7 +19,7 @@ from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.visibility import DepthMap
 
 DESCRIPTION = "render.json"
-_IN_WORDS = {"colour_map": "colours", "colour_range": "range of colours", "levels": "16-bit levels", "video": "videos"}
+_IN_WORDS = {"levels": "16-bit levels", "video": "videos"}
 
 
 def file_names(frames: Sequence[Frame]) -> list[str]:
@@ -145,12 +145,11 @@ class Order:
             return False
         raise UserError(
             f"{folder} contains the same pictures with different {' and '.join(_IN_WORDS[key] for key in differing)}",
-            "add --overwrite to write previews and videos again from the pictures, which are kept, or choose another "
-            "folder with -o",
+            "add --overwrite to write them again from the pictures, which are kept, or choose another folder with -o",
         )
 
     def shares_pictures_with(self, folder: Path) -> bool:
-        """Return whether a finished folder holds the same pictures, with other previews, 16-bit files or videos."""
+        """Return whether a finished folder holds the same pictures, with other 16-bit files or videos."""
         try:
             made = _made(folder)
         except UserError:  # a damaged description cannot be compared; everything is rendered again

@@ -15,7 +15,7 @@ from nerfcli.export.order import Order
 from nerfcli.export.settings import MEASURED, meaning_of
 from nerfcli.media.depth_pictures import KEY, DepthMeta
 from nerfcli.media.images import read_image, write_png
-from nerfcli.media.preview import preview
+from nerfcli.media.preview import COLOURS, preview
 from nerfcli.media.quantiles import quantiles
 from nerfcli.media.video import write_video
 
@@ -26,7 +26,7 @@ _KEPT_BYTES = 2**28
 
 
 def write_previews(folder: Path, order: Order, meta: DepthMeta, *, threads: int = 1) -> dict[str, tuple[float, float]]:
-    """Write a false-colour PNG beside each measured file, with one range per output (for depth, the given one if any).
+    """Write a false-colour PNG beside each measured file, with one range per output.
 
     Args:
         folder: holds the complete files of every frame.
@@ -59,12 +59,11 @@ def _write_previews_of(
             kept[name] = values
         return values
 
-    given, colour_map = order.settings.colour_range if output == "depth" else None, order.settings.colour_map
-    lo, hi = given or value_range(lambda: map(read, order.names), output)
-    metadata = _texts(meaning) | {"range": f"{lo} {hi}", "colour map": colour_map}
+    lo, hi = value_range(lambda: map(read, order.names), output)
+    metadata = _texts(meaning) | {"range": f"{lo} {hi}", "colour map": COLOURS}
 
     def write(name: str) -> None:
-        picture = preview(read(name), meaning, lo=lo, hi=hi, colour_map=colour_map)
+        picture = preview(read(name), meaning, lo=lo, hi=hi)
         write_png(_picture(folder, output, name), picture, metadata=metadata)
 
     with ThreadPoolExecutor(threads) as pool:
@@ -123,7 +122,7 @@ def _comment(order: Order, meta: DepthMeta, output: str, ranges: dict[str, tuple
     description: dict[str, Any] = {"nerfcli": __version__, "outputs": [output], **order.provenance}
     if output in MEASURED:
         description |= meta.to_json()
-        description |= {"ranges": {output: ranges[output]}, "colour_map": order.settings.colour_map}
+        description |= {"ranges": {output: ranges[output]}, "colour_map": COLOURS}
     return description
 
 

@@ -1,12 +1,13 @@
 """Settings of an export: outputs, file formats, videos."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from nerfcli.media.depth_pictures import CONVENTION_OF, QUANTITIES, DepthMeta
+from nerfcli.render import depth_errors
 from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import Quality
+from nerfcli.render.tracing import TOLERANCE
 
 OUTPUTS = ("rgb", "depth", "opacity", *CONVENTION_OF)
 # Measured outputs, which are stored as floats, with previews in false colours.
@@ -40,20 +41,15 @@ class ExportSettings:
         outputs: some of `OUTPUTS`.
         depth: the definition of depth, if "depth" is among the outputs.
         formats: some of `FORMATS`, for measured outputs. 16-bit levels are computed from float files, which are kept.
-        depth_scale: scene units per level of 16-bit files; None chooses the same for all frames.
-        colour_map: one of `media.colours.COLOUR_MAPS`, for measured outputs.
-        colour_range: the depths with the first and the last colour, in scene units; None chooses them from the views.
+        tolerance: largest error of a colour channel due to early stopping of rays, see `render.tracing`.
         rgba: colours without the background, with the opacity as straight alpha.
     """
 
     outputs: tuple[str, ...]
     depth: DepthRequest
     formats: tuple[str, ...] = ("tiff",)
-    depth_scale: float | None = None
-    colour_map: str = "turbo"
-    colour_range: tuple[float, float] | None = None
     video: VideoSettings | None = None
-    quality: Quality = field(default_factory=Quality)
+    tolerance: float = TOLERANCE
     rgba: bool = False
 
     @property
@@ -91,22 +87,16 @@ class ExportSettings:
     def of_pictures(self) -> dict[str, Any]:
         """Return the settings that determine the rendered numbers and their files, as plain values."""
         settings = asdict(self)
-        for name in ("colour_map", "colour_range", "video", "depth_scale"):
-            del settings[name]
+        del settings["video"]
         for name in ("min_views", "min_parallax_deg"):
             if not settings["depth"][name]:  # as in folders that were written before these settings existed
-                del settings["depth"][name]
-        for name, outputs in (("level", {"lower", "upper"}), ("depth_tolerance", {"confidence"})):
-            if not outputs & set(self.outputs):
                 del settings["depth"][name]
         return settings | {"outputs": list(self.outputs), "formats": list(self.float_formats)}
 
     def of_presentation(self) -> dict[str, Any]:
         """Return the settings that determine the previews and videos made from these files, as plain values."""
         video = None if self.video is None else asdict(self.video) | {"formats": list(self.video.formats)}
-        levels = {"scale": self.depth_scale or "auto"} if self.in_levels else None
-        colour_range = None if self.colour_range is None else list(self.colour_range)
-        return {"colour_map": self.colour_map, "colour_range": colour_range, "levels": levels, "video": video}
+        return {"levels": self.in_levels or None, "video": video}
 
 
 def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
@@ -125,7 +115,8 @@ def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
 
 def meaning_of(meta: DepthMeta, request: DepthRequest, output: str) -> DepthMeta:
     """Return the definition of a measured output of a picture whose depth is defined by `meta`."""
-    number = {"lower": request.level, "upper": request.level, "confidence": request.depth_tolerance}.get(output)
+    level, tolerance = depth_errors.LEVEL, depth_errors.TOLERANCE
+    number = {"lower": level, "upper": level, "confidence": tolerance}.get(output)
     convention = None if number is None else f"{output}:{number:g}"
     return meta.of(output, opacity_floor=floor_of(request, output), convention=convention)
 

@@ -17,7 +17,6 @@ from nerfcli.kernels.interface import (
     AdamStep,
     HashGrid,
     Intervals,
-    LightEnds,
     March,
     Medium,
     PixelTable,
@@ -49,18 +48,6 @@ class Backend(abc.ABC):
     def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
         """Return origins (N, 3), directions (N, 3) and colours (N, C) in [0, 1] of chosen pixels (N,) int64."""
         return self.parts.pixel_rays(chosen, pixels)
-
-    def light_ends(self, intervals: Intervals, *, fractions: tuple[float, ...]) -> LightEnds:
-        """Return where the light of rays is absorbed, without gradients; see `reference.light_ends`."""
-        density, starts, ends, offsets = intervals
-        return self.parts.light_ends(density, starts, ends, offsets=offsets, fractions=fractions)
-
-    def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, fraction: float) -> Tensor:
-        """Return the distance (R / rays_per_pixel,) by which a fraction of the light of a group of rays is absorbed."""
-        density, starts, ends, offsets = intervals
-        return self.parts.mixture_quantile(
-            density, starts, ends, offsets=offsets, rays_per_pixel=rays_per_pixel, fraction=fraction
-        )
 
     def render_rays(
         self,

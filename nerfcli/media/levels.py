@@ -92,17 +92,16 @@ def _levels(path: Path, depth: np.ndarray, units_per_level: float) -> tuple[np.n
     levels = np.rint(exact)
     if levels.max(initial=0) > LARGEST_LEVEL:
         largest, reach = float(depth[valid].max()), LARGEST_LEVEL * units_per_level
-        fits = f"--depth-scale {chosen_scale(largest, 'arbitrary'):g}, or " if math.isfinite(largest) else ""
         raise UserError(
             f"{path}: 16 bits hold depth up to {reach:.6g} at {units_per_level:g} per level, but the maximum is "
             f"{largest:.6g}",
-            f"use {fits}a float format (--depth-format tiff)",
+            "use a float format (--depth-format tiff)",
         )
     if (valid & (levels < 1)).any():
         smallest = float(depth[valid].min())
         raise UserError(
             f"{path}: a depth of {smallest:.6g} would become 0 (no value) in levels of {units_per_level:g}",
-            "use a smaller --depth-scale, --depth-axis ray, or a float format (--depth-format tiff)",
+            "use --depth-axis ray, or a float format (--depth-format tiff)",
         )
     rounding = float(np.abs(exact - levels).max(initial=0)) * units_per_level
     return levels.astype(np.uint16), rounding

@@ -9,13 +9,14 @@ from PIL import Image, ImageDraw, ImageFont
 from nerfcli.media.colours import levels_of
 from nerfcli.media.depth_pictures import AXES, UNIT_OF, DepthMeta
 
+COLOURS = "turbo"
 _HATCH = np.array([[112, 112, 112], [160, 160, 160]], dtype=np.uint8)
 _INK, _PAPER = (20, 20, 20), (255, 255, 255)
 _NUM_TICKS = 5
 
 
-def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_map: str = "turbo") -> np.ndarray:
-    """Return a depth map in false colours (turbo: blue near, red far) with a legend below it.
+def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float) -> np.ndarray:
+    """Return a depth map in false colours (`COLOURS`: blue near, red far) with a legend below it.
 
     Depths outside lo...hi have the colours of the ends, as the legend says; pixels that are not finite are hatched
     grey. A picture too narrow for the legend is centred on a wider sheet. The size depends only on the map's shape and
@@ -25,7 +26,6 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_
         depth: (height, width).
         lo: the depth with the first colour, in the unit of `meta`.
         hi: the depth with the last colour, >= lo.
-        colour_map: one of `colours.COLOUR_MAPS`.
 
     Returns:
         uint8 RGB (height + legend, at least width, 3).
@@ -33,9 +33,9 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_
     Raises:
         ValueError: lo and hi are not finite or not in order.
     """
-    picture = coloured(depth, lo=lo, hi=hi, colour_map=colour_map)
+    picture = coloured(depth, lo=lo, hi=hi, colour_map=COLOURS)
     suffix = " m" if meta.unit == "metre" else ""
-    legend = _legend(_lines(meta), suffix, lo=lo, hi=hi, colour_map=colour_map, width=depth.shape[1])
+    legend = _legend(_lines(meta), suffix, lo=lo, hi=hi, width=depth.shape[1])
     sheet = np.full((len(picture) + len(legend), legend.shape[1], 3), _PAPER, dtype=np.uint8)
     left = (legend.shape[1] - depth.shape[1]) // 2
     sheet[: len(picture), left : left + depth.shape[1]] = picture
@@ -46,7 +46,7 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_
 def coloured(depth: np.ndarray, *, lo: float, hi: float, colour_map: str) -> np.ndarray:
     """Return the false colours of `preview` without the legend, uint8 RGB (height, width, 3).
 
-    Arguments and errors are those of `preview`.
+    Arguments and errors are those of `preview`, and one of `colours.COLOUR_MAPS`.
     """
     if not -math.inf < lo <= hi < math.inf:
         raise ValueError(f"lo <= hi must be finite, got {lo}, {hi}")
@@ -65,7 +65,7 @@ def coloured(depth: np.ndarray, *, lo: float, hi: float, colour_map: str) -> np.
 
 
 @lru_cache(maxsize=8)  # all frames of a clip have the same legend
-def _legend(lines: tuple[str, ...], suffix: str, *, lo: float, hi: float, colour_map: str, width: int) -> np.ndarray:
+def _legend(lines: tuple[str, ...], suffix: str, *, lo: float, hi: float, width: int) -> np.ndarray:
     """Draw a colour bar, numbers with a suffix and lines of text; wider than `width` if the text needs it."""
     size = min(max(round(width / 40), 12), 28)
     font = ImageFont.load_default(size)
@@ -77,7 +77,7 @@ def _legend(lines: tuple[str, ...], suffix: str, *, lo: float, hi: float, colour
 
     sheet = Image.new("RGB", (width, size // 2 + line * (2 + len(lines)) + size // 2), _PAPER)
     bar = (width - 2 * margin, size)
-    ramp = levels_of(colour_map)[np.linspace(0, 255, bar[0]).round().astype(np.uint8)]
+    ramp = levels_of(COLOURS)[np.linspace(0, 255, bar[0]).round().astype(np.uint8)]
     sheet.paste(Image.fromarray(np.repeat(ramp[None], bar[1], axis=0)), (margin, size // 2))
     draw = ImageDraw.Draw(sheet)
     below = size // 2 + bar[1]

@@ -18,7 +18,7 @@ from nerfcli.kernels import RaysSeen
 from nerfcli.render.depth import DepthRequest, fractions, requested
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import RenderedPicture
-from nerfcli.render.rays import CENTRES, pixel_rays
+from nerfcli.render.rays import pixel_rays
 from nerfcli.render.tracing import render_rays, uniform_cuts
 
 IN_WORDS = (
@@ -121,7 +121,7 @@ def _renderings(
     model: Model, frame: Frame, pixels: np.ndarray, *, depth: DepthRequest | None, tolerance: float
 ) -> tuple[Tensor, Tensor]:
     """Return colours (4, P, 3), depths (4, P): as rendered; then at `TIGHT` with intervals whole and cut in 2 and 4."""
-    rays = pixel_rays(frame, model.training_from_scene, pixels=pixels, places=CENTRES, device=model.device)
+    rays = pixel_rays(frame, model.training_from_scene, pixels=pixels, device=model.device)
     directions, cosines = rays.directions[rays.valid], rays.cosines[rays.valid]
     background = colours_behind(model.background, directions)
     cuts = uniform_cuts(model.marching)

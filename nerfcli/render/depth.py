@@ -41,8 +41,6 @@ class DepthRequest:
             the scene's unit; only needed by that convention.
         min_views, min_parallax_deg: coverage and parallax of the median point below which an export removes the depth;
             see `visibility`.
-        level: confidence level of the interval between the outputs lower and upper, see `depth_errors`.
-        depth_tolerance: largest relative error of a depth that the output confidence counts as right.
 
     Raises:
         ValueError: unknown convention or axis.
@@ -54,8 +52,6 @@ class DepthRequest:
     background_distance: float | None = None
     min_views: int = 0
     min_parallax_deg: float = 0.0
-    level: float = 0.9
-    depth_tolerance: float = 0.02
 
     def __post_init__(self) -> None:
         if not is_convention(self.convention):

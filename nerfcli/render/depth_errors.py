@@ -6,6 +6,8 @@ from typing import Any, Self
 
 import numpy as np
 
+# Fraction of the errors in the interval of depth; largest relative error of a depth that confidence counts as right.
+LEVEL, TOLERANCE = 0.9, 0.02
 # Least coverage of each stratum. Where no photo sees the surface, no error can be measured.
 STRATA = (1, 2, 4)
 # Quantiles of the errors in a stratum that are kept: every half per cent.
@@ -41,31 +43,31 @@ class DepthErrors:
             rows.append(np.quantile(errors[inside], _FRACTIONS) if enough else np.full(len(_FRACTIONS), np.nan))
         return cls(np.stack(rows), tuple(counts), len(np.unique(photos)), matched)
 
-    def bounds(self, median: np.ndarray, coverage: np.ndarray, *, level: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the central interval of depth, (lower, upper) like `median`, with a fraction `level` of the errors.
+    def bounds(self, median: np.ndarray, coverage: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the central interval of depth, (lower, upper) like `median`, with a fraction `LEVEL` of the errors.
 
-        lower = median (1 + q), where q is the quantile of the errors in the pixel's stratum at (1 - level) / 2; upper
-        uses the quantile at (1 + level) / 2. NaN where no photo sees the surface, or the stratum has too few errors.
+        lower = median (1 + q), where q is the quantile of the errors in the pixel's stratum at (1 - LEVEL) / 2; upper
+        uses the quantile at (1 + LEVEL) / 2. NaN where no photo sees the surface, or the stratum has too few errors.
 
         Source: split conformal prediction by groups: Angelopoulos and Bates 2021, arXiv:2107.07511, section 4.1.
         """
         number = _stratum(coverage)
         sides = []
-        for fraction in ((1 - level) / 2, (1 + level) / 2):
+        for fraction in ((1 - LEVEL) / 2, (1 + LEVEL) / 2):
             of_strata = np.array([np.interp(fraction, _FRACTIONS, row) for row in self.quantiles])
             factor = np.where(number >= 0, 1.0 + of_strata[number], np.nan)
             sides.append((median * factor).astype(np.float32))
         return sides[0], sides[1]
 
-    def confidence(self, coverage: np.ndarray, *, tolerance: float) -> np.ndarray:
-        """Return the fraction of errors of at most `tolerance` in each pixel's stratum, from 0 to 1, like `coverage`.
+    def confidence(self, coverage: np.ndarray) -> np.ndarray:
+        """Return the fraction of errors of at most `TOLERANCE` in each pixel's stratum, from 0 to 1, like `coverage`.
 
-        F(tolerance) - F(-tolerance), with the distribution function F interpolated between the kept quantiles. NaN as
+        F(TOLERANCE) - F(-TOLERANCE), with the distribution function F interpolated between the kept quantiles. NaN as
         in `bounds`.
         """
         number = _stratum(coverage)
         of_strata = np.array(
-            [np.diff(np.interp((-tolerance, tolerance), row, _FRACTIONS))[0] for row in self.quantiles]
+            [np.diff(np.interp((-TOLERANCE, TOLERANCE), row, _FRACTIONS))[0] for row in self.quantiles]
         )
         return np.where(number >= 0, of_strata[number], np.nan).astype(np.float32)
 

@@ -12,7 +12,6 @@ from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.background import Background, colours_behind
 from nerfcli.render.depth import DepthRequest, disagreement, fractions, median, requested, spread
 from nerfcli.render.model import Model
-from nerfcli.render.pixels import pixels_of_rays
 from nerfcli.render.rays import PictureRays, successive_rays
 from nerfcli.render.tracing import TOLERANCE, render_rays
 
@@ -23,26 +22,6 @@ RAYS_PER_GPU_TILE = 2**16
 FRACTION_OF_GPU, BYTES_PER_STEP = 1 / 8, 110
 # Rays and their background are computed in blocks of this many, so that their last bits do not depend on the tile.
 RAYS_PER_BLOCK = 2**18
-
-
-@dataclass(frozen=True)
-class Quality:
-    """Rendering quality of a picture.
-
-    Args:
-        tolerance: largest truncation error of a colour channel, in (0, 1]; see `tracing`.
-        samples_per_pixel: number of rays per pixel, at the places of `rays.places_in_pixel`.
-
-    Raises:
-        ValueError: out of range.
-    """
-
-    tolerance: float = TOLERANCE
-    samples_per_pixel: int = 1
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.tolerance <= 1.0 or self.samples_per_pixel < 1:
-            raise ValueError(f"need 0 < tolerance <= 1 and samples_per_pixel >= 1, got {self}")
 
 
 @dataclass(frozen=True)
@@ -85,20 +64,17 @@ def render_picture(
     *,
     background: Background,
     depth: DepthRequest | None = None,
-    quality: Quality = Quality(),
+    tolerance: float = TOLERANCE,
     on_tile: Callable[[int], None] | None = None,
     rays_per_tile: int | None = None,
 ) -> RenderedPicture:
     """Render one frame; the result is bit-identical for any tile size and number of threads.
 
-    With several samples per pixel, colour and opacity are means over its rays; depth, spread and disagreement are those
-    of the mixture of their end distances along the axis of depth, see `pixels`.
-
     Args:
         frame: camera and pose in the scene's frame.
         background: colour behind everything.
         depth: the depth to compute along with the colour; None for none.
-        quality: tolerance and number of samples.
+        tolerance: largest truncation error of a colour channel, in (0, 1]; see `tracing`.
         on_tile: called after each tile with its number of pixels.
         rays_per_tile: number of rays rendered at a time, which only affects speed and memory; None for the default of
             the device.
@@ -108,19 +84,20 @@ def render_picture(
     """
     if depth is not None and depth.convention == "background" and depth.background_distance is None:
         raise ValueError("the background convention needs a background distance")
-    width, height, count = frame.camera.width, frame.camera.height, quality.samples_per_pixel
+    if not 0.0 < tolerance <= 1.0:
+        raise ValueError(f"need 0 < tolerance <= 1, got {tolerance}")
+    width, height = frame.camera.width, frame.camera.height
     columns: list[tuple[Tensor, ...]] = []
-    together = rays_per_tile or default_rays_per_tile(model)
-    block, tile = max(1, RAYS_PER_BLOCK // count), max(1, together // count)
-    for first in range(0, width * height, block):
-        chosen = range(first, min(first + block, width * height))
-        rays = successive_rays(frame, model.training_from_scene, pixels=chosen, count=count, device=model.device)
+    tile = rays_per_tile or default_rays_per_tile(model)
+    for first in range(0, width * height, RAYS_PER_BLOCK):
+        chosen = range(first, min(first + RAYS_PER_BLOCK, width * height))
+        rays = successive_rays(frame, model.training_from_scene, pixels=chosen, device=model.device)
         behind = colours_behind(background, rays.directions)
         for begin in range(0, len(chosen), tile):
-            part = slice(begin * count, min((begin + tile) * count, len(rays.directions)))
-            columns.append(_render_tile(model, rays, part, background=behind, depth=depth, quality=quality))
+            part = slice(begin, min(begin + tile, len(chosen)))
+            columns.append(_render_tile(model, rays, part, background=behind, depth=depth, tolerance=tolerance))
             if on_tile is not None:
-                on_tile((part.stop - part.start) // count)
+                on_tile(part.stop - part.start)
     rgb, opacity, error, valid, *distances = (
         torch.cat(column).reshape(height, width, *column[0].shape[1:]).cpu().numpy()
         for column in zip(*columns, strict=True)
@@ -159,45 +136,45 @@ def straight_rgba(picture: RenderedPicture) -> np.ndarray:
 
 
 def _render_tile(
-    model: Model, rays: PictureRays, part: slice, *, background: Tensor, depth: DepthRequest | None, quality: Quality
+    model: Model, rays: PictureRays, part: slice, *, background: Tensor, depth: DepthRequest | None, tolerance: float
 ) -> tuple[Tensor, ...]:
     """Render the pixels of some rays: colour, opacity, truncation error, validity; if requested, depth, spread,
     disagreement and median.
     """
-    directions, count = rays.directions[part], quality.samples_per_pixel
-    wanted = fractions(depth) if depth is not None else ()
-    behind = background[part]
+    directions, valid, behind = rays.directions[part], rays.valid[part], background[part]
     seen = render_rays(
         model,
         rays.origin.expand_as(directions),
         directions,
         background=behind,
-        fractions=wanted,
-        tolerance=quality.tolerance,
+        fractions=fractions(depth) if depth is not None else (),
+        tolerance=tolerance,
         cones=rays.cones[part],
-        keep_intervals=count > 1,
+        keep_intervals=False,
     )
+    opacity = torch.where(valid, seen.ends.opacity, 0.0)
+    colours = (
+        torch.where(valid[:, None], seen.rgb, behind).clamp(0.0, 1.0),
+        opacity,
+        torch.where(valid, seen.truncation_error, 0.0),
+        valid,
+    )
+    if depth is None:
+        return colours
     scale = model.training_from_scene.scale
     # From distances along the ray in the training frame to distances along the axis in the scene's unit. There is no z
     # behind the camera.
-    factor, ahead = torch.full_like(rays.cosines[part], 1.0 / scale), torch.ones_like(rays.valid[part])
-    if depth is not None and depth.axis == "z":
+    factor, ahead = torch.full_like(rays.cosines[part], 1.0 / scale), torch.ones_like(valid)
+    if depth.axis == "z":
         ahead = rays.cosines[part] > 0
         factor = torch.where(ahead, rays.cosines[part], 1.0) / scale
-    pixels = pixels_of_rays(
-        seen,
-        valid=rays.valid[part],
-        background=behind,
-        factor=factor,
-        fractions=wanted,
-        count=count,
-        backend=model.field.backend,
+    ends = seen.ends._replace(
+        opacity=opacity,
+        mean=seen.ends.mean * factor,
+        spread=seen.ends.spread * factor,
+        heaviest=seen.ends.heaviest * factor,
+        quantiles=seen.ends.quantiles * factor[:, None],
     )
-    colours = (pixels.rgb.clamp(0.0, 1.0), pixels.ends.opacity, pixels.truncation_error, pixels.valid)
-    if depth is None:
-        return colours
-    far = (depth.background_distance or 0.0) * scale * pixels.to_background
-    distances = requested(depth, pixels.ends, background_distance=far)
-    maps = (distances, spread(depth, pixels.ends), disagreement(depth, pixels.ends), median(depth, pixels.ends))
-    defined = pixels.valid & ahead.view(-1, count).all(1)
-    return *colours, *(torch.where(defined, values, torch.nan) for values in maps)
+    distances = requested(depth, ends, background_distance=(depth.background_distance or 0.0) * scale * factor)
+    maps = (distances, spread(depth, ends), disagreement(depth, ends), median(depth, ends))
+    return *colours, *(torch.where(valid & ahead, values, torch.nan) for values in maps)

@@ -153,17 +153,6 @@ def depth_rays() -> list[Ray]:
     ]
 
 
-# Pixels of two rays each: hit and miss, near and far, thin and opaque.
-PIXELS: tuple[tuple[Ray, Ray], ...] = (
-    (even("wall", [2.0**20], 1.0, 0.5), even("wall", [2.0**20], 3.0, 0.5)),
-    (even("fog", [0.125] * 8, 1.0, 0.125), Ray("nothing", [], [], [])),
-    (even("shell", [2.0**27], 3.0, 2.0**-13), even("thin fog", [0.25] * 256, 1.0, 0.015625)),
-    (even("far fog", [0.015625] * 100, 200.0, 1.0), even("far wall", [2.0**10], 250.0, 1.0)),
-    (even("thick", [64.0, 0.0, 64.0], 0.25, 0.25), even("empty", [0.0] * 3, 0.25, 0.25)),
-)
-PIXEL_FRACTIONS = (0.04, 0.25, 0.75)
-
-
 def thick_and_thin(precision: Precision) -> list[Segments]:
     """Return fog in as many intervals as the precision can add up, and walls next to thin fog."""
     counts = (1, 16) if precision.dtype == torch.bfloat16 else (1, 16, 1024, 4096)

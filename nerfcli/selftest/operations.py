@@ -232,22 +232,6 @@ def _depths(values: list[Tensor], columns: tuple[str, ...], given: Inputs, densi
     return Outcome(tuple(value.detach() for value in values), gradients, sizes)
 
 
-def mixture(module: ModuleType, given: Inputs) -> Outcome:
-    """Compute quantiles of the combined light of two rays."""
-    spans = (given["density"], given["starts"], given["ends"])
-    pixels = {"offsets": given["offsets"], "rays_per_pixel": 2}
-    return Outcome(
-        tuple(module.mixture_quantile(*spans, **pixels, fraction=fraction) for fraction in cases.PIXEL_FRACTIONS)
-    )
-
-
-def mixture_by_mean(given: Inputs) -> Outcome:
-    """Compute the mean of the quantiles of two rays."""
-    spans = (given["density"], given["starts"], given["ends"])
-    seen = reference.light_ends(*spans, offsets=given["offsets"], fractions=cases.PIXEL_FRACTIONS)
-    return Outcome(tuple(column.view(-1, 2).mean(1) for column in seen.quantiles.unbind(1)))
-
-
 def grid_inputs(points: Sequence[cases.Point], levels: int, precision: Precision) -> Inputs:
     """Return points and a table of features."""
     places = torch.tensor(points).tolist()  # the numbers that float32 holds

@@ -10,7 +10,6 @@ import torch
 
 from nerfcli import kernels
 from nerfcli.kernels import reference
-from nerfcli.kernels.reference.depth import BISECTIONS
 from nerfcli.selftest import cases, operations, textbook
 from nerfcli.selftest.measure import Errors, Precision, Row
 
@@ -142,16 +141,6 @@ def checks() -> Iterator[Check]:
                 textbook=functools.partial(operations.textbook_depth, columns),
                 no_gradient=VALUE_ONLY,
             )
-    yield Check(
-        "quantiles of several rays of a pixel, of which some hit nothing",
-        "mixture_quantile",
-        functools.partial(operations.depth_inputs, [ray for pixel in cases.PIXELS for ray in pixel]),
-        operations.mixture,
-        lambda precision: Errors(4 * precision.unit + 2.0 ** (9 - BISECTIONS)),
-        "4 u, and the last bracket of the bisection over the smallest answer",
-        formula="mean of the rays' quantiles",
-        textbook=operations.mixture_by_mean,
-    )
     for name, points, grids, rounded in (
         ("hash grid on borders and corners of cells, and outside", cases.BORDERS, cases.EXACT_GRIDS, 0),
         ("hash grid of up to 2048 cells, between vertices", cases.BETWEEN, cases.FINE_GRIDS, 1),

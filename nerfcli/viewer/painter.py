@@ -22,7 +22,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.field.background import colours_behind
 from nerfcli.render.depth import MEDIAN
 from nerfcli.render.model import Model
-from nerfcli.render.rays import CENTRES, pixel_rays
+from nerfcli.render.rays import pixel_rays
 from nerfcli.render.tracing import render_rays
 
 # Target times of a tile, and of the first picture of a view, which is as coarse as needed to be done in that time.
@@ -104,7 +104,7 @@ def render_tile(model: Model, view: View, tile: Tile) -> np.ndarray:
     frame = view.coarse(tile.stride)
     rows, columns = np.arange(tile.y, tile.y + tile.height), np.arange(tile.x, tile.x + tile.width)
     pixels = (rows[:, None] * frame.camera.width + columns).ravel()
-    rays = pixel_rays(frame, model.training_from_scene, pixels=pixels, places=CENTRES, device=model.device)
+    rays = pixel_rays(frame, model.training_from_scene, pixels=pixels, device=model.device)
     seen = render_rays(
         model,
         rays.origin.expand_as(rays.directions),

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from nerfcli.errors import UserError
-from nerfcli.export.frames import Workers, automatic_workers, export_frames, export_part
+from nerfcli.export.frames import export_frames, export_part
 from nerfcli.export.order import Order, refuse_foreign
 from nerfcli.export.settings import OUTPUTS, ExportSettings
 from nerfcli.runs.run import Run, load_run
@@ -40,8 +40,6 @@ def render_run(
     settings: ExportSettings | None = None,
     device: str = "auto",
     threads: int = 0,
-    step: float = 1.0,
-    jobs: int = 0,
     part: slice | None = None,
     overwrite: bool = False,
     notify: Notify = silent,
@@ -58,11 +56,9 @@ def render_run(
         run: the folder that `train_scene` wrote.
         target: the folder to write; in RUN/renders by default, named after views and depth.
         views: which cameras; the held-out ones by default.
-        settings: outputs, depth, file formats, videos, and quality of the pictures; `usual_settings` by default.
+        settings: outputs, depth, file formats, videos, and tolerance of the pictures; `usual_settings` by default.
         device: "auto", "cpu", "cuda" or "cuda:1".
         threads: number of CPU threads; 0 for all.
-        step: length of the steps along rays, relative to training.
-        jobs: number of processes; 0 to let `automatic_workers` choose.
         part: render only these views, for a later call to complete; None for all.
         overwrite: replace existing renders at `target`.
         notify: called with lines for the user.
@@ -90,7 +86,6 @@ def render_run(
         depths = part_of(progress, 0.0, 1.0, "depth of the held-out photos")
         errors = depth_errors(trained, model, seen, threads=cores, on_progress=depths, notify=notify)
         provenance["measured_photos"] = errors.photos
-    model = model.stretched(step)
     if settings.depth.convention == "background" and settings.depth.background_distance is None:
         farthest = model.marching.far / model.training_from_scene.scale
         settings = replace(settings, depth=replace(settings.depth, background_distance=farthest))
@@ -98,8 +93,6 @@ def render_run(
     frames = chosen_frames(trained, views, depth_hint=1.0 / model.training_from_scene.scale)
     if "depth" in settings.outputs and settings.depth.axis == "z":
         refuse_z_depth_for_equirectangular(frames, notify=notify)
-    if step != 1.0:
-        provenance["step"] = step
     order = Order(tuple(frames), settings, provenance, seen, errors)
     chosen = range(len(frames))[part] if part is not None else range(len(frames))
     if not chosen:
@@ -118,8 +111,6 @@ def render_run(
         progress(done / total, f"of {len(chosen)} frames")
 
     progress(0.0, "")
-    thread_safe = torch_device != "cpu" or model.thread_safe
-    workers = Workers(jobs, cores) if jobs else automatic_workers(total, threads=cores, thread_safe=thread_safe)
     if part is not None:
-        return [export_part(model, order, folder, chosen, on_rays=on_rays, notify=notify, workers=workers)]
-    return export_frames(model, order, folder, on_rays=on_rays, notify=notify, workers=workers)
+        return [export_part(model, order, folder, chosen, on_rays=on_rays, notify=notify, threads=cores)]
+    return export_frames(model, order, folder, on_rays=on_rays, notify=notify, threads=cores)

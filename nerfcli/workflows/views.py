@@ -11,7 +11,7 @@ from nerfcli import scene as scenes
 from nerfcli.atomic import cannot_write
 from nerfcli.cameras import paths
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.camera_path import losses_camera_path, read_normalisation, read_path, write_camera_path
+from nerfcli.cameras.formats.camera_path import losses_camera_path, read_path, write_camera_path
 from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture, Frame, frames_named
 from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
@@ -81,7 +81,6 @@ class Views:
         cameras: test, train, a path, or a file or folder of cameras.
         count: number of views of a path.
         through: comma-separated names of the photos that a path goes through or around; None for all training photos.
-        nerfstudio_frame: dataparser_transforms.json of the nerfstudio run whose world frame the file's cameras use.
         max_size: maximum longer side of the pictures, in pixels; None for no maximum.
         look: size, lens and crop of the pictures.
     """
@@ -89,7 +88,6 @@ class Views:
     cameras: str
     count: int = 60
     through: str | None = None
-    nerfstudio_frame: Path | None = None
     max_size: int | None = None
     look: PictureOptions = PictureOptions()
 
@@ -114,12 +112,6 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
         raise UserError(
             f"--through cannot be used with --cameras {cameras}", f"it works with {', '.join(PATHS)}", exit_code=2
         )
-    if views.nerfstudio_frame is not None and cameras in ("test", "train", *PATHS):
-        raise UserError(
-            f"--nerfstudio-frame cannot be used with --cameras {cameras}",
-            "it works with a file of cameras",
-            exit_code=2,
-        )
     sets, factor = run.cameras, run.config.downscale
     keyframes = sets.train
     if through is not None:
@@ -137,7 +129,7 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
         path = {"orbit": paths.orbit, "spiral": paths.spiral}[cameras]
         chosen = path(keyframes, count=views.count, depth_hint=depth_hint)
     else:
-        chosen = _frames_of(Path(cameras), views.nerfstudio_frame)
+        chosen = _frames_of(Path(cameras))
         factor = 1
     chosen = [replace(frame, camera=downscaled_camera(frame.camera, factor)) for frame in chosen]
     if views.max_size is not None:
@@ -220,7 +212,7 @@ def refuse_frames(target: Path, *, overwrite: bool) -> None:
         raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another folder with -o")
 
 
-def _frames_of(path: Path, nerfstudio_frame: Path | None) -> tuple[Frame, ...]:
+def _frames_of(path: Path) -> tuple[Frame, ...]:
     """Return the cameras of a scene, rescaled to its photos, or of any file or folder that `nerfcli convert` reads."""
     if not path.exists():
         raise UserError(
@@ -229,13 +221,8 @@ def _frames_of(path: Path, nerfstudio_frame: Path | None) -> tuple[Frame, ...]:
         )
     form, found = recognise(path)
     if path.is_dir() and form.name in SCENES:
-        frames = scenes.load(path).frames
-    else:
-        frames = form.parse(found, UserInputs()).frames
-    if nerfstudio_frame is None:
-        return frames
-    world_from_nerfstudio = read_normalisation(nerfstudio_frame).inverse()
-    return tuple(replace(f, world_from_cam=world_from_nerfstudio.apply_pose(f.world_from_cam)) for f in frames)
+        return scenes.load(path).frames
+    return form.parse(found, UserInputs()).frames
 
 
 def _within(camera: Camera, max_size: int) -> Camera:

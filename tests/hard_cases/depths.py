@@ -1,7 +1,6 @@
 """Depths, depth quantiles and optical depths of hard rays, against 60-digit answers."""
 
 import itertools
-import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,12 +11,9 @@ from torch import Tensor
 from hard_cases import exact, exact_depths
 from hard_cases.exact_depths import FRACTIONS, quantile_name
 from nerfcli.kernels import LightEnds
-from nerfcli.kernels.reference.depth import BISECTIONS
 from nerfcli.selftest import textbook
 from nerfcli.selftest.cases import (
     MEANINGLESS,
-    PIXEL_FRACTIONS,
-    PIXELS,
     Ray,
     Segments,
     deepest_ray,
@@ -40,7 +36,6 @@ def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
         rays = [_rounded(ray, precision) for ray in depth_rays()]
         yield from _depth_rows([ray for ray in rays if len(ray.density) <= FEW], precision, cut="1 to 15")
         yield from _depth_rows([ray for ray in rays if len(ray.density) > FEW], precision, cut="100 or 256")
-        yield _mixture_row(precision)
 
 
 # The depths, grouped by what makes them hard: name of the group, columns.
@@ -183,41 +178,6 @@ def _rounded(ray: Ray, precision: Precision) -> Ray:
     dtype = torch.bfloat16 if precision.dtype == torch.bfloat16 else torch.float32
     columns = (torch.tensor(v, dtype=dtype).double().tolist() for v in (ray.density, ray.starts, ray.ends))
     return Ray(ray.name, *columns)
-
-
-def _mixture_row(precision: Precision) -> Row:
-    """Measure quantiles of the combined light of two rays, at no fraction where the combined light has a gap."""
-    rays = [_rounded(ray, precision) for pixel in PIXELS for ray in pixel]
-    density, starts, ends, offsets = _packed(rays, precision)
-    module = precision.parts
-    got, means, wanted = [], [], []
-    start = time.perf_counter()
-    for fraction in PIXEL_FRACTIONS:
-        pixels = {"offsets": offsets, "rays_per_pixel": 2, "fraction": fraction}
-        got.append(module.mixture_quantile(density, starts, ends, **pixels))
-    seconds = time.perf_counter() - start
-    for fraction in PIXEL_FRACTIONS:
-        alone = module.light_ends(density, starts, ends, offsets=offsets, fractions=(fraction,)).quantiles
-        means.append(alone.view(-1, 2).mean(1))
-        wanted += [exact.mixture_quantile(rays[i : i + 2], fraction) for i in range(0, len(rays), 2)]
-    return Row(
-        case="quantiles of several rays of a pixel, of which some hit nothing",
-        operation="mixture_quantile",
-        precision=precision.name,
-        errors=Errors(largest_error(torch.cat(got), wanted, tiny=precision.tiny)),
-        no_gradient="found by bisection",
-        bounds=Errors(4 * precision.unit + 2.0**-BISECTIONS * _farthest(rays, wanted)),
-        reason="4 u, and the last bracket of the bisection over the smallest answer",
-        formula="mean of the rays' quantiles",
-        textbook=None if precision.compiled else Errors(largest_error(torch.cat(means), wanted, tiny=precision.tiny)),
-        seconds=seconds,
-    )
-
-
-def _farthest(rays: list[Ray], wanted: list[float]) -> float:
-    """Return the largest ratio of a pixel's farthest distance to its answer."""
-    ends = [max((*a.ends, *b.ends)) for a, b in zip(rays[::2], rays[1::2], strict=True)]
-    return max(ends[i % len(ends)] / place for i, place in enumerate(wanted) if not math.isnan(place))
 
 
 def _flat(rays: list[Segments], precision: Precision) -> tuple[Tensor, Tensor, Tensor]:

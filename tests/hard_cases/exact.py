@@ -1,11 +1,10 @@
 """Answers for rays in 60 decimal digits, by the definitions, from exactly the numbers that the kernels get."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from itertools import accumulate
 
-from nerfcli.selftest.cases import Ray, Segments
+from nerfcli.selftest.cases import Segments
 
 DIGITS = 60
 
@@ -86,35 +85,6 @@ def optical_depths(ray: Segments) -> list[float]:
         context.prec = DIGITS
         parts = (Decimal(sigma) * Decimal(length) for sigma, length in zip(ray.density, ray.lengths, strict=True))
         return [float(depth) for depth in accumulate(parts, initial=Decimal(0))]
-
-
-def mixture_quantile(rays: Sequence[Ray], fraction: float) -> float:
-    """Return the distance at which a fraction of the rays' combined light has ended, by bisection.
-
-    NaN if less light than that ends anywhere.
-    """
-    with localcontext() as context:
-        context.prec = DIGITS
-        columns = [
-            [tuple(map(Decimal, values)) for values in zip(ray.density, ray.starts, ray.ends, strict=True)]
-            for ray in rays
-        ]
-        wanted = 1 - Decimal(fraction)
-
-        def passed(t: Decimal) -> Decimal:
-            depths = (
-                sum((sigma * min(max(t - start, Decimal(0)), end - start) for sigma, start, end in ray), Decimal(0))
-                for ray in columns
-            )
-            return sum(((-depth).exp() for depth in depths), Decimal(0)) / len(rays)
-
-        low, high = Decimal(0), max(end for ray in columns for _, _, end in ray)
-        if passed(high) > wanted:
-            return float("nan")
-        while high - low > high * Decimal("1e-25"):
-            middle = (low + high) / 2
-            low, high = (low, middle) if passed(middle) <= wanted else (middle, high)
-        return float(high)
 
 
 def distortion(weights: list[float], starts: list[float], ends: list[float]) -> tuple[float, list[float]]:

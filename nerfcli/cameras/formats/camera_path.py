@@ -8,11 +8,10 @@ fisheye alike, with square pixels and the principal point in the middle; aspect 
 equidistant one, radius = focal length * angle, so a fisheye's fov is not its field of view: with fov 90, a picture is
 114.6 degrees high. Keyframes are the state of the viewer's editor; only camera_path is rendered.
 
-The world of the viewer is nerfstudio's normalised one, in which it trains. `read_normalisation` reads the similarity to
-it from dataparser_transforms.json in the run's folder; its inverse maps a path back to the scene.
+A path drawn in nerfstudio's viewer is in its normalised world, not in that of the scene.
 
 Sources: nerfstudio, cameras/camera_paths.py get_path_from_json; viewer/render_panel.py _write_json; cameras/cameras.py
-for the fisheye; data/dataparsers/base_dataparser.py save_dataparser_transform.
+for the fisheye.
 """
 
 import math
@@ -31,7 +30,6 @@ from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.limits import rigid_pose
 from nerfcli.cameras.formats.unsupported import distortion, projection
 from nerfcli.cameras.frame import Capture, Frame
-from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 
 # A larger width or height is taken for a damaged number.
@@ -145,27 +143,6 @@ def write_camera_path(capture: Capture, path: Path, *, fps: float = _DEFAULT_FPS
         "camera_path": records,
     }
     write_json(path, content)
-
-
-def read_normalisation(path: Path) -> Similarity:
-    """Read the similarity nerfstudio_from_world in a run's dataparser_transforms.json: scale * (transform @ point).
-
-    The world is that of the transforms.json that nerfstudio trained on, or if that file has an applied_transform, the
-    world before the transform.
-
-    Raises:
-        UserError: the file is malformed; file and field are named.
-    """
-    content = read_json_object(path)
-    scale = _number(content, "scale", str(path))
-    if scale <= 0:
-        raise UserError(f"{path}: scale is {scale}", "expected a number above 0")
-    expected = "expected 3 rows of 4 numbers"
-    rows = content.get("transform")
-    if not isinstance(rows, list) or len(rows) not in (3, 4) or not all(isinstance(row, list) for row in rows):
-        raise UserError(f"{path}: transform is {_short(rows)}", expected)
-    transform = rigid_pose(_matrix([value for row in rows[:3] for value in row], 3, f"{path}: transform"), str(path))
-    return Similarity(scale, transform[:3, :3], scale * transform[:3, 3])
 
 
 def _camera(record: dict[str, Any], kind: str, width: int, height: int, *, where: str) -> Camera:

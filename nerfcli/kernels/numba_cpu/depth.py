@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nerfcli.kernels.interface import LightEnds
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.reference.depth import BISECTIONS, SERIES_BELOW, VARIANCE_SERIES, VARIANCE_SERIES_BELOW
+from nerfcli.kernels.reference.depth import SERIES_BELOW, VARIANCE_SERIES, VARIANCE_SERIES_BELOW
 
 _SERIES = np.array(VARIANCE_SERIES)
 
@@ -114,49 +114,3 @@ def light_ends_of(sums: np.ndarray, quantiles: np.ndarray, fractions: tuple[floa
         largest=largest.float(),
         quantiles=torch.from_numpy(quantiles[:, back]),
     )
-
-
-@numba.njit(inline="always")
-def _passed(density: Any, starts: Any, ends: Any, offsets: Any, first: Any, count: Any, t: Any) -> Any:
-    """Return the mean transmittance of some rays at distance t."""
-    total = 0.0
-    for ray in range(first, first + count):
-        depth = 0.0
-        for i in range(offsets[ray], offsets[ray + 1]):
-            start = np.float64(starts[i])
-            if start >= t:
-                break
-            depth += np.float64(density[i]) * (min(t, np.float64(ends[i])) - start)
-        total += np.exp(-depth)
-    return total / count
-
-
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _mixture_quantile(density: Any, starts: Any, ends: Any, offsets: Any, out: Any, parameters: Any) -> None:
-    count, wanted = np.int64(parameters[0]), parameters[1]
-    for pixel in numba.prange(out.shape[0]):
-        first, low, high = pixel * count, 0.0, 0.0
-        for ray in range(first, first + count):
-            if offsets[ray + 1] > offsets[ray]:
-                high = max(high, np.float64(ends[offsets[ray + 1] - 1]))
-        out[pixel] = np.nan
-        if high > 0.0 and _passed(density, starts, ends, offsets, first, count, high) <= wanted:
-            for _ in range(BISECTIONS):
-                middle = (low + high) / 2
-                if _passed(density, starts, ends, offsets, first, count, middle) <= wanted:
-                    high = middle
-                else:
-                    low = middle
-            out[pixel] = high
-
-
-def mixture_quantile(
-    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, fraction: float
-) -> Tensor:
-    """See `depth.mixture_quantile`; float32 on the CPU."""
-    use_threads()
-    out = torch.empty((len(offsets) - 1) // rays_per_pixel)
-    wanted = torch.tensor([float(rays_per_pixel), 1.0 - fraction], dtype=torch.float64)
-    tensors = (density, starts, ends, offsets, out, wanted)
-    _mixture_quantile(*(x.detach().contiguous().numpy() for x in tensors))
-    return out

@@ -15,7 +15,7 @@ from nerfcli.kernels.reference.compositing import (
     scale_gradients,
     sum_along_rays,
 )
-from nerfcli.kernels.reference.depth import light_ends, mixture_quantile
+from nerfcli.kernels.reference.depth import light_ends
 from nerfcli.kernels.reference.encoding import corner_rows, hash_encode
 from nerfcli.kernels.reference.marching import (
     keep_largest,
@@ -45,7 +45,6 @@ __all__ = [
     "keep_largest",
     "light_ends",
     "march",
-    "mixture_quantile",
     "occupied_samples",
     "off_target",
     "optical_depth_before",

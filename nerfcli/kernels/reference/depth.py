@@ -2,7 +2,7 @@
 
 A ray has density sigma(t), transmittance T(t) and the density of absorption p(t) = T(t) sigma(t), whose integral is the
 opacity. Density is constant inside an interval, and everything here is exact for that: no midpoints. Packed samples as
-in `interface`; any dtype, differentiable. Only `light_ends` and `mixture_quantile` have fast versions.
+in `interface`; any dtype, differentiable. Only `light_ends` has fast versions.
 """
 
 import math
@@ -29,9 +29,6 @@ VARIANCE_SERIES = (
     *(-3617 / 711374856192000, 43867 / 300534953951232000, -174611 / 42255666457804800000),
     *(77683 / 671480954256752640000, -236364091 / 73644527683988855193600000),
 )
-
-# Bisection steps of `mixture_quantile`: to 1e-12 of the farthest sample's distance.
-BISECTIONS = 40
 
 
 def mean_fraction(optical_depth: Tensor) -> Tensor:
@@ -201,43 +198,6 @@ def light_ends(
     quantiles = torch.stack(columns, dim=-1) if columns else density.new_empty(len(offsets) - 1, 0)
     heaviest, largest = max_weight(weights, means, offsets), _largest(weights, offsets)
     return LightEnds(total, transmittance, mean, width, heaviest, largest, quantiles)
-
-
-def mixture_quantile(
-    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, fraction: float
-) -> Tensor:
-    """Compute the distance by which a fraction of the light of a group of equally weighted rays is absorbed.
-
-    mean_k T_k(t) = 1 - fraction, solved by bisection to 1e-12 of the group's farthest sample.
-
-    Args:
-        density, starts, ends, offsets: as in `light_ends`; groups are `rays_per_pixel` consecutive rays.
-        rays_per_pixel: rays per group, a divisor of R.
-        fraction: of the light, between 0 and 1.
-
-    Returns:
-        (R / rays_per_pixel,); NaN where the mean opacity stays below `fraction`. Without gradients.
-    """
-    with torch.no_grad():
-        rays, rows = ray_indices(offsets), len(offsets) - 1
-        place = torch.arange(len(density), device=density.device) - offsets[rays]
-        most = int(offsets.diff().max()) if rows else 0
-        padded = torch.zeros(3, rows, most, dtype=torch.float64, device=density.device)
-        padded[:, rays, place] = torch.stack([density, starts, ends]).double()
-        sigma, first, last = padded
-
-        def passed(t: Tensor) -> Tensor:
-            inside = torch.minimum((t.repeat_interleave(rays_per_pixel)[:, None] - first).clamp_min(0.0), last - first)
-            return torch.exp(-(sigma * inside).sum(-1)).view(-1, rays_per_pixel).mean(-1)
-
-        high = torch.nn.functional.pad(last, (0, 1)).amax(-1).view(-1, rays_per_pixel).amax(-1)
-        reached = (passed(high) <= 1.0 - fraction) & (high > 0)
-        low = torch.zeros_like(high)
-        for _ in range(BISECTIONS):
-            middle = (low + high) / 2
-            enough = passed(middle) <= 1.0 - fraction
-            low, high = torch.where(enough, low, middle), torch.where(enough, middle, high)
-        return torch.where(reached, high, torch.nan).to(density.dtype)
 
 
 def _largest(weights: Tensor, offsets: Tensor) -> Tensor:

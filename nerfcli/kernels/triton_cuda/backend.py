@@ -1,7 +1,7 @@
 """Backend of the GPU kernels: float32 fields, computed in float16 with float32 sums where it is safe.
 
 The reference, on the device, samples and evaluates a hash grid of sizes that the kernels do not support, and computes
-mixtures of rays, total variation and projections of scans.
+total variation and projections of scans.
 """
 
 import weakref

@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from nerfcli.kernels.interface import AdamStep, HashGrid, March, Rays, Samples
-from nerfcli.kernels.reference import keep_largest, mixture_quantile
+from nerfcli.kernels.reference import keep_largest
 from nerfcli.kernels.triton_cuda import marching, row_adam
 from nerfcli.kernels.triton_cuda.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.triton_cuda.depth import light_ends
@@ -20,7 +20,6 @@ __all__ = [
     "interval_weights",
     "keep_largest",
     "light_ends",
-    "mixture_quantile",
     "occupied_samples",
     "optical_depth_before",
     "pixel_rays",
