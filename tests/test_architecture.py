@@ -74,17 +74,7 @@ MAY_IMPORT = {
     "export": {"render", "field", "scene", "cameras", "media"},
     "ablate": {"runs"},
     "bench": {
-        "evaluate",
-        "train",
-        "runs",
-        "photos",
-        "render",
-        "field",
-        "kernels",
-        "scene",
-        "cameras",
-        "media",
-        "pages",
+        *("evaluate", "train", "runs", "photos", "render", "kernels", "scene", "cameras", "media"),
     },
     "selftest": {"kernels"},
     "report": {"runs", "evaluate", "export", "render", "field", "scene", "cameras", "media", "pages"},
@@ -109,7 +99,7 @@ CONFINED = {
     "pycolmap": {"poses", "poses.engine", "poses.judge", "poses.model", "cameras", "surface"},
     "typer": {"cli"},
     "rich": {"cli"},
-    "matplotlib": {"media"},
+    "matplotlib": {"media", "bench"},
 }
 # The command line starts in a fraction of a second because these are imported inside the commands that need them.
 NOT_AT_START = (

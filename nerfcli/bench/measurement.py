@@ -1,156 +1,190 @@
-"""Run a bench from beginning to end: split the budget between rendering and training, and continue earlier calls."""
+"""Measure the settings of a bench: renderings of a run in interleaved rounds, or trainings of a scene one by one.
 
+Every rendering setting renders the same held-out photos. A first round renders the pictures from which errors are
+computed, and warms up; its times do not count. Every later round times all settings in a different order, so that a
+machine that gets slower in the middle does not make one setting look slow.
+"""
+
+import random
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import torch
 
-from nerfcli import kernels
-from nerfcli.bench.machine import describe_machine, is_busy, load_average
-from nerfcli.bench.records import Records, opened
-from nerfcli.bench.rendering import WORK, measure_rendering
-from nerfcli.bench.sample_pictures import FOLDER, slug
-from nerfcli.bench.session import Session
-from nerfcli.bench.sweep import RenderSetting, render_settings, train_settings
-from nerfcli.bench.trained_run import BenchedRun
-from nerfcli.bench.training import KEPT_FIELD, Trainings, measure_trainings
-from nerfcli.bench.worker import measure_model
+from nerfcli import scene as scenes
+from nerfcli.bench.machine import PeakMemory
+from nerfcli.bench.results import Point, spread
+from nerfcli.bench.settings import RenderSetting, affordable, render_settings, train_settings
 from nerfcli.errors import UserError
-from nerfcli.render.model import Model, load_model
-from nerfcli.runs.files import FIELD
+from nerfcli.evaluate.metrics import psnr, to_8_bit
+from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
+from nerfcli.evaluate.run_photos import held_out_photos_of
+from nerfcli.evaluate.sampled import SampledPixels
+from nerfcli.media.images import downscale
+from nerfcli.photos.loading import downscaled_camera
+from nerfcli.render.accuracy import TIGHT
+from nerfcli.render.model import Model
+from nerfcli.render.pictures import RenderedPicture, render_picture
+from nerfcli.runs.run import Run
+from nerfcli.runs.settings import TrainSettings, sizes_for
+from nerfcli.train.loop import Progress, train
 
-# Fraction of the budget for rendering where training is measured as well: renderings are short, trainings are not.
-_RENDERING_FRACTION = 0.4
-# Fraction of the budget that is reserved for the report.
-_KEPT_BACK = 0.03
-# Fraction of the budget that rendering gets even if training took longer than planned.
-_LEAST_FRACTION = 0.1
-COMPLETE = "complete"
-THIS_RUN = "this run"
+MOST_PHOTOS = 3
+LEAST_ROUNDS, MOST_ROUNDS = 3, 9
+# With fewer settings there is nothing to compare; these are measured even if time is short.
+LEAST_SETTINGS = 7
+# Mean time of the first settings over that of the default.
+_MEAN_COST = 1.2
+# A rendering counts as converged with steps this many times as fine, and next to nothing left out by the early stop.
+FINER = 8
+# Seconds of a training besides the training: photos, preparation, comparison with held-out photos.
+_OVERHEAD_SECONDS = 6.0
+_WORK = ".training"
 
-
-@dataclass(frozen=True)
-class BenchOptions:
-    """Options of a bench.
-
-    Args:
-        budget_seconds: time limit for everything.
-        sweep: "both", "render" or "train".
-    """
-
-    budget_seconds: float
-    sweep: str
-    seed: int
-
-
-def open_bench(subject: BenchedRun, folder: Path, wanted: BenchOptions) -> Records:
-    """Open the records of this bench in a folder, new or to be continued.
-
-    Raises:
-        UserError: the folder holds something else.
-    """
-    plan: dict[str, Any] = {
-        "source": _title(subject.path.resolve()),
-        "measured": subject.identity,
-        "machine": describe_machine(subject.base.device, subject.base.threads),
-        "budget_seconds": wanted.budget_seconds,
-        "sweep": wanted.sweep,
-        "seed": wanted.seed,
-    }
-    return opened(folder, plan)
+# Called with the points so far, after each round of renderings and after each training.
+Save = Callable[[Sequence[Point]], None]
+# Called with (fraction of the time used, current work).
+Tell = Callable[[float, str], None]
 
 
-def measure(
-    subject: BenchedRun,
-    records: Records,
-    wanted: BenchOptions,
-    *,
-    tell: Callable[[float, str], None],
-    notify: Callable[[str], None],
-) -> None:
-    """Measure what is still missing; every finished measurement is in the records, even if this is interrupted.
-
-    Args:
-        subject: a run or a scene.
-        records: from `open_bench`.
+def measure_renderings(run: Run, *, device: str, threads: int, seconds: float, save: Save, tell: Tell) -> None:
+    """Measure as many rendering settings of a run as time allows.
 
     Raises:
-        UserError: a photo cannot be read, or the results cannot be written.
+        UserError: a photo cannot be read, or nothing was held out.
     """
-    if records.last(COMPLETE) is not None:
-        return
-    load = load_average()
-    kernels.prepare(notify, subject.base.device)
-    session = Session(records, wanted.budget_seconds, tell, notify)
-    session.record("begun", load_average=load, busy=is_busy(load))
-    if is_busy(load):
-        notify(f"other programs are using the processors (load average {load:.1f}): times will be too long and vary")
-    torch.set_num_threads(subject.base.threads)
-    (records.folder / FOLDER).mkdir(exist_ok=True)
-    if subject.run is not None:
-        _measure_run(subject, subject.run, wanted, session)
-    else:
-        _measure_scene(subject, wanted, session)
-    session.record(COMPLETE, load_average=load_average())
-    shutil.rmtree(records.folder / WORK, ignore_errors=True)
+    began = time.monotonic()
 
+    def spent() -> float:
+        return min(1.0, (time.monotonic() - began) / seconds)
 
-def _measure_run(subject: BenchedRun, run: Path, wanted: BenchOptions, session: Session) -> None:
-    """Render the run's field, then train its scene again in other ways."""
-    ends = (1.0 - _KEPT_BACK) * wanted.budget_seconds
-    model = load_model(run / FIELD, subject.base.device)
-    if model.sha256 != subject.identity:
-        raise UserError(f"{run / FIELD} was replaced while bench started", "wait until the training has finished")
-    if wanted.sweep != "train":
-        fraction = _RENDERING_FRACTION if wanted.sweep == "both" and subject.scene is not None else 1.0
-        _render(subject, model, session, ends=fraction * ends)
-    if wanted.sweep == "render":
-        return
-    if subject.scene is None:
-        session.notify(f"training settings are skipped: {subject.why_no_scene}")
-        return
-    if subject.trained and not any(entry["point"] == THIS_RUN for entry in session.records.of_kind("training")):
-        session.say("comparing this run with held-out photos")
-        torch.set_num_threads(subject.base.threads)
-        photos, pictures = subject.held_out(model), session.folder / FOLDER
-        measured = measure_model(
-            model, photos, seed=0, folder=pictures, prefix=slug(f"training {THIS_RUN}"), shown=subject.shown
+    model = run.model(device)
+    photos = held_out_photos_of(run.config, run.cameras.test, model, threads=threads)
+    if not photos:
+        raise UserError(f"{run.path} has no held-out photos", "by default every 8th photo is held out; check the split")
+    settings = render_settings(threads)
+    tell(0.0, "rendering a first picture")
+    _render(model, photos[0], settings[0])
+    once = _timed(model, photos[:1], settings[0])
+    # One photo, and a smaller one, where the least number of rounds would take longer than the time.
+    needed = once * (FINER + LEAST_SETTINGS * (LEAST_ROUNDS + 1)) * _MEAN_COST
+    count = max(1, min(MOST_PHOTOS, len(photos), int(seconds / needed)))
+    photos = [smaller(photo, (needed / seconds) ** 0.5) for photo in photos[:: -(-len(photos) // count)]]
+    tell(spent(), "rendering the converged pictures")
+    converged = [_converged(model, photo) for photo in photos]
+    pictures: dict[RenderSetting, tuple[float, float]] = {}
+    for number, setting in enumerate(settings):
+        if number >= LEAST_SETTINGS and spent() > 0.3:
+            break
+        tell(spent(), f"rendering: {setting.name(settings[0])}")
+        pictures[setting] = _errors(model, photos, converged, setting)
+    memory = PeakMemory(device)
+    taken: dict[RenderSetting, list[float]] = {setting: [] for setting in pictures}
+    peaks: dict[RenderSetting, int | None] = {}
+    for number in range(MOST_ROUNDS):
+        if number >= LEAST_ROUNDS and spent() > 0.95:
+            break
+        order = list(pictures)
+        random.Random(number).shuffle(order)
+        for setting in order:
+            tell(spent(), f"timing, round {number + 1}: {setting.name(settings[0])}")
+            memory.begin()
+            taken[setting].append(_timed(model, photos, setting))
+            peaks[setting] = memory.read()
+        save(
+            [
+                Point(
+                    setting.name(settings[0]),
+                    **spread(taken[setting]),
+                    peak_memory_bytes=peaks[setting],
+                    psnr=decibels,
+                    levels_off=levels,
+                )
+                for setting, (decibels, levels) in pictures.items()
+            ]
         )
-        described = {"group": "run", "options": None, "settings": subject.base.to_json()}
-        session.record("training", point=THIS_RUN, **described, **subject.trained, **measured)
-    trainings = Trainings(subject.scene, subject.base, subject.shown, kept=None)
-    measure_trainings(trainings, train_settings(), session=session, seconds=ends - session.spent)
 
 
-def _measure_scene(subject: BenchedRun, wanted: BenchOptions, session: Session) -> None:
-    """Train the scene, then render the field of the default training."""
-    assert subject.scene is not None
-    ends = (1.0 - _KEPT_BACK) * wanted.budget_seconds
-    settings = train_settings()
-    fraction = {"both": 1.0 - _RENDERING_FRACTION, "train": 1.0, "render": _RENDERING_FRACTION}[wanted.sweep]
-    if wanted.sweep == "render":
-        settings = settings[:1]  # rendering needs one trained field
-    trainings = Trainings(subject.scene, subject.base, subject.shown, kept=settings[0].name)
-    measure_trainings(trainings, settings, session=session, seconds=fraction * ends - session.spent)
-    field = session.folder / KEPT_FIELD
-    if wanted.sweep != "train" and field.exists():
-        _render(subject, load_model(field, subject.base.device), session, ends=ends)
+def measure_trainings(
+    scene_folder: Path, work: Path, *, device: str, threads: int, seconds: float, save: Save, tell: Tell
+) -> None:
+    """Train a scene with as many settings as time allows, each for the same time unless it is the time that varies.
+
+    Args:
+        work: folder for the runs; they are deleted again.
+
+    Raises:
+        UserError: see `nerfcli.train.loop.train`; or nothing was held out.
+    """
+    scene = scenes.load(scene_folder)
+    if not scene.test_frames:
+        raise UserError(f"{scene_folder} has no held-out photos", "by default every 8th photo is held out")
+    base = TrainSettings(device=device, threads=threads, **sizes_for(device))
+    chosen, unit = affordable(train_settings(), seconds, overhead=_OVERHEAD_SECONDS)
+    points: list[Point] = []
+    memory, folder = PeakMemory(device), work / _WORK
+    for number, setting in enumerate(chosen):
+
+        def on_progress(progress: Progress, number: int = number, name: str = setting.name) -> None:
+            tell((number + progress.fraction) / len(chosen), f"training: {name}, step {progress.step}")
+
+        memory.begin()
+        shutil.rmtree(folder, ignore_errors=True)
+        try:
+            wanted = setting.settings(base, unit)
+            train(scene, folder, wanted, resume=False, notify=lambda text: None, on_progress=on_progress)
+            trained = Run(folder)
+            model, summary = trained.model(device), trained.summary
+            photos = held_out_photos_of(trained.config, scene.test_frames, model, threads=threads)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+        assert summary is not None
+        decibels = SampledPixels.drawn(photos, seed=0).psnr(model)
+        taken = spread([summary.seconds])
+        points.append(Point(setting.name, **taken, peak_memory_bytes=memory.read(), psnr=decibels, steps=summary.steps))
+        save(points)
 
 
-def _render(subject: BenchedRun, model: Model, session: Session, *, ends: float) -> None:
-    seconds = max(ends - session.spent, _LEAST_FRACTION * session.budget_seconds)
-    measure_rendering(model, subject.held_out(model), _ways_to_render(subject), session=session, seconds=seconds)
+def smaller(photo: HeldOutPhoto, factor: float) -> HeldOutPhoto:
+    """Return the photo with its sides divided by a factor; unchanged if the factor is 1 or less."""
+    if factor <= 1.0:
+        return photo
+    used = None if photo.used is None else downscale(photo.used.astype(np.uint8) * 255, factor) == 255
+    frame = replace(photo.frame, camera=downscaled_camera(photo.frame.camera, factor))
+    return replace(photo, frame=frame, pixels=downscale(photo.pixels, factor), used=used)
 
 
-def _title(path: Path) -> str:
-    """Return the folder's name, with that of its parent if the name is only "run" or "scene"."""
-    return f"{path.parent.name}/{path.name}" if path.name in ("run", "scene") else path.name
+def _render(model: Model, photo: HeldOutPhoto, setting: RenderSetting) -> RenderedPicture:
+    torch.set_num_threads(setting.threads)
+    background, fine = background_of(model, photo), model.stretched(setting.step)
+    return render_picture(fine, photo.frame, background=background, tolerance=setting.tolerance)
 
 
-def _ways_to_render(subject: BenchedRun) -> list[RenderSetting]:
-    """Return the settings that matter on this device: on a GPU, the number of CPU threads makes no difference."""
-    base = subject.base
-    return [way for way in render_settings(base.threads) if base.device == "cpu" or way.threads == base.threads]
+def _timed(model: Model, photos: Sequence[HeldOutPhoto], setting: RenderSetting) -> float:
+    """Return the seconds per picture."""
+    began = time.perf_counter()
+    for photo in photos:
+        _render(model, photo, setting)
+    return (time.perf_counter() - began) / len(photos)
+
+
+def _converged(model: Model, photo: HeldOutPhoto) -> np.ndarray:
+    background, fine = background_of(model, photo), model.stretched(1 / FINER)
+    return render_picture(fine, photo.frame, background=background, tolerance=TIGHT).rgb
+
+
+def _errors(
+    model: Model, photos: Sequence[HeldOutPhoto], converged: Sequence[np.ndarray], setting: RenderSetting
+) -> tuple[float, float]:
+    """Return the mean PSNR on the photos, and the rms difference from the converged pictures in levels of 255."""
+    decibels, squares = [], []
+    for photo, fine in zip(photos, converged, strict=True):
+        picture = _render(model, photo, setting)
+        compared = compare(photo, picture)
+        decibels.append(psnr(to_8_bit(compared.rendered), compared.photo, used=compared.used))
+        squares.append(float(np.square(picture.rgb - fine, dtype=np.float64)[compared.used].mean()))
+    return float(np.mean(decibels)), 255.0 * float(np.sqrt(np.mean(squares)))

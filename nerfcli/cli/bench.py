@@ -1,5 +1,7 @@
 """nerfcli bench: speed against error."""
 
+import json as json_text
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,27 +14,20 @@ from nerfcli.errors import UserError
 from nerfcli.workflows.machine import device_name, thread_count
 
 if TYPE_CHECKING:
-    from nerfcli.bench.measurement import BenchOptions
+    from nerfcli.bench.results import Point
 
-_SWEEPS = ("both", "render", "train")
 _SHORTEST_SECONDS = 20.0
-_STYLES = {"in it": "green"}
+_STYLES = {"yes": "green"}
 
 
 @command
 def bench(
-    source: Annotated[
-        str, typer.Argument(help="Run folder, or a scene to train first; - to read paths from standard input.")
-    ],
+    source: Annotated[str, typer.Argument(help="Run folder, or a scene; - to read paths from standard input.")],
     output: options.Output = None,
     budget: Annotated[
         str, typer.Option(help="Total time: 8m, 1h. More time allows more settings, longer trainings and more repeats.")
     ] = "8m",
-    sweep: Annotated[
-        str, typer.Option(help="render (rendering settings only), train (training settings only) or both.")
-    ] = "both",
     device: options.Device = "auto",
-    seed: options.Seed = 0,
     threads: options.Threads = 0,
     overwrite: options.Overwrite = False,
     json: options.Json = False,
@@ -40,96 +35,75 @@ def bench(
 ) -> None:
     """Measure speed against error on this scene and machine.
 
-    Renders one trained field with many settings and trains with many settings. Measures for each the time (median and
-    quartiles of interleaved repeats), peak memory, size, the error against the held-out photos and, separately, the
-    error against a converged rendering of the same field. Shows which settings are in the Pareto set, which setting
-    dominates the others, and recommends settings. Run nothing else meanwhile.
+    Of a run: renders its field with other steps, tolerances and numbers of threads. Measures the time per picture
+    (median and quartiles of interleaved rounds), peak memory, the error against the held-out photos and, separately,
+    against a converged rendering of the same field. Of a scene: trains it with other sizes, batches, seeds and times.
+    Run nothing else meanwhile.
 
-    Writes SOURCE-bench/ with bench.html (plots, and the pictures behind each point), bench.csv and bench.json. An
-    interrupted bench reports its results so far; run the same command again to continue.
+    Writes SOURCE-bench/ with bench.csv, bench.json and a plot, bench.png; after an interruption they hold the results
+    so far. In the column "fastest" are the settings than which none is faster with as small an error.
 
     \b
     Examples:
       nerfcli bench photos-scene-run
-      nerfcli bench photos-scene-run --sweep render --budget 3m
       nerfcli bench photos-scene --budget 30m -o bench/
-      nerfcli bench photos-scene-run --json | jq -r .recommendations[].point
+      nerfcli bench photos-scene-run --json | jq .points[].name
     """
-    options.one_of(sweep, _SWEEPS, "--sweep")
     seconds = options.seconds_from_text(budget)
     if seconds < _SHORTEST_SECONDS:
         raise typer.BadParameter(
             f"{budget!r} is too short; give at least {_SHORTEST_SECONDS:g}s", param_hint="--budget"
         )
     console = Console(quiet=quiet, json_lines=json)
-    from nerfcli.bench.measurement import BenchOptions
-    from nerfcli.cli.scans import refuse_scan
-
-    wanted = BenchOptions(seconds, sweep, seed)
 
     def work(path: Path, one_of_many: bool) -> None:
+        from nerfcli.cli.scans import refuse_scan
+
         refuse_scan(path, "bench")
         folder = result_path(path, suffix="-bench", output=output, one_of_many=one_of_many)
-        page, content = bench_one(
-            path,
-            folder,
-            wanted,
-            device=device_name(device),
-            threads=thread_count(threads),
-            overwrite=overwrite,
-            console=console,
-        )
-        console.result(page, content)
+        how = {"device": device_name(device), "threads": thread_count(threads), "seconds": seconds}
+        content = bench_one(path, folder, how, overwrite=overwrite, console=console)
+        console.result(folder / "bench.csv", content)
 
     for_each_input(source, work, command="bench")
 
 
-def bench_one(
-    path: Path, folder: Path, wanted: "BenchOptions", *, device: str, threads: int, overwrite: bool, console: Console
-) -> tuple[Path, dict[str, Any]]:
-    """Measure one run or scene, continue an earlier bench, and write the report, even if interrupted.
+def bench_one(path: Path, folder: Path, how: dict[str, Any], *, overwrite: bool, console: Console) -> dict[str, Any]:
+    """Measure one run or scene, or keep a complete bench of it; return the content of bench.json.
 
     Raises:
         UserError: the input cannot be measured, or `folder` holds something else.
-        KeyboardInterrupt: passed on after the report of the measurements so far.
     """
-    from nerfcli.bench.measurement import COMPLETE, measure, open_bench
-    from nerfcli.bench.records import MEASURED
-    from nerfcli.bench.report import discard, write_report
-    from nerfcli.bench.trained_run import find_subject
+    from nerfcli import kernels
+    from nerfcli.bench.machine import describe_machine, is_busy, load_average
+    from nerfcli.bench.measurement import measure_renderings, measure_trainings
+    from nerfcli.bench.results import BENCH, COLUMNS, Point, table_of, write_results
+    from nerfcli.runs.run import Run
 
-    subject = find_subject(path, device=device, threads=threads, seed=wanted.seed)
-    if overwrite:
-        discard(folder)
-    records = open_bench(subject, folder, wanted)
-    if records.last(COMPLETE) is not None:
-        console.note(f"{folder} is complete; add --overwrite to measure again")
-    elif (folder / MEASURED).exists():
-        console.note(f"resuming {folder} with {len(records.all())} measurements")
-    interrupted = None
-    with console.progress(f"bench {path.name}") as update:
-        try:
-            measure(subject, records, wanted, tell=update, notify=console.note)
-        except KeyboardInterrupt as error:
-            interrupted = error
-    page, content = write_report(records)
-    if interrupted is not None and not content["rendering"] and not content["training"]:
-        raise interrupted
-    _print(content, console)
-    if interrupted is not None:
-        console.note(f"{page} shows the measurements so far; run the same command again to continue")
-        raise interrupted
-    return page, content
+    if not path.exists():
+        raise UserError(f"{path} does not exist", "give a run folder, or a scene folder")
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / BENCH).is_file()):
+        raise UserError(f"{folder} exists and is not a bench folder", "choose another folder with -o")
+    if not overwrite and (folder / BENCH).is_file():
+        content = json_text.loads((folder / BENCH).read_text(encoding="utf-8"))
+        if content["complete"]:
+            console.note(f"{folder} is complete; add --overwrite to measure again")
+            return content
+    if is_busy(load := load_average()):
+        console.warn(f"other programs use the processors (load average {load:.1f}): times will be too long and vary")
+    kernels.prepare(console.note, how["device"])
+    about = {"source": str(path), "machine": describe_machine(how["device"], how["threads"]), "load_average": load}
+    latest: list[Point] = []
 
+    def save(points: Sequence["Point"]) -> None:
+        latest[:] = points
+        write_results(folder, about, latest, complete=False)
 
-def _print(content: dict[str, Any], console: Console) -> None:
-    from nerfcli.bench.tables import RENDERING_COLUMNS, TRAINING_COLUMNS, rendering_rows, sentences, training_rows
-
-    if content["rendering"]:
-        console.table(RENDERING_COLUMNS, rendering_rows(content["rendering"]), styles=_STYLES)
-    if content["training"]:
-        console.table(TRAINING_COLUMNS, training_rows(content["training"]), styles=_STYLES)
-    if not content["rendering"] and not content["training"]:
-        raise UserError("nothing was measured yet", "give more time with --budget, or run the same command again")
-    for sentence in sentences(content):
-        console.note(sentence)
+    with console.progress(f"bench {path.name}") as tell:
+        if Run(path).is_trained:
+            measure_renderings(Run(path), **how, save=save, tell=tell)
+        else:
+            measure_trainings(path, folder, **how, save=save, tell=tell)
+    content = write_results(folder, about, latest, complete=True)
+    console.table(COLUMNS, table_of(latest), styles=_STYLES)
+    return content

@@ -30,6 +30,8 @@ REMOVED: tuple[Removed, ...] = (
     Removed("ablate", "--with", "2026-11-29", "name the components to vary with --only"),
     Removed("ablate", "--without", "2026-11-29", "name the components to vary with --only"),
     Removed("convert", "--no-verify", "2026-11-29", "remove it: every file is read back and compared"),
+    Removed("bench", "--seed", "2026-11-29", "trainings with other seeds are among the settings of a scene"),
+    Removed("bench", "--sweep", "2026-11-29", "give a run for rendering settings, a scene for trainings"),
     Removed("convert", "--to npz", "2026-11-29", "use --to nerfcli (a scene folder), or --to colmap without photos"),
     Removed("convert", "--tolerance", "2026-11-29", "remove it: a file is kept if no ray is off by more than 1e-6 px"),
     Removed("convert", "--verify", "2026-11-29", "remove it: every file is read back and compared"),
