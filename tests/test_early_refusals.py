@@ -35,9 +35,10 @@ def test_json_nested_too_deeply_is_refused_and_not_a_traceback(tmp_path):
     assert "not valid JSON" in error_of(result)[0]
 
 
-def test_doctor_refuses_the_number_of_further_photos_where_no_run_is(tmp_path):
-    lines = error_of(nerfcli("doctor", tmp_path, "--views", "3"))
-    assert "--views is for runs" in lines[0]
+def test_doctor_refuses_a_run(finished):
+    error, hint = error_of(nerfcli("doctor", finished))
+    assert error == f"Error: {finished} is a run: doctor examines photos, scenes and scans"
+    assert hint.startswith("Hint:  nerfcli report RUN shows how many photos see what")
 
 
 @pytest.mark.parametrize("command", ["evaluate", "report", "export"])

@@ -19,24 +19,19 @@ if TYPE_CHECKING:
 
 _NAMES_SHOWN = 4
 _GATES = ("good", "look")
-DEFAULT_VIEWS = 5
 _STYLES = {"good": "green", "look": "yellow", "bad": "bold red"}
 
 
 @command
 def doctor(
     capture: Annotated[
-        str, typer.Argument(help="Folder of photos, a scene, or a run, or - to read paths from standard input.")
+        str, typer.Argument(help="Folder of photos, or a scene, or - to read paths from standard input.")
     ],
     output: Output = None,
     intrinsics: Intrinsics = None,
     subfolders: Subfolders = False,
     require: Annotated[
         str | None, typer.Option(help="good or look: exit code 7 if any finding is worse.", show_default=False)
-    ] = None,
-    views: Annotated[
-        int | None,
-        typer.Option(help=f"Runs: number of further photos to suggest.  [default: {DEFAULT_VIEWS}]", min=1, max=100),
     ] = None,
     threads: Threads = 0,
     overwrite: Overwrite = False,
@@ -49,9 +44,6 @@ def doctor(
     cameras. Prints a table on stderr and writes a page with thumbnails next to the capture, CAPTURE-doctor.html. Each
     finding is good, look or bad, with its number, its threshold and advice.
 
-    Of a run: the percentage of the surface that no, one, two or more training photos have seen, and the positions from
-    which further photos would see most of what fewer than two have, as a page and a camera path in RUN-next-views/.
-
     Of a scan by X-rays: I > I0, drift, rings, counts, truncation, directions and number of views, the centre of
     rotation, beam hardening.
 
@@ -62,8 +54,6 @@ def doctor(
       nerfcli doctor photos/kitchen --intrinsics calibration/cameras.txt
       nerfcli doctor photos/kitchen --require look
       nerfcli doctor stereo-rig/ --subfolders
-      nerfcli doctor photos-scene-run --views 8
-      nerfcli render photos-scene-run --cameras photos-scene-run-next-views/cameras.json
       ls -d captures/*/ | nerfcli doctor - -o pages/
     """
     one_of(require, _GATES, "--require")
@@ -77,16 +67,10 @@ def doctor(
 
     def work(path: Path, one_of_many: bool) -> None:
         if find_run(path) is not None:
-            if intrinsics is not None or require is not None or subfolders:
-                raise UserError(
-                    f"{path}: --intrinsics, --require and --subfolders are for photos, and this is a run",
-                    "leave them out",
-                )
-            folder = result_path(path, suffix="-next-views", output=output, one_of_many=one_of_many)
-            _examine_run(path, folder, console, count=views or DEFAULT_VIEWS, threads=threads, overwrite=overwrite)
-            return
-        if views is not None:
-            raise UserError(f"{path}: --views is for runs, whose missing photos it suggests", "leave it out")
+            raise UserError(
+                f"{path} is a run: doctor examines photos, scenes and scans",
+                "nerfcli report RUN shows how many photos see what; render has --outputs coverage,parallax",
+            )
         if is_reconstruction(path):
             raise UserError(
                 f"{path} is the reconstruction of an X-ray scan", "doctor examines the scan itself: give its folder"
@@ -116,27 +100,6 @@ def doctor(
         _show(diagnosis, page, content(diagnosis), console, require=require)
 
     for_each_input(capture, work, command="doctor")
-
-
-def _examine_run(path: Path, folder: Path, console: Console, *, count: int, threads: int, overwrite: bool) -> None:
-    """Examine how much of the surface the photos of a run see, and suggest further photos."""
-    from nerfcli.workflows.next_views import examine_run
-
-    with console.callbacks(f"doctor {path.name}") as callbacks:
-        found = examine_run(path, folder, count=count, threads=threads, overwrite=overwrite, **callbacks)
-    fractions = [(f"{name} of {found.photos}", f"{100 * fraction:.1f} %") for name, fraction in found.fractions.items()]
-    console.table(("photos that see it", "surface"), fractions, styles={})
-    if not found.views:
-        console.note("no further view would see a part of the surface that fewer than two photos see")
-        return
-    rows = [
-        (view.name, " ".join(f"{value:.3g}" for value in view.centre), f"{100 * gain:.1f} %")
-        for view, gain in zip(found.views, found.gains, strict=True)
-    ]
-    console.table(("further photo", "position", "surface it would be first or second to see"), rows, styles={})
-    before, after = found.seen_twice
-    console.note(f"two photos or more see {100 * before:.1f} % of the surface, with these {100 * after:.1f} %")
-    console.result(folder, found.to_json())
 
 
 def _show(

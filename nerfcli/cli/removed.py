@@ -35,6 +35,7 @@ REMOVED: tuple[Removed, ...] = (
     Removed("convert", "--to npz", "2026-11-29", "use --to nerfcli (a scene folder), or --to colmap without photos"),
     Removed("convert", "--tolerance", "2026-11-29", "remove it: a file is kept if no ray is off by more than 1e-6 px"),
     Removed("convert", "--verify", "2026-11-29", "remove it: every file is read back and compared"),
+    Removed("doctor", "--views", "2026-11-29", "find what few photos see with render RUN --outputs coverage,parallax"),
     Removed("evaluate", "--align", "2026-11-29", "psnr_colour_aligned in metrics.json is after a colour correction"),
     Removed("evaluate", "--dry-run", "2026-11-29", "time three views: nerfcli render RUN --frames 0:3 -o three"),
     Removed("evaluate", "--members", "2026-11-29", "train with --seed 1, --seed 2, ... and evaluate each run"),

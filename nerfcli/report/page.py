@@ -93,7 +93,7 @@ def page_html(
         ledger=ledger_html(runs),
         settings=settings_html(runs),
     )
-    style = page.asset("compare.css") + _STYLE + LEGEND_STYLE + ABOVE_STYLE
+    style = page.asset("compare.css") + _STYLE
     script = page.asset("compare.js") + page.asset("sort.js")
     mark = mark_of([run.path for run in runs])
     return page.page_html(title=title, mark=mark, style=style, body=body, script=script, origin=origin)
@@ -182,12 +182,11 @@ def _legends_html(runs: Sequence[RunFacts], ranges: Sequence[tuple[float, float]
         of = [run.label for run, meaning in zip(runs, meanings, strict=True) if meaning == ((low, high), words)]
         name = "depth" if len(of) == len(runs) else f"depth, {', '.join(of)}"
         rows.append(_legend(name, DEPTH_COLOURS, f"<= {low:.3g}", f">= {high:.3g}", words))
-    rows.append(coverage_legend())
+    rows.append(_coverage_legend())
     return "".join(rows)
 
 
-def coverage_legend() -> str:
-    """Return the legend of coverage maps."""
+def _coverage_legend() -> str:
     words = "training photos that see the surface; hatched: no surface"
     return _legend("coverage", COVERAGE_COLOURS, "0", f">= {COVERAGE_RANGE}", words)
 
@@ -234,13 +233,6 @@ def _cameras_html(runs: Sequence[RunFacts]) -> str:
     return "".join(f'<section class="chart">{drawing}</section>' for drawing in drawn.values() if drawing)
 
 
-LEGEND_STYLE = """\
-.legend{font-size:13px;color:var(--soft);margin:8px 0}.legend b{color:var(--ink)}
-.legend span{display:inline-block;width:140px;height:10px;border-radius:3px;vertical-align:middle;margin:0 4px}
-"""
-ABOVE_STYLE = """\
-.above{max-width:420px}.above .train{stroke:var(--bar);fill:var(--bar)}.above .test{stroke:var(--look);fill:var(--look)}
-"""
 _STYLE = """\
 .sortable button{all:unset;cursor:pointer}.sortable button:focus-visible{outline:2px solid var(--bar)}
 [aria-sort=ascending] button::after{content:" \\2191"}[aria-sort=descending] button::after{content:" \\2193"}
@@ -252,6 +244,9 @@ _STYLE = """\
 .s2{stroke:#2c9a66;fill:#2c9a66;background:#2c9a66}.s3{stroke:#b6479b;fill:#b6479b;background:#b6479b}
 .s4{stroke:#7b61c9;fill:#7b61c9;background:#7b61c9}.s5{stroke:#8c8c35;fill:#8c8c35;background:#8c8c35}
 .key span{margin-right:18px}.key i{display:inline-block;width:12px;height:12px;border-radius:3px;margin-right:6px}
+.legend{font-size:13px;color:var(--soft);margin:8px 0}.legend b{color:var(--ink)}
+.legend span{display:inline-block;width:140px;height:10px;border-radius:3px;vertical-align:middle;margin:0 4px}
+.above{max-width:420px}.above .train{stroke:var(--bar);fill:var(--bar)}.above .test{stroke:var(--look);fill:var(--look)}
 """
 
 _BODY = Template("""\

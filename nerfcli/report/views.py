@@ -93,7 +93,7 @@ def look_at(
                 picture=rendered,
                 error=error_map(rendered, compared.photo, used=used),
                 depth=picture.depth,
-                coverage=coverage_map(model, photo.frame, photo_depths),
+                coverage=_coverage_map(model, photo.frame, photo_depths),
                 psnr=psnr(rendered, compared.photo, used=used),
                 ssim=ssim(rendered, compared.photo, used=used),
             )
@@ -102,7 +102,7 @@ def look_at(
     return views
 
 
-def coverage_map(model: Model, frame: Frame, photo_depths: Sequence[DepthMap]) -> np.ndarray:
+def _coverage_map(model: Model, frame: Frame, photo_depths: Sequence[DepthMap]) -> np.ndarray:
     """Count the training photos that see the surface in each pixel of a small picture (h, w)."""
     small = small_frame(frame, COVERAGE_PX)
     picture = render_picture(model, small, background=model.background, depth=_COVERAGE)
@@ -112,7 +112,7 @@ def coverage_map(model: Model, frame: Frame, photo_depths: Sequence[DepthMap]) -
 
 
 def coverage_picture(coverage: np.ndarray) -> np.ndarray:
-    """Colour a map of `coverage_map`, as uint8 RGB; hatched where there is no surface."""
+    """Colour a map of coverage, as uint8 RGB; hatched where there is no surface."""
     return coloured(coverage, lo=0.0, hi=float(COVERAGE_RANGE), colour_map=COVERAGE_COLOURS)
 
 

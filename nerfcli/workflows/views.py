@@ -190,7 +190,8 @@ def write_frames(
     """
     views = tuple(replace(frame, image=None, mask=None, split=None) for frame in frames)
     capture = Capture(views, np.zeros((0, 3)), (), None, "camera-path")
-    refuse_frames(target, overwrite=overwrite)
+    if there := [target / name for name in _FRAME_FILES if (target / name).exists() and not overwrite]:
+        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another folder with -o")
     listed, path = (target / name for name in _FRAME_FILES)
     for loss in losses_camera_path(capture):
         warn(f"{path.name} cannot hold {loss}; use {listed.name} instead")
@@ -200,16 +201,6 @@ def write_frames(
         raise cannot_write(target, error) from error
     write_transforms(capture, listed)
     write_camera_path(capture, path, fps=fps)
-
-
-def refuse_frames(target: Path, *, overwrite: bool) -> None:
-    """Refuse a folder that already has a file that `write_frames` writes, unless it may be replaced.
-
-    Raises:
-        UserError: one of the files exists.
-    """
-    if there := [target / name for name in _FRAME_FILES if (target / name).exists() and not overwrite]:
-        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another folder with -o")
 
 
 def _frames_of(path: Path) -> tuple[Frame, ...]:
