@@ -70,7 +70,7 @@ def render(
         float | None, typer.Option(help="Distance of light that passes, for --depth background, in scene units.", min=0)
     ] = None,
     depth_format: render_options.DepthFormat = "tiff",
-    tolerance: render_options.Tolerance = "1/1020",
+    step: render_options.Step = 1.0,
     rgba: render_options.Rgba = False,
     video: Annotated[
         bool, typer.Option("--video", help="Write a video of each output; same as --video-format mp4.")
@@ -185,6 +185,7 @@ def render(
     formats = render_options.depth_formats(depth_format, outputs=chosen, convention=depth)
     if max_size is not None and (width is not None or height is not None):
         raise typer.BadParameter("cannot be combined with --width or --height", param_hint="--max-size")
+    render_options.finite(step, "--step")
     look = render_options.look_of(width, height, lens=lens, fov_deg=fov, crop=crop)
     writes_video = video or video_format is not None
     _refuse_unused(values, outputs=chosen, writes_video=writes_video)
@@ -195,7 +196,7 @@ def render(
         depth=request,
         formats=formats,
         video=render_options.video_settings(video_format or "mp4", fps) if writes_video else None,
-        tolerance=render_options.tolerance_of(tolerance),
+        step=step,
         rgba=rgba,
     )
     views = Views(cameras, count, through, max_size, look)

@@ -22,6 +22,7 @@ from nerfcli.render.depth import DepthRequest
 from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import RenderedPicture, render_picture, straight_rgba
+from nerfcli.render.tracing import TOLERANCE
 from nerfcli.render.visibility import DepthMap, coverage_and_parallax
 
 
@@ -128,9 +129,7 @@ def render_frame(
     frame, name, settings = order.frames[index], order.names[index], order.settings
     wanted = settings.depth if settings.measured else None
     background = BLACK if settings.rgba else model.background
-    picture = render_picture(
-        model, frame, background=background, depth=wanted, tolerance=settings.tolerance, on_tile=on_rays
-    )
+    picture = render_picture(model, frame, background=background, depth=wanted, on_tile=on_rays)
     if settings.rgba:
         picture = replace(picture, rgb=straight_rgba(picture))
     removed = {}
@@ -139,8 +138,8 @@ def render_frame(
         if order.depth_errors is not None:
             picture = with_measured_errors(picture, order.depth_errors)
         picture, removed = without_unseen_depth(picture, settings.depth)
-    measured = measure_error(model, frame, depth=wanted, tolerance=settings.tolerance)
-    facts = truncation_bounds(picture, settings.tolerance) | measured.to_json()
+    measured = measure_error(model, frame, depth=wanted, tolerance=TOLERANCE)
+    facts = truncation_bounds(picture, TOLERANCE) | measured.to_json()
     bounds = {**facts, "meaning": ERROR_IN_WORDS}
     meta = frame_meta(depth_meta(model, settings.depth), frame, provenance=order.provenance, error_bounds=bounds)
     files = _write_outputs(picture, unfinished.folder, name, settings=settings, meta=meta, background=model.background)

@@ -7,7 +7,6 @@ from nerfcli.media.depth_pictures import CONVENTION_OF, QUANTITIES, DepthMeta
 from nerfcli.render import depth_errors
 from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
 from nerfcli.render.model import Model
-from nerfcli.render.tracing import TOLERANCE
 
 OUTPUTS = ("rgb", "depth", "opacity", *CONVENTION_OF)
 # Measured outputs, which are stored as floats, with previews in false colours.
@@ -41,7 +40,7 @@ class ExportSettings:
         outputs: some of `OUTPUTS`.
         depth: the definition of depth, if "depth" is among the outputs.
         formats: some of `FORMATS`, for measured outputs. 16-bit levels are computed from float files, which are kept.
-        tolerance: largest error of a colour channel due to early stopping of rays, see `render.tracing`.
+        step: length of the steps along rays, relative to those of the training.
         rgba: colours without the background, with the opacity as straight alpha.
     """
 
@@ -49,7 +48,7 @@ class ExportSettings:
     depth: DepthRequest
     formats: tuple[str, ...] = ("tiff",)
     video: VideoSettings | None = None
-    tolerance: float = TOLERANCE
+    step: float = 1.0
     rgba: bool = False
 
     @property

@@ -56,7 +56,7 @@ def render_run(
         run: the folder that `train_scene` wrote.
         target: the folder to write; in RUN/renders by default, named after views and depth.
         views: which cameras; the held-out ones by default.
-        settings: outputs, depth, file formats, videos, and tolerance of the pictures; `usual_settings` by default.
+        settings: outputs, depth, file formats, videos, and steps along rays; `usual_settings` by default.
         device: "auto", "cpu", "cuda" or "cuda:1".
         threads: number of CPU threads; 0 for all.
         part: render only these views, for a later call to complete; None for all.
@@ -93,6 +93,7 @@ def render_run(
     frames = chosen_frames(trained, views, depth_hint=1.0 / model.training_from_scene.scale)
     if "depth" in settings.outputs and settings.depth.axis == "z":
         refuse_z_depth_for_equirectangular(frames, notify=notify)
+    model = model.stretched(settings.step)
     order = Order(tuple(frames), settings, provenance, seen, errors)
     chosen = range(len(frames))[part] if part is not None else range(len(frames))
     if not chosen:
