@@ -12,7 +12,6 @@ from nerfcli.ablate.results import MeasuredTraining, half_interval, rows_of
 from nerfcli.ablate.variants import AUTO, CHOSEN, CaptureTraits, Variant, variants
 from nerfcli.cli import app
 from nerfcli.runs.components import CHOICES, Components
-from nerfcli.workflows import evaluate as evaluate_workflow
 
 ALL = CaptureTraits(has_alpha=False, has_points=True, has_exif=True)
 
@@ -54,7 +53,7 @@ def test_differences_are_taken_seed_by_seed_and_get_a_verdict():
     models.append(Variant("antialias=true", Components(antialias=True), True))
     psnr = {CHOSEN: (20.0, 22.0, 21.0), "view=0": (19.0, 21.1, 19.9), "antialias=true": (20.5, 21.5, 21.1)}
     measured = [
-        MeasuredTraining(name, seed, value, None, 60.0, 100, "protocol")
+        MeasuredTraining(name, seed, value, 60.0, 100, "protocol")
         for name, values in psnr.items()
         for seed, value in enumerate(values)
     ]
@@ -73,8 +72,6 @@ def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
     from nerfcli.train import loop
 
     monkeypatch.setattr("nerfcli.runs.settings.FEWEST_LOG2_ROWS", 10)  # 34 MB for each run otherwise
-    # How a field compares with billboards has its own tests; here it would be computed four times.
-    monkeypatch.setattr(evaluate_workflow, "training_billboards", lambda run, *, notify: None)
     trained, real = [], loop.train
 
     def train(scene, run, settings, **rest):
@@ -101,14 +98,6 @@ def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
         rows = list(csv.DictReader(file))
     assert float(rows[1]["difference_db"]) == pytest.approx(content["rows"][1]["difference_db"])
     assert "sampled: 324 random pixels of 3 held-out photos at 12x9" in rows[1]["protocol"]
-
-    # The same trainings measured on whole photos, which are so small that the sample was all of their pixels.
-    assert CliRunner().invoke(app, [*command, "--whole"]).exit_code == 0
-    whole = json.loads((tmp_path / "out" / "ablation.json").read_text())
-    assert len(trained) == 5
-    assert [row["psnr"] for row in whole["rows"]] == pytest.approx([row["psnr"] for row in content["rows"]], abs=1e-3)
-    assert [row["ssim"] is None for row in content["rows"] + whole["rows"]] == [True] * 3 + [False] * 3
-    assert "sampled" not in whole["rows"][1]["protocol"]
 
 
 def test_something_else_is_left_alone(tmp_path):

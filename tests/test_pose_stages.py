@@ -342,7 +342,7 @@ def test_ten_kills_at_random_moments_change_nothing(photos: Path, whole: Path, t
     """The whole command is killed (SIGKILL); its worker then ends by itself, and the next call waits for neither."""
     rng = random.Random(0)
     scene = tmp_path / "scene"
-    command = [sys.executable, "-m", "nerfcli", "poses", str(photos), "-o", str(scene), "--max-features", "200"]
+    command = [sys.executable, "-m", "nerfcli", "poses", str(photos), "-o", str(scene), "--quality", "fast"]
     command += ["--max-size", "192", "--camera-model", "SIMPLE_RADIAL"]
     environment = {**os.environ, "PYTHONPATH": str(Path(nerfcli.__file__).parent.parent)}
     for _ in range(10):

@@ -20,7 +20,7 @@ from nerfcli.errors import BAD_INPUT
 from nerfcli.media.images import list_photos
 from nerfcli.media.masks import find_mask
 from nerfcli.poses.input.photos import camera_groups, find_photos
-from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.input.settings import QUALITIES, PoseSettings
 from nerfcli.poses.structure_from_motion import is_same_scene
 
 RIG = PoseSettings(max_features=200, threads=1, subfolders=True)
@@ -76,7 +76,9 @@ def test_each_subfolder_has_the_camera_that_took_its_photos(scene: Path):
     assert right / left == pytest.approx(ZOOM, rel=0.01)
 
 
-def test_the_scene_has_the_photos_of_both_and_is_kept_the_second_time(rig: Path, scene: Path):
+def test_the_scene_has_the_photos_of_both_and_is_kept_the_second_time(
+    rig: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
+):
     loaded = scenes.load(scene)
     names = [f"{folder}/{index}.png" for folder in ("left", "right") for index in range(PHOTOS)]
     assert sorted(frame.name for frame in loaded.frames) == names
@@ -84,7 +86,8 @@ def test_the_scene_has_the_photos_of_both_and_is_kept_the_second_time(rig: Path,
         assert frame.image is not None
         assert frame.image.samefile(rig / frame.name)
     assert is_same_scene(scene, rig, RIG)
-    result = nerfcli("poses", rig, "-o", scene, "--subfolders", "--max-features", "200", "--threads", "1", "--json")
+    monkeypatch.setitem(QUALITIES, "default", (RIG.max_image_size, RIG.max_features))
+    result = nerfcli("poses", rig, "-o", scene, "--subfolders", "--threads", "1", "--json")
     assert result.exit_code == 0, result.stderr
     assert "is kept" in result.stderr
     assert not is_same_scene(scene, rig / "left", PoseSettings(max_features=200, threads=1))

@@ -36,7 +36,6 @@ def test_what_is_no_amount_of_memory(text: str):
         ("--quality superb", "'superb'; choose fast, default or best"),
         ("--pairing random", "'random'; choose auto, exhaustive, sequential, retrieval or spatial"),
         ("--pairing spatial --pairs p.txt", "cannot be combined with --pairs"),
-        ("--memory lots", "'lots' is not an amount of memory"),
         ("--time-limit soon", "'soon' is not a time"),
     ],
 )
@@ -52,7 +51,6 @@ def test_bad_values_are_usage_errors(line: str, named: str):
         ((), 1600, 4096),
         (("--quality", "fast"), 1000, 2048),
         (("--quality", "best", "--max-size", "2000"), 2000, 8192),
-        (("--quality", "fast", "--max-features", "500"), 1000, 500),
     ],
 )
 def test_a_dry_run_prints_the_plan_and_writes_nothing(

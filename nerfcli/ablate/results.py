@@ -22,12 +22,11 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class MeasuredTraining:
-    """One training: means over the held-out photos of PSNR and, on whole photos, SSIM, measured as in `protocol`."""
+    """One training: the mean PSNR over the held-out photos, measured as in `protocol`."""
 
     variant: str
     seed: int
     psnr: float
-    ssim: float | None
     seconds: float
     steps: int
     protocol: str
@@ -39,7 +38,6 @@ class ResultRow:
 
     Args:
         psnr: mean PSNR over its seeds, in dB.
-        ssim: mean SSIM over its seeds; None if it is not known.
         difference_db: mean PSNR difference of the variant from the chosen model, over the seeds that both have; None
             for the chosen model itself and if they have no seed in common.
         interval_db: half the width of the 95 % interval of that mean, by Student's t over seeds; None for one seed.
@@ -49,7 +47,6 @@ class ResultRow:
 
     name: str
     psnr: float
-    ssim: float | None
     difference_db: float | None
     interval_db: float | None
     seconds: float
@@ -71,12 +68,10 @@ def rows_of(measured: Sequence[MeasuredTraining], variants: Sequence[Variant]) -
         compared = bool(differences) and variant.name != CHOSEN
         mean = statistics.fmean(differences) if compared else None
         half = half_interval(differences) if compared else None
-        ssims = [entry.ssim for entry in own if entry.ssim is not None]
         rows.append(
             ResultRow(
                 variant.name,
                 statistics.fmean(entry.psnr for entry in own),
-                statistics.fmean(ssims) if ssims else None,
                 mean,
                 half,
                 statistics.fmean(entry.seconds for entry in own),
@@ -153,7 +148,6 @@ def table_of(rows: Sequence[ResultRow]) -> list[tuple[str, ...]]:
         (
             row.name,
             f"{row.psnr:.2f}",
-            "-" if row.ssim is None else f"{row.ssim:.4f}",
             difference(row),
             f"{row.seconds:.0f}",
             f"{row.steps:.0f}",
@@ -164,4 +158,4 @@ def table_of(rows: Sequence[ResultRow]) -> list[tuple[str, ...]]:
     ]
 
 
-COLUMNS = ("model", "PSNR", "SSIM", "difference, dB", "seconds", "steps", "seeds", "verdict")
+COLUMNS = ("model", "PSNR", "difference, dB", "seconds", "steps", "seeds", "verdict")

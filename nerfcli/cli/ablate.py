@@ -34,14 +34,7 @@ def ablate(
             callback=options.split_at_commas,
         ),
     ] = None,
-    whole: Annotated[
-        bool,
-        typer.Option(
-            "--whole", help="Measure whole held-out photos with SSIM, as `evaluate` does, instead of random pixels."
-        ),
-    ] = False,
     downscale: options.Downscale = "auto",
-    holdout: options.Holdout = None,
     device: options.Device = "auto",
     seed: options.Seed = 0,
     threads: options.Threads = 0,
@@ -57,17 +50,17 @@ def ablate(
     change what is measured. For the components see `nerfcli train --help`.
 
     PSNR is measured on about 16,000 random pixels of the held-out photos: the same pixels for all variants of a seed,
-    other pixels for each seed, so that the interval includes the choice of pixels. Add --whole for whole photos and
-    SSIM by the protocol of `nerfcli evaluate`, for example for a table in a paper; this takes longer.
+    other pixels for each seed, so that the interval includes the choice of pixels. `nerfcli evaluate` measures the runs
+    on whole photos, with SSIM.
 
     Writes SCENE-ablation/ with ablation.csv, ablation.json and all runs. Run the same command again to resume an
-    interrupted one, or with --whole to measure completed trainings on whole photos.
+    interrupted one.
 
     \b
     Examples:
       nerfcli ablate photos-scene
       nerfcli ablate photos-scene --only view,exposure --budget 30s
-      nerfcli ablate photos-scene --seeds 5 --whole -o paper/ablation
+      nerfcli ablate photos-scene --seeds 5 -o paper/ablation
     """
     from nerfcli.ablate.results import COLUMNS, ResultRow, table_of
     from nerfcli.cli.scans import refuse_scan
@@ -92,7 +85,7 @@ def ablate(
         model="auto",
         **sizes_for(torch_device),
     )
-    rule, limit = options.holdout_rule(holdout), default_memory_limit(torch_device)
+    limit = default_memory_limit(torch_device)
 
     def work(path: Path, one_of_many: bool) -> None:
         refuse_scan(path, "ablate")
@@ -104,8 +97,6 @@ def ablate(
                 settings,
                 seeds=seeds,
                 only=tuple(only or ()),
-                whole=whole,
-                holdout=rule,
                 memory_bytes=limit,
                 overwrite=overwrite,
                 warn=console.warn,

@@ -44,9 +44,6 @@ def poses(
         int | None,
         typer.Option(help="Longer side of images for feature extraction, in pixels.  [default: by --quality]", min=100),
     ] = None,
-    max_features: Annotated[
-        int | None, typer.Option(help="SIFT features per photo.  [default: by --quality]", min=100)
-    ] = None,
     pairing: Annotated[
         str, typer.Option(help="Which pairs of photos to match: auto, exhaustive, sequential, retrieval or spatial.")
     ] = "auto",
@@ -63,7 +60,6 @@ def poses(
     accept_refused: Annotated[
         bool, typer.Option("--accept-refused", help="Write the scene even if the checks refuse the poses.")
     ] = False,
-    memory: options.Memory = None,
     time_limit: Annotated[
         str | None, typer.Option(help="Stop after this time: 90s, 10m, 2h. Run the command again to continue.")
     ] = None,
@@ -98,6 +94,7 @@ def poses(
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
     from nerfcli.holdout import DEFAULT_HOLDOUT
+    from nerfcli.memory import default_memory_limit
     from nerfcli.poses.input.pairs import PAIRINGS
     from nerfcli.poses.input.settings import CAMERA_MODELS, Limits, PoseSettings
     from nerfcli.poses.workspace import database_bytes
@@ -120,10 +117,10 @@ def poses(
             param_hint="--camera-model",
         )
     console = Console(quiet=quiet, json_lines=json)
-    usual_size, usual_features = sizes_of(quality)
+    usual_size, features = sizes_of(quality)
     settings = PoseSettings(
         max_image_size=usual_size if max_size is None else max_size,
-        max_features=usual_features if max_features is None else max_features,
+        max_features=features,
         seed=seed,
         threads=thread_count(threads),
         camera_model=camera_model,
@@ -137,7 +134,7 @@ def poses(
         subfolders=subfolders,
     )
     limits = Limits(
-        memory_bytes=options.memory_limit(memory),
+        memory_bytes=default_memory_limit(),
         seconds=None if time_limit is None else options.seconds_from_text(time_limit, "--time-limit"),
     )
 

@@ -23,7 +23,6 @@ def run(
     budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h.")] = "2m",
     downscale: options.Downscale = "auto",
     holdout: options.Holdout = None,
-    strict: options.Strict = False,
     require: options.Require = None,
     device: options.Device = "auto",
     seed: options.Seed = 0,
@@ -69,7 +68,6 @@ def run(
         seed=seed,
         threads=cores,
         holdout=rule or DEFAULT_HOLDOUT,
-        strict=strict,
         subfolders=subfolders,
     )
     train_settings = TrainSettings(

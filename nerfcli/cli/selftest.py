@@ -25,17 +25,6 @@ _COLUMNS = (
     "of its gradient",
     "ms",
 )
-_FORMULAS = (
-    "textbook formula",
-    "worst where",
-    "operation",
-    "precision",
-    "error",
-    "of gradient",
-    "nerfcli",
-    "of its gradient",
-    "bound",
-)
 _VALUE_ONLY = "value only"
 _STYLES = {"met": "green", "not met": "bold red"}
 
@@ -44,12 +33,6 @@ _STYLES = {"met": "green", "not met": "bold red"}
 def selftest(
     device: Device = "auto",
     threads: Threads = 0,
-    textbook: Annotated[
-        bool,
-        typer.Option(
-            "--textbook", help="Show one row per textbook formula: its worst case, next to the error of nerfcli."
-        ),
-    ] = False,
     json: Annotated[
         bool, typer.Option("--json", help="Print one line of JSON per row on stdout instead of the table.")
     ] = False,
@@ -65,7 +48,6 @@ def selftest(
     \b
     Examples:
       nerfcli selftest
-      nerfcli selftest --textbook
       nerfcli selftest --device cuda
       nerfcli selftest --device cpu --json | jq 'select(.verdict == "not met")'
     """
@@ -79,15 +61,10 @@ def selftest(
     begin, measured = time.perf_counter(), []
     for row in rows(device_name(device), console.note):
         measured.append(row)
-        if json and not textbook:
+        if json:
             console.fact(row.to_json())
     formulas = by_formula(measured)
-    if json and textbook:
-        for row in formulas:
-            console.fact(row.to_json())
-    elif textbook:
-        console.fact_table(_FORMULAS, [_formula_cells(row) for row in formulas], styles=_STYLES)
-    elif not json:
+    if not json:
         console.fact_table(_COLUMNS, [_cells(row) for row in measured], styles=_STYLES)
     met = sum(row.verdict == MET for row in measured)
     failed = [row for row in measured if row.verdict == NOT_MET]
@@ -107,11 +84,6 @@ def selftest(
 
 def _pair(errors: "Errors | None") -> tuple[str, str]:
     return (_number(errors.value), _number(errors.gradient)) if errors else ("", "")
-
-
-def _formula_cells(row: "Row") -> tuple[str, ...]:
-    shown = (*_pair(row.textbook), *_pair(row.errors), _number(row.bounds.value))
-    return (row.formula, row.case, row.operation, row.precision, *shown)
 
 
 def _cells(row: "Row") -> tuple[str, ...]:

@@ -19,7 +19,6 @@ from nerfcli.runs.files import STATE
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene, model_folder
-from nerfcli.workflows.evaluate import evaluate_run
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.workflows.train import train_scene, was_interrupted
 
@@ -33,8 +32,6 @@ def ablate_scene(
     *,
     seeds: int,
     only: tuple[str, ...] = (),
-    whole: bool = False,
-    holdout: str | None = None,
     memory_bytes: int | None = None,
     overwrite: bool = False,
     notify: Notify = silent,
@@ -48,8 +45,6 @@ def ablate_scene(
         settings: of all trainings; with `model` "auto", the components are first selected for the scene.
         seeds: number of seeds, counted up from the seed of the settings.
         only: components to vary; all if empty.
-        whole: measure whole held-out photos as `evaluate_run` does, not random pixels of them.
-        holdout: see `train_scene`.
         memory_bytes: limit of a training's resident memory, or of the memory that it uses on a GPU.
 
     Returns:
@@ -58,16 +53,15 @@ def ablate_scene(
     Raises:
         UserError: see `nerfcli.train.loop.train`; or no photos are held out, or the folder holds something else.
     """
-    scene = scenes.load(path, holdout=holdout)
+    scene = scenes.load(path)
     if not scene.test_frames:
-        raise UserError(f"{path} has no held-out photos", "hold some out with --holdout every:8")
+        raise UserError(f"{path} has no held-out photos", "by default every 8th photo is held out; check its split")
     refuse_foreign(folder)
-    measure = _measured_whole if whole else _measured_pixels
 
     def trained(name: str, settings: TrainSettings) -> Run:
         """Return a run with these settings, trained now or by an earlier call."""
         target = folder / RUNS / f"{name}-{settings.seed}"
-        resume = not overwrite and was_interrupted(path, target, settings, holdout=holdout)
+        resume = not overwrite and was_interrupted(path, target, settings)
         run = train_scene(
             path,
             target,
@@ -75,7 +69,6 @@ def ablate_scene(
             memory_bytes=memory_bytes,
             resume=resume,
             overwrite=overwrite,
-            holdout=holdout,
             warn=warn,
         )
         # The training state is three times as large as the field, and complete trainings are not resumed.
@@ -91,7 +84,7 @@ def ablate_scene(
         progress(0.0, "selecting components for this scene")
         run = trained(AUTO, settings)
         compared.append(Variant(AUTO, settings.components))
-        measured.append(measure(run, AUTO, settings, overwrite))
+        measured.append(_measured(run, AUTO, settings))
         settings = replace(settings, model="default", components=run.components, fixed=())
         about["chosen"] = asdict(settings.components)
         notify(_line(measured[-1]))
@@ -102,7 +95,7 @@ def ablate_scene(
     for number, (seed, variant) in enumerate(todo):
         progress(number / len(todo), f"{variant.name}, seed {seed} ({number + 1} of {len(todo)})")
         wanted = replace(settings, components=variant.components, seed=seed)
-        measured.append(measure(trained(variant.name, wanted), variant.name, wanted, overwrite))
+        measured.append(_measured(trained(variant.name, wanted), variant.name, wanted))
         notify(_line(measured[-1]))
         about["complete"] = number + 1 == len(todo)
         rows = rows_of(measured, compared)
@@ -122,22 +115,13 @@ def _capture(scene: Scene) -> CaptureTraits:
     )
 
 
-def _measured_whole(run: Run, name: str, settings: TrainSettings, overwrite: bool) -> MeasuredTraining:
-    """Return a training measured on whole photos with `evaluate_run`, now or by an earlier call."""
-    metrics = evaluate_run(run.path, device=settings.device, threads=settings.threads, overwrite=overwrite).metrics
-    mean, training, protocol = metrics["mean"], metrics["training"], metrics["protocol"]
-    return MeasuredTraining(
-        name, settings.seed, mean["psnr"], mean["ssim"], training["seconds"], training["steps"], protocol
-    )
-
-
-def _measured_pixels(run: Run, name: str, settings: TrainSettings, overwrite: bool) -> MeasuredTraining:
+def _measured(run: Run, name: str, settings: TrainSettings) -> MeasuredTraining:
     """Return a training measured on random pixels of the held-out photos, the same for all variants of a seed."""
     model, last = run.model(settings.device), run.log[-1]
     photos = held_out_photos_of(run.config, run.cameras.test, model, threads=settings.threads)
     sample = SampledPixels.drawn(photos, seed=settings.seed)
     return MeasuredTraining(
-        name, settings.seed, sample.psnr(model), None, last["seconds"], last["step"], f"{sample.protocol()}{_SAME}"
+        name, settings.seed, sample.psnr(model), last["seconds"], last["step"], f"{sample.protocol()}{_SAME}"
     )
 
 

@@ -34,7 +34,7 @@ _STAGES = {
     "settle": "adjusting with a principal point for each photo",
 }
 _GO_ON = "completed work is kept; run the same command again to continue"
-_LESS_MEMORY = "use smaller photos (--max-size), fewer features (--max-features) or fewer threads (--threads)"
+_LESS_MEMORY = "use smaller photos (--max-size), fewer features (--quality fast) or fewer threads (--threads)"
 # Memory can double in a second or two, when a photo is decoded or a bundle adjustment begins.
 _LOOK_EVERY_SECONDS = 0.1
 # With less free space, SQLite and pycolmap cannot write the next part.

@@ -39,7 +39,7 @@ _ADVICE = {
     "contradicts the rest": "take photos with more overlap around this one, or remove it",
     "matches too few points": "hold out photos that overlap with training photos, see --holdout",
     NO_TRAINING_PHOTO: "hold out only photos of cameras that also took training photos, see --holdout",
-    "rejected by the mapper": "take photos with more overlap and while moving sideways, or raise --max-features",
+    "rejected by the mapper": "take photos with more overlap and while moving sideways, or try --quality best",
 }
 
 
