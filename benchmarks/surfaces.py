@@ -18,19 +18,21 @@ from typing import Annotated
 
 import cv2
 import numpy as np
+import torch
 import typer
 from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 
 from nerfcli.cameras.camera import Camera
+from nerfcli.kernels import grid_coordinates
 from nerfcli.media.float_tiff import read_any_tiff
 from nerfcli.render.depth import DepthRequest
+from nerfcli.render.model import Model
 from nerfcli.runs.run import load_run
 from nerfcli.surface.extent import Grid, scene_box
 from nerfcli.surface.fusion import fuse
 from nerfcli.surface.marching import Mesh, mesh_of, simplified, surface_of, without_small_pieces
 from nerfcli.surface.views import depth_views
-from nerfcli.surface.volume import density_at
 
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk" / "truth"
 THRESHOLDS = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
@@ -126,6 +128,22 @@ def samples_of(mesh: Mesh) -> np.ndarray:
     a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
     first, second, third = corners[chosen].transpose(1, 0, 2)
     return first + a * (second - first) + b * (third - first)
+
+
+@torch.no_grad()
+def density_at(model: Model, points: np.ndarray) -> np.ndarray:
+    """Return the field's density (N,) float32 per scene unit at points in the scene's frame; 0 in skipped cells."""
+    places = torch.as_tensor(model.training_from_scene.apply(points), dtype=torch.float32, device=model.device)
+    coordinates = grid_coordinates(places, model.contraction)
+    inside = ((coordinates >= 0) & (coordinates <= 1)).all(-1)
+    side = model.occupied.shape[0]
+    x, y, z = (coordinates.clamp(0, 1) * side).long().clamp_max(side - 1).unbind(-1)
+    kept = (inside & model.occupied[z, y, x]).nonzero()[:, 0]
+    density = torch.zeros(len(places), device=model.device)
+    medium = model.field.medium()
+    for part in kept.split(2**18):
+        density[part] = model.field.backend.density(coordinates[part].contiguous(), medium)
+    return (density * model.training_from_scene.scale).cpu().numpy()
 
 
 def main(

@@ -188,7 +188,7 @@ def test_all_threads_are_the_processors_of_this_process():
         ("train x --field mlp --log2-rows 12", "--log2-rows: it works with --field hash"),
         ("export x --to page --faces 100", "--faces: it is for meshes"),
         ("export x --to page --voxel-size 0.1", "--voxel-size: it is for all but pages"),
-        ("export x --to volume --max-size 64", "--max-size: it is for all but pages and volumes"),
+        ("export x --to volume --max-size 64", "--max-size: it is for meshes, points and maps"),
         ("export x --to volume --water 0.2", "--water: it is for X-ray scans"),
         ("export x --to points --format laz -o x.ply", "'laz' contradicts -o x.ply"),
         ("train x y", "(y); give one, or several on standard input: ls -d *-scene/ | nerfcli train -"),

@@ -47,7 +47,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_the_work(command, finis
     (run / "metrics.json").unlink(missing_ok=True)
     before = listing(tmp_path)
     monkeypatch.setattr("nerfcli.atomic.os.access", lambda path, mode: False)
-    result = nerfcli(command, run, *(("--to", "volume") if command == "export" else ()))
+    result = nerfcli(command, run, *(("--to", "mesh") if command == "export" else ()))
     assert result.exit_code == BAD_INPUT
     error, hint = error_of(result)
     assert error.startswith("Error: cannot write ")

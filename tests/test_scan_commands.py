@@ -1,5 +1,6 @@
 """Scans through the commands: train, evaluate, render on a small phantom, and what they refuse."""
 
+import gzip
 import json
 import re
 import shutil
@@ -16,7 +17,7 @@ from nerfcli.cli import app
 from nerfcli.errors import UserError
 from nerfcli.interrupts import Terminated
 from nerfcli.media.images import read_image
-from nerfcli.tomography.grid import centred_grid
+from nerfcli.tomography.grid import VoxelGrid, centred_grid
 from nerfcli.tomography.marks import UNSEEN
 from nerfcli.tomography.result import ReconstructionSettings, load_reconstruction
 from nerfcli.tomography.scan import save_scan
@@ -295,6 +296,22 @@ def test_volume_files_read_back(bean_run: Path, tmp_path: Path, suffix: str) -> 
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(UserError, match="damaged"):
         read_volume(path)
+
+
+def test_an_nrrd_states_its_place_and_unit(tmp_path: Path) -> None:
+    """As the definition of the format has it: sizes x, y, z with x fastest, and the centre of the first voxel."""
+    values = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
+    grid = VoxelGrid((3, 4, 5), (1.0, 2.0, 3.0), 0.5)
+    write_volume(tmp_path / "a.nrrd", VolumeFile(values, grid, "mm", "1/mm"))
+    head, _, body = (tmp_path / "a.nrrd").read_bytes().partition(b"\n\n")
+    fields = dict(line.split(": ", 1) for line in head.decode().splitlines() if ": " in line and ":=" not in line)
+    assert fields["sizes"] == "5 4 3"
+    assert fields["space directions"] == "(0.5,0,0) (0,0.5,0) (0,0,0.5)"
+    assert fields["space origin"] == "(1,2,3)"
+    assert fields["space units"] == '"mm" "mm" "mm"'
+    assert gzip.decompress(body) == values.tobytes()
+    facts = json.loads(call("info", tmp_path / "a.nrrd", "--json")[1])
+    assert (facts["voxels"], facts["last_centre"]) == ("5x4x3", [3.0, 3.5, 4.0])
 
 
 def test_hounsfield_units_of_water_and_air(tmp_path: Path, bean_run: Path) -> None:

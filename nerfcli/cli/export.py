@@ -1,4 +1,4 @@
-"""nerfcli export: export a run as a page, a mesh, points, a volume, a map, or COLMAP's dense folder."""
+"""nerfcli export: export a run as a page, a mesh, points or a map; of a scan, its volume."""
 
 import math
 from pathlib import Path
@@ -10,6 +10,7 @@ from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, one_of
 from nerfcli.cli.render_options import finite
+from nerfcli.errors import UserError
 from nerfcli.workflows.machine import device_name, thread_count
 
 # Parameters for reconstructions of X-ray scans.
@@ -20,13 +21,14 @@ _OF_SCANS = "run to output form water device threads overwrite json quiet"
 def export(
     run: Annotated[str, typer.Argument(help="Run folder written by train, or - to read paths from standard input.")],
     to: Annotated[
-        str, typer.Option("--to", help="What to export: page, mesh, points, volume, tsdf, ortho or colmap-dense.")
+        str, typer.Option("--to", help="What to export: page, mesh, points or ortho; of an X-ray scan: volume.")
     ],
     output: Output = None,
     form: Annotated[
         str | None,
         typer.Option(
-            "--format", help="File format if -o does not determine it: ply, glb or obj; ply, las or laz; npz or nrrd."
+            "--format",
+            help="File format if -o does not determine it: ply, glb or obj; ply, las or laz; nrrd, mha, nii or tif.",
         ),
     ] = None,
     box: Annotated[
@@ -55,19 +57,16 @@ def export(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Export a run: page, mesh, points, volume, map, or for COLMAP.
+    """Export a run: page, mesh, points or map; volume of an X-ray scan.
 
-    All results are in the frame and unit of the scene. Files state both, but for COLMAP's; nerfcli info shows them.
+    All results are in the frame and unit of the scene. Files state both; nerfcli info shows them.
 
     \b
-    page          one .html that renders the field in a browser (WebGL2), from the disk, without a server
-    mesh          .ply, .glb or .obj: zero level of truncated signed distances from median depths, with colours
-    points        .ply, .las or .laz: where median and mean depth agree and two photos see the same point, with normals,
-                  photos, parallax and spread
-    volume        .npz (density, colour) or .nrrd (density, 1 / unit)
-    tsdf          .npz (signed distance, weight) or .nrrd (signed distance): the input of the mesh
-    ortho         folder with orthophoto.tif and heights.tif, GeoTIFF as seen from straight above (+z of the scene)
-    colmap-dense  folder with undistorted photos, depth and normal maps for COLMAP's stereo fusion
+    page    one .html that renders the field in a browser (WebGL2), from the disk, without a server
+    mesh    .ply, .glb or .obj: zero level of truncated signed distances from median depths, with colours
+    points  .ply, .las or .laz: where median and mean depth agree and two photos see the same point, with normals,
+            photos, parallax and spread
+    ortho   folder with orthophoto.tif and heights.tif, GeoTIFF as seen from straight above (+z of the scene)
 
     Writes RUN.html, RUN-mesh.ply, ... next to the run. Regions that no photo sees stay open. In a .glb, the rotation to
     +Y up is in the root node; positions stay in the scene's frame.
@@ -81,12 +80,11 @@ def export(
       nerfcli export photos-scene-run --to mesh --voxel-size 0.005 --faces 100000 -o kitchen.glb
       nerfcli export photos-scene-run --to mesh --box=-1,-1,0,1,1,2
       nerfcli export photos-scene-run --to points -o kitchen.ply
-      nerfcli export photos-scene-run --to volume --format nrrd
       nerfcli export survey-run --to ortho --voxel-size 0.02
-      nerfcli export photos-scene-run --to colmap-dense -o kitchen-dense
       nerfcli export tooth-scene-run --to volume -o tooth.nrrd
     """
     values = dict(locals())
+    from nerfcli.runs.run import load_run
     from nerfcli.surface.settings import FACES, SurfaceSettings
     from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.export import TARGETS, default_target, export_run
@@ -115,9 +113,9 @@ def export(
     if run != STDIN and is_reconstruction(Path(run)):
         export_one_scan(Path(run), False)
         return
-    one_of(to, tuple(TARGETS), "--to")
+    one_of(to, (*TARGETS, "volume"), "--to")
     suffix = None if form is None else f".{form.lstrip('.').lower()}"
-    if suffix is not None:
+    if suffix is not None and to != "volume":
         one_of(suffix[1:], [kind[1:] for kind in TARGETS[to] if kind] or ["none"], "--format")
     finite(voxel_size, "--voxel-size")
     if voxel_size is not None and voxel_size <= 0:
@@ -125,7 +123,7 @@ def export(
     unused = {
         "--faces": (faces is not None and to != "mesh", "meshes"),
         "--voxel-size": (voxel_size is not None and to == "page", "all but pages"),
-        "--max-size": (max_size != SurfaceSettings.max_size and to in ("page", "volume"), "all but pages and volumes"),
+        "--max-size": (max_size != SurfaceSettings.max_size and to in ("page", "volume"), "meshes, points and maps"),
         "--water": (water is not None, "X-ray scans"),
     }
     for option, (is_unused, suited) in unused.items():
@@ -141,6 +139,9 @@ def export(
         if is_reconstruction(folder):
             export_one_scan(folder, one_of_many)
             return
+        if to == "volume":
+            _ = load_run(folder).config
+            raise UserError(f"{folder}: --to volume is for X-ray scans", "use --to mesh or --to points", exit_code=2)
         target = output
         if output is None or one_of_many:
             usual = default_target(folder, to, suffix)

@@ -42,6 +42,8 @@ REMOVED: tuple[Removed, ...] = (
     Removed("evaluate", "--dry-run", "2026-11-29", "time three views: nerfcli render RUN --frames 0:3 -o three"),
     Removed("evaluate", "--members", "2026-11-29", "train with --seed 1, --seed 2, ... and evaluate each run"),
     Removed("evaluate", "--seeds", "2026-11-29", "train with --seed 1, --seed 2, ... and evaluate each run"),
+    Removed("export", "--to colmap-dense", "2026-11-29", "use --to points, which has normals, colours and parallax"),
+    Removed("export", "--to tsdf", "2026-11-29", "use --to mesh, the surface of the signed distances"),
     Removed("poses", "--component", "2026-11-29", "put the photos of the other model into a folder of their own"),
     Removed("poses", "--drop-database", "2026-11-29", "delete database.db in the scene folder"),
     Removed("poses", "--intrinsics-as", "2026-11-29", "intrinsics are kept; without --intrinsics they are estimated"),

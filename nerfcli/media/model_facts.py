@@ -1,4 +1,4 @@
-"""Describe files of meshes, points and volumes as plain values."""
+"""Describe files of meshes and points as plain values."""
 
 import json
 from pathlib import Path
@@ -10,15 +10,14 @@ from nerfcli.errors import UserError
 from nerfcli.media.las_files import SUFFIXES as LAS_SUFFIXES
 from nerfcli.media.las_files import las_facts
 from nerfcli.media.mesh_files import KEY, read_glb_json, read_ply_header
-from nerfcli.media.volume_files import Volume, read_nrrd, read_volume_npz
 
 # Note for files without a description.
 NOT_STATED = "nothing in the file says its unit or its frame"
-SUFFIXES = (".ply", ".glb", ".obj", ".nrrd", *LAS_SUFFIXES)
+SUFFIXES = (".ply", ".glb", ".obj", *LAS_SUFFIXES)
 
 
-def model_facts(path: Path) -> dict[str, Any] | None:
-    """Return the facts about a file by name; None for an archive that is not a volume.
+def model_facts(path: Path) -> dict[str, Any]:
+    """Return the facts about a file by name.
 
     Keys: kind, format, counts, low and high corner if known, and the description: unit, frame, run, ...
 
@@ -34,18 +33,8 @@ def model_facts(path: Path) -> dict[str, Any] | None:
             return _glb_facts(path)
         case ".obj":
             return _obj_facts(path)
-        case ".las" | ".laz":
-            return las_facts(path)
-        case ".nrrd":
-            values, fields = read_nrrd(path)
-            origin = np.array([float(value) for value in fields["space origin"].strip("()").split(",")])
-            size = float(fields["space directions"].split(",")[0].lstrip("("))
-            described = json.loads(fields.get(KEY, "{}"))
-            name = described.pop("map", "values")
-            return volume_facts(Volume({name: values}, origin, size, described), "NRRD")
         case _:
-            volume = read_volume_npz(path)
-            return None if volume is None else volume_facts(volume, "NPZ")
+            return las_facts(path)
 
 
 def _ply_facts(path: Path) -> dict[str, Any]:
@@ -98,22 +87,6 @@ def _obj_facts(path: Path) -> dict[str, Any]:
         raise UserError(f"{path} has no vertices", "copy or export it once more")
     facts = {"kind": "mesh", "format": "OBJ", "vertices": counts["v"], "faces": counts["f"]}
     return _described(comments) | facts
-
-
-def volume_facts(volume: Volume, form: str) -> dict[str, Any]:
-    """Return the facts about a volume from a file of any format."""
-    facts: dict[str, Any] = {"kind": "volume", "format": form, "voxel_size": volume.voxel_size}
-    shape = next(iter(volume.maps.values())).shape[:3]
-    facts |= {"voxels": "x".join(map(str, shape)), "first_centre": volume.origin.tolist()}
-    facts["last_centre"] = (volume.origin + volume.voxel_size * (np.array(shape) - 1)).tolist()
-    for name, values in volume.maps.items():
-        finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
-        span = f", {finite.min():.6g} to {finite.max():.6g}" if finite.size else ", no numbers"
-        facts[name] = f"{values.dtype}{span}, {100 * finite.size / values.size:.1f} % known"
-    # The description may define a map's values under the map's own name, which is already a key of `facts`.
-    described = dict(volume.description or {"note": NOT_STATED})
-    meanings = {f"{name}_is": described.pop(name) for name in volume.maps if name in described}
-    return described | facts | meanings
 
 
 def _corners(points: np.ndarray) -> dict[str, Any]:

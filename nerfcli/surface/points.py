@@ -28,7 +28,6 @@ class Points:
         photos: (N,) number of photos that see the point.
         parallax_deg: (N,) the largest angle between the rays of two photos that see it.
         spread: (N,) standard deviation of the depth distribution, scene units.
-        seen: (N, views) bool, True where a photo sees the point.
     """
 
     places: np.ndarray
@@ -37,7 +36,6 @@ class Points:
     photos: np.ndarray
     parallax_deg: np.ndarray
     spread: np.ndarray
-    seen: np.ndarray
 
 
 def agreed_points(
@@ -61,7 +59,6 @@ def agreed_points(
         photos=photos[kept].astype(np.uint16),
         parallax_deg=largest_angle_deg(seen[kept], places[kept], np.stack([view.frame.centre for view in views])),
         spread=spread[kept],
-        seen=seen[kept],
     )
 
 

@@ -6,21 +6,24 @@ is that of the scan: x and y across the rotation axis, z along it.
 
 import json
 import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tifffile
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
-from nerfcli.media.volume_files import KEY, Volume, read_nrrd, write_nrrd
+from nerfcli.media.mesh_files import KEY
 from nerfcli.tomography.grid import VoxelGrid
 
 _NIFTI_HEADER = 352
 _NIFTI_UNITS = {"m": 1, "mm": 2, "um": 3}
 _NIFTI_TYPES = {np.dtype(np.uint8): (2, 8), np.dtype(np.float32): (16, 32)}
+_NRRD_TYPES = {np.dtype(np.uint8): "uchar", np.dtype(np.float32): "float"}
 _WORDS = {np.dtype(np.uint8): "MET_UCHAR", np.dtype(np.float32): "MET_FLOAT"}
 
 # Suffixes of volumes, the default first.
@@ -72,16 +75,16 @@ def read_volume(path: Path) -> VolumeFile:
         return _FORMATS[path.suffix.lower()][1](path)
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}", "give a volume file") from error
-    except (KeyError, ValueError, IndexError, struct.error) as error:
+    except (KeyError, ValueError, IndexError, struct.error, zlib.error) as error:
         raise UserError(
             f"{path} is damaged or not a volume written by nerfcli: {error}", "export the volume again"
         ) from error
 
 
 def is_volume_file(path: Path) -> bool:
-    """Return whether a file is a MetaImage or a NIfTI, or a TIFF stack that `write_volume` wrote."""
+    """Return whether a file is an NRRD, a MetaImage or a NIfTI, or a TIFF stack that `write_volume` wrote."""
     if path.suffix.lower() not in (".tif", ".tiff"):
-        return path.suffix.lower() in (".mha", ".nii") and path.is_file()
+        return path.suffix.lower() in (".nrrd", ".mha", ".nii") and path.is_file()
     try:
         with tifffile.TiffFile(path) as tiff:
             return {"first", "spacing"} <= set(tiff.imagej_metadata or {})
@@ -89,26 +92,77 @@ def is_volume_file(path: Path) -> bool:
         return False
 
 
-def map_of(volume: VolumeFile) -> Volume:
-    """Return the volume indexed [x, y, z], named "marks" or "attenuation"."""
-    name = "marks" if volume.values.dtype == np.uint8 else "attenuation"
-    description = {"unit": volume.unit, "quantity": volume.quantity}
-    values = np.ascontiguousarray(volume.values).transpose(2, 1, 0)
-    return Volume({name: values}, np.array(volume.grid.first), volume.grid.size, description)
+def volume_facts(path: Path) -> dict[str, Any]:
+    """Return the facts about a volume's file by name.
+
+    Raises:
+        UserError: see `read_volume`.
+    """
+    volume = read_volume(path)
+    values, grid = volume.values, volume.grid
+    known = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+    span = f", {known.min():.6g} to {known.max():.6g}" if known.size else ", no numbers"
+    return {
+        "unit": volume.unit,
+        "quantity": volume.quantity,
+        "kind": "volume",
+        "format": path.suffix[1:].upper(),
+        "voxel_size": grid.size,
+        "voxels": "x".join(map(str, reversed(grid.shape))),
+        "first_centre": list(grid.first),
+        "last_centre": [float(grid.axis(name)[-1]) for name in "xyz"],
+        _name_of(volume): f"{values.dtype}{span}, {100 * known.size / values.size:.1f} % known",
+    }
+
+
+def _name_of(volume: VolumeFile) -> str:
+    return "marks" if volume.values.dtype == np.uint8 else "attenuation"
 
 
 def _write_nrrd(path: Path, volume: VolumeFile) -> None:
-    own = map_of(volume)
-    write_nrrd(own, next(iter(own.maps)), path)
+    """Write NRRD 5 (gzip), with the units and the name of the map under the key `nerfcli`.
+
+    Source: Definition of NRRD File Format, teem.sourceforge.net/nrrd/format.html.
+    """
+    unit = volume.unit if volume.unit in ("mm", "um") else "arbitrary"
+    size, name = f"{volume.grid.size:.17g}", _name_of(volume)
+    stated = {"unit": volume.unit, "quantity": volume.quantity, "map": name}
+    lines = [
+        "NRRD0005",
+        f"# {name} by nerfcli",
+        f"type: {_NRRD_TYPES[volume.values.dtype]}",
+        "dimension: 3",
+        "space dimension: 3",
+        f"sizes: {' '.join(map(str, reversed(volume.grid.shape)))}",
+        f"space directions: ({size},0,0) (0,{size},0) (0,0,{size})",
+        f"space origin: ({','.join(f'{value:.17g}' for value in volume.grid.first)})",
+        f'space units: "{unit}" "{unit}" "{unit}"',
+        "kinds: domain domain domain",
+        "centers: cell cell cell",
+        "endian: little",
+        "encoding: gzip",
+        f"{KEY}:={json.dumps(stated, ensure_ascii=True, allow_nan=False)}",
+        "",
+        "",
+    ]
+    packed = zlib.compressobj(6, zlib.DEFLATED, 31)
+    body = packed.compress(np.ascontiguousarray(volume.values).tobytes()) + packed.flush()
+    path.write_bytes("\n".join(lines).encode("ascii") + body)
 
 
 def _read_nrrd(path: Path) -> VolumeFile:
-    values, fields = read_nrrd(path)
-    description = json.loads(fields[KEY])
+    head, _, body = path.read_bytes().partition(b"\n\n")
+    fields = {}
+    for line in head.decode("utf-8", errors="replace").splitlines()[1:]:
+        name, _, value = line.partition(":")
+        fields[name] = value.removeprefix("=").strip()
+    stated = json.loads(fields[KEY])
+    kind = {word: kind for kind, word in _NRRD_TYPES.items()}[fields["type"]]
+    shape = tuple(int(count) for count in reversed(fields["sizes"].split()))
+    values = np.frombuffer(zlib.decompress(body, 31), kind).reshape(shape)
     first = [float(v) for v in fields["space origin"].strip("()").split(",")]
     size = float(fields["space directions"].split(",")[0].strip("("))
-    values = values.transpose(2, 1, 0)
-    return VolumeFile(values, VoxelGrid.of(values.shape, first, size), description["unit"], description["quantity"])
+    return VolumeFile(values, VoxelGrid.of(shape, first, size), stated["unit"], stated["quantity"])
 
 
 def _write_mha(path: Path, volume: VolumeFile) -> None:

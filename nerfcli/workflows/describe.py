@@ -14,10 +14,10 @@ from nerfcli.errors import UserError, in_shell
 from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
 from nerfcli.media.geotiff import map_facts
 from nerfcli.media.model_facts import SUFFIXES as MODEL_SUFFIXES
-from nerfcli.media.model_facts import model_facts, volume_facts
+from nerfcli.media.model_facts import model_facts
 from nerfcli.runs.files import CONFIG, DEPTH_ERRORS, LOG, METRICS, REPORT
 from nerfcli.tomography.result import is_reconstruction, load_reconstruction
-from nerfcli.tomography.volume_files import is_volume_file, map_of, read_volume
+from nerfcli.tomography.volume_files import is_volume_file, volume_facts
 
 # Formats that only `nerfcli convert` reads, and the suffixes of their files; "" is that of a folder.
 _CAPTURES = (
@@ -51,12 +51,10 @@ def describe(path: str | Path) -> dict[str, Any]:
         return describe_tensors(folder)
     if folder.suffix.lower() in _CAPTURE_SUFFIXES and (facts := _describe_capture(folder)) is not None:
         return facts
-    if folder.suffix.lower() in (*MODEL_SUFFIXES, ".npz") and (folder.is_file() or folder.suffix.lower() != ".npz"):
-        facts = model_facts(folder)
-        if facts is not None:
-            return facts
+    if folder.suffix.lower() in MODEL_SUFFIXES:
+        return model_facts(folder)
     if folder.is_file() and is_volume_file(folder):
-        return volume_facts(map_of(read_volume(folder)), folder.suffix[1:].upper())
+        return volume_facts(folder)
     if folder.is_file() and folder.suffix.lower() in (".tif", ".tiff") and (facts := map_facts(folder)) is not None:
         return facts
     if folder.is_file() and folder.suffix.lower() != ".json":

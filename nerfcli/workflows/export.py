@@ -1,4 +1,4 @@
-"""Export a run to files that other programs open: a page, a mesh, points, a volume, a map, COLMAP's dense folder."""
+"""Export a run to files that other programs open: a page, a mesh, points, a map."""
 
 from pathlib import Path
 
@@ -17,13 +17,7 @@ from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import page_photos
 from nerfcli.viewer.proof import make_proof
-from nerfcli.workflows.export_geometry import (
-    export_colmap_dense,
-    export_mesh,
-    export_points,
-    export_tsdf,
-    export_volume,
-)
+from nerfcli.workflows.export_geometry import export_mesh, export_points
 from nerfcli.workflows.export_map import export_ortho
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
@@ -36,10 +30,7 @@ TARGETS = {
     "page": (".html",),
     "mesh": (".ply", ".glb", ".obj"),
     "points": (".ply", ".las", ".laz"),
-    "volume": (".npz", ".nrrd"),
-    "tsdf": (".npz", ".nrrd"),
     "ortho": ("",),
-    "colmap-dense": ("",),
 }
 SURFACE = SurfaceSettings()
 
@@ -153,8 +144,5 @@ _EXPORTS = {
     "page": _export_page,
     "mesh": export_mesh,
     "points": export_points,
-    "volume": export_volume,
-    "tsdf": export_tsdf,
     "ortho": export_ortho,
-    "colmap-dense": export_colmap_dense,
 }

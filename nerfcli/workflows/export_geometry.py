@@ -1,7 +1,6 @@
-"""Export the geometry of a run: surfaces, points, volumes, and COLMAP's dense folder, in the scene's frame and unit."""
+"""Export the geometry of a run, surfaces and points, in the scene's frame and unit."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,29 +8,22 @@ import numpy as np
 import torch
 
 from nerfcli import __version__
-from nerfcli.atomic import atomic_folder
-from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import look_at
-from nerfcli.errors import UserError, in_shell
+from nerfcli.errors import UserError
 from nerfcli.media.las_files import SUFFIXES as LAS_SUFFIXES
 from nerfcli.media.las_files import las_module, write_las
 from nerfcli.media.mesh_files import write_glb, write_obj, write_ply
-from nerfcli.media.volume_files import Volume, write_nrrd, write_volume_npz
-from nerfcli.photos.loading import load_photo
-from nerfcli.photos.undistorted import pinhole_frame, pinhole_of, undistorted
 from nerfcli.render.model import Model
 from nerfcli.render.visibility import coverage_and_parallax
 from nerfcli.runs.run import Run
-from nerfcli.surface.colmap_dense import photo_name, write_photo, write_sparse, write_stereo
 from nerfcli.surface.colours import surface_colours
 from nerfcli.surface.extent import Grid, automatic_voxel, scene_box
 from nerfcli.surface.fusion import fuse
-from nerfcli.surface.marching import SEEN, Mesh, simplified, surface_of, without_small_pieces
+from nerfcli.surface.marching import Mesh, simplified, surface_of, without_small_pieces
 from nerfcli.surface.points import agreed_points
 from nerfcli.surface.settings import MOST_VIEWS, SurfaceSettings
 from nerfcli.surface.views import DepthView, depth_views, spread_frames
-from nerfcli.surface.volume import automatic_volume_voxel, sample_volume
 from nerfcli.workflows.notices import Notify, Progress, part_of
 
 FORMAT = "nerfcli geometry 1"
@@ -100,76 +92,9 @@ def export_points(
     notify(f"{len(points.places)} points that two photos or more see, {_grid_in_words(grid, model)}")
 
 
-def export_volume(
-    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
-) -> None:
-    """Write density and colour on a grid as .npz, or only the density as .nrrd."""
-    box = settings.box or scene_box(model, run.cameras.train)
-    grid = Grid.over(box, settings.voxel_size or automatic_volume_voxel(box))
-    maps = sample_volume(model, grid, on_progress=part_of(progress, 0.05, 1.0, "evaluating the field"))
-    per_unit = "1/m" if model.unit == "metre" else "1 / unit"
-    described = _description(run, model, "volume", grid) | {
-        "density": f"fraction of light that ends per length, {per_unit}; 0 where rays pass over cells",
-        "colour": "sRGB, mean over six directions; 0 where a voxel takes less than a thousandth of the light",
-    }
-    _write_volume(path, Volume(maps, grid.centres(np.zeros(3)), grid.voxel_size, described), "density")
-    notify(_grid_in_words(grid, model))
-
-
-def export_tsdf(
-    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
-) -> None:
-    """Write the signed distances that the mesh is made from, with their weights as .npz or without them as .nrrd."""
-    views, grid = _seen(run, model, settings, progress)
-    fused = fuse(views, grid, on_progress=part_of(progress, _DEPTHS, 1.0, "fuses"))
-    distance, weight = fused.dense((0, 0, 0), grid.shape)
-    described = _description(run, model, "tsdf", grid) | {
-        "distance": "to the surface, positive outside, in the unit; NaN where too few photos see",
-        "truncation": fused.truncation,
-        "weight": f"sum over photos; {SEEN} and more count as seen",
-    }
-    maps = {"distance": np.where(weight >= SEEN, distance, np.float32(np.nan)), "weight": weight}
-    _write_volume(path, Volume(maps, grid.centres(np.zeros(3)), grid.voxel_size, described), "distance")
-    notify(_grid_in_words(grid, model))
-
-
-def export_colmap_dense(
-    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
-) -> None:
-    """Write a folder that COLMAP's fusion reads."""
-    factor = run.config.downscale
-    there = [frame for frame in run.cameras.train if frame.image is not None]
-    frames = [replace(frame, name=photo_name(frame.name)) for frame in spread_frames(there, MOST_VIEWS)]
-    if not frames:
-        raise UserError(f"{run.path} has no photos", "use a run that was trained on photos")
-    views, grid = _seen(run, model, settings, progress, frames=frames)
-    points = agreed_points(views, grid)
-    if not len(points.places):
-        raise UserError("no two photos see the same point in the box", "use another --box, or train longer")
-    with atomic_folder(path) as partial:
-        cameras = []
-        for index, frame in enumerate(frames):
-            photo = load_photo(frame, factor, "ignore")
-            pinhole = pinhole_of(photo.frame.camera)
-            pixels, _ = undistorted(photo.pixels, photo.frame.camera, pinhole)
-            write_photo(partial / "images" / frame.name, pixels[..., :3])
-            cameras.append(pinhole_frame(photo.frame))
-            progress(_DEPTHS + (1 - _DEPTHS) * (index + 1) / len(frames), "photos")
-        write_sparse(partial, cameras, points)
-        write_stereo(partial, views)
-    notify(
-        f"{len(frames)} photos share {len(points.places)} points; to fuse them: "
-        f"colmap stereo_fusion --workspace_path {in_shell(path)}"
-    )
-    if model.unit != "arbitrary":
-        notify(f"COLMAP's files hold no unit: their lengths are in {model.unit}s, as those of the scene")
-
-
-def _seen(
-    run: Run, model: Model, settings: SurfaceSettings, progress: Progress, *, frames: Sequence[Frame] | None = None
-) -> tuple[list[DepthView], Grid]:
+def _seen(run: Run, model: Model, settings: SurfaceSettings, progress: Progress) -> tuple[list[DepthView], Grid]:
     """Return depth maps of the training cameras, and the grid to fuse them in."""
-    chosen = spread_frames(run.cameras.train, MOST_VIEWS) if frames is None else frames
+    chosen = spread_frames(run.cameras.train, MOST_VIEWS)
     box = settings.box or scene_box(model, run.cameras.train)
     views = depth_views(
         model, chosen, max_size=settings.max_size, on_progress=part_of(progress, 0.02, _DEPTHS, "renders depths")
@@ -236,13 +161,6 @@ def _write_mesh(
             columns |= dict(zip(("nx", "ny", "nz"), mesh.normals.astype("<f4").T, strict=True))
             columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
             write_ply(path, {**columns, **seen}, faces=mesh.faces, description=description)
-
-
-def _write_volume(path: Path, volume: Volume, name: str) -> None:
-    if path.suffix.lower() == ".nrrd":
-        write_nrrd(volume, name, path)
-    else:
-        write_volume_npz(volume, path)
 
 
 def _y_up_from_scene(run: Run) -> np.ndarray:
