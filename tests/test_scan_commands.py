@@ -328,7 +328,6 @@ def test_hounsfield_units_of_water_and_air(tmp_path: Path, bean_run: Path) -> No
     ("arguments", "option"),
     [
         (("train", "SCAN", "--holdout", "every:4"), "--holdout"),
-        (("train", "SCAN", "--view"), "--view"),
         (("render", "RUN", "--video"), "--video"),
         (("render", "RUN", "--lens", "fisheye"), "--lens"),
         (("evaluate", "RUN", "--save-predictions", "png"), "--save-predictions"),

@@ -1,23 +1,19 @@
-"""The server of the interactive page: who may look, what they get, and what their buttons do to a training."""
+"""The server of the interactive page: who may look, and what they get, during a training too."""
 
 import json
 import re
 import signal
 import socket
 import struct
-import subprocess
-import sys
 import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from queue import Queue
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,24 +26,20 @@ from fog import foggy_cells
 from nerfcli import scene
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.child import messages as child_messages
-from nerfcli.errors import INTERRUPTED, UserError
+from nerfcli.errors import INTERRUPTED
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Marching, Model, save_model
 from nerfcli.render.pictures import RenderedPicture, render_picture
-from nerfcli.runs.files import FIELD, LIVE
-from nerfcli.runs.live import Pulse, Request, read_status, write_request
+from nerfcli.runs.files import FIELD
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.train import live as training_side
 from nerfcli.train import loop
 from nerfcli.viewer import painter
 from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.painter import Painter, Tile, View, render_tile, strides_of, tiles_of, view_from_json
 from nerfcli.viewer.pictures import view_of
 from nerfcli.viewer.server import PageServer
-from nerfcli.workflows import view_worker
 from nerfcli.workflows.view import RunData
 
 FEW = TrainSettings(
@@ -82,7 +74,6 @@ class Served:
     def close(self) -> None:
         self.server.shutdown()
         self.server.server_close()
-        self.show.close()
 
 
 @pytest.fixture
@@ -269,15 +260,13 @@ def test_a_wrong_token_is_refused_everywhere(served):
         wrong = served.url.replace(served.server.token, token)
         for place, body in (
             ("", None),
-            ("events", None),
+            ("version", None),
             ("field", None),
             ("picture", {}),
-            ("control", {"action": "stop"}),
         ):
             code, text = served.refusal(place, body, url=wrong)
             assert code == 403
             assert "wrong token" in text
-    assert not served.show._request.stop
 
 
 def test_only_this_machine_can_reach_the_server_by_default(served):
@@ -289,7 +278,6 @@ def test_missing_and_meaningless_inputs_are_reported(served):
     assert served.refusal("nothing")[0] == 404
     assert served.refusal("photo?n=1000&px=100")[0] == 404
     assert served.refusal("photo?n=x")[0] == 400
-    assert served.refusal("control", {"action": "explode"})[0] == 400
     assert served.refusal("picture", {"view": {}})[0] == 400
     assert served.refusal("picture", [1])[0] == 400
     assert served.refusal("picture", {"client": "x" * 10**5})[0] == 400
@@ -332,25 +320,6 @@ def test_what_the_page_cannot_render_is_drawn_by_the_server(finished):
     np.testing.assert_array_equal(picture[..., :3], rendered(model, frame, "conditional").rgb)
 
 
-def events(url: str) -> Generator[dict[str, Any], None, None]:
-    with urllib.request.urlopen(url + "events", timeout=60) as stream:
-        for line in stream:
-            if line.startswith(b"data: "):
-                yield json.loads(line[6:])
-
-
-def test_a_second_client_is_counted_and_goes(served):
-    with closing(events(served.url)) as one:
-        assert next(one)["clients"] == 1
-        with closing(events(served.url)) as other:
-            assert next(other)["clients"] == 2
-            served.server.announce()
-            assert next(one)["clients"] == 2
-        assert next(one)["clients"] == 1
-    with served.server.changed:
-        assert served.server.changed.wait_for(lambda: served.server.clients == 0, 60) or served.server.clients == 0
-
-
 # Addresses
 
 
@@ -376,42 +345,16 @@ def test_ctrl_c_ends_the_server(finished):
     process = started("view", finished, "--no-browser", "--json")
     assert process.stdout is not None
     url = json.loads(process.stdout.readline())["url"]
-    with closing(events(url)) as stream:
-        assert next(stream)["state"] == "none"
-        process.send_signal(signal.SIGINT)
-        stdout, stderr = process.communicate(timeout=60)
+    with urllib.request.urlopen(url + "version", timeout=60) as answer:
+        assert answer.read() == b"1"
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=60)
     assert (process.returncode, stdout) == (INTERRUPTED, "")
     assert re.search(r"ssh -L (\d+):127\.0\.0\.1:\1 ", stderr)
     assert stderr.splitlines()[-1].startswith("Interrupted")
-    assert not (finished / LIVE).exists()
 
 
 # During a training
-
-
-def test_a_server_without_viewers_has_not_imported_the_renderer(finished):
-    program = (
-        "import sys; from pathlib import Path; from types import SimpleNamespace\n"
-        "from nerfcli.workflows import view_worker\nfrom nerfcli.workflows.view import RunData\n"
-        f"show = RunData(Path({str(finished)!r}), threads=1); show.check()\n"
-        "show.tick(SimpleNamespace(clients=0, announce=bool)); print({'torch', 'numba', 'cv2'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\n"
-
-
-def test_a_counter_that_goes_on_is_a_sign_of_life_and_an_old_one_is_none():
-    now = 0.0
-    pulse = Pulse(5.0, lambda: now)
-    assert not pulse.beats(None)
-    assert not pulse.beats(7)  # it may be years old
-    assert pulse.beats(8)
-    now = 4.9
-    assert pulse.beats(8)
-    now = 5.1
-    assert not pulse.beats(8)
-    assert pulse.beats(9)
-    assert not pulse.beats(None)
 
 
 def fit(run: Path, *, on_step: Any = lambda progress: None) -> None:
@@ -420,142 +363,25 @@ def fit(run: Path, *, on_step: Any = lambda progress: None) -> None:
     )
 
 
-class Watched:
-    """A run with a viewer from its first step on."""
-
-    def __init__(self, run: Path):
-        self.run, self.show = run, RunData(run, threads=1)
-        self.server = SimpleNamespace(clients=1, announce=lambda: None)
-        self.states: list[str] = []
-
-    def on_step(self, progress: loop.Progress) -> None:
-        self.show.tick(self.server)  # type: ignore[arg-type]
-        self.states.append(self.show.status()["state"])
-
-
-@pytest.fixture
-def at_once(monkeypatch):
-    """The training looks for viewers, and gives them its field, after every step."""
-    for name, seconds in (("LOOK_SECONDS", 0.0), ("FIELD_SECONDS", 0.0), ("MOST_OF_TIME", 1e9)):
-        monkeypatch.setattr(training_side, name, seconds)
-    monkeypatch.setattr(loop, "_LAST_LOOK_SECONDS", 0.0)
-
-
-def test_who_looks_sees_each_field_and_changes_nothing(capture, at_once):
+def test_each_checkpoint_is_a_new_version_and_viewers_change_nothing(capture, monkeypatch):
+    monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
     alone, run = capture.with_name("alone"), capture.with_name("watched")
     fit(alone)
-    watched = Watched(run)
-    seen: dict[str, int] = {}
+    with closing(Served(run)) as served:
+        seen: list[int] = []
 
-    def on_step(progress: loop.Progress) -> None:
-        watched.on_step(progress)
-        if progress.step > 3:
-            status = watched.show.status()
-            assert (status["step"], status["version"]) == (progress.step - 1, progress.step - 1)
-            seen[str(watched.show.model()[1].sha256)] = progress.step
+        def on_step(progress: loop.Progress) -> None:
+            seen.append(int(served.get("version")))
+            if progress.step == 1:
+                no_field = f"{run} has no field yet: wait for the first checkpoint of its training\n"
+                assert served.refusal("") == (503, no_field)
+            else:
+                assert served.show.model()[1].sha256 == Run(run).checkpoint_sha256()
 
-    fit(run, on_step=on_step)
-    assert watched.states[3:] == ["training"] * 9
-    assert len(seen) >= 6  # the last steps of such a short training hit nothing and do not change the field
-    assert (run / FIELD).read_bytes() == (alone / FIELD).read_bytes()
-    watched.server.clients = 0
-    watched.show.tick(watched.server)  # type: ignore[arg-type]
-    assert watched.show.status()["state"] == "ended"
-    assert watched.show.model()[1].sha256 == Run(run).checkpoint_sha256()
-    assert not (run / LIVE).exists()
-    assert not (alone / LIVE).exists()
-
-
-def test_pause_and_stop_reach_the_training(capture, at_once):
-    run = capture.with_name("watched")
-    watched = Watched(run)
-    paused_at: list[int] = []
-    last = 0
-
-    def elsewhere() -> None:
-        """Act as the server's thread while the training waits."""
-        deadline = time.monotonic() + 60
-        while (status := read_status(run)) is None or not status.paused:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        for _ in range(5):
-            watched.show.tick(watched.server)  # type: ignore[arg-type]
-            time.sleep(0.05)
-            paused_at.append(last)
-        watched.show.control("continue")
-
-    def on_step(progress: loop.Progress) -> None:
-        nonlocal last
-        last = progress.step
-        watched.on_step(progress)
-        if progress.step == 4:
-            watched.show.control("pause")
-            threading.Thread(target=elsewhere, daemon=True).start()
-        if progress.step == 7:
-            watched.show.control("stop")
-
-    with pytest.raises(KeyboardInterrupt):
         fit(run, on_step=on_step)
-    assert paused_at == [4] * 5
-    assert Run(run).saved_progress()[0] == 7
-    assert read_status(run) is None
-
-
-def test_a_viewer_that_died_during_a_pause_delays_nothing(capture, at_once, monkeypatch):
-    monkeypatch.setattr(training_side, "VIEWER_SECONDS", 0.3)
-    run = capture.with_name("watched")
-
-    def on_step(progress: loop.Progress) -> None:
-        if progress.step <= 4:
-            write_request(run, Request(progress.step, paused=progress.step == 4))
-
-    fit(run, on_step=on_step)
-    assert Run(run).saved_progress()[0] == 12
-
-
-def test_a_disk_that_is_full_ends_the_view_and_not_the_training(capture, at_once, monkeypatch):
-    def full(path: Path, model: Model) -> None:
-        raise UserError(f"cannot write {path}: No space left on device", "free some")
-
-    monkeypatch.setattr(training_side, "save_model", full)
-    run, notes = capture.with_name("watched"), []
-    watched = Watched(run)
-    loaded = scene.load(capture)
-    loop.train(loaded, run, FEW, resume=False, notify=notes.append, on_progress=watched.on_step)
-    assert Run(run).saved_progress()[0] == 12
-    assert sum("can no longer be viewed" in note for note in notes) == 1
-
-
-def test_train_serves_its_run_with_view(capture, monkeypatch):
-    """The server is a process of its own; what it announces is read here, and in what the command prints."""
-    announced: Queue[str] = Queue()
-    seen: list[int] = []
-
-    def overheard(child: Any) -> Iterator[dict[str, Any]]:
-        for message in child_messages(child):
-            announced.put(" ".join(message["lines"]))
-            yield message
-
-    def look_and_stop() -> None:
-        found = re.search(r"http://\S+", announced.get(timeout=60))
-        assert found is not None
-        with closing(events(found[0])) as stream:
-            seen.append(next(s["step"] for s in stream if s["state"] == "training" and s["version"] > 0))
-            request = urllib.request.Request(found[0] + "control", json.dumps({"action": "stop"}).encode())
-            urllib.request.urlopen(request, timeout=60).close()
-
-    monkeypatch.setattr(view_worker, "messages", overheard)
-    client = threading.Thread(target=look_and_stop)
-    client.start()
-    small = ("--downscale", "8", "--log2-rows", "10", "--threads", "1", "--model", "default")
-    result = nerfcli("train", capture, "--steps", "20000", *small, "--view")
-    client.join()
-    assert result.exit_code == INTERRUPTED
-    assert "view the training at http://" in result.stderr
-    assert "--resume" in result.stderr
-    run = capture.with_name(f"{capture.name}-run")
-    assert Run(run).saved_progress()[0] >= seen[0]
-    assert not (run / LIVE).exists()
+        assert seen == list(range(12))
+        assert int(served.get("version")) == 12
+        assert (run / FIELD).read_bytes() == (alone / FIELD).read_bytes()
 
 
 # In a browser
@@ -601,8 +427,6 @@ def test_a_browser_draws_each_new_field_by_itself(finished, tmp_path):
         pytest.skip("there is no Chromium on this machine to open the page with")
     old = Run(finished).model()
     with closing(Served(finished)) as served, Browser(tmp_path, width=420, height=200) as browser:
-        served.server.clients = 1  # as `tick` counts them; the test calls it
-        served.show.tick(served.server)
         browser.visit(served.url + "?by=page")
         browser.wait("document.body.dataset.rested > 0")
         assert browser.run("nerfcliPage.probe.colour.slice(0, 3)") == {"0": 1, "1": 1, "2": 1}
@@ -610,7 +434,6 @@ def test_a_browser_draws_each_new_field_by_itself(finished, tmp_path):
             finished / FIELD,
             replace(old, background=(0.0, 0.5, 1.0), occupied=foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.0))),
         )
-        served.show.tick(served.server)
         browser.wait("document.body.dataset.version == 2")
         browser.wait("nerfcliPage.done")
         browser.run("nerfcliPage.check()")

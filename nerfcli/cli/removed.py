@@ -84,6 +84,7 @@ REMOVED: tuple[Removed, ...] = (
     Removed("train", "--levels", "2026-11-29", "8 levels are used; set the size of the field with --log2-rows"),
     Removed("train", "--members", "2026-11-29", "train with --seed 1, --seed 2, ...; see docs/uncertainty.md"),
     Removed("train", "--vary", "2026-11-29", "train with --seed 1, --seed 2, ...; see docs/uncertainty.md"),
+    Removed("train", "--view", "2026-11-29", "in another terminal, nerfcli view RUN shows the newest checkpoint"),
     Removed("train", "--width", "2026-11-29", "networks have width 32; set the size of the field with --log2-rows"),
     Removed("train", "--with entropy", "2026-11-29", "use --with distortion, which also clears haze"),
     Removed("train", "--with movers", "2026-11-29", "mask what moves; occluders are left out without it"),

@@ -57,9 +57,6 @@ def train(
         bool,
         typer.Option("--resume", help="Continue from the last checkpoint to the new total; without one, start."),
     ] = False,
-    view: Annotated[
-        bool, typer.Option("--view", help="Show the field in a browser while it trains; see nerfcli view.")
-    ] = False,
     memory: options.DeviceMemory = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show how much memory, disk and time it would take.")
@@ -113,7 +110,6 @@ def train(
       nerfcli train photos-scene --budget 90s
       nerfcli train photos-scene --budget 5m --resume
       nerfcli train photos-scene --budget 5m --dry-run --json
-      nerfcli train photos-scene --view
       nerfcli train photos-scene --holdout block:0.15 -o gap-run
       nerfcli train data/lego --steps 2000 --downscale 2 -o lego-run
       nerfcli train photos-scene --budget 5m --model default
@@ -194,7 +190,6 @@ def train(
                 resume=resume,
                 overwrite=overwrite,
                 holdout=rule,
-                view=view,
                 warn=console.warn,
                 **callbacks,
             )

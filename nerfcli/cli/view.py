@@ -29,10 +29,9 @@ def view(
 ) -> None:
     """Show a run in a browser, during its training and after.
 
-    The page is that of `nerfcli export --to page`. While the run is being trained it shows the field every few seconds,
-    with buttons to pause and to stop; it sees trainings that were started in another terminal, too. Where the browser
-    has no graphics card, and for blocks and fields of type mlp, the CPU of this machine renders: coarse during a
-    motion, then in full.
+    The page is that of `nerfcli export --to page`. While the run is being trained in another terminal, it shows the
+    newest checkpoint, one every 30 s. Where the browser has no graphics card, and for fields of type mlp, the CPU of
+    this machine renders: coarse during a motion, then in full.
 
     Only this machine can open the page, at the address printed, which contains a secret. On another machine, run the
     printed ssh command first and open the same address there. Ctrl-C ends the server (exit code 130).

@@ -9,6 +9,5 @@ DEPTH_ERRORS = "depth_errors.json"
 PHOTO_DEPTHS = "photo_depths.npz"
 REPORT = "report.html"
 LOCK = ".train.lock"
-LIVE = ".live"
 # Written and read by tomography, for a reconstruction from an X-ray scan.
 RECONSTRUCTION = "reconstruction.json"

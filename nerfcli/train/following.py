@@ -23,7 +23,7 @@ from nerfcli.train.preparation import Prepared, load_training_photos
 from nerfcli.train.sentinel import Sentinel
 
 # Announcements of rank 0 other than a fraction of the budget, which announces a step.
-WAIT, SETTLE, END = -1.0, -2.0, -3.0
+SETTLE, END = -1.0, -2.0
 # Ctrl-C and SIGTERM reach all ranks, and rank 0 announces the end. A rank that does not hear it in this time leaves.
 GRACE_SECONDS = 5.0
 # Steps from whose duration the efficiency is computed.
@@ -119,7 +119,7 @@ def follow(scene: Scene, run: Path, settings: TrainSettings, ranks: SingleProces
                     interrupts.raise_if_pending()
                 if message == SETTLE:
                     sentinel.settle()
-                elif message != WAIT:
+                else:
                     sentinel.advance(message)
                     storage.release_pages()
         except UserError:

@@ -24,16 +24,13 @@ from nerfcli.runs.log import LogEntry, append_log, cut_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
-from nerfcli.train.following import END, SETTLE, TIMED_STEPS, WAIT, describe_efficiency, start_others
+from nerfcli.train.following import END, SETTLE, TIMED_STEPS, describe_efficiency, start_others
 from nerfcli.train.left_out import remove_left_out, write_left_out
-from nerfcli.train.live import LiveTraining
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
 from nerfcli.train.waypoints import FRACTIONS, forget_waypoints, keep_waypoint, measure_waypoints
 
 CHECKPOINT_SECONDS = 30.0
-# Time that a page that is open when the training ends has to load the last checkpoint.
-_LAST_LOOK_SECONDS = 2.0
 
 
 @dataclass(frozen=True)
@@ -106,19 +103,10 @@ def train(
     sentinel = Sentinel(fitting, prepared.pool, run=run, notify=notify)
     with deferred_interrupts() as interrupts:
 
-        def still_wanted() -> None:
-            interrupts.raise_if_pending()
-            ranks.announce(WAIT)
-
-        live = LiveTraining(run, checkpoints.model, still_wanted=still_wanted, notify=notify)
-
         def after_step(progress: Progress) -> None:
             on_progress(progress)
             prepared.storage.release_pages()
             interrupts.raise_if_pending()
-            live.after_step(
-                fraction=progress.fraction, step=progress.step, seconds=progress.seconds, loss=progress.loss
-            )
 
         try:
             seconds = _run(fitting, totals, sentinel=sentinel, checkpoints=checkpoints, run=run, on_progress=after_step)
@@ -128,16 +116,13 @@ def train(
                 sentinel.settle()
                 checkpoints.write()
                 ranks.announce(END)
-            live.end()
             raise
         except UserError as error:
             if error.exit_code == LOST_RANK:  # nothing has been learned from that step
                 checkpoints.write()
-            live.end()
             raise
         checkpoints.write()
         ranks.announce(END)
-        live.end(seconds=_LAST_LOOK_SECONDS)
     if fitting.rollbacks:
         notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
     measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)

@@ -1,5 +1,7 @@
-// A page that its server keeps up to date: who draws, new numbers of the field, the training's state and its buttons.
+// A page that its server keeps up to date: who draws, and each newer field of a training.
 "use strict";
+
+const POLL_MS = 2000;
 
 /** Bytes of the server's answer: length of the JSON, the JSON, its arrays. */
 async function fetchArrays(place) {
@@ -60,68 +62,24 @@ async function startLive(scene) {
   $("scale").value = state.scale;
   $("proof").hidden = by === "server";
   if (by === "server") Object.assign($("clip"), { disabled: true, title: "only where this device draws" });
-  new Live(page, by, version);
+  follow(page, by, version);
 }
 
-class Live {
-  constructor(page, by, version) {
-    Object.assign(this, { page, by, version, busy: false, last: null });
-    const events = new EventSource("events");
-    events.onmessage = event => this.news(JSON.parse(event.data));
-    events.onerror = () => {
-      $("training").hidden = false;
-      $("progress").textContent = "The server has ended. Start it again with nerfcli view; the address is then another one.";
-      for (const id of ["pause", "stop"]) $(id).disabled = true;
-    };
-    $("pause").onclick = () => this.control(this.last?.state === "paused" ? "continue" : "pause");
-    $("stop").onclick = () => { if (confirm("End the training? It saves a checkpoint; --resume goes on from it.")) this.control("stop"); };
-  }
-
-  async control(action) {
-    const answer = await fetch("control", { method: "POST", body: JSON.stringify({ action }) });
-    if (answer.ok) this.news(await answer.json());
-  }
-
-  news(status) {
-    const { state: now, share, step, seconds, loss, version, stopping } = status;
-    this.last = status;
-    document.body.dataset.training = now;
-    $("training").hidden = now === "none";
-    $("done").value = share ?? 1;
-    const numbers = step === undefined ? "" : `step ${step.toLocaleString("en")}, ${seconds.toFixed(0)} s, loss ${loss.toFixed(4)}`;
-    const words = { training: stopping ? "Stopping" : "Training", paused: "Paused", ended: "The training has ended" }[now];
-    $("progress").textContent = [words, numbers].filter(Boolean).join(": ");
-    this.page.press("pause", now === "paused");
-    $("pause").textContent = now === "paused" ? "Continue" : "Pause";
-    for (const id of ["pause", "stop"]) $(id).disabled = now === "ended" || Boolean(stopping);
-    if (version > this.version) this.take(version);
-  }
-
-  /** Show a newer field, when the picture of the one before is complete. */
-  async take(version) {
-    this.newest = version;
-    if (this.busy) return;
-    this.busy = true;
-    while (this.newest > this.version) {
-      try {
-        if (this.by === "page") {
-          this.version = Math.max(this.newest, await fetchField(this.page.scene));
-          if (!this.page.renderer.gl.isContextLost()) this.page.renderer.load();
-        } else {
-          await this.rested();
-          this.version = this.page.renderer.version = this.newest;
-        }
-        this.page.request();
-      } catch (error) {
-        $("status").textContent = `no new field from the server: ${error.message}`;
-        await new Promise(resolve => setTimeout(resolve, 2000));
-      }
+/** Show each newer field; of those that the server draws, when the picture of the one before is complete. */
+async function follow(page, by, version) {
+  for (;;) {
+    document.body.dataset.version = version;
+    await new Promise(resolve => setTimeout(resolve, POLL_MS));
+    try {
+      const newest = await (await fetch("version")).json();
+      if (newest === version || by === "server" && !page.done) continue;
+      if (by === "page") {
+        version = await fetchField(page.scene);
+        if (!page.renderer.gl.isContextLost()) page.renderer.load();
+      } else version = page.renderer.version = newest;
+      page.request();
+    } catch (error) {
+      $("status").textContent = `no newer field from the server: ${error.message}`;
     }
-    this.busy = false;
-    document.body.dataset.version = this.version;
-  }
-
-  async rested() {
-    while (!this.page.done) await new Promise(resolve => setTimeout(resolve, 100));
   }
 }

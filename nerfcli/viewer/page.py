@@ -83,7 +83,7 @@ def live_page_html(
     Args:
         model, run, frames, box: as for `page_html`.
         photos: see `pictures.fetched_photos`.
-        version: version of the field, see `server.PageData.status`.
+        version: version of the field, see `server.PageData.version`.
         refusal: reason why the page cannot draw this field itself; None if it can.
     """
     scene = _scene(model, run=run, frames=frames, photos=photos, box=box)

@@ -1,12 +1,10 @@
-"""The server of the interactive page: an address with a token, status events for clients, rendered pictures."""
+"""The server of the interactive page: an address with a token, the newest field, rendered pictures."""
 
 import hmac
 import json
 import secrets
 import socket
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -17,10 +15,7 @@ from nerfcli.errors import UserError
 
 # The first port to try, and the number of ports to try.
 FIRST_PORT, PORTS_TRIED = 8123, 50
-# Longest time between writes to a client; a lost connection is noticed at the next write.
-EVENT_SECONDS = 1.0
 MOST_REQUEST_BYTES = 65536
-ACTIONS = ("pause", "continue", "stop")
 _HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
 
 
@@ -32,11 +27,11 @@ class PageData(Protocol):
         ...
 
     def field(self) -> bytes:
-        """Return the parameters of the newest field, see `live_data.field_bytes`."""
+        """Return the parameters of the newest field, with a description."""
         ...
 
     def proof(self) -> bytes:
-        """Return reference pictures of the newest field, see `live_data.proof_bytes`."""
+        """Return reference pictures of the newest field."""
         ...
 
     def photo(self, index: int, longest_px: int) -> bytes:
@@ -47,17 +42,13 @@ class PageData(Protocol):
         """Yield the parts of a picture, see `Painter.paint`; raise ValueError for an invalid view."""
         ...
 
-    def status(self) -> dict[str, Any]:
-        """Return the state of the training and the version of the newest field."""
-        ...
-
-    def control(self, action: str) -> None:
-        """Pass one of `ACTIONS` to the training."""
+    def version(self) -> int:
+        """Return the version number of the newest field, 0 if there is none yet."""
         ...
 
 
 class PageServer(ThreadingHTTPServer):
-    """Serves a show; `clients` is the number of open pages.
+    """Serves a show.
 
     Args:
         show: the data source.
@@ -75,8 +66,6 @@ class PageServer(ThreadingHTTPServer):
     def __init__(self, show: PageData, *, host: str, port: int | None):
         self.show = show
         self.token = secrets.token_urlsafe(16)
-        self.clients = 0
-        self.changed = threading.Condition()
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         ports = [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS_TRIED), 0]
         for candidate in ports:
@@ -95,11 +84,6 @@ class PageServer(ThreadingHTTPServer):
         """Return the address of the page for a browser that reaches this machine as `host`."""
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self.token}/"
 
-    def announce(self) -> None:
-        """Wake the event streams after a change of the status."""
-        with self.changed:
-            self.changed.notify_all()
-
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore lost connections; report all other errors."""
         if not isinstance(sys.exc_info()[1], ConnectionError):
@@ -115,10 +99,10 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server
 
     def do_GET(self) -> None:
-        self._answer({"": self._page, "events": self._events, "field": self._field, "proof": self._proof})
+        self._answer({"": self._page, "version": self._version, "field": self._field, "proof": self._proof})
 
     def do_POST(self) -> None:
-        self._answer({"picture": self._picture, "control": self._control})
+        self._answer({"picture": self._picture})
 
     def _answer(self, places: dict[str, Any]) -> None:
         address = urlsplit(self.path)
@@ -153,6 +137,9 @@ class _Handler(BaseHTTPRequestHandler):
             return
         self._send(HTTPStatus.OK, "text/html; charset=utf-8", text.encode())
 
+    def _version(self) -> None:
+        self._send(HTTPStatus.OK, "application/json", json.dumps(self._of.show.version()).encode())
+
     def _field(self) -> None:
         self._send(HTTPStatus.OK, "application/octet-stream", self._of.show.field())
 
@@ -162,27 +149,6 @@ class _Handler(BaseHTTPRequestHandler):
     def _photo(self) -> None:
         content = self._of.show.photo(int(self._query.get("n", "")), int(self._query.get("px", "800")))
         self._send(HTTPStatus.OK, "image/jpeg", content, {"Cache-Control": "private, max-age=3600"})
-
-    def _events(self) -> None:
-        """Send the status when it changes, and a keep-alive otherwise; the client counts as open until this ends."""
-        server = self._of
-        with server.changed:
-            server.clients += 1
-            server.changed.notify_all()
-        try:
-            self._begin("text/event-stream")
-            before = None
-            while True:
-                status = {**server.show.status(), "clients": server.clients}
-                line = f"data: {json.dumps(status)}\n\n" if status != before else ": still here\n\n"
-                before = status
-                self.wfile.write(line.encode())
-                with server.changed:
-                    server.changed.wait(EVENT_SECONDS)
-        finally:
-            with server.changed:
-                server.clients -= 1
-                server.changed.notify_all()
 
     def _picture(self) -> None:
         content = self._body()
@@ -196,13 +162,6 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(part)
         finally:
             parts.close()  # type: ignore[attr-defined]
-
-    def _control(self) -> None:
-        action = self._body().get("action")
-        if action not in ACTIONS:
-            raise ValueError(f"unknown action {action!r}")
-        self._of.show.control(action)
-        self._send(HTTPStatus.OK, "application/json", json.dumps(self._of.show.status()).encode())
 
     def _body(self) -> dict[str, Any]:
         length = int(self.headers.get("Content-Length", ""))
@@ -225,23 +184,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Log nothing for each request."""
-
-
-def serve(server: PageServer, *, tick: float, on_tick: Any) -> None:
-    """Serve until interrupted, calling `on_tick` every `tick` seconds in this thread.
-
-    Raises:
-        KeyboardInterrupt: raised again after the server has stopped.
-    """
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
-    thread.start()
-    try:
-        while True:
-            on_tick()
-            time.sleep(tick)
-    finally:
-        server.shutdown()
-        server.server_close()
 
 
 def _is_taken(error: OSError) -> bool:

@@ -18,7 +18,6 @@ from nerfcli.train.following import follow
 from nerfcli.train.left_out import OCCLUDERS
 from nerfcli.train.ranks import joined_ranks
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
-from nerfcli.workflows.view_worker import viewer_beside
 
 NAMES_SHOWN = 8
 
@@ -32,7 +31,6 @@ def train_scene(
     resume: bool = False,
     overwrite: bool = False,
     holdout: str | None = None,
-    view: bool = False,
     notify: Notify = silent,
     warn: Notify = warn_python,
     progress: Progress = no_progress,
@@ -55,7 +53,6 @@ def train_scene(
         resume: continue from the last checkpoint of `run`; start from the beginning if there is none.
         overwrite: replace another run at `run`.
         holdout: photos to hold out, "every:8", "block:0.15" or a file of names; None for the scene's own split.
-        view: serve the interactive page during the training, see `workflows.view`; `notify` gets its address.
         notify, warn: called with lines for the user.
         progress: called with the fraction of the budget and a short text, after every step.
 
@@ -76,7 +73,6 @@ def train_scene(
             resume=resume,
             overwrite=overwrite,
             holdout=holdout,
-            view=view,
             notify=notify,
             warn=warn,
             progress=progress,
@@ -96,7 +92,6 @@ def _trained(
     resume: bool,
     overwrite: bool,
     holdout: str | None,
-    view: bool,
     notify: Notify,
     warn: Notify,
     progress: Progress,
@@ -139,25 +134,22 @@ def _trained(
         clear_leftovers(run)
         if overwrite:
             (run / METRICS).unlink(missing_ok=True)  # they belong to the field that is replaced
-        with viewer_beside(run, threads=settings.threads, notify=notify) as start_viewer:
 
-            def on_progress(state: loop.Progress) -> None:
-                if view:  # cameras and configuration have been written by now
-                    start_viewer()
-                speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
-                progress(state.fraction, f"step {state.step}  loss {state.loss:.4f}  {speed}")
+        def on_progress(state: loop.Progress) -> None:
+            speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
+            progress(state.fraction, f"step {state.step}  loss {state.loss:.4f}  {speed}")
 
-            progress(0.0, "")
-            loop.train(
-                loaded,
-                run,
-                settings,
-                resume=resume,
-                memory_bytes=memory_bytes,
-                ranks=ranks,
-                notify=notify,
-                on_progress=on_progress,
-            )
+        progress(0.0, "")
+        loop.train(
+            loaded,
+            run,
+            settings,
+            resume=resume,
+            memory_bytes=memory_bytes,
+            ranks=ranks,
+            notify=notify,
+            on_progress=on_progress,
+        )
     return Run(run)
 
 
