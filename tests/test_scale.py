@@ -1,20 +1,25 @@
 """Scale from known distances, GPS and printed markers, on scenes of known size; and their standard errors."""
 
+import json
+import re
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
 import pytest
+from commands import nerfcli
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.alignment import align, align_robustly
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.cameras.world import transformed
@@ -26,6 +31,7 @@ from nerfcli.scale.corners import Side, nearest_in_pixels, scale_from_corners
 from nerfcli.scale.distances import KnownDistance, known_distance, scale_from_distances
 from nerfcli.scale.estimate import ScaleEstimate
 from nerfcli.scale.gps import gps_positions, scale_from_gps
+from nerfcli.scene import load
 
 few = examples(20)
 seeds = st.integers(0, 2**32 - 1)
@@ -161,7 +167,7 @@ def test_local_metres_are_arcs_of_the_ellipsoid(latitude, longitude, seed):
     meridian = a * (1 - e2) / (1 - e2 * sine**2) ** 1.5
     normal = a / np.sqrt(1 - e2 * sine**2)
     step = 1e-5
-    enu, reference = east_north_up(
+    enu = east_north_up(
         [
             (latitude, longitude, 100.0),
             (latitude + step, longitude, 100.0),
@@ -169,17 +175,15 @@ def test_local_metres_are_arcs_of_the_ellipsoid(latitude, longitude, seed):
             (latitude, longitude, 107.0),
         ]
     )
-    assert reference == (latitude, longitude, 100.0)
     north = np.radians(step) * (meridian + 100)
     east = np.radians(step) * (normal + 100) * np.cos(np.radians(latitude))
     np.testing.assert_allclose(enu, [[0, 0, 0], [0, north, 0], [east, 0, 0], [0, 0, 7]], rtol=0, atol=2e-6)
 
 
 def test_a_photo_without_altitude_is_at_the_median_of_the_others():
-    enu, _ = east_north_up([(48.0, 11.0, 500.0), (48.0, 11.0, None), (48.0, 11.0, 510.0), (48.0, 11.0, 504.0)])
+    enu = east_north_up([(48.0, 11.0, 500.0), (48.0, 11.0, None), (48.0, 11.0, 510.0), (48.0, 11.0, 504.0)])
     np.testing.assert_allclose(enu[:, 2], [0, 4, 10, 4], rtol=0, atol=1e-6)
-    enu, reference = east_north_up([(48.0, 11.0, None), (48.0, 11.0001, None)])
-    assert reference[2] == 0
+    enu = east_north_up([(48.0, 11.0, None), (48.0, 11.0001, None)])
     assert abs(enu[1, 2]) < 1e-4
 
 
@@ -238,24 +242,22 @@ def photographed(
 
 @given(seed=seeds)
 @few
-def test_gps_gives_the_scale_and_the_directions(seed):
+def test_gps_gives_the_scale(seed):
     rng = np.random.default_rng(seed)
     frames, gps, truth = photographed(rng, count=60, size=300.0, noise=3.0)
     gps["005.jpg"] = (48.2, 11.7, 520.0)  # the fix of another place
-    fit = scale_from_gps(frames, gps)
-    assert "005.jpg" in fit.left_out
-    assert len(fit.left_out) < 6
-    error = fit.estimate.metres_per_unit / truth.scale - 1
+    found = scale_from_gps(frames, gps)
+    error = found.metres_per_unit / truth.scale - 1
     assert abs(error) < 0.02
-    assert fit.enu_from_world is not None
-    turn = Rotation.from_matrix(fit.enu_from_world.rotation @ truth.rotation.T).magnitude()
-    assert np.degrees(turn) < 2.0
-    assert 3.0 < fit.noise < 8.0  # 3 m in each of three coordinates: 5.2
-    assert fit.estimate.residual_unit == "metre"
-    assert fit.estimate.details.startswith(f"the photos are spread over {fit.spread:.3g} m, and the GPS error is")
-    assert "outliers ignored: " in fit.estimate.details
-    assert "005.jpg" in fit.estimate.details
-    assert max(fit.estimate.residuals, key=lambda r: r[1])[0] == "005.jpg"
+    assert found.residual_unit == "metre"
+    stated = re.fullmatch(
+        r"the photos are spread over (\d+) m, and the GPS error is ([\d.]+) m; outliers ignored: (.+)", found.details
+    )
+    assert stated is not None
+    assert 3.0 < float(stated[2]) < 8.0  # 3 m in each of three coordinates: 5.2
+    assert "005.jpg" in stated[3]
+    assert len(stated[3].split(", ")) < 6
+    assert max(found.residuals, key=lambda r: r[1])[0] == "005.jpg"
 
 
 def test_the_standard_error_of_gps_is_the_spread_of_estimates():
@@ -263,7 +265,7 @@ def test_the_standard_error_of_gps_is_the_spread_of_estimates():
     ratios, stated_error = [], []
     for _ in range(120):
         frames, gps, truth = photographed(rng, count=30, size=200.0, noise=3.0)
-        estimate = scale_from_gps(frames, gps).estimate
+        estimate = scale_from_gps(frames, gps)
         ratios.append(estimate.metres_per_unit / truth.scale)
         stated_error.append((estimate.standard_error or 0) / truth.scale)
     assert np.sqrt(np.mean(np.square(stated_error))) == pytest.approx(np.std(ratios), rel=0.25)
@@ -279,7 +281,7 @@ def test_the_standard_error_of_gps_allows_for_correlated_errors_of_neighbours():
     for _ in range(80):
         truth = random_similarity(rng)
         errors = 3 * np.repeat(rng.normal(size=(20, 3)), 3, axis=0)
-        estimate = scale_from_gps(*with_gps(walk, errors, truth)).estimate
+        estimate = scale_from_gps(*with_gps(walk, errors, truth))
         ratios.append(estimate.metres_per_unit / truth.scale)
         stated_error.append((estimate.standard_error or 0) / truth.scale)
     assert np.sqrt(np.mean(np.square(stated_error))) == pytest.approx(np.std(ratios), rel=0.25)
@@ -292,7 +294,7 @@ def test_gps_is_refused_up_to_a_spread_of_three_times_the_noise():
         for seed in range(5):
             frames, gps, _ = photographed(np.random.default_rng(seed), count=200, size=size, noise=3.0)
             if ratio > 3:
-                assert scale_from_gps(frames, gps).estimate.metres_per_unit > 0
+                assert scale_from_gps(frames, gps).metres_per_unit > 0
             else:
                 with pytest.raises(UserError, match="GPS is too inaccurate for a scale"):
                     scale_from_gps(frames, gps)
@@ -320,23 +322,22 @@ def test_gps_of_photos_within_a_few_metres_is_refused_with_numbers():
 def test_centimetres_over_a_few_metres_are_accepted():
     """An RTK receiver gives the scale of a house: only the ratio of spread to noise counts."""
     frames, gps, truth = photographed(np.random.default_rng(3), count=30, size=4.0, noise=0.02)
-    fit = scale_from_gps(frames, gps)
-    assert fit.estimate.metres_per_unit == pytest.approx(truth.scale, rel=0.01)
+    found = scale_from_gps(frames, gps)
+    assert found.metres_per_unit == pytest.approx(truth.scale, rel=0.01)
 
 
-def test_two_photos_far_apart_give_the_scale_alone_and_three_on_a_line_too():
+def test_two_photos_far_apart_give_the_scale_and_three_on_a_line_too():
     for metres in ([[0, 0, 0], [400, 0, 0]], [[0, 0, 0], [200, 1, 0], [400, 0, 0]]):
         frames = frames_at(np.array(metres) / 7.0)
         gps = {
             frame.name: (0.0, float(np.degrees(m[0] / 6378137.0)), float(m[1]))
             for frame, m in zip(frames, metres, strict=True)
         }
-        fit = scale_from_gps(frames, gps)
-        assert fit.estimate.metres_per_unit == pytest.approx(7.0, rel=1e-4)
-        assert fit.enu_from_world is None
+        found = scale_from_gps(frames, gps)
+        assert found.metres_per_unit == pytest.approx(7.0, rel=1e-4)
         # An error of 3 m at each position along the line.
-        expected = 7.0 * 3.0 / (np.sqrt(len(metres)) * fit.spread)
-        assert fit.estimate.standard_error == pytest.approx(expected, rel=1e-3)
+        expected = 7.0 * 3.0 / np.sqrt(np.sum((np.array(metres) - np.mean(metres, axis=0)) ** 2))
+        assert found.standard_error == pytest.approx(expected, rel=1e-3)
 
 
 def test_what_gps_cannot_determine():
@@ -554,3 +555,31 @@ def test_corners_through_distorted_lenses_and_how_well_their_error_is_estimated(
     scatter = np.std([one.metres_per_unit for one in found])
     stated_error = np.sqrt(np.mean([(one.standard_error or 0) ** 2 for one in found]))
     assert 0.6 < stated_error / scatter < 1.7
+
+
+def test_positions_in_exif_give_the_scale(tmp_path):
+    """Photos 11 m apart in a square at 48 degrees north, with positions to a hundredth of a second of arc."""
+    frames = []
+    for i, (east, north) in enumerate([(0, 0), (11, 0), (22, 0), (0, 11), (11, 11), (22, 11), (0, 22), (22, 22)]):
+        exif = Image.Exif()
+        seconds = (3600 * north / 111194.0, 3600 * east / 74629.0)  # metres per degree there
+        exif[ExifTags.IFD.GPSInfo] = {
+            1: "N",
+            2: (48, 0, seconds[0]),
+            3: "E",
+            4: (11, 0, seconds[1]),
+            5: b"\0",
+            6: 500.0,
+        }
+        path = tmp_path / f"{i}.jpg"
+        Image.new("RGB", (64, 48)).save(path, exif=exif)
+        pose = rigid.from_parts(np.diag([1.0, -1, -1]), np.array([north, -east, 3.0]) / 10)
+        frames.append(Frame(path.name, Camera.pinhole(64, 48, 50.0), pose, image=path))
+    write_colmap_binary(Capture(tuple(frames), np.zeros((0, 3)), (), None, "made"), tmp_path / "in")
+    done = nerfcli("convert", tmp_path / "in", tmp_path / "out", "--to", "nerfcli", "--scale", "gps", "--json")
+    assert done.exit_code == 0, done.stderr
+    assert json.loads(done.stdout)["scale"]["metres_per_unit"] == pytest.approx(10.0, rel=2e-3)
+    written = load(tmp_path / "out")
+    assert written.unit == "metre"
+    assert (written.unit_source or "").startswith("GPS of 8 photos (EXIF)")
+    assert np.linalg.norm(written.frames[7].centre - written.frames[0].centre) == pytest.approx(22 * 2**0.5, rel=2e-3)

@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,9 +13,9 @@ from fog import fog, foggy_cells
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
 from nerfcli.errors import UserError
-from nerfcli.media.las_files import write_las
 from nerfcli.media.mesh_files import read_glb_json, read_ply_header, read_ply_mesh, write_glb, write_ply
 from nerfcli.photos.undistorted import pinhole_of, undistorted
 from nerfcli.render.model import Model, save_model
@@ -258,14 +257,14 @@ def ball_mesh() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 def test_a_ply_comes_back_and_says_what_it_is(tmp_path):
     vertices, faces, _, _ = ball_mesh()
-    source = "6 control points (Hügel.txt), ± 0.3 %"
+    source = "2 known distances (Hügel.txt), ± 0.3 %"
     described = {"format": "nerfcli geometry 1", "unit": "metre", "unit_source": source, "frame": "of the scene"}
     write_ply(tmp_path / "a.ply", dict(zip("xyz", vertices.T, strict=True)), faces=faces, description=described)
     again, triangles = read_ply_mesh(tmp_path / "a.ply")
     np.testing.assert_array_equal(again, vertices)
     np.testing.assert_array_equal(triangles, faces)
     _, _, comments, _ = read_ply_header(tmp_path / "a.ply")
-    assert r"unit metre (6 control points (H\xfcgel.txt), +- 0.3 %)" in comments
+    assert r"unit metre (2 known distances (H\xfcgel.txt), +- 0.3 %)" in comments
     assert json.loads(comments[-1].partition(" ")[2])["unit_source"] == source
     assert "frame of the scene" in comments
     facts = describe(tmp_path / "a.ply")
@@ -313,71 +312,10 @@ def test_damaged_files_are_refused(name, tmp_path):
         describe(tmp_path / name)
 
 
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-@pytest.mark.parametrize("far", [0.0, 5e6])
-def test_points_come_back_from_las_files(suffix, far, tmp_path):
-    """Coordinates keep eight digits of their extent at any offset, as read by laspy."""
-    laspy = pytest.importorskip("laspy", reason="an extra")
-    rng = np.random.default_rng(0)
-    places = far + rng.uniform(-40, 40, (500, 3))
-    columns: dict[str, np.ndarray] = dict(zip("xyz", places.T, strict=True))
-    columns |= {name: rng.integers(0, 256, 500, np.uint8) for name in ("red", "green", "blue")}
-    columns |= {"photos": np.arange(500, dtype=np.int32), "spread": rng.random(500, np.float32)}
-    path = tmp_path / f"a{suffix}"
-    write_las(path, columns, description={"unit": "metre", "frame": "its own"})
-    again = laspy.read(path)
-    np.testing.assert_allclose(again.xyz, places, rtol=0, atol=1e-6)
-    for name in ("red", "green", "blue"):
-        np.testing.assert_array_equal(again[name], columns[name].astype(int) * 257)
-    for name in ("photos", "spread"):
-        np.testing.assert_array_equal(again[name], columns[name])
-    facts = describe(path)
-    assert (facts["vertices"], facts["unit"], facts["frame"]) == (500, "metre", "its own")
-    np.testing.assert_allclose(facts["low"], places.min(0), rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_damaged_las_files_are_refused(suffix, tmp_path):
-    """Without points, or cut short anywhere: in the last point, in the middle, and in the header."""
-    pytest.importorskip("laspy", reason="an extra")
-    path = tmp_path / f"a{suffix}"
-    path.write_bytes(b"LASF" + bytes(400))
-    with pytest.raises(UserError, match="damaged or not a LAS file"):
-        describe(path)
-    columns: dict[str, np.ndarray] = dict(zip("xyz", np.random.default_rng(0).random((3, 500)), strict=True))
-    write_las(path, columns | dict.fromkeys(("red", "green", "blue"), np.zeros(500, np.uint8)), description={})
-    whole = path.read_bytes()
-    for length in (len(whole) - 1, len(whole) // 2, 400, 100):
-        path.write_bytes(whole[:length])
-        with pytest.raises(UserError, match="damaged or not a LAS file"):
-            describe(path)
-
-
-def test_las_files_with_impossible_counts_are_refused(tmp_path):
-    """Of records in the header, and of chunks in the table at the end: laspy would not end, lazrs would abort."""
-    pytest.importorskip("laspy", reason="an extra")
-    columns: dict[str, np.ndarray] = dict(zip("xyz", np.random.default_rng(0).random((3, 500)), strict=True))
-    path = tmp_path / "a.laz"
-    write_las(path, columns | dict.fromkeys(("red", "green", "blue"), np.zeros(500, np.uint8)), description={})
-    whole = path.read_bytes()
-    table = int.from_bytes(whole[(start := int.from_bytes(whole[96:100], "little")) : start + 8], "little")
-    for place, what in ((100, "variable-length records"), (table + 4, "chunks")):
-        path.write_bytes(whole[:place] + b"\xff\xff\xff\x7f" + whole[place + 4 :])
-        with pytest.raises(UserError, match=f"2147483647 {what}"):
-            describe(path)
-
-
 def test_a_mesh_without_vertices_is_refused(tmp_path):
     (tmp_path / "a.obj").write_text("# nothing\n")
     with pytest.raises(UserError, match="has no vertices"):
         describe(tmp_path / "a.obj")
-
-
-def test_las_files_say_what_they_need(monkeypatch, blocked, tmp_path):
-    monkeypatch.setitem(sys.modules, "lazrs", None)
-    result = nerfcli("export", blocked, "--to", "points", "-o", tmp_path / "a.laz")
-    assert result.exit_code == 3
-    assert error_of(result) == ("Error: .las and .laz files need laspy and lazrs", "Hint:  pip install 'nerfcli[las]'")
 
 
 # Photos without distortion
@@ -437,6 +375,8 @@ def test_a_mesh_is_written_in_the_frame_of_the_scene(blocked, tmp_path):
     assert (facts["kind"], facts["unit"], facts["frame"]) == ("mesh", "metre", "of the scene, as its cameras have it")
     assert facts["vertices"] == len(vertices)
     assert "turn to +Y up" in nerfcli("info", tmp_path / "a.glb").stdout
+    turn = np.array(read_glb_json(tmp_path / "a.glb")["nodes"][0]["matrix"]).reshape(4, 4).T[:3, :3]
+    np.testing.assert_allclose(turn @ up_direction(Run(blocked).cameras.train), [0, 1, 0], atol=1e-6)
     lines = (tmp_path / "a.obj").read_text().splitlines()
     assert "# unit metre" in lines
     first = next(line for line in lines if line.startswith("v "))

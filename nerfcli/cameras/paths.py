@@ -36,9 +36,7 @@ _INSIDE = 0.8
 _FEWEST_VIEWING = 3
 
 
-def orbit(
-    frames: Sequence[Frame], *, count: int, depth_hint: float | None = None, up: np.ndarray | None = None
-) -> tuple[Frame, ...]:
+def orbit(frames: Sequence[Frame], *, count: int, depth_hint: float | None = None) -> tuple[Frame, ...]:
     """Return a closed path around the focus point, looking at it.
 
     If the cameras surround the focus, the path goes around it once, at their mean elevation, on an ellipse fitted to
@@ -49,7 +47,7 @@ def orbit(
     """
     _check(frames, count)
     focus = focus_point(frames, depth_hint=depth_hint)
-    up = up_direction(frames) if up is None else np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    up = up_direction(frames)
     offsets = centres_of(frames) - focus
     distances = np.linalg.norm(offsets, axis=1)
     elsewhere = distances > 0
@@ -69,9 +67,7 @@ def orbit(
     return _looking_at(frames, centres, focus, up=up, name="orbit")
 
 
-def ellipse(
-    frames: Sequence[Frame], *, count: int, depth_hint: float | None = None, up: np.ndarray | None = None
-) -> tuple[Frame, ...]:
+def ellipse(frames: Sequence[Frame], *, count: int, depth_hint: float | None = None) -> tuple[Frame, ...]:
     """Return a closed level ellipse about the focus point, at the cameras' mean height, looking at the focus.
 
     Its axes are the principal axes of the camera centres on the ground, and each half axis is the 90th percentile of
@@ -85,7 +81,7 @@ def ellipse(
     """
     _check(frames, count)
     focus = focus_point(frames, depth_hint=depth_hint)
-    up = up_direction(frames) if up is None else np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    up = up_direction(frames)
     centres = centres_of(frames)
     ground = np.stack(horizontal_axes(up), axis=-1)  # (3, 2)
     flat = (centres - centres.mean(axis=0)) @ ground

@@ -1,12 +1,10 @@
-"""Change a capture's world frame: its up direction, its origin, also on Earth, and its unit of length.
+"""Change a capture's world frame: its up direction, its origin, and its unit of length.
 
 Each change is a `Similarity` new_from_old, which can be inverted and saved (`Similarity.to_json`).
 """
 
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,80 +13,18 @@ from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 
-_SEPARATOR = "; origin "
-# Three-dimensional geographic systems and their two-dimensional counterparts: WGS 84, ETRS89.
-_WITHOUT_HEIGHT = {4979: 4326, 4937: 4258}
 WORLD_AXES = {f"{sign}{'xyz'[i]}": float(f"{sign}1") * np.eye(3)[i] for sign in ("", "-") for i in range(3)}
 ORIGINS = ("centre-of-cameras", "focus")
-
-
-def without_origin(unit_source: str | None) -> str | None:
-    """Remove the origin that `Origin.in_source` appended."""
-    return None if unit_source is None else unit_source.partition(_SEPARATOR)[0]
-
-
-@dataclass(frozen=True)
-class Origin:
-    """Origin of a georeferenced world: metres, x east, y north and z up.
-
-    Args:
-        system: the coordinate system, such as EPSG:32611.
-        coordinates: of the origin in it: x, y, height in metres, or latitude, longitude in degrees, height in metres.
-        in_degrees: True for latitude and longitude. Otherwise, world coordinates + `coordinates` are coordinates in the
-            system.
-    """
-
-    system: str
-    coordinates: tuple[float, float, float]
-    in_degrees: bool
-
-    @staticmethod
-    def from_json(content: Mapping[str, Any]) -> "Origin":
-        """Read what `dataclasses.asdict` gave.
-
-        Raises:
-            KeyError, TypeError, ValueError: the content is invalid.
-        """
-        a, b, height = (float(value) for value in content["coordinates"])
-        return Origin(str(content["system"]), (a, b, height), bool(content["in_degrees"]))
-
-    @property
-    def epsg(self) -> int | None:
-        """EPSG code of the horizontal coordinate system; None if `system` neither contains nor implies one."""
-        compact = re.sub(r"\s", "", self.system).upper()
-        if code := re.fullmatch(r"EPSG:(\d{4,5})", compact):
-            return _WITHOUT_HEIGHT.get(int(code[1]), int(code[1]))
-        if self.in_degrees:
-            return 4326
-        if zone := re.fullmatch(r"WGS84UTM(\d{1,2})([NS])", compact):
-            return (32700 if zone[2] == "S" else 32600) + int(zone[1])
-        zone = re.search(r"\+PROJ=UTM.*\+ZONE=(\d{1,2})(?!\d)", compact)
-        if zone and ("DATUM=WGS84" in compact or "ELLPS=WGS84" in compact):
-            return (32700 if "+SOUTH" in compact else 32600) + int(zone[1])
-        return None
-
-    def in_source(self, unit_source: str) -> str:
-        """Append this origin to the source of a unit, see `Scene.unit_source`."""
-        return f"{unit_source}{_SEPARATOR}{self}"
-
-    def __str__(self) -> str:
-        a, b, height = self.coordinates
-        if self.in_degrees:
-            return f"at latitude {a:.8f}, longitude {b:.8f}, height {height:.3f} m"
-        return f"at {a:.0f}, {b:.0f}, {height:.0f} in {self.system}"
 
 
 def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
     """Return the same capture in another world frame.
 
     Poses and points are mapped, and depths along the cameras' axes are scaled. Pictures, observations and cameras do
-    not change, since a similarity preserves angles. The unit is kept if the scale is 1, else it becomes "arbitrary"; if
-    anything moves, the origin on Earth is no longer stated with it.
+    not change, since a similarity preserves angles. The unit is kept if the scale is 1, else it becomes "arbitrary".
     """
     poses = new_from_world.apply_pose(np.stack([frame.world_from_cam for frame in capture.frames] or [np.eye(4)]))
     bounds = capture.depth_bounds
-    moves = not np.array_equal(new_from_world.matrix(), np.eye(4))
-    source = without_origin(capture.unit_source) if moves else capture.unit_source
     return replace(
         capture,
         # Not strict: for a capture without frames there is one pose too many.
@@ -96,7 +32,7 @@ def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
         points=new_from_world.apply(capture.points),
         depth_bounds=None if bounds is None else new_from_world.scale * bounds,
         unit=capture.unit if new_from_world.scale == 1 else "arbitrary",
-        unit_source=source if new_from_world.scale == 1 else None,
+        unit_source=capture.unit_source if new_from_world.scale == 1 else None,
     )
 
 

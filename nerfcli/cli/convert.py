@@ -109,14 +109,6 @@ def convert(
             "DICT_5X5_100:7x5:0.04:0.03 (squares, sides of square and marker; append :legacy for OpenCV < 4.6)."
         ),
     ] = None,
-    georeference: Annotated[
-        str | None,
-        typer.Option(
-            metavar="<gps|path>",
-            help="World in metres, x east, y north, z up: gps (positions in EXIF), or a file of ground control points "
-            "like OpenDroneMap's gcp_list.txt.",
-        ),
-    ] = None,
     pixels: Annotated[
         str | None,
         typer.Option(
@@ -178,7 +170,6 @@ def convert(
       nerfcli convert transforms.json opencv.json --to transforms --axes opencv --pixel-center 0
       nerfcli convert scene metric.json --to transforms --world-up z --origin focus --scale 0.25
       nerfcli convert colmap-project metric-scene --to nerfcli --distance "a.jpg b.jpg 1.25"
-      nerfcli convert photos-scene surveyed-scene --to nerfcli --georeference gcp_list.txt
       nerfcli convert strange/ --detect
       nerfcli convert strange/ repaired.json --to transforms --from-axes opencv --from-inverted
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
@@ -222,7 +213,7 @@ def convert(
         if target is None:
             raise typer.BadParameter("missing; give the file or folder to write", param_hint="OUT")
         one_of(pixels, ("stored", "upright"), "--pixels")
-        world = WorldFrame(world_up, origin, scale, markers, tuple(distance or ()), georeference)
+        world = WorldFrame(world_up, origin, scale, markers, tuple(distance or ()))
         wanted = TargetOptions(
             format_named(to),
             axes=axes,

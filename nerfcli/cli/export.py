@@ -1,4 +1,4 @@
-"""nerfcli export: export a run as a page, a mesh, points or a map; of a scan, its volume."""
+"""nerfcli export: export a run as a page, a mesh or points; of a scan, its volume."""
 
 import math
 from pathlib import Path
@@ -20,15 +20,13 @@ _OF_SCANS = "run to output form water device threads overwrite json quiet"
 @command
 def export(
     run: Annotated[str, typer.Argument(help="Run folder written by train, or - to read paths from standard input.")],
-    to: Annotated[
-        str, typer.Option("--to", help="What to export: page, mesh, points or ortho; of an X-ray scan: volume.")
-    ],
+    to: Annotated[str, typer.Option("--to", help="What to export: page, mesh or points; of an X-ray scan: volume.")],
     output: Output = None,
     form: Annotated[
         str | None,
         typer.Option(
             "--format",
-            help="File format if -o does not determine it: ply, glb or obj; ply, las or laz; nrrd, mha, nii or tif.",
+            help="File format if -o does not determine it: ply, glb or obj; of scans nrrd, mha, nii or tif.",
         ),
     ] = None,
     box: Annotated[
@@ -37,9 +35,7 @@ def export(
     ] = None,
     voxel_size: Annotated[
         float | None,
-        typer.Option(
-            help="Size of a voxel, or of a pixel of ortho, in scene units.  [default: the resolution of the photos]"
-        ),
+        typer.Option(help="Size of a voxel in scene units.  [default: the resolution of the photos]"),
     ] = None,
     faces: Annotated[
         int | None,
@@ -57,16 +53,15 @@ def export(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Export a run: page, mesh, points or map; volume of an X-ray scan.
+    """Export a run: page, mesh or points; volume of an X-ray scan.
 
     All results are in the frame and unit of the scene. Files state both; nerfcli info shows them.
 
     \b
     page    one .html that renders the field in a browser (WebGL2), from the disk, without a server
     mesh    .ply, .glb or .obj: zero level of truncated signed distances from median depths, with colours
-    points  .ply, .las or .laz: where median and mean depth agree and two photos see the same point, with normals,
+    points  .ply: where median and mean depth agree and two photos see the same point, with normals,
             photos, parallax and spread
-    ortho   folder with orthophoto.tif and heights.tif, GeoTIFF as seen from straight above (+z of the scene)
 
     Writes RUN.html, RUN-mesh.ply, ... next to the run. Regions that no photo sees stay open. In a .glb, the rotation to
     +Y up is in the root node; positions stay in the scene's frame.
@@ -80,7 +75,6 @@ def export(
       nerfcli export photos-scene-run --to mesh --voxel-size 0.005 --faces 100000 -o kitchen.glb
       nerfcli export photos-scene-run --to mesh --box=-1,-1,0,1,1,2
       nerfcli export photos-scene-run --to points -o kitchen.ply
-      nerfcli export survey-run --to ortho --voxel-size 0.02
       nerfcli export tooth-scene-run --to volume -o tooth.nrrd
     """
     values = dict(locals())
@@ -116,14 +110,14 @@ def export(
     one_of(to, (*TARGETS, "volume"), "--to")
     suffix = None if form is None else f".{form.lstrip('.').lower()}"
     if suffix is not None and to != "volume":
-        one_of(suffix[1:], [kind[1:] for kind in TARGETS[to] if kind] or ["none"], "--format")
+        one_of(suffix[1:], [kind[1:] for kind in TARGETS[to]], "--format")
     finite(voxel_size, "--voxel-size")
     if voxel_size is not None and voxel_size <= 0:
         raise typer.BadParameter(f"{voxel_size:g} is not a positive size", param_hint="--voxel-size")
     unused = {
         "--faces": (faces is not None and to != "mesh", "meshes"),
-        "--voxel-size": (voxel_size is not None and to == "page", "all but pages"),
-        "--max-size": (max_size != SurfaceSettings.max_size and to in ("page", "volume"), "meshes, points and maps"),
+        "--voxel-size": (voxel_size is not None and to in ("page", "volume"), "meshes and points"),
+        "--max-size": (max_size != SurfaceSettings.max_size and to in ("page", "volume"), "meshes and points"),
         "--water": (water is not None, "X-ray scans"),
     }
     for option, (is_unused, suited) in unused.items():

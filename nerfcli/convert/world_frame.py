@@ -2,20 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.cameras.world import Origin, moved_to_origin, transformed, up_aligned
+from nerfcli.cameras.world import moved_to_origin, transformed, up_aligned
 from nerfcli.convert.stored_pixels import measure_of, upright
 from nerfcli.errors import UserError
 from nerfcli.scale.boards import CharucoBoard, scale_from_charuco, scale_from_markers
-from nerfcli.scale.control_points import read_control_points
 from nerfcli.scale.distances import known_distance, scale_from_distances
 from nerfcli.scale.estimate import ScaleEstimate
-from nerfcli.scale.georeference import Georeference, georeference_by_gps, georeference_by_points
 from nerfcli.scale.gps import gps_positions, scale_from_gps
 
 GPS = "gps"
@@ -35,8 +32,6 @@ class WorldFrame:
             "DICTIONARY:COLUMNSxROWS:SQUARE:MARKER", with sides in metres: lengths become metres. Append ":legacy" for
             boards with an even number of rows that were made with OpenCV before 4.6.
         distances: known distances, "A B METRES", between images by name or points x,y,z: lengths become metres.
-        georeference: "gps" for metres east, north and up by the positions in the photos' EXIF, or a file of control
-            points (see `read_control_points`). It determines origin, directions and unit.
     """
 
     up: str | None = None
@@ -44,7 +39,6 @@ class WorldFrame:
     scale: str | None = None
     markers: str | None = None
     distances: Sequence[str] = ()
-    georeference: str | None = None
 
 
 @dataclass(frozen=True)
@@ -53,13 +47,11 @@ class Moved:
 
     Args:
         scale: the estimate of the scale if lengths became metres.
-        origin: where the origin is on Earth, if the capture was georeferenced.
     """
 
     capture: Capture
     new_from_old: Similarity
     scale: ScaleEstimate | None = None
-    origin: Origin | None = None
 
 
 def in_world_frame(capture: Capture, wanted: WorldFrame) -> Moved:
@@ -69,11 +61,6 @@ def in_world_frame(capture: Capture, wanted: WorldFrame) -> Moved:
         UserError: a value is invalid, or the photos do not determine the scale.
     """
     _check_combination(wanted)
-    if wanted.georeference is not None:
-        found = _georeference(capture, wanted.georeference)
-        moved = transformed(capture, found.metres_from_world)
-        moved = replace(moved, unit="metre", unit_source=found.origin.in_source(_source(found.estimate)))
-        return Moved(moved, found.metres_from_world, found.estimate, found.origin)
     estimate = _estimate(capture, wanted)
     change = Similarity.identity()
     if wanted.origin is not None:
@@ -90,22 +77,9 @@ def in_world_frame(capture: Capture, wanted: WorldFrame) -> Moved:
 
 
 def _check_combination(wanted: WorldFrame) -> None:
-    scales = {"--scale": wanted.scale, "--markers": wanted.markers, "--distance": wanted.distances or None}
-    given = {"--georeference": wanted.georeference, **scales}
-    if wanted.georeference is not None:
-        given |= {"--world-up": wanted.up, "--origin": wanted.origin}
+    given = {"--scale": wanted.scale, "--markers": wanted.markers, "--distance": wanted.distances or None}
     if len(named := [name for name, value in given.items() if value is not None]) > 1:
         raise UserError(f"{' and '.join(named)} cannot be combined", "give only one of them", exit_code=2)
-
-
-def _georeference(capture: Capture, text: str) -> Georeference:
-    if text == GPS:
-        frames = _with_photos(capture)
-        return georeference_by_gps(frames, gps_positions(frames))
-    path = Path(text)
-    control = read_control_points(path)
-    frames = [upright(f, measure_of(capture)) if f.has_photo else f for f in capture.frames]
-    return georeference_by_points(frames, control, path.name)
 
 
 def _source(estimate: ScaleEstimate) -> str:
@@ -121,7 +95,7 @@ def _estimate(capture: Capture, wanted: WorldFrame) -> ScaleEstimate | None:
     if wanted.markers is not None:
         return _scale_from_markers([upright(frame, measure_of(capture)) for frame in frames], wanted.markers)
     if wanted.scale == GPS:
-        return scale_from_gps(frames, gps_positions(frames)).estimate
+        return scale_from_gps(frames, gps_positions(frames))
     return None
 
 

@@ -207,7 +207,7 @@ def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
     positions = [photo.exif.gps for photo in photos if photo.exif.gps is not None and photo.exif.gps[:2] != (0.0, 0.0)]
     if not positions:
         return None
-    metres, _ = east_north_up(positions)
+    metres = east_north_up(positions)
     extent = np.ptp(metres[:, :2], axis=0)
     widest = float(extent.max())
     use = "may be enough for a metric scale" if widest > _GPS_WIDE else "too close together for a metric scale"

@@ -27,8 +27,8 @@ def ecef(latitude_deg: np.ndarray, longitude_deg: np.ndarray, height: np.ndarray
     )
 
 
-def east_north_up(positions: Sequence[Position]) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """Return positions in metres east, north and up of the first one, (N, 3), and the first one's GPS position.
+def east_north_up(positions: Sequence[Position]) -> np.ndarray:
+    """Return positions in metres east, north and up of the first one, (N, 3).
 
     EXIF altitudes are above sea level, not above the ellipsoid; ignoring the difference moves all positions alike. A
     photo without altitude is placed at the median altitude of the others.
@@ -46,19 +46,4 @@ def east_north_up(positions: Sequence[Position]) -> tuple[np.ndarray, tuple[floa
             [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
         ]
     )
-    reference = (float(latitude[0]), float(longitude[0]), float(height[0]))
-    return (earth - earth[0]) @ enu_from_ecef.T, reference
-
-
-def degrees_per_metre(latitude_deg: float, height: float) -> tuple[float, float]:
-    """Return degrees of latitude per metre north, and of longitude per metre east, at a height above the ellipsoid.
-
-    Radii of curvature: a (1 - e^2) / w^3 along the meridian and a / w across it, w^2 = 1 - e^2 sin^2(lat).
-    Source: Snyder 1987, Map projections: a working manual, eq. 4-18 and 4-20.
-    """
-    latitude = np.radians(latitude_deg)
-    squared = _FLATTENING * (2 - _FLATTENING)
-    w = np.sqrt(1 - squared * np.sin(latitude) ** 2)
-    along = _SEMI_MAJOR * (1 - squared) / w**3 + height
-    across = (_SEMI_MAJOR / w + height) * np.cos(latitude)
-    return float(np.degrees(1 / along)), float(np.degrees(1 / across))
+    return (earth - earth[0]) @ enu_from_ecef.T

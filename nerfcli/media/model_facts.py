@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 
 from nerfcli.errors import UserError
-from nerfcli.media.las_files import SUFFIXES as LAS_SUFFIXES
-from nerfcli.media.las_files import las_facts
 from nerfcli.media.mesh_files import KEY, read_glb_json, read_ply_header
 
 # Note for files without a description.
 NOT_STATED = "nothing in the file says its unit or its frame"
-SUFFIXES = (".ply", ".glb", ".obj", *LAS_SUFFIXES)
+SUFFIXES = (".ply", ".glb", ".obj")
 
 
 def model_facts(path: Path) -> dict[str, Any]:
@@ -31,10 +29,8 @@ def model_facts(path: Path) -> dict[str, Any]:
             return _ply_facts(path)
         case ".glb":
             return _glb_facts(path)
-        case ".obj":
-            return _obj_facts(path)
         case _:
-            return las_facts(path)
+            return _obj_facts(path)
 
 
 def _ply_facts(path: Path) -> dict[str, Any]:

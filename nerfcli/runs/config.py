@@ -11,7 +11,6 @@ from typing import Any
 from nerfcli import __version__
 from nerfcli.cameras.formats.run_cameras import MEND
 from nerfcli.cameras.orientation import describe_rescaling
-from nerfcli.cameras.world import Origin
 from nerfcli.errors import UserError, in_shell
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
@@ -84,14 +83,6 @@ class RunConfig:
                 **{name: version(name) for name in ("torch", "numpy")},
             },
         )
-
-    @property
-    def origin(self) -> Origin | None:
-        """Where the origin of the scene is on Earth; None if the scene was not georeferenced, and z may not be up."""
-        try:
-            return Origin.from_json((self.history or {})["origin"])
-        except (KeyError, TypeError, ValueError):
-            return None
 
     @property
     def components(self) -> Components:

@@ -1,1 +1,1 @@
-"""Metric scale from known distances, GPS, markers or control points, with its uncertainty; georeferencing."""
+"""Metric scale from known distances, GPS or markers, with its uncertainty."""

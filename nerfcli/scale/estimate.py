@@ -59,12 +59,6 @@ class ScaleEstimate:
         }
 
 
-def spans_a_plane(metres: np.ndarray, sigma: float) -> bool:
-    """Return whether points (N, 3) deviate from their best line by clearly more than the noise."""
-    off = np.linalg.svd(metres - metres.mean(axis=0), compute_uv=False)[1] if len(metres) >= 3 else 0.0
-    return bool(off > SPREAD_PER_NOISE * sigma)
-
-
 def jackknife(x: np.ndarray, y: np.ndarray) -> float:
     """Return the standard error of the scale: sqrt((g - 1) / g sum (s_i - mean)^2), s_i without the i-th of g groups.
 

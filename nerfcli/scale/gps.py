@@ -1,4 +1,4 @@
-"""Scale and location on Earth, from the GPS positions that cameras and phones write into their photos.
+"""Scale from the GPS positions that cameras and phones write into their photos.
 
 The GPS of phones is off by metres, and its errors last for minutes: it gives the scale of a street, not of a teapot.
 In up to 1 of 100 captures, errors that drift as slowly as the photographer walks are taken for the walk, and no
@@ -6,45 +6,21 @@ residual shows that.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from nerfcli.cameras.alignment import align_robustly
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of
-from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.media.exif import read_exif
 from nerfcli.media.geodesy import Position, east_north_up
-from nerfcli.scale.estimate import SPREAD_PER_NOISE, ScaleEstimate, jackknife, spans_a_plane
+from nerfcli.scale.estimate import SPREAD_PER_NOISE, ScaleEstimate, jackknife
 
 # GPS noise per coordinate in metres, assumed if there are too few photos to estimate it. Smartphones under open sky
 # are within 4.9 m. Source: gps.gov, "GPS accuracy", after van Diggelen & Enge 2015.
 _TYPICAL_NOISE = 3.0
 _ENOUGH_TO_TELL = 6
-
-
-@dataclass(frozen=True)
-class GpsFit:
-    """A capture fitted to GPS positions.
-
-    Args:
-        estimate: of the scale; residuals in metres for every photo with GPS.
-        enu_from_world: to metres east, north and up of `reference`; None if the photos are too close to a line to
-            determine the rotation about it.
-        reference: latitude and longitude in degrees and altitude in metres of the origin of ENU.
-        left_out: names of photos whose GPS positions are outliers and were not used.
-        spread: root mean square distance of the photos from their mean, metres.
-        noise: root mean square GPS error in three dimensions, metres.
-    """
-
-    estimate: ScaleEstimate
-    enu_from_world: Similarity | None
-    reference: tuple[float, float, float]
-    left_out: tuple[str, ...]
-    spread: float
-    noise: float
 
 
 def gps_positions(frames: Sequence[Frame]) -> dict[str, Position]:
@@ -59,7 +35,7 @@ def gps_positions(frames: Sequence[Frame]) -> dict[str, Position]:
     return {name: gps for name, gps in found.items() if gps is not None and gps[:2] != (0.0, 0.0)}
 
 
-def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -> GpsFit:
+def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -> ScaleEstimate:
     """Estimate metres per unit from the GPS positions of the photos.
 
     It fits a similarity from camera centres to ENU metres, by least squares without outliers (`align_robustly`). The
@@ -77,10 +53,10 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
     if len(used) < 2:
         raise UserError(
             f"{'only 1' if used else 'none'} of {len(frames)} photos with a pose has a GPS position in its EXIF",
-            "at least 2 are needed for the scale and 3 for directions; give a known distance instead",
+            "at least 2 are needed; give a known distance instead",
         )
     x = centres_of(used)
-    y, reference = east_north_up([positions[frame.name] for frame in used])
+    y = east_north_up([positions[frame.name] for frame in used])
     if not (np.ptp(x, axis=0).max() > 0 and np.ptp(y, axis=0).max() > 0):
         which = "GPS positions" if np.ptp(x, axis=0).max() > 0 else "cameras"
         raise UserError(
@@ -101,9 +77,9 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
         )
     scale = fit.b_from_a.scale
     residuals = np.linalg.norm(fit.b_from_a.apply(x) - y, axis=1)
-    left_out = tuple(frame.name for frame, kept in zip(used, keep, strict=True) if not kept)
+    left_out = [frame.name for frame, kept in zip(used, keep, strict=True) if not kept]
     off = f"; outliers ignored: {', '.join(left_out)}" if left_out else ""
-    estimate = ScaleEstimate(
+    return ScaleEstimate(
         metres_per_unit=scale,
         standard_error=max(jackknife(x[keep], y[keep]), scale * sigma / (np.sqrt(keep.sum()) * spread)),
         residuals=tuple((frame.name, float(r)) for frame, r in zip(used, residuals, strict=True)),
@@ -111,5 +87,3 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
         source=f"GPS of {int(keep.sum())} photos (EXIF)",
         details=f"the photos are spread over {spread:.3g} m, and the GPS error is {noise:.2g} m{off}",
     )
-    directions = fit.b_from_a if spans_a_plane(scale * x[keep], sigma) else None
-    return GpsFit(estimate, directions, reference, left_out, spread, noise)

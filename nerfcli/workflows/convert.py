@@ -4,17 +4,15 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from nerfcli.cameras.formats.scene_json import read_description
 from nerfcli.cameras.frame import Capture
 from nerfcli.cameras.orientation import describe_rescaling
-from nerfcli.cameras.world import Origin
 from nerfcli.convert import detect
 from nerfcli.convert.check import TOLERANCE_PX
 from nerfcli.convert.conversion import ConventionOverrides, Conversion, TargetOptions, convert, load
 from nerfcli.convert.formats import Format, UserInputs, recording
 from nerfcli.convert.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.convert.world_frame import WorldFrame, in_world_frame
-from nerfcli.errors import UserError, several
+from nerfcli.errors import several
 from nerfcli.media.images import HEIC_SUFFIXES
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
@@ -57,10 +55,6 @@ def convert_capture(
             f"{scale.rms_residual:.2g} {unit}" + (f"; {scale.details}" if scale.details else "")
         )
     frame = {"new_from_old": moved.new_from_old.to_json()} | ({} if scale is None else {"scale": scale.to_json()})
-    if moved.origin is not None:
-        notify(f"world: x east, y north, z up; origin {moved.origin}")
-    if origin := moved.origin or (_origin_of(found, form.name) if world == WorldFrame() else None):
-        frame |= {"origin": asdict(origin)}
     wanted = replace(wanted, form=recording(wanted.form, {"source": str(found), **frame}))
     done = convert(moved.capture, target, source_format=form.name, wanted=wanted)
     for text in done.notes:
@@ -89,18 +83,6 @@ def _describe_outside(capture: Capture) -> str | None:
         f"the principal point of {several(len(outside), 'photo')}, such as {outside[0]}, is outside the picture; if "
         "the intrinsics are for larger pictures, say so with --from-size (--detect finds the factor)"
     )
-
-
-def _origin_of(path: Path, form: str) -> Origin | None:
-    """Return where the origin of a scene, or of a run's scene, is on Earth; None if it is unknown."""
-    try:
-        if form == "run":
-            from nerfcli.runs.run import Run  # imports torch, which no other conversion needs
-
-            return Run(path.parent).config.origin
-        return Origin.from_json(read_description(path).provenance["origin"]) if form == "nerfcli" else None
-    except (UserError, KeyError, TypeError, ValueError):  # cameras.json may be alone, and a scene may have no origin
-        return None
 
 
 def detect_convention(

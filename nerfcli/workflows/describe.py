@@ -12,7 +12,6 @@ from nerfcli.cameras.formats.run_cameras import CAMERAS
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError, in_shell
 from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
-from nerfcli.media.geotiff import map_facts
 from nerfcli.media.model_facts import SUFFIXES as MODEL_SUFFIXES
 from nerfcli.media.model_facts import model_facts
 from nerfcli.runs.files import CONFIG, DEPTH_ERRORS, LOG, METRICS, REPORT
@@ -55,8 +54,6 @@ def describe(path: str | Path) -> dict[str, Any]:
         return model_facts(folder)
     if folder.is_file() and is_volume_file(folder):
         return volume_facts(folder)
-    if folder.is_file() and folder.suffix.lower() in (".tif", ".tiff") and (facts := map_facts(folder)) is not None:
-        return facts
     if folder.is_file() and folder.suffix.lower() != ".json":
         return file_facts(folder)
     if (folder / RENDERS).exists():

@@ -1,4 +1,4 @@
-"""Export a run to files that other programs open: a page, a mesh, points, a map."""
+"""Export a run to files that other programs open: a page, a mesh, points."""
 
 from pathlib import Path
 
@@ -18,19 +18,17 @@ from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import page_photos
 from nerfcli.viewer.proof import make_proof
 from nerfcli.workflows.export_geometry import export_mesh, export_points
-from nerfcli.workflows.export_map import export_ortho
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.workflows.photo_depths import photo_depths
 
 # Maximum size of a page; the field comes first, and photos get the rest.
 PAGE_BYTES = 9_700_000
-# File suffixes by type of export, the default first; "" is a folder.
+# File suffixes by type of export, the default first.
 TARGETS = {
     "page": (".html",),
     "mesh": (".ply", ".glb", ".obj"),
-    "points": (".ply", ".las", ".laz"),
-    "ortho": ("",),
+    "points": (".ply",),
 }
 SURFACE = SurfaceSettings()
 
@@ -47,7 +45,7 @@ def export_run(
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> Path:
-    """Export a run to a file, or a folder, that other programs open.
+    """Export a run to a file that other programs open.
 
     Example:
         >>> import nerfcli
@@ -73,12 +71,12 @@ def export_run(
     trained, torch_device = Run(Path(run)), device_name(device)
     path = Path(target) if target is not None else default_target(trained.path, to)
     suffixes = TARGETS[to]
-    if "" not in suffixes and path.suffix.lower() not in suffixes:
+    if path.suffix.lower() not in suffixes:
         raise UserError(f"{path} does not have the suffix of a {to}", f"use one of {', '.join(suffixes)}", exit_code=2)
     if settings.box is not None:
         check_box(settings.box)
     _ = trained.config
-    refuse_existing(path, overwrite=overwrite, folder="" in suffixes)
+    _refuse_existing(path, overwrite=overwrite)
     torch.set_num_threads(thread_count(threads))
     model = trained.model(torch_device)
     progress(0.0, "")
@@ -93,13 +91,13 @@ def default_target(run: Path, to: str, suffix: str | None = None) -> Path:
     return (run if run.name not in ("", "..") else place).with_name(name + (suffix or TARGETS[to][0]))
 
 
-def refuse_existing(path: Path, *, overwrite: bool, folder: bool) -> None:
+def _refuse_existing(path: Path, *, overwrite: bool) -> None:
     """Refuse an output path that exists, unless it may be replaced; create its parent folder.
 
     Raises:
         UserError: the path exists, or cannot be written.
     """
-    if path.is_dir() and not folder:
+    if path.is_dir():
         raise UserError(f"{path} is a folder", "give a file name with -o")
     if path.exists() and not overwrite:
         raise UserError(f"{path} exists", "add --overwrite to replace it, or choose another path with -o")
@@ -144,5 +142,4 @@ _EXPORTS = {
     "page": _export_page,
     "mesh": export_mesh,
     "points": export_points,
-    "ortho": export_ortho,
 }

@@ -11,8 +11,6 @@ from nerfcli import __version__
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import look_at
 from nerfcli.errors import UserError
-from nerfcli.media.las_files import SUFFIXES as LAS_SUFFIXES
-from nerfcli.media.las_files import las_module, write_las
 from nerfcli.media.mesh_files import write_glb, write_obj, write_ply
 from nerfcli.render.model import Model
 from nerfcli.render.visibility import coverage_and_parallax
@@ -63,10 +61,7 @@ def export_mesh(
 def export_points(
     run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
 ) -> None:
-    """Write points of the surfaces as .ply, .las or .laz."""
-    las = path.suffix.lower() in LAS_SUFFIXES
-    if las:
-        las_module()  # fails before the work if laspy is missing, not after it
+    """Write points of the surfaces as .ply."""
     views, grid = _seen(run, model, settings, progress)
     points = agreed_points(views, grid, on_progress=part_of(progress, _DEPTHS, 1.0, "compares"))
     if not len(points.places):
@@ -79,16 +74,7 @@ def export_points(
         "parallax_deg": PARALLAX,
         "spread": "standard deviation of where the light of the pixel ends, in the unit",
     }
-    origin = run.config.origin
-    if las and origin is not None and not origin.in_degrees:
-        columns |= {axis: columns[axis] + shift for axis, shift in zip("xyz", origin.coordinates, strict=True)}
-        box = np.add(described["box"], 2 * origin.coordinates).tolist()
-        described |= {"frame": origin.system, "box": box}
-        write_las(path, columns, description=described, system=(origin.system, origin.epsg))
-    elif las:
-        write_las(path, columns, description=described)
-    else:
-        write_ply(path, columns, description=described)
+    write_ply(path, columns, description=described)
     notify(f"{len(points.places)} points that two photos or more see, {_grid_in_words(grid, model)}")
 
 
@@ -110,12 +96,12 @@ def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any
         "frame": FRAME,
         "box": [*grid.low.tolist(), *grid.high.tolist()],
         "voxel_size": grid.voxel_size,
-        **provenance_of(run, model),
+        **_provenance_of(run, model),
     }
 
 
-def provenance_of(run: Run, model: Model) -> dict[str, Any]:
-    """Return the unit of lengths and the origin of an exported file."""
+def _provenance_of(run: Run, model: Model) -> dict[str, Any]:
+    """Return the unit of lengths and the run of an exported file."""
     return {
         "unit": model.unit,
         "unit_source": model.unit_source,
@@ -126,10 +112,10 @@ def provenance_of(run: Run, model: Model) -> dict[str, Any]:
 
 
 def _grid_in_words(grid: Grid, model: Model) -> str:
-    return f"{'x'.join(map(str, grid.shape))} voxels of {grid.voxel_size:.4g} {unit_of(model)}"
+    return f"{'x'.join(map(str, grid.shape))} voxels of {grid.voxel_size:.4g} {_unit_of(model)}"
 
 
-def unit_of(model: Model) -> str:
+def _unit_of(model: Model) -> str:
     """Return the unit of lengths, for messages."""
     return "m" if model.unit == "metre" else "units of the scene"
 
@@ -164,8 +150,8 @@ def _write_mesh(
 
 
 def _y_up_from_scene(run: Run) -> np.ndarray:
-    """Return the rotation that turns up to +y: z of a georeferenced scene, else the up direction of the cameras."""
-    up = up_direction(run.cameras.train) if run.config.origin is None else np.array([0.0, 0.0, 1.0])
+    """Return the rotation that turns the up direction of the cameras to +y."""
+    up = up_direction(run.cameras.train)
     aside = np.eye(3)[np.argmin(np.abs(up))]
     # The axes (right, down, ahead) of a camera whose down direction is -up.
     right, down, ahead = look_at(np.zeros(3), np.cross(up, aside), up)[:3, :3].T

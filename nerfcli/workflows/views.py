@@ -123,8 +123,7 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
     elif cameras == "interpolate":
         chosen = paths.interpolate(keyframes, count=views.count)
     elif cameras == "ellipse":
-        up = None if run.config.origin is None else np.array([0.0, 0.0, 1.0])
-        chosen = paths.ellipse(keyframes, count=views.count, depth_hint=depth_hint, up=up)
+        chosen = paths.ellipse(keyframes, count=views.count, depth_hint=depth_hint)
     elif cameras in PATHS:
         path = {"orbit": paths.orbit, "spiral": paths.spiral}[cameras]
         chosen = path(keyframes, count=views.count, depth_hint=depth_hint)

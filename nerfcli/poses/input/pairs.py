@@ -229,7 +229,7 @@ def _positions(photos: Sequence[Photo]) -> np.ndarray:
             f"--pairing spatial: {len(without)} of {len(photos)} photos have no GPS position ({without[0]})",
             "choose --pairing retrieval or auto",
         )
-    return east_north_up([(*place[:2], None) for place in places if place is not None])[0][:, :2]
+    return east_north_up([(*place[:2], None) for place in places if place is not None])[:, :2]
 
 
 def _rising(i: int, j: int) -> tuple[int, int]:
