@@ -18,11 +18,10 @@ from test_format_folders import WRITERS
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
-from nerfcli.cli.info_text import lines_of
+from nerfcli.cli.info import lines_of
 from nerfcli.media.depth_pictures import KEY
 from nerfcli.media.exr import write_exr
 from nerfcli.media.file_facts import NOT_STATED, RENDERS, description_of
-from nerfcli.media.float_tiff import write_tiff
 from nerfcli.media.images import write_png
 from nerfcli.media.levels import write_png16
 
@@ -51,7 +50,7 @@ def test_facts_fit_the_lines_of_a_terminal():
         "metrics": {"psnr": 21.6765, "ssim": 0.651505, "psnr_colour_aligned": 21.7141},
         "low": [-3.550517134718522, 1.0],
         "decisions": ["view=0: kept", "points=0.1: " + "not kept " * 30],
-        "angles_deg": {"from": 0.0, "to": 352.5},
+        "maps": {"depth": {"dtype": "float32", "min": 1.5}},
         "rescaled": [],
         "versions": {},
     }
@@ -59,22 +58,23 @@ def test_facts_fit_the_lines_of_a_terminal():
         "kind: run",
         "photos: 4",
         "held out: 1",
-        "time: 15.03 s",
+        "seconds: 15.0331",
         "loss: 0.0150976",
-        "samples per second: 281,659",
-        "size of the field: 8.40 MB",
-        "occupied cells: 95.0 %",
-        "settings: seed 0, rows per level 2^18, set by hand points and view, setting 0 0, setting 1 1, setting 2 2,",
-        "  setting 3 3, setting 4 4, setting 5 5, setting 6 6, setting 7 7, setting 8 8",
+        "samples per second: 281659",
+        "field bytes: 8403328",
+        "occupied share: 0.9497",
+        'settings: seed=0, log2_rows=18, fixed=["points", "view"], setting_0=0, setting_1=1, setting_2=2, setting_3=3,',
+        "  setting_4=4, setting_5=5, setting_6=6, setting_7=7, setting_8=8",
         "components: view=3, stereo=true, points=0.1",
-        "metrics: PSNR 21.68 dB, SSIM 0.652, PSNR after colour correction 21.71 dB",
+        "metrics: psnr=21.6765, ssim=0.651505, psnr_colour_aligned=21.7141",
         "low:",
         "  -3.55052",
         "  1",
         "decisions:",
         "  view=0: kept",
         "  points=0.1: " + "not kept " * 30,
-        "angles in degrees: 0 to 352.5",
+        "maps:",
+        "  depth: dtype=float32, min=1.5",
     ]
 
 
@@ -97,11 +97,12 @@ def test_info_shows_everything_a_depth_file_records(suffix, tmp_path):
     text = info(path).stdout
     for expected in (
         "background depth along the optical axis (z), in metres (from: GPS, ± 0.3 %)",
-        "pixels with an opacity below 0.333333 have no value (" + ("0)" if suffix == ".png" else "NaN)"),
-        "background distance, 12.25",
-        "a bound on the rendering, not on the accuracy of the field",
-        "camera of Küche 北.jpg: PINHOLE 53x37, parameters 50 0.333333",
-        "run kitchen",
+        "opacity floor: 0.333333",
+        "invalid: " + ("0" if suffix == ".png" else "nan"),
+        "background distance: 12.25",
+        "error bounds: ",
+        "name: Küche 北.jpg",
+        "run=kitchen",
     ):
         assert expected in text, expected
 
@@ -109,9 +110,9 @@ def test_info_shows_everything_a_depth_file_records(suffix, tmp_path):
 def test_levels_state_their_scale_and_rounding(tmp_path):
     write_png16(tmp_path / "a.png", plain_depth(), META, units_per_level=2e-3)
     text = info(tmp_path / "a.png").stdout
-    assert "value = level x 0.002" in text
-    assert "rounding to integers changed depth by at most 0.001" in text
-    assert "the scene has no metric scale" in text
+    assert "units per level: 0.002" in text
+    assert "error bounds: rounding_max=0.001" in text
+    assert "unit: arbitrary" in text
 
 
 def test_each_map_of_a_file_is_described(tmp_path):
@@ -121,7 +122,7 @@ def test_each_map_of_a_file_is_described(tmp_path):
     printed = json.loads(info(tmp_path / "a.exr", "--json").stdout)
     assert set(printed["maps"]) == {"depth", "spread", "opacity"}
     assert printed["maps"]["spread"]["max"] == pytest.approx(np.nanmax(depth) / 10)
-    assert "also in the file: spread (standard-deviation)" in info(tmp_path / "a.exr").stdout
+    assert "spread: convention=standard-deviation, opacity_floor=0.5" in info(tmp_path / "a.exr").stdout
 
 
 def test_depth_of_another_program_is_shown_with_what_it_does_not_state(tmp_path):
@@ -133,12 +134,11 @@ def test_depth_of_another_program_is_shown_with_what_it_does_not_state(tmp_path)
     for path in sorted(tmp_path.iterdir()):
         printed = json.loads(info(path, "--json").stdout)
         assert printed["meaning"] is None, path
-        assert printed["note"].startswith(NOT_STATED), path
+        assert printed["not_stated"] == NOT_STATED, path
         assert (printed["width"], printed["height"]) == (53, 37), path
         (numbers,) = printed["maps"].values()
         assert numbers["max"] == pytest.approx(np.nanmax(depth) * (1000 if path.suffix == ".png" else 1), rel=1e-4)
-        assert NOT_STATED in info(path).stdout, path
-    assert "often 1 mm" in info(tmp_path / "a.png").stdout
+        assert f"not stated: {NOT_STATED}" in info(path).stdout, path
 
 
 def test_arrays_that_are_not_pictures_are_described_by_their_shape(tmp_path):
@@ -151,9 +151,9 @@ def test_arrays_that_are_not_pictures_are_described_by_their_shape(tmp_path):
 def test_a_preview_is_not_taken_for_numbers(tmp_path):
     write_png(tmp_path / "a.png", np.zeros((4, 5, 3), np.uint8), metadata={KEY: META.to_text(), "range": "1.0 2.0"})
     text = info(tmp_path / "a.png").stdout
-    assert "preview of a depth map (colours, not values)" in text
+    assert "kind: preview" in text
     assert "conditional depth along the ray" in text
-    assert "range: 1.0 2.0" in text
+    assert "range=1.0 2.0" in text
 
 
 def test_the_comment_of_a_video_is_read_back(tmp_path):
@@ -201,23 +201,14 @@ def test_what_is_no_file_of_depth_is_refused(tmp_path):
     assert "is of format 'nerfcli depth 9'" in info(tmp_path / "b.tiff").stderr
 
 
-def test_renders_whose_depth_files_differ_are_refused(tmp_path):
-    """A file with another axis has been put beside the others."""
+def test_renders_show_the_definition_of_their_depth(tmp_path):
     description = {"frames": [{}, {}], "settings": {"outputs": ["depth"]}, "depth_meaning": META.to_json(), "run": "r"}
     (tmp_path / RENDERS).write_text(json.dumps(description))
-    write_tiff(tmp_path / "depth" / "a.tiff", plain_depth(), META)
-    write_tiff(tmp_path / "depth" / "b.tiff", plain_depth(), META)
-    write_png16(tmp_path / "depth16" / "a.png", plain_depth(), META, units_per_level=1e-3)
-    printed = json.loads(info(tmp_path, "--json").stdout)
-    assert (printed["frames"], printed["files"], printed["meaning"]["axis"]) == (2, 3, "ray")
-    assert "3 depth files with the same definition" in info(tmp_path / RENDERS).stdout
-    write_png16(tmp_path / "depth16" / "b.png", plain_depth(), META, units_per_level=2e-3)
-    assert "units per level 0.001 and 0.002" in info(tmp_path).stderr
-    write_tiff(tmp_path / "depth" / "b.tiff", plain_depth(), replace(META, axis="z"))
-    result = info(tmp_path)
-    assert result.exit_code == 3
-    assert "b.tiff" in result.stderr
-    assert "have different definitions: axis ray and z" in result.stderr
+    printed = json.loads(info(tmp_path / RENDERS, "--json").stdout)
+    assert (printed["kind"], printed["frames"], printed["meaning"]["axis"]) == ("renders", 2, "ray")
+    assert "depth: conditional depth along the ray" in info(tmp_path).stdout
+    (tmp_path / RENDERS).write_text("{}")
+    assert "render again with --overwrite" in info(tmp_path).stderr
 
 
 def test_a_text_file_of_a_run_shows_the_run(finished, capture):
@@ -238,7 +229,7 @@ def test_captures_of_other_programs_show_their_cameras_and_how_to_train_on_them(
         path = WRITERS[name](tmp_path)
     shown = info(tmp_path if name == "pose-files" else path).stdout.splitlines()
     photos = {"alicevision": ("0", "2"), "pose-files": ("3", "0"), "neus": ("3", "0")}[name]
-    assert shown[1:4] == [f"  kind: {name}", f"  photos: {photos[0]}", f"  missing photos: {photos[1]}"]
+    assert shown[1:4] == [f"  kind: {name}", f"  photos: {photos[0]}", f"  missing: {photos[1]}"]
     assert any("focal" in line for line in shown)
     assert shown[-1].startswith("  to train: nerfcli convert ")
     assert shown[-1].endswith(" SCENE --to nerfcli")

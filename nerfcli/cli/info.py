@@ -1,16 +1,19 @@
 """nerfcli info: show what a folder or a file contains."""
 
-from json import dumps
+import json as json_text
+import textwrap
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.info_text import lines_of, words_of
 from nerfcli.cli.options import Json
 from nerfcli.workflows.machine import thread_count
+
+# Maximum number of characters per line of several values; longer lines are wrapped, and their continuations indented.
+WIDTH = 110
 
 
 @command
@@ -24,14 +27,14 @@ def info(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Show what a scene, a run or one of their files contains.
+    """Show what a scene, a run or one of their files contains, as keys and values.
 
     \b
     scene       cameras, photos, missing files, split, unit; also of captures that nerfcli convert makes a scene
-    run         settings, time, metrics, how far refined cameras moved; bytes of weights and optimizer, operations and
-                memory traffic per sample and picture, next to other types of field of the same size
-    depth file  (TIFF, EXR, NPZ, NPY, PNG; also pictures, videos and folders of renders) definition, axis, unit and its
+    run         settings, components, decisions, time, metrics, how far refined cameras moved
+    depth file  (TIFF, EXR, NPY, PNG; also pictures, videos and folders of renders) definition, axis, unit and its
                 source, invalid value, camera, run, range of values; for files of other programs, what is not stated
+    mesh        (PLY, GLB, OBJ) and volume (NRRD, MHA, NIfTI, TIFF): counts, unit, frame, run
     failure     (saved by train) which numbers became non-finite, where, and whether that repeats
 
     \b
@@ -51,12 +54,38 @@ def info(
         from nerfcli.kernels.devices import describe_machine
 
         described = describe_machine(thread_count(0))
-        typer.echo(dumps(described) if json else "\n".join(f"{name}: {value}" for name, value in described.items()))
+        typer.echo(json_text.dumps(described) if json else "\n".join(lines_of(described)))
         return
 
     def work(folder: Path, one_of_many: bool) -> None:
         content = describe(folder)
-        lines = words_of(content) if "in_words" in content else lines_of(content)
-        console.facts(folder, content, "\n".join([str(folder), *(f"  {line}" for line in lines)]))
+        console.facts(folder, content, "\n".join([str(folder), *(f"  {line}" for line in lines_of(content))]))
 
     for_each_input(path, work, command="info")
+
+
+def lines_of(facts: dict[str, Any]) -> list[str]:
+    """Format facts as "key: value"; lists and dictionaries of dictionaries below their key; no line without a value."""
+    lines = []
+    for key, value in facts.items():
+        name = key.replace("_", " ")
+        if isinstance(value, dict) and any(isinstance(entry, dict) for entry in value.values()):
+            lines += [f"{name}:", *(f"  {line}" for line in lines_of(value))]
+        elif isinstance(value, dict):
+            listed = ", ".join(f"{part}={_plain(entry)}" for part, entry in value.items() if entry not in (None, []))
+            lines += _wrapped(f"{name}: {listed}") if listed else []
+        elif isinstance(value, list):
+            lines += [f"{name}:", *(f"  {_plain(entry)}" for entry in value)] if value else []
+        elif value not in (None, ""):
+            lines.append(f"{name}: {_plain(value)}")
+    return lines
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return value if isinstance(value, str) else json_text.dumps(value, ensure_ascii=False)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from nerfcli.errors import UserError
-from nerfcli.field.cost import parameter_bytes, work
+from nerfcli.field.cost import parameter_bytes
 from nerfcli.field.fourier_field import FourierFieldSettings
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
@@ -86,11 +86,11 @@ def _largest_within(sizes: Sequence[int], settings: Callable[[int], FieldSetting
     Raises:
         UserError: not even the first one does.
     """
-    smallest = parameter_bytes(work(settings(sizes[0])).parameters)
+    smallest = parameter_bytes(settings(sizes[0]))
     limit = memory_bytes * (1 + SLACK)
     if smallest > limit:
         raise UserError(
             f"no field fits into {memory_bytes} bytes: the smallest needs {smallest}", "give a larger --field-memory"
         )
-    fitting = [size for size in sizes if parameter_bytes(work(settings(size)).parameters) <= limit]
+    fitting = [size for size in sizes if parameter_bytes(settings(size)) <= limit]
     return settings(fitting[-1])

@@ -9,7 +9,7 @@ import re
 import struct
 import subprocess
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ import tifffile
 from PIL import Image
 
 from nerfcli.errors import UserError
-from nerfcli.media.depth_pictures import FORMAT, KEY, DepthMeta, as_floats, entries_of_text, refuse_mixing
+from nerfcli.media.depth_pictures import FORMAT, KEY, DepthMeta, entries_of_text
 from nerfcli.media.exr import CHANNELS, read_exr
 from nerfcli.media.float_tiff import read_any_tiff
 from nerfcli.media.levels import depth_of_levels
@@ -37,10 +37,7 @@ DAMAGED = (
 _KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".exr": "OpenEXR", ".npy": "NPY", ".png": "PNG"}
 # The file in which an export describes itself, beside the folders of its outputs.
 RENDERS = "render.json"
-NOT_STATED = (
-    "the file does not state the definition of depth (mean, median, ...), its axis (ray or optical axis) or its unit"
-)
-_LEVELS_NOT_STATED = "the length of a level is not stated either: often 1 mm, 0.2 mm in the TUM data sets"
+NOT_STATED = "definition of depth (mean, median, ...), axis (ray or optical axis), unit, and the length of a level"
 
 
 def description_of(path: Path) -> dict[str, Any] | None:
@@ -152,9 +149,9 @@ _READERS: dict[str, Callable[[Path], str | None]] = {
 def file_facts(path: Path) -> dict[str, Any]:
     """Return the facts about one file as plain values.
 
-    Keys: kind ("depth", "levels", "preview", "picture", "video", "array"), format, width and height, meaning
-    (`DepthMeta` as plain values, None if not stated), in_words, maps (for each map its dtype, valid_share, min, median
-    and max in the unit of the meaning), texts (other texts in a PNG), note (what is not known).
+    Keys: kind ("depth", "levels", "preview", "picture", "video", "array"), format, width and height, depth (in words),
+    meaning (`DepthMeta` as plain values), not_stated, maps (for each map its dtype, shape, valid_share, min, median and
+    max in the unit of the meaning), texts (other texts in a PNG).
 
     Raises:
         UserError: the file is missing, damaged, or of another kind.
@@ -162,67 +159,40 @@ def file_facts(path: Path) -> dict[str, Any]:
     entries = description_of(path)
     meta = _meta(path, entries)
     suffix = path.suffix.lower()
-    content: dict[str, Any]
+    maps, texts = {}, {}
     if suffix in VIDEO_SUFFIXES:
-        content = _video_facts(path)
-    elif suffix == ".png":
-        content = _png_facts(path, meta)
+        facts = {"kind": "video", "format": suffix[1:], **_video_facts(path)}
     else:
-        maps = _maps(path, meta)
-        kind = "depth" if meta is not None else "array"
-        content = {"kind": kind, "format": _KINDS[suffix], **_size_of(maps), "maps": _statistics(maps)}
-    content["meaning"] = None if entries is None or meta is None else entries
-    content["in_words"] = None if meta is None else meta.in_words()
-    if meta is None and content["kind"] in ("array", "levels"):
-        content["note"] = f"{NOT_STATED}; {_LEVELS_NOT_STATED}" if content["kind"] == "levels" else NOT_STATED
-    return content
+        maps, texts = _read_png(path, meta) if suffix == ".png" else (_read_maps(path, meta), {})
+        if "picture" in maps:
+            kind = "picture" if meta is None else "preview"
+        else:
+            kind = "depth" if meta is not None else "levels" if "levels" in maps else "array"
+        facts = {"kind": kind, "format": _KINDS[suffix], **_size_of(maps)}
+        maps = {name: _range(array) for name, array in maps.items() if name != "picture"}
+    facts |= _definition(entries, meta)
+    not_stated = NOT_STATED if meta is None and facts["kind"] in ("array", "levels") else None
+    return {**facts, "not_stated": not_stated, "maps": maps, "texts": texts}
 
 
 def renders_facts(folder: Path) -> dict[str, Any]:
-    """Return the facts about a folder that `nerfcli render` wrote.
-
-    Keys: kind ("renders"), format, frames, meaning and in_words of its depth, files (how many state a definition),
-    outputs, run.
+    """Return the facts about a folder that `nerfcli render` wrote: kind, frames, outputs, run, depth and meaning.
 
     Raises:
-        UserError: its description cannot be read, or its depth files have different definitions.
+        UserError: its description cannot be read.
     """
+    path = folder / RENDERS
     try:
-        content = json.loads((folder / RENDERS).read_text(encoding="utf-8"))
-        frames, settings = content["frames"], content["settings"]
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        raise UserError(f"cannot read {folder / RENDERS}: {error}", "render again with --overwrite") from error
+        content = json.loads(path.read_text(encoding="utf-8"))
+        facts = {"kind": "renders", "frames": len(content["frames"]), "outputs": content["settings"].get("outputs")}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise UserError(f"cannot read {path}: {error}", "render again with --overwrite") from error
     entries = content.get("depth_meaning")
-    meta = _meta(folder / RENDERS, entries)
-    counted = 0
-    for kind in sorted(path for path in folder.iterdir() if path.is_dir()):
-        metas = [*_depth_metas(kind)]
-        counted += len(metas)
-        stated = [] if meta is None else [(folder / RENDERS, meta)]
-        same_kind = [pair for pair in metas if meta is None or pair[1].quantity == meta.quantity]
-        refuse_mixing([*stated, *((path, as_floats(found)) for path, found in same_kind)])
-        for quantity in {found.quantity for _, found in metas}:
-            refuse_mixing((path, found) for path, found in metas if found.quantity == quantity)
-    return {
-        "kind": "renders",
-        "format": "folder",
-        "frames": len(frames),
-        "files": counted,
-        "meaning": entries,
-        "in_words": "" if meta is None else meta.in_words(),
-        "outputs": settings.get("outputs"),
-        "run": content.get("run"),
-    }
+    return {**facts, "run": content.get("run"), **_definition(entries, _meta(path, entries))}
 
 
-def _depth_metas(folder: Path) -> Iterator[tuple[Path, DepthMeta]]:
-    """Yield every numeric file below a folder that states its definition, and that definition."""
-    for path in sorted(folder.rglob("*")):
-        if path.suffix in _KINDS and path.is_file():
-            meta = depth_meta_of(path)
-            # Previews carry the definition of the map that they show, but are not numeric.
-            if meta is not None and (path.suffix != ".png" or meta.units_per_level is not None):
-                yield path, meta
+def _definition(entries: dict[str, Any] | None, meta: DepthMeta | None) -> dict[str, Any]:
+    return {"depth": None if meta is None else meta.in_words(), "meaning": None if meta is None else entries}
 
 
 def _meta(path: Path, entries: dict[str, Any] | None) -> DepthMeta | None:
@@ -233,8 +203,8 @@ def _meta(path: Path, entries: dict[str, Any] | None) -> DepthMeta | None:
     return _stated(entries)
 
 
-def _maps(path: Path, meta: DepthMeta | None) -> dict[str, np.ndarray]:
-    """Return the arrays of a file by name."""
+def _read_maps(path: Path, meta: DepthMeta | None) -> dict[str, np.ndarray]:
+    """Return the arrays of a TIFF, OpenEXR or NPY file by name."""
     suffix = path.suffix.lower()
     if suffix != ".exr":
         values = read_npy(path) if suffix == ".npy" else read_any_tiff(path)[0]
@@ -246,24 +216,22 @@ def _maps(path: Path, meta: DepthMeta | None) -> dict[str, np.ndarray]:
     return named | {name: channels[name] for name in ("R", "G", "B", "A") if name in channels}
 
 
-def _png_facts(path: Path, meta: DepthMeta | None) -> dict[str, Any]:
+def _read_png(path: Path, meta: DepthMeta | None) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Return the depth, levels or colours of a PNG by name, and its texts without the definition of depth."""
     try:
         with Image.open(path) as image:
             image.load()
-            texts = {key: str(value) for key, value in image.info.items() if isinstance(value, str)}
+            texts = {str(key): value for key, value in image.info.items() if isinstance(value, str)}
             pixels = np.asarray(image)
     except (OSError, SyntaxError, ValueError) as error:
         raise damaged(path, error) from error
-    levels = pixels.ndim == 2 and pixels.dtype != np.uint8
-    facts: dict[str, Any] = {"format": "PNG", "width": pixels.shape[1], "height": pixels.shape[0]}
-    if levels and meta is not None and meta.units_per_level is not None:
-        depth = depth_of_levels(pixels, meta.units_per_level)
-        statistics = {**_range(depth), "dtype": f"{pixels.dtype} levels"}
-        return {"kind": "depth", **facts, "maps": {meta.quantity: statistics}}
-    if levels:
-        return {"kind": "levels", **facts, "maps": _statistics({"levels": pixels}), "texts": texts}
-    texts = {key: value for key, value in texts.items() if key != "nerfcli" or meta is None}
-    return {"kind": "picture" if meta is None else "preview", **facts, "texts": texts}
+    if meta is not None:
+        texts.pop(KEY, None)
+    if pixels.ndim == 3 or pixels.dtype == np.uint8:
+        return {"picture": pixels.astype(np.uint8)}, texts
+    if meta is not None and meta.units_per_level is not None:
+        return {meta.quantity: depth_of_levels(pixels, meta.units_per_level)}, texts
+    return {"levels": pixels}, texts
 
 
 def _video_facts(path: Path) -> dict[str, Any]:
@@ -277,8 +245,8 @@ def _video_facts(path: Path) -> dict[str, Any]:
         width, height = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
         frames, fps = video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)
         video.release()
-    facts = {"kind": "video", "format": path.suffix[1:].lower(), "width": int(width), "height": int(height)}
-    return facts | {"frames": int(frames), "fps": None if fps is None else round(fps, 3)}
+    fps = None if fps is None else round(fps, 3)
+    return {"width": int(width), "height": int(height), "frames": int(frames), "fps": fps}
 
 
 def _size_of(maps: dict[str, np.ndarray]) -> dict[str, int]:
@@ -290,12 +258,8 @@ def _size_of(maps: dict[str, np.ndarray]) -> dict[str, int]:
     return {"width": width, "height": height}
 
 
-def _statistics(maps: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """Return for each map how its values are stored, the fraction that is valid, and their range."""
-    return {name: _range(array) for name, array in maps.items()}
-
-
 def _range(array: np.ndarray) -> dict[str, Any]:
+    """Return how values are stored, the fraction that is valid, and their range."""
     facts: dict[str, Any] = {"dtype": str(array.dtype), "shape": list(array.shape)}
     if array.dtype.kind not in "fiu" or array.size == 0:
         return facts

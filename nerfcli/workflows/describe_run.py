@@ -1,14 +1,11 @@
-"""Describe a run or a file of tensors as plain values: settings, decisions, metrics, costs."""
+"""Describe a run or a file of tensors as plain values: settings, decisions, metrics."""
 
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from nerfcli.field.checkpoint import load_tensors
-from nerfcli.field.comparison import described_cost, other_kinds_with_equal_storage
 from nerfcli.field.cost import field_bytes
-from nerfcli.photos.pool import pixel_footprint
-from nerfcli.render.model import Model
 from nerfcli.runs.camera_moves import camera_moves
 from nerfcli.runs.run import Run
 from nerfcli.train.sentinel import FAILURE_FORMAT, replay
@@ -39,7 +36,6 @@ def describe_run(run: Run) -> dict[str, Any]:
             "field_bytes": field_bytes(model.field),
             "occupied_share": round(model.occupied.float().mean().item(), 4),
             "contraction": model.contraction,
-            "cost": costs_of_run(run, model),
         }
         if run.components.cameras != "fixed":
             radius = 1.0 / model.training_from_scene.scale
@@ -47,36 +43,6 @@ def describe_run(run: Run) -> dict[str, Any]:
     if (metrics := run.metrics()) is not None:
         content["metrics"] = metrics["mean"]
     return content
-
-
-def costs_of_run(run: Run, model: Model) -> dict[str, dict[str, Any]]:
-    """Return the cost of the field and of other kinds of field with equal storage; see `comparison.described_cost`.
-
-    Args:
-        run: provides settings, cameras and the last number of samples per ray.
-
-    Returns:
-        Size, bytes, operations and memory traffic by kind of field, with the run's own kind first.
-    """
-    factor, log = run.config.downscale, run.log
-    camera = run.cameras.train[0].camera
-    rays = log[-1]["rays"] if log else 0
-    samples_per_ray = log[-1]["samples"] / rays if rays else 1.0
-    own = model.field.settings
-    footprint = pixel_footprint(run.cameras.train, model.training_from_scene) * factor
-    return {
-        size.kind: {
-            "settings": size.to_json(),
-            **described_cost(
-                size,
-                occupancy_side=len(model.occupied),
-                batch=run.config.settings.samples_per_step,
-                samples_per_ray=samples_per_ray,
-                picture_px=(camera.width // factor) * (camera.height // factor),
-            ),
-        }
-        for size in (own, *other_kinds_with_equal_storage(own, footprint).values())
-    }
 
 
 def describe_tensors(path: Path) -> dict[str, Any]:
