@@ -6,7 +6,6 @@ one folder, video or mesh.
 """
 
 import json
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
@@ -197,25 +196,6 @@ def difference_of(one: DepthMeta, other: DepthMeta) -> str | None:
         if a != b:
             return f"{name.replace('_', ' ')} {a} and {b}"
     return None
-
-
-def as_floats(meta: DepthMeta) -> DepthMeta:
-    """Return the definition of a map after its integer levels are converted to lengths."""
-    return replace(meta, invalid="nan", units_per_level=None)
-
-
-def refuse_mixing(metas: Iterable[tuple[Path, DepthMeta]]) -> None:
-    """Refuse maps with different definitions where only one is allowed: in a folder, a video or a mesh.
-
-    Raises:
-        UserError: two definitions differ; the message names both files and the difference.
-    """
-    first: tuple[Path, DepthMeta] | None = None
-    for path, meta in metas:
-        if first is None:
-            first = (path, meta)
-        elif difference := difference_of(first[1], meta):
-            raise mixed(path, first[0], difference)
 
 
 def mixed(path: Path, other: Path, difference: str) -> UserError:
