@@ -21,12 +21,13 @@ import numpy as np
 import typer
 from PIL import ExifTags, Image
 
-from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
+from nerfcli.cameras.formats import scene_folder
 from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import rotation_from_vector
+from nerfcli.holdout import default_split
 from nerfcli.media.images import downscale, read_image
 
 SAMPLES = Path(__file__).parent.parent / "sample_scenes"
@@ -77,7 +78,7 @@ def desk_views() -> list[View]:
     recorded = json.loads((SAMPLES / "desk" / "truth" / "cameras.json").read_text(encoding="utf-8"))
     whole = Camera.from_json(recorded["camera"])
     camera = whole.resized(whole.width // DESK_DOWNSCALE, whole.height // DESK_DOWNSCALE)
-    test = scenes.default_split(view["name"] for view in recorded["images"])
+    test = default_split(view["name"] for view in recorded["images"])
     return [
         View(
             view["name"],
@@ -352,10 +353,10 @@ def make(name: str, folder: Path, seed: int) -> None:
     for view in views:
         write_photo(view, images / view.name)
     frames = tuple(Frame(view.name, view.camera, view.world_from_cam, images / view.name) for view in views)
-    model = folder / scenes.MODEL_FOLDER
+    model = folder / scene_folder.MODEL_FOLDER
     model.mkdir(parents=True, exist_ok=True)
     write_colmap_binary(Capture(frames, np.zeros((0, 3)), (), None, "colmap"), model)
-    scenes.save(
+    scene_folder.save(
         folder,
         image_folder=images,
         provenance={"made_by": "benchmarks/component_scenes.py", "seed": seed},

@@ -15,7 +15,9 @@ from pathlib import Path, PurePosixPath
 
 from nerfcli.errors import UserError
 
-DEFAULT_HOLDOUT = "every:8"
+# By default, one of this many photos in the order of their names is held out.
+HELD_OUT_EVERY = 8
+DEFAULT_HOLDOUT = f"every:{HELD_OUT_EVERY}"
 _NAMES_SHOWN = 3
 # Folders of Blender's captures, whose pictures of the same name have nothing in common.
 _SPLIT_FOLDERS = frozenset({"train", "test", "val"})
@@ -68,6 +70,11 @@ def names_held_out(rule: str, names: Iterable[str], *, others: Iterable[str] = (
             "some photos are needed for training and some for evaluation",
         )
     return held_out
+
+
+def default_split(names: Iterable[str]) -> frozenset[str]:
+    """Return the held-out names: every 8th of the sorted names, including the first, as `holdout` counts them."""
+    return frozenset(name for moment in moments(names)[::HELD_OUT_EVERY] for name in moment)
 
 
 def moments(names: Iterable[str]) -> list[list[str]]:

@@ -1,42 +1,25 @@
 """A scene: the photos of a capture with their cameras, read from any supported format.
 
-`load` detects the format; `save` writes nerfcli's own scene.json beside a COLMAP model. The world frame of a scene is
-that of its files: it is never rotated, moved or scaled here.
+The world frame of a scene is that of its files: it is never rotated, moved or scaled here.
 """
 
 import hashlib
 import math
-import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerfcli.atomic import write_json
-from nerfcli.cameras.formats.blender import read_blender
-from nerfcli.cameras.formats.colmap import colmap_on_disk, is_model, read_colmap, read_model
-from nerfcli.cameras.formats.colmap_model import ColmapModel
-from nerfcli.cameras.formats.llff import IMAGE_FOLDERS, read_llff
-from nerfcli.cameras.formats.run_cameras import CAMERAS
-from nerfcli.cameras.formats.scene_json import SCENE_FILE, SCENE_VERSION, UNITS, UNUSED, read_description
-from nerfcli.cameras.formats.transforms import read_transforms
+from nerfcli.cameras.formats.registry import Format, UserInputs, recognise
+from nerfcli.cameras.formats.scene_folder import read_description
 from nerfcli.cameras.frame import Capture, Frame, Size
+from nerfcli.cameras.orientation import counted, rescaling
+from nerfcli.cameras.stored_pixels import measure_of, upright
 from nerfcli.errors import UserError, in_shell
-from nerfcli.holdout import moments, names_held_out
-from nerfcli.media.exif import read_exif
-from nerfcli.media.images import image_size, list_images
-from nerfcli.media.masks import find_mask, masks_inside
-
-MODEL_FOLDER = "sparse/0"
-
-
-# By default, one of this many photos in the order of their names is held out.
-HELD_OUT_EVERY = 8
-
-_MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-_FOREIGN_FILES = ("transforms.json", "transforms_train.json", "poses_bounds.npy")
+from nerfcli.holdout import default_split, names_held_out
+from nerfcli.media.masks import masks_inside
 
 
 @dataclass(frozen=True)
@@ -44,8 +27,8 @@ class Scene:
     """The photos of a capture with cameras and poses.
 
     Args:
-        root: the folder that was loaded.
-        kind: "nerfcli", "colmap", "transforms", "blender" or "llff".
+        root: the folder that was loaded, or that the file is in.
+        kind: name of the format, see `cameras.formats.registry`.
         frames: all views whose photos are on disk.
         test_names: names of the held-out frames.
         points: (N, 3) surface points in the world frame, float64; N is 0 if the format has none.
@@ -82,19 +65,8 @@ class Scene:
         return tuple(frame for frame in self.frames if frame.name in self.test_names)
 
 
-def is_scene(path: Path) -> bool:
-    """Return True if a folder contains the files of a scene, well-formed or not."""
-    files = (SCENE_FILE, *_FOREIGN_FILES)
-    return any((path / name).is_file() for name in files) or model_folder(path) is not None
-
-
-def model_folder(path: Path) -> Path | None:
-    """Return the folder of the COLMAP model in a scene's folder; None if there is none."""
-    return next((path / name for name in _MODEL_FOLDERS if is_model(path / name)), None)
-
-
 def load(path: str | Path, *, holdout: str | None = None) -> Scene:
-    """Load the scene in a folder of any supported format; or from the path of a scene.json or transforms.json.
+    """Load the scene in a file or folder of any format of captures, with the photos that are on disk.
 
     Example:
         >>> import nerfcli
@@ -102,81 +74,26 @@ def load(path: str | Path, *, holdout: str | None = None) -> Scene:
         >>> [frame.name for frame in scene.test_frames]
 
     Args:
-        path: the folder, or the file.
+        path: the folder, or the file of cameras.
         holdout: rule for the held-out photos, see `holdout`, instead of the split of the capture.
 
     Raises:
-        UserError: there is no scene, its files are malformed or do not fit the photos, or the rule does not fit.
+        UserError: there is no capture, its files are malformed or do not fit the photos, none is on disk, or the rule
+            does not fit.
     """
-    scene = _load(Path(path))
+    path = Path(path)
+    form, found = recognise(path)
+    if form.name == "run" and path.is_dir():
+        raise UserError(
+            f"{path} is a run, not a scene",
+            f"give the scene it was trained on, or {in_shell(found)} for its refined cameras; to continue it: nerfcli "
+            f"train SCENE -o {in_shell(path)} --resume",
+        )
+    scene = scene_of(path, form, found, form.parse(found, UserInputs()))
     if holdout is None:
         return scene
     names = names_held_out(holdout, (frame.name for frame in scene.frames), others=scene.missing)
     return replace(scene, test_names=names, holdout=holdout)
-
-
-def save(
-    scene_dir: Path,
-    *,
-    image_folder: Path,
-    provenance: dict[str, Any],
-    unit: str = "arbitrary",
-    unit_source: str | None = None,
-    masks: Path | Mapping[str, Path] | None = None,
-    split: Mapping[str, str | None] | None = None,
-    depth_bounds: Mapping[str, tuple[float, float]] | None = None,
-) -> None:
-    """Write scene.json beside the COLMAP model in scene_dir/sparse/0, and fix the held-out split.
-
-    Args:
-        scene_dir: contains sparse/0, whose cameras refer to upright photos (EXIF orientation applied).
-        image_folder: the photos; stored relative to the scene folder, so that both can be moved together.
-        provenance: plain values: versions, command, settings.
-        unit: "arbitrary" or "metre".
-        unit_source: source of the metric scale.
-        masks: a folder of masks, named as in `media.masks.find_mask`; or masks by the name of the photo.
-        split: "train", "test", "val" or None (unused) by the name of the photo; by default every 8th is held out.
-        depth_bounds: nearest and farthest z by name, in scene units, if they are known without points.
-
-    Raises:
-        UserError: the model cannot be read, or scene.json cannot be written.
-    """
-    if unit not in UNITS:
-        raise ValueError(f"unit must be one of {UNITS}, got {unit!r}")
-    model = read_model(scene_dir / MODEL_FOLDER)
-    points = model.points
-    if split is None:
-        parts = {"test": sorted(default_split([image.name for image in model.images]))}
-    else:
-        listed = {part: sorted(name for name, of in split.items() if of == part) for part in ("test", "val")}
-        unused = sorted(name for name, of in split.items() if of is None)
-        parts = {"test": listed["test"], **{k: v for k, v in (("val", listed["val"]), (UNUSED, unused)) if v}}
-    if isinstance(masks, Path):
-        mask_entry: Any = _relative(masks, scene_dir)
-    else:
-        mask_entry = {name: _relative(mask, scene_dir) for name, mask in (masks or {}).items()} or None
-    content = {
-        "version": SCENE_VERSION,
-        "image_folder": _relative(image_folder, scene_dir),
-        "model": MODEL_FOLDER,
-        "split": parts,
-        "masks": mask_entry,
-        "unit": unit,
-        "unit_source": unit_source,
-        "frame_from_world": None,
-        "bounds": {
-            "points_min": points.min(axis=0).tolist() if len(points) else None,
-            "points_max": points.max(axis=0).tolist() if len(points) else None,
-        },
-        **({"depth_bounds": {name: list(pair) for name, pair in depth_bounds.items()}} if depth_bounds else {}),
-        "provenance": provenance,
-    }
-    write_json(scene_dir / SCENE_FILE, content)
-
-
-def default_split(names: Iterable[str]) -> frozenset[str]:
-    """Return the held-out names: every 8th of the sorted names, including the first, as `holdout` counts them."""
-    return frozenset(name for moment in moments(names)[::HELD_OUT_EVERY] for name in moment)
 
 
 def fingerprint(scene: Scene) -> str:
@@ -201,118 +118,61 @@ def fingerprint(scene: Scene) -> str:
     return digest.hexdigest()
 
 
-def _load(path: Path) -> Scene:
-    if not path.exists():
-        raise UserError(f"{path} does not exist", "give a scene folder, such as one written by nerfcli poses")
-    if path.is_file():
-        if path.suffix.lower() != ".json":
-            advice = "give a scene folder, or its transforms.json; nerfcli poses makes a scene from photos or a video"
-            raise UserError(f"{path} is a file, not a scene", advice)
-        if path.name != SCENE_FILE:
-            return _scene(path.parent, read_transforms(path, _measure))
-        path = path.parent
-    if (path / SCENE_FILE).is_file():
-        return _load_own(path)
-    model_dir = model_folder(path)
-    if model_dir is not None:
-        model = read_model(model_dir)
-        return _scene(path, colmap_on_disk(model, _image_folder(path, model_dir, model), _measure, model_dir))
-    if (path / "transforms.json").is_file():
-        return _scene(path, read_transforms(path / "transforms.json", _measure))
-    if (path / "transforms_train.json").is_file():
-        return _scene(path, read_blender(path, _measure))
-    if (path / "poses_bounds.npy").is_file():
-        return _scene(path, read_llff(path, _measure, list_images))
-    raise _no_scene(path)
+def scene_of(path: Path, form: Format, found: Path, capture: Capture) -> Scene:
+    """Return the scene of a capture, with the photos that are on disk, and the split of its files if they have one.
 
+    Args:
+        path: the file or folder that was given.
+        form, found: what `cameras.formats.registry.recognise` returns for it.
 
-def _scene(root: Path, capture: Capture) -> Scene:
-    """Return the scene of a capture in a foreign format, with the capture's split if it has one."""
-    splits = {frame.split for frame in capture.frames}
+    Raises:
+        UserError: no photo is on disk, or one does not fit its camera.
+    """
     frames = capture.frames
-    if "test" in splits or "val" in splits:
+    order = list(range(len(frames)))
+    if capture.kind == "colmap":  # ids of a model are in no particular order
+        order.sort(key=lambda index: frames[index].name)
+    if form.name == "blender":  # NeRF's views for choosing settings
+        order = [index for index in order if frames[index].split != "val"]
+    fitted = {index: _upright(capture, frames[index]) for index in order if frames[index].has_photo}
+    if not fitted:
+        first = frames[order[0] if order else 0]
+        raise UserError(
+            f"{found}: {form.name} ({form.of}), none of its {len(order)} photos is on disk, such as "
+            f"{first.image or first.name}",
+            "put the photos where the capture lists them, or give their folder: "
+            f"nerfcli convert {in_shell(path)} SCENE --to nerfcli --images FOLDER",
+        )
+    own = form.name == "nerfcli"
+    splits = {frames[index].split for index in (order if own else fitted)}
+    if own or {"test", "val"} & splits:
         held_out = "test" if "test" in splits else "val"
-        test_names = frozenset(frame.name for frame in frames if frame.split == held_out)
         # Views of other splits are used neither for training nor for evaluation.
-        kept = [index for index, frame in enumerate(frames) if frame.split in ("train", held_out)]
+        kept = [index for index in fitted if frames[index].split in ("train", held_out)]
+        test_names = frozenset(frames[index].name for index in kept if frames[index].split == held_out)
     else:
-        test_names = default_split(frame.name for frame in frames)
-        kept = list(range(len(frames)))
-    bounds = None if capture.depth_bounds is None else capture.depth_bounds[kept]
+        kept = list(fitted)
+        test_names = default_split(frames[index].name for index in kept)
     return Scene(
-        root=root,
-        kind=capture.kind,
-        frames=tuple(frames[index] for index in kept),
+        root=path.parent if path.is_file() else path,
+        kind=form.name,
+        frames=tuple(fitted[index] for index in kept),
         test_names=test_names,
         points=capture.points,
-        missing=capture.missing,
+        missing=(*(frames[index].name for index in order if index not in fitted), *capture.missing),
         unit=capture.unit,
-        depth_bounds=bounds,
+        depth_bounds=None if capture.depth_bounds is None else capture.depth_bounds[kept],
         unit_source=capture.unit_source,
-        rescaled=capture.rescaled,
-        history={"from": capture.kind},
+        rescaled=counted(rescaling(frames[index].camera, frame.camera) for index, frame in fitted.items()),
+        history=read_description(found).provenance if own else {"from": form.name},
     )
 
 
-def _load_own(root: Path) -> Scene:
-    """Load the scene that `save` described."""
-    described = read_description(root)
-    images = described.image_folder
-    if not images.is_dir():
-        raise UserError(
-            f"{described.path}: the photo folder {images} does not exist",
-            "put the photos back, or correct image_folder in that file",
-        )
-    capture = read_colmap(described.model_dir, images, _measure_upright)
-    listed = described.listed
-    held_out = listed["test"] or listed["val"]
-    left_out = listed[UNUSED] | (listed["val"] if listed["test"] else frozenset())
-    frames = tuple(frame for frame in described.described(capture.frames, find_mask) if frame.name not in left_out)
-    return Scene(
-        root=root,
-        kind="nerfcli",
-        frames=frames,
-        test_names=held_out & {frame.name for frame in frames},
-        points=capture.points,
-        missing=capture.missing,
-        unit=described.unit,
-        depth_bounds=described.bounds_of(frames),
-        unit_source=described.unit_source,
-        rescaled=capture.rescaled,
-        history=described.provenance,
-    )
-
-
-def _measure(path: Path) -> tuple[int, int, int]:
-    exif = read_exif(path)
-    return exif.width, exif.height, exif.orientation
-
-
-def _measure_upright(path: Path) -> tuple[int, int, int]:
-    """Measure photos for models whose cameras refer to upright photos, as those of nerfcli poses do: no rotation."""
-    return (*image_size(path), 1)
-
-
-def _image_folder(root: Path, model_dir: Path, model: ColmapModel) -> Path:
-    """Return the folder of a COLMAP project's photos: the one that contains most of the names, among the image folders
-    in `root`, the model's folder and its parents, and these folders themselves if names include the image folder."""
-    homes = list(dict.fromkeys([root, model_dir, *model_dir.resolve().parents[:3]]))
-    folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
-    if not folders:
-        raise UserError(
-            f"{root} has a COLMAP model but no photos: the folder images/ is missing",
-            "put the photos of the model into images/ next to it",
-        )
-    names = [image.name for image in model.images]
-    return max((*folders, *homes), key=lambda folder: sum((folder / name).is_file() for name in names))
-
-
-def _relative(path: Path, start: Path) -> str:
-    """Return a path relative to a folder, with forward slashes; absolute if that is impossible (another drive)."""
-    try:
-        return Path(os.path.relpath(path.resolve(), start.resolve())).as_posix()
-    except ValueError:
-        return path.resolve().as_posix()
+def _upright(capture: Capture, frame: Frame) -> Frame:
+    """Return a frame fitted to its upright photo on disk."""
+    if frame.mask is not None and not frame.mask.is_file():
+        raise UserError(f"{frame.mask}, the mask of {frame.name}, does not exist", "restore it, or remove its entry")
+    return upright(frame, measure_of(capture))
 
 
 def refuse_without_training_photos(scene: Scene) -> None:
@@ -328,31 +188,6 @@ def refuse_without_training_photos(scene: Scene) -> None:
         )
 
 
-def photo_folder(path: Path) -> Path | None:
-    """Return the folder that contains photos: `path` or its subfolder `images`; None if neither does."""
-    return next((folder for folder in (path, path / "images") if folder.is_dir() and list_images(folder)), None)
-
-
-def _no_scene(path: Path) -> UserError:
-    if (path / CAMERAS).is_file():
-        hint = f"give the scene it was trained on; to continue it: nerfcli train SCENE -o {in_shell(path)} --resume"
-        return UserError(f"{path} is a run, not a scene", hint)
-    looked_for = (
-        f"{SCENE_FILE}, {', '.join(name for name in _MODEL_FOLDERS[:-1])} (COLMAP), "
-        "transforms.json, transforms_train.json, poses_bounds.npy"
-    )
-    if folder := photo_folder(path):
-        return UserError(
-            f"{folder} has {len(list_images(folder))} photos but no poses; looked for {looked_for}",
-            f"estimate them with: nerfcli poses {in_shell(folder)}; or convert poses in another format with: nerfcli "
-            f"convert {in_shell(path)} SCENE --to nerfcli",
-        )
-    return UserError(
-        f"{path} is not a scene; looked for {looked_for}",
-        "give a scene folder, or estimate poses first: nerfcli poses PHOTOS",
-    )
-
-
 def describe_unused_masks(scene: Scene) -> str | None:
     """Describe how to use a folder of masks in the scene's folder that none of its files mentions; None without one."""
     if any(frame.mask is not None for frame in scene.frames):
@@ -361,3 +196,10 @@ def describe_unused_masks(scene: Scene) -> str | None:
     if masks is None:
         return None
     return f"{masks}; to use them: nerfcli convert {in_shell(scene.root)} SCENE --to nerfcli --masks {in_shell(masks)}"
+
+
+def describe_source(path: Path, scene: Scene) -> str:
+    """Describe which file or folder a scene at `path` was read from, in which format, and how many photos it has."""
+    form, found = recognise(path)
+    there = len(scene.frames)
+    return f"{found}: {form.name} ({form.of}), {there} of {there + len(scene.missing)} photos on disk"

@@ -1,9 +1,11 @@
 """Small captures of every camera model with known truth, and comparisons of captures, for tests of capture formats."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
@@ -64,6 +66,14 @@ def ring(*cameras: Camera, num_frames: int = 6, num_points: int = 40, seed: int 
     observations = Observations(np.array(frame_index), np.array(point_index), np.array(pixels).reshape(-1, 2))
     colours = rng.integers(1, 256, size=(num_points, 3), dtype=np.uint8)
     return Capture(tuple(frames), points, (), None, "colmap", colours=colours, observations=observations)
+
+
+def photograph(frames: Sequence[Frame]) -> None:
+    """Put a picture where each frame has its image."""
+    for frame in frames:
+        assert frame.image is not None
+        frame.image.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", frame.camera.size).save(frame.image)
 
 
 def with_photos(capture: Capture, folder: Path) -> Capture:

@@ -28,7 +28,7 @@ MAY_IMPORT = {
     "child": set(),
     "torchrun": set(),
     "__init__": set(),
-    "cameras": set(),
+    "cameras": {"holdout", "media"},
     "media": set(),
     "pages": set(),
     "kernels": set(),
@@ -41,7 +41,7 @@ MAY_IMPORT = {
     "poses.judge": {"multiview", "poses.model", "poses.input"},
     "poses.engine": {"multiview", "poses.judge", "poses.model", "poses.input", "media"},
     "poses": {
-        *("poses.engine", "poses.judge", "poses.model", "poses.input", "scene", "holdout", "cameras", "media"),
+        *("poses.engine", "poses.judge", "poses.model", "poses.input", "cameras", "holdout", "media"),
     },
     "scale": {"cameras", "media"},
     "doctor": {
@@ -58,7 +58,7 @@ MAY_IMPORT = {
             "multiview",
         ),
     },
-    "convert": {"multiview", "scale", "scene", "cameras", "media"},
+    "convert": {"multiview", "scale", "cameras", "media"},
     "render": {"field", "kernels", "cameras"},
     "tomography": {"findings", "holdout", "kernels", "media", "pages"},
     "photos": {"runs", "render", "kernels", "cameras", "media"},

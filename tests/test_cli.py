@@ -250,7 +250,7 @@ def test_photos_where_cameras_are_needed_are_reported_with_what_to_do(tmp_path):
     photos = write_photos(tmp_path / "my photos", 1)
     error = error_of(nerfcli("convert", photos, tmp_path / "out.json", "--to", "transforms"))
     assert error == (
-        f"Error: {photos} contains photos but no cameras",
+        f"Error: {photos} has 1 photo but no cameras",
         f"Hint:  estimate them with: nerfcli poses '{photos}'",
     )
 
@@ -316,7 +316,7 @@ def test_photos_without_poses_are_sent_to_poses(tmp_path):
     result = nerfcli("train", photos, *QUICK)
     assert result.exit_code == BAD_INPUT
     error, hint = error_of(result)
-    assert "has 5 photos but no poses" in error
+    assert "has 5 photos but no cameras" in error
     assert f"nerfcli poses {photos}" in hint
     assert not (tmp_path / "photos-run").exists()
 
@@ -380,6 +380,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch, finished):
 def test_train_evaluate_render_info_in_a_row(capture):
     run = capture.with_name("spheres-run")
     trained = nerfcli("train", capture, *QUICK)
+    assert trained.stderr.startswith(f"{capture}: blender (NeRF's synthetic scenes), 5 of 5 photos on disk\n")
     assert (trained.exit_code, trained.stdout) == (0, f"{run}\n")
     evaluated = nerfcli("evaluate", run, "--json")
     assert evaluated.exit_code == 0

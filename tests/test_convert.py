@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from captures import photograph, with_photos
 from commands import error_of, listing, nerfcli
-from PIL import Image
 from test_cli import check_that_it_parses
 from test_scale import photos_of, sheet_of_markers
 from views import BROWN, FISHEYE, PANORAMA, PINHOLE, PRISM, RADIAL, RATIONAL, SQUARE, capture_of
@@ -16,28 +16,18 @@ from views import BROWN, FISHEYE, PANORAMA, PINHOLE, PRISM, RADIAL, RATIONAL, SQ
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import OPENCV_FROM_LLFF, OPENCV_FROM_OPENGL
-from nerfcli.cameras.formats import blender, colmap_binary, transforms, transforms_cameras
+from nerfcli.cameras.formats import blender, transforms, transforms_cameras
 from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.formats.ply import write_ply
+from nerfcli.cameras.formats.registry import FORMATS, UserInputs, format_named, recognise
 from nerfcli.cameras.frame import Capture, Observations
 from nerfcli.cli.convert import FORMATS_WRITTEN
 from nerfcli.convert.axes import Convention, all_axes, expressed, opencv_from_axes, reinterpreted
 from nerfcli.convert.conversion import ConventionOverrides, TargetOptions, convert, load
-from nerfcli.convert.formats import FORMATS, UserInputs, format_named, recognise
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
 
 USAGE = 2
 LIMIT_PX = 1e-6
-
-
-def write_photos(folder: Path, capture: Capture) -> None:
-    folder.mkdir(parents=True)
-    for frame in capture.frames:
-        Image.new("L", (frame.camera.width, frame.camera.height)).save(folder / frame.name)
-
-
-def with_images(capture: Capture, folder: Path) -> Capture:
-    return replace(capture, frames=tuple(replace(f, image=folder / f.name) for f in capture.frames))
 
 
 def model_of(tmp_path: Path, capture: Capture) -> Path:
@@ -120,8 +110,8 @@ def test_programs_that_read_transforms_name_it(program, tmp_path):
 @pytest.mark.parametrize("form", [name for name in FORMATS_WRITTEN if name != "ply"])
 def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
     capture = capture_of(CAMERAS.get(form, EVERYTHING))
-    write_photos(tmp_path / "images", capture)
-    capture = with_images(capture, tmp_path / "images")
+    capture = with_photos(capture, tmp_path / "images")
+    photograph(capture.frames)
     source = model_of(tmp_path, capture)
     there = nerfcli("convert", source, tmp_path / "there", "--to", form, "--allow-loss", "--json")
     assert there.exit_code == 0, there.stderr
@@ -140,22 +130,6 @@ def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
     assert back.exit_code == 0, back.stderr
     _, _, again = load(tmp_path / "back", UserInputs(), ConventionOverrides())
     assert farthest_px(capture, again) < LIMIT_PX
-
-
-@pytest.mark.parametrize("form", ["colmap", "colmap-text"])
-def test_points_and_observations_survive(form, tmp_path):
-    capture = replace(capture_of(EVERYTHING), colours=None)
-    names = [frame.name.replace(" ", "_") for frame in capture.frames]
-    capture = replace(
-        capture, frames=tuple(replace(f, name=name) for f, name in zip(capture.frames, names, strict=True))
-    )
-    done = convert(capture, tmp_path / "out", source_format="made", wanted=TargetOptions(format_named(form)))
-    assert done.losses == ()
-    _, _, again = load(done.path, UserInputs(), ConventionOverrides())
-    np.testing.assert_array_equal(again.points, capture.points)
-    assert again.observations is not None
-    assert capture.observations is not None
-    np.testing.assert_array_equal(again.observations.pixels, capture.observations.pixels)
 
 
 def test_axes_and_pixel_centre_of_the_written_file(tmp_path):
@@ -219,7 +193,7 @@ def test_the_world_frame_and_its_scale(tmp_path):
     capture = capture_of([PINHOLE])
     first, second = capture.frames[:2]
     metres = 2.5 * float(np.linalg.norm(first.centre - second.centre))
-    write_photos(tmp_path / "images", capture)
+    photograph(with_photos(capture, tmp_path / "images").frames)
     out = tmp_path / "out"
     distance = f"{','.join(map(str, first.centre))} {','.join(map(str, second.centre))} {metres}"
     options = ("--origin", "centre-of-cameras", "--world-up", "-y", "--distance", distance, "--json")
@@ -314,15 +288,9 @@ def half_a_pixel(camera: Camera) -> dict[str, Any]:
     return {**content, "cx": content["cx"] + 0.5, "cy": content["cy"] + 0.5}
 
 
-rows_of_poses = colmap_binary.pose_rows
-
 FAULTS = {
     "half a pixel": ("transforms", transforms, "record_of_camera", half_a_pixel, "a ray is off by 0.707 px"),
     "flipped axes": ("blender", blender, "opengl_from_opencv_pose", lambda pose: pose, "a ray is off by"),
-    "moved poses": (
-        *("colmap", colmap_binary, "pose_rows"),
-        *(lambda model: rows_of_poses(model) + 1e-3, "a ray is off by"),
-    ),
     "moved points": (
         *("transforms", transforms, "write_ply"),
         *(lambda c, path: write_ply(replace(c, points=c.points[:, ::-1]), path), "60 points instead of 60, or other"),
@@ -441,7 +409,7 @@ def test_wrong_usage(options, named, tmp_path):
 @pytest.mark.parametrize("prefix", ["", "images/"])
 def test_photos_of_a_model_are_found_whatever_its_names_are_relative_to(prefix, tmp_path):
     capture = replace(capture_of([PINHOLE]), observations=None)
-    write_photos(tmp_path / "images", capture)
+    photograph(with_photos(capture, tmp_path / "images").frames)
     capture = replace(capture, frames=tuple(replace(f, name=prefix + f.name) for f in capture.frames))
     convert(capture, tmp_path / "sparse" / "0", source_format="made", wanted=TargetOptions(format_named("colmap")))
     result = nerfcli("convert", tmp_path, tmp_path / "elsewhere" / "transforms.json", "--to", "transforms")

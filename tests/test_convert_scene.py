@@ -18,12 +18,12 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats import colmap_binary
 from nerfcli.cameras.formats.colmap import write_colmap_binary
+from nerfcli.cameras.formats.registry import UserInputs, format_named
+from nerfcli.cameras.formats.scene_folder import write_scene
 from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture
+from nerfcli.cameras.stored_pixels import in_pixels
 from nerfcli.convert.conversion import ConventionOverrides, TargetOptions, convert, load
-from nerfcli.convert.formats import UserInputs, format_named
-from nerfcli.convert.scene_folder import write_scene
-from nerfcli.convert.stored_pixels import in_pixels
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
 from nerfcli.media.images import read_image
 

@@ -2,112 +2,40 @@
 
 import json
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from corruption import assert_refused_or_sound, corrupted_binary, corrupted_json, corrupted_text
+from every_format import WITH_PHOTOS, Views, matrix_text, text
 from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.registry import UserInputs, recognise
 from nerfcli.cameras.frame import Capture
-from nerfcli.convert.formats import UserInputs, recognise
 from nerfcli.errors import BAD_INPUT, UserError
 
 SIZE = (64, 48)
 CAMERA = Camera("PINHOLE", *SIZE, (70.0, 71.5, 30.25, 25.5))
-MATRIX = np.array([[70.0, 0, 30.25], [0, 71.5, 25.5], [0, 0, 1]])
 ROTATIONS = Rotation.from_rotvec([[0.1, -0.4, 0.2], [1.3, 0.2, -0.7], [-0.5, 2.1, 0.3]])
 CENTRES = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 2.0], [0.1, -3.0, 1.5]])
 POSES = rigid.from_parts(ROTATIONS.as_matrix(), CENTRES)  # world_from_cam, OpenCV axes
-OPENGL = np.diag([1.0, -1.0, -1.0])
+VIEWS = Views(CAMERA, POSES)
+NAMES = ("pose-files", "mvsnet", "neus", "polycam", "record3d")
 
 
-def photo(path: Path, size: tuple[int, int] = SIZE) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.full((size[1], size[0], 3), 128, np.uint8))
+def write(name: str, folder: Path) -> Path:
+    return WITH_PHOTOS[name](VIEWS, folder)
 
 
-def matrix_text(matrix: np.ndarray) -> str:
-    return "\n".join(" ".join(map(repr, row)) for row in matrix.tolist()) + "\n"
+def photo(path: Path) -> None:
+    VIEWS.put(0, path)
 
 
-def text(path: Path, content: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(content, encoding="utf-8")
-    return path
-
-
-def write_scannet(folder: Path) -> Path:
-    """ScanNet's SensReader: 4x4 matrices everywhere."""
-    for index, pose in enumerate(POSES):
-        photo(folder / f"color/{index}.jpg")
-        text(folder / f"pose/{index}.txt", matrix_text(pose))
-    intrinsics = np.eye(4)
-    intrinsics[:3, :3] = MATRIX
-    text(folder / "intrinsic/intrinsic_color.txt", matrix_text(intrinsics))
-    return folder / "pose/0.txt"
-
-
-def write_mvsnet(folder: Path) -> Path:
-    for index, pose in enumerate(POSES):
-        photo(folder / f"images/{index:08d}.jpg")
-        blocks = (f"extrinsic\n{matrix_text(np.linalg.inv(pose))}", f"intrinsic\n{matrix_text(MATRIX)}", "2.5 0.01\n")
-        text(folder / f"cams/{index:08d}_cam.txt", "\n".join(blocks))
-    return folder / "cams/00000000_cam.txt"
-
-
-def write_neus(folder: Path) -> Path:
-    """The product K [R t] scaled by numbers of both signs, as a projection is only defined up to its scale."""
-    arrays = {}
-    for index, (pose, scale) in enumerate(zip(POSES, (1.0, -2.0, 0.3), strict=True)):
-        photo(folder / f"image/{index:03d}.png")
-        photo(folder / f"mask/{index:03d}.png")
-        projection = np.eye(4)
-        projection[:3] = scale * MATRIX @ np.linalg.inv(pose)[:3]
-        arrays |= {f"world_mat_{index}": projection, f"scale_mat_{index}": 2 * np.eye(4)}
-    np.savez(folder / "cameras_sphere.npz", **arrays)
-    return folder / "cameras_sphere.npz"
-
-
-def write_polycam(folder: Path) -> Path:
-    for index, pose in enumerate(POSES):
-        photo(folder / f"keyframes/corrected_images/{1000 + index}.jpg")
-        rows = np.column_stack([pose[:3, :3] @ OPENGL, pose[:3, 3]])
-        record = {f"t_{row}{column}": rows[row, column] for row in range(3) for column in range(4)}
-        record |= {"fx": 70.0, "fy": 71.5, "cx": 30.25, "cy": 25.5, "width": 64, "height": 48, "blur_score": 71.0}
-        text(folder / f"keyframes/corrected_cameras/{1000 + index}.json", json.dumps(record))
-    return folder / "keyframes/corrected_cameras/1000.json"
-
-
-def record3d(**change: Any) -> dict[str, Any]:
-    poses = [
-        [*(rotation * Rotation.from_matrix(OPENGL)).as_quat().tolist(), *centre.tolist()]  # qx, qy, qz, qw first
-        for rotation, centre in zip(ROTATIONS, CENTRES, strict=True)
-    ]
-    rows = [[70.0 + index, 71.5, 30.25, 25.5] for index in range(len(poses))]  # the focus moves
-    by_columns = MATRIX.T.ravel().tolist()
-    content = {"poses": poses, "perFrameIntrinsicCoeffs": rows, "K": by_columns, "w": 64, "h": 48, "fps": 60}
-    return {key: value for key, value in (content | change).items() if value is not None}
-
-
-def write_record3d(folder: Path) -> Path:
-    for index in range(len(POSES)):
-        photo(folder / f"rgb/{index}.jpg")
-    return text(folder / "metadata.json", json.dumps(record3d()))
-
-
-WRITERS: dict[str, Callable[[Path], Path]] = {
-    "pose-files": write_scannet,
-    "mvsnet": write_mvsnet,
-    "neus": write_neus,
-    "polycam": write_polycam,
-    "record3d": write_record3d,
-}
+def change_json(path: Path, **change: Any) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
 
 
 def parse(folder: Path, given: UserInputs = UserInputs()) -> tuple[str, Capture]:
@@ -115,27 +43,26 @@ def parse(folder: Path, given: UserInputs = UserInputs()) -> tuple[str, Capture]
     return form.name, form.parse(found, given)
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", NAMES)
 def test_views_written_by_hand_come_back(tmp_path, name):
-    WRITERS[name](tmp_path)
+    write(name, tmp_path)
     kind, capture = parse(tmp_path)
     assert (kind, capture.kind) == (name, name)
     assert capture.missing == ()
     assert len(capture.frames) == len(POSES)
-    for index, (frame, pose) in enumerate(zip(capture.frames, POSES, strict=True)):
+    for frame, pose in zip(capture.frames, POSES, strict=True):
         np.testing.assert_allclose(frame.world_from_cam, pose, rtol=0, atol=1e-13)
         assert (frame.camera.model, frame.camera.width, frame.camera.height) == ("PINHOLE", *SIZE)
-        focus = index if name == "record3d" else 0.0
-        np.testing.assert_allclose(frame.camera.params, np.add(CAMERA.params, (focus, 0, 0, 0)), rtol=1e-12)
+        np.testing.assert_allclose(frame.camera.params, CAMERA.params, rtol=1e-12)
         assert frame.image is not None
         assert frame.image.is_file()
         assert frame.name == frame.image.name
     assert capture.unit == ("metre" if name in ("polycam", "record3d") else "arbitrary")
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_missing_photo_is_listed_and_without_any_the_capture_is_refused(tmp_path, name):
-    WRITERS[name](tmp_path)
+    write(name, tmp_path)
     photos = sorted((*tmp_path.rglob("*.jpg"), *tmp_path.rglob("image/*.png")))
     photos[0].unlink()
     if name == "neus":  # pairs photos and cameras by order
@@ -152,9 +79,9 @@ def test_a_missing_photo_is_listed_and_without_any_the_capture_is_refused(tmp_pa
     assert "--images" in caught.value.hint
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", NAMES)
 def test_photos_in_another_folder(tmp_path, name):
-    WRITERS[name](tmp_path / "capture")
+    write(name, tmp_path / "capture")
     home = next(iter((tmp_path / "capture").rglob("*.jpg")), tmp_path / "capture/image/000.png").parent
     home.rename(tmp_path / "elsewhere")
     _, capture = parse(tmp_path / "capture", UserInputs(images=tmp_path / "elsewhere"))
@@ -162,9 +89,9 @@ def test_photos_in_another_folder(tmp_path, name):
     assert len(capture.frames) == len(POSES)
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_hundred_damaged_files_are_refused_or_sound(tmp_path, name):
-    path = WRITERS[name](tmp_path)
+    path = write(name, tmp_path)
     form, found = recognise(tmp_path)
     parse_found = form.parse
     damage = {".txt": corrupted_text, ".json": corrupted_json, ".npz": corrupted_binary}[path.suffix]
@@ -191,7 +118,7 @@ OTHER_NAMES = [
 
 @pytest.mark.parametrize(("name", "usual", "other"), OTHER_NAMES)
 def test_other_names_of_folders_and_files_give_the_same_capture(tmp_path, name, usual, other):
-    WRITERS[name](tmp_path)
+    write(name, tmp_path)
     expected = parse(tmp_path)[1]
     (tmp_path / usual).rename(tmp_path / other)
     found = parse(tmp_path)[1]
@@ -205,7 +132,7 @@ def test_other_names_of_folders_and_files_give_the_same_capture(tmp_path, name, 
 
 
 def test_of_photos_that_differ_only_in_suffix_the_first_is_used(tmp_path):
-    write_record3d(tmp_path)
+    write("record3d", tmp_path)
     photo(tmp_path / "rgb/1.jpeg")
     photo(tmp_path / "rgb/1.png")
     assert [frame.name for frame in parse(tmp_path)[1].frames] == ["0.jpg", "1.jpeg", "2.jpg"]
@@ -226,7 +153,7 @@ class TestPoseFiles:
         assert {frame.camera for frame in capture.frames} == {CAMERA}
 
     def test_frames_that_were_not_tracked_are_left_out_and_numbers_are_in_order(self, tmp_path):
-        write_scannet(tmp_path)
+        write("pose-files", tmp_path)
         photo(tmp_path / "color/10.jpg")
         text(tmp_path / "pose/10.txt", matrix_text(POSES[0]))
         text(tmp_path / "pose/1.txt", "-inf " * 12 + "0 0 0 1")
@@ -258,7 +185,7 @@ class TestPoseFiles:
         ],
     )
     def test_intrinsics_that_are_none_are_refused(self, tmp_path, content, what):
-        write_scannet(tmp_path)
+        write("pose-files", tmp_path)
         path = text(tmp_path / "intrinsic/intrinsic_color.txt", content)
         with pytest.raises(UserError, match=what) as caught:
             parse(tmp_path)
@@ -272,7 +199,7 @@ class TestMvsnet:
         [("2 0.5 64", (2, 34)), ("2 0.5 64 30", (2, 30)), ("2 0.5", None), ("", None), ("2 0.5 64 1", None)],
     )
     def test_depth_bounds(self, tmp_path, depths, bounds):
-        write_mvsnet(tmp_path)
+        write("mvsnet", tmp_path)
         for path in (tmp_path / "cams").iterdir():
             path.write_text(path.read_text().replace("2.5 0.01", depths))
         found = parse(tmp_path)[1].depth_bounds
@@ -284,14 +211,14 @@ class TestMvsnet:
 
 class TestNeus:
     def test_masks_belong_to_photos_in_order(self, tmp_path):
-        write_neus(tmp_path)
+        write("neus", tmp_path)
         masks = [frame.mask for frame in parse(tmp_path)[1].frames]
         assert masks == [tmp_path / f"mask/{index:03d}.png" for index in range(3)]
         (tmp_path / "mask/001.png").unlink()
         assert {frame.mask for frame in parse(tmp_path)[1].frames} == {None}
 
     def test_one_camera_rounded_to_float32_stays_one(self, tmp_path):
-        path = write_neus(tmp_path)
+        path = write("neus", tmp_path)
         with np.load(path) as arrays:
             rounded = {name: array.astype(np.float32) for name, array in arrays.items()}
         np.savez(path, **rounded)
@@ -303,7 +230,7 @@ class TestNeus:
         assert len({frame.camera for frame in parse(tmp_path)[1].frames}) == 3
 
     def test_a_projection_of_no_camera_is_refused(self, tmp_path):
-        path = write_neus(tmp_path)
+        path = write("neus", tmp_path)
         with np.load(path) as arrays:
             changed = dict(arrays)
         for damaged in (np.zeros((4, 4)), np.diag([1, 1, 0, 1]), np.full((4, 4), np.nan)):
@@ -317,7 +244,7 @@ class TestNeus:
 
     def test_fifty_corruptions_of_the_arrays_inside(self, tmp_path):
         """Damage behind the archive's checksums."""
-        path = write_neus(tmp_path)
+        path = write("neus", tmp_path)
         with zipfile.ZipFile(path) as archive:
             members = {name: archive.read(name) for name in archive.namelist()}
         rng, refused = np.random.default_rng(9), 0
@@ -333,7 +260,7 @@ class TestNeus:
 class TestPolycam:
     @pytest.mark.parametrize("corrected_cameras", [False, True])
     def test_a_capture_without_corrected_photos_has_the_poses_of_arkit(self, tmp_path, corrected_cameras):
-        write_polycam(tmp_path)
+        write("polycam", tmp_path)
         for name in ("cameras", "images"):
             (tmp_path / f"keyframes/corrected_{name}").rename(tmp_path / f"keyframes/{name}")
         if corrected_cameras:
@@ -343,10 +270,10 @@ class TestPolycam:
 
 
 class TestRecord3d:
-    def test_intrinsics_of_all_frames_are_stored_by_columns(self, tmp_path):
-        path = write_record3d(tmp_path)
-        path.write_text(json.dumps(record3d(perFrameIntrinsicCoeffs=None)))
-        assert {frame.camera for frame in parse(tmp_path)[1].frames} == {CAMERA}
+    def test_the_focus_may_move(self, tmp_path):
+        rows = [[70.0 + index, 71.5, 30.25, 25.5] for index in range(len(POSES))]
+        change_json(write("record3d", tmp_path), perFrameIntrinsicCoeffs=rows)
+        assert [frame.camera.params for frame in parse(tmp_path)[1].frames] == [tuple(row) for row in rows]
 
     @pytest.mark.parametrize(
         ("change", "what"),
@@ -358,8 +285,7 @@ class TestRecord3d:
         ],
     )
     def test_damaged_metadata_is_refused_with_its_field(self, tmp_path, change, what):
-        path = write_record3d(tmp_path)
-        path.write_text(json.dumps(record3d(**change)))
+        change_json(write("record3d", tmp_path), **change)
         with pytest.raises(UserError, match=what):
             parse(tmp_path)
 

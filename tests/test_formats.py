@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
@@ -15,11 +16,10 @@ from nerfcli.cameras.conventions import (
     opencv_from_opengl_pose,
     opengl_from_opencv_pose,
 )
-from nerfcli.cameras.formats.blender import read_blender
-from nerfcli.cameras.formats.colmap import is_model, read_colmap, read_model
-from nerfcli.cameras.formats.llff import read_llff
-from nerfcli.cameras.formats.transforms import parse_transforms, read_transforms
+from nerfcli.cameras.formats.colmap import is_model, read_model
+from nerfcli.cameras.formats.transforms import parse_transforms
 from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.scene import load
 
 # A camera at (1, 2, 3) that looks along -x with +z up. OpenGL axes: right +y, up +z, backward +x, as columns.
 OPENGL_POSE = [[0.0, 0.0, 1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
@@ -31,20 +31,11 @@ LLFF_POSE = [[0.0, 0.0, 1.0, 1.0], [0.0, 1.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 3.0], 
 SHARED = {"fl_x": 50.0, "fl_y": 51.0, "cx": 33.0, "cy": 23.0, "w": 64.0, "h": 48}
 
 
-def measure(_: Path) -> tuple[int, int, int]:
-    """Stand in for media: every image is 64 x 48 and upright."""
-    return 64, 48, 1
-
-
-def list_files(folder: Path) -> list[Path]:
-    return sorted(folder.iterdir())
-
-
-def touch(folder: Path, *names: str) -> None:
+def put(folder: Path, *names: str, size: tuple[int, int] = (64, 48)) -> None:
     for name in names:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(b"")
+        Image.new("L", size).save(path)
 
 
 def write_capture(folder: Path, content: dict[str, Any], *, name: str = "transforms.json") -> Path:
@@ -66,10 +57,10 @@ def test_axes_of_other_programs_by_hand():
 
 def test_instant_ngp_file_with_shared_intrinsics_and_missing_images(tmp_path):
     names = ["./images/a b.jpg", "images\\ü.jpg", "images/gone.jpg", "images/no_suffix"]
-    touch(tmp_path, "images/a b.jpg", "images/ü.jpg", "images/no_suffix.png")
+    put(tmp_path, "images/a b.jpg", "images/ü.jpg", "images/no_suffix.png")
     content = {**SHARED, "k1": 0.1, "k2": -0.05, "p1": 0.001, "p2": 0.002, "aabb_scale": 4, "scale": 0.33}
     path = write_capture(tmp_path, {**content, "frames": [entry(name, sharpness=3.0) for name in names]})
-    capture = read_transforms(path, measure)
+    capture = load(path)
     assert capture.kind == "transforms"
     assert [frame.name for frame in capture.frames] == ["images/a b.jpg", "images/ü.jpg", "images/no_suffix.png"]
     assert all(frame.image is not None and frame.image.is_file() for frame in capture.frames)
@@ -81,11 +72,11 @@ def test_instant_ngp_file_with_shared_intrinsics_and_missing_images(tmp_path):
 
 
 def test_nerfstudio_file_with_intrinsics_and_masks_per_frame(tmp_path):
-    touch(tmp_path, "a.png", "b.png", "masks/a.png")
+    put(tmp_path, "a.png", "b.png", "masks/a.png")
     fisheye = {**SHARED, "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "camera_model": "OPENCV_FISHEYE"}
     frames = [entry("a.png", mask_path="masks/a.png", **fisheye), entry("b.png", **SHARED, k3=0.3)]
     path = write_capture(tmp_path, {"frames": frames, "train_filenames": ["a.png"], "test_filenames": ["./b.png"]})
-    first, second = read_transforms(path, measure).frames
+    first, second = load(path).frames
     assert first.camera == Camera("OPENCV_FISHEYE", 64, 48, (50, 51, 33, 23, 0.1, 0.2, 0.3, 0.4))
     assert second.camera == Camera("FULL_OPENCV", 64, 48, (50, 51, 33, 23, 0, 0, 0, 0, 0.3, 0, 0, 0))
     assert (first.mask, second.mask) == (tmp_path / "masks/a.png", None)
@@ -103,18 +94,18 @@ def test_nerfstudio_file_with_intrinsics_and_masks_per_frame(tmp_path):
     ],
 )
 def test_focal_length_from_what_the_file_gives(tmp_path, intrinsics, params):
-    touch(tmp_path, "a.png")
+    put(tmp_path, "a.png")
     path = write_capture(tmp_path, {**intrinsics, "frames": [entry("a.png")]})
-    camera = read_transforms(path, measure).frames[0].camera
+    camera = load(path).frames[0].camera
     assert (camera.model, camera.width, camera.height) == ("PINHOLE", 64, 48)
     np.testing.assert_allclose(camera.params, params, rtol=1e-14)
 
 
 def test_rounded_poses_become_exactly_rigid(tmp_path):
-    touch(tmp_path, "a.png")
+    put(tmp_path, "a.png")
     rounded = rigid.look_at(np.array([1.0, 2, 3]), np.zeros(3), np.array([0, 0, 1.0])).round(4)
     path = write_capture(tmp_path, {**SHARED, "frames": [{"file_path": "a", "transform_matrix": rounded[:3].tolist()}]})
-    pose = read_transforms(path, measure).frames[0].world_from_cam
+    pose = load(path).frames[0].world_from_cam
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), rtol=0, atol=1e-14)
     np.testing.assert_allclose(opengl_from_opencv_pose(pose), rounded, rtol=0, atol=1e-4)
 
@@ -132,8 +123,8 @@ def test_rounded_poses_become_exactly_rigid(tmp_path):
         ({"frames": [entry("a.png", transform_matrix=np.full((4, 4), np.nan).tolist())]}, "not finite"),
         ({"frames": [entry("a.png"), {"transform_matrix": OPENGL_POSE}]}, r"frames\[1\]: file_path is None"),
         ({"frames": [entry("a.png"), entry("./a.png")]}, "a.png is listed twice"),
-        ({"frames": [entry("x.png"), entry("y.png")]}, "none of the 2 listed images .* such as x.png"),
-        ({"frames": [entry("a.png", mask_path="m.png")]}, "mask m.png does not exist"),
+        ({"frames": [entry("x.png"), entry("y.png")]}, r"none of its 2 photos is on disk, such as .*x\.png"),
+        ({"frames": [entry("a.png", mask_path="m.png")]}, r"m\.png, the mask of a\.png, does not exist"),
         ({"fl_x": "wide"}, "fl_x is 'wide'"),
         ({"fl_x": -3}, "fl_x is -3.0"),
         ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
@@ -147,10 +138,10 @@ def test_rounded_poses_become_exactly_rigid(tmp_path):
     ],
 )
 def test_malformed_transforms_are_refused_with_file_and_field(tmp_path, change, what):
-    touch(tmp_path, "a.png")
+    put(tmp_path, "a.png")
     path = write_capture(tmp_path, {**SHARED, "frames": [entry("a.png")], **change})
     with pytest.raises(UserError, match=what) as caught:
-        read_transforms(path, measure)
+        load(path)
     assert caught.value.exit_code == BAD_INPUT
     assert str(tmp_path) in caught.value.message
 
@@ -168,13 +159,13 @@ def test_what_is_no_json_object_is_refused(tmp_path, data, what):
     path = tmp_path / "transforms.json"
     path.write_bytes(data)
     with pytest.raises(UserError, match=what):
-        read_transforms(path, measure)
+        parse_transforms(path)
     with pytest.raises(UserError, match="No such file"):
-        read_transforms(tmp_path / "none.json", measure)
+        parse_transforms(tmp_path / "none.json")
 
 
 def test_blender_splits_are_kept_and_val_is_left_out(tmp_path):
-    touch(tmp_path, "train/r_0.png", "train/r_1.png", "test/r_0.png", "val/r_0.png")
+    put(tmp_path, "train/r_0.png", "train/r_1.png", "test/r_0.png", "val/r_0.png")
     angle = {"camera_angle_x": 2 * np.arctan(0.5)}
     write_capture(
         tmp_path, {**angle, "frames": [entry("./train/r_0"), entry("./train/r_1")]}, name="transforms_train.json"
@@ -183,13 +174,13 @@ def test_blender_splits_are_kept_and_val_is_left_out(tmp_path):
         tmp_path, {**angle, "frames": [entry("./test/r_0"), entry("./test/r_1")]}, name="transforms_test.json"
     )
     write_capture(tmp_path, {**angle, "frames": [entry("./val/r_0")]}, name="transforms_val.json")
-    capture = read_blender(tmp_path, measure)
+    capture = load(tmp_path)
     assert [(frame.name, frame.split) for frame in capture.frames] == [
         ("train/r_0.png", "train"),
         ("train/r_1.png", "train"),
         ("test/r_0.png", "test"),
     ]
-    assert capture.missing == ("test/r_1",)
+    assert capture.missing == ("test/r_1.png",)
     assert capture.kind == "blender"
 
 
@@ -219,35 +210,35 @@ def llff_rows(count: int) -> np.ndarray:
 def test_llff_by_hand(tmp_path):
     np.save(tmp_path / "poses_bounds.npy", llff_rows(2))
     # images/ has a different number of photos than poses; images_4/ has the right number, at a quarter of the size.
-    touch(tmp_path, "images/1.jpg", "images_4/b.png", "images_4/a.png")
-    capture = read_llff(tmp_path, measure, list_files)
+    put(tmp_path, "images/1.jpg", "images_4/b.png", "images_4/a.png")
+    capture = load(tmp_path)
     assert [frame.name for frame in capture.frames] == ["images_4/a.png", "images_4/b.png"]
     assert capture.frames[0].camera == Camera("PINHOLE", 64, 48, (50, 50, 32, 24))
     np.testing.assert_allclose(capture.frames[0].world_from_cam, OPENCV_POSE, rtol=0, atol=1e-15)
     np.testing.assert_allclose(capture.frames[1].centre, [1, 2, 4])
     np.testing.assert_array_equal(capture.depth_bounds, [[1.5, 20], [1.5, 21]])
     assert capture.kind == "llff"
-    touch(tmp_path, "images/2.jpg")
-    assert read_llff(tmp_path, measure, list_files).frames[0].name == "images/1.jpg"
+    put(tmp_path, "images/2.jpg")
+    assert load(tmp_path).frames[0].name == "images/1.jpg"
 
 
 def test_malformed_llff_is_refused(tmp_path):
     path = tmp_path / "poses_bounds.npy"
     np.save(path, llff_rows(3))
-    with pytest.raises(UserError, match="has 3 rows, but the folder images/ is missing"):
-        read_llff(tmp_path, measure, list_files)
-    touch(tmp_path, "images/1.jpg", "images_8/1.jpg", "images_8/2.jpg")
+    with pytest.raises(UserError, match="none of its 3 photos is on disk, such as image000"):
+        load(tmp_path)
+    put(tmp_path, "images/1.jpg", "images_8/1.jpg", "images_8/2.jpg")
     with pytest.raises(UserError, match="3 rows, but images/ has 1, images_8/ has 2"):
-        read_llff(tmp_path, measure, list_files)
+        load(tmp_path)
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(UserError, match=r"poses_bounds\.npy is not a readable NumPy array"):
-        read_llff(tmp_path, measure, list_files)
+        load(tmp_path)
     path.write_bytes(b"")
     with pytest.raises(UserError, match="not a readable NumPy array"):
-        read_llff(tmp_path, measure, list_files)
+        load(tmp_path)
     np.save(path, llff_rows(3)[:, :15])
     with pytest.raises(UserError, match=r"array of shape \(3, 15\)"):
-        read_llff(tmp_path, measure, list_files)
+        load(tmp_path)
     for column, value, what in (
         (15, 0.0, "depth bounds 0 and 20"),
         (14, -1.0, "row 0: .* -1"),
@@ -257,7 +248,7 @@ def test_malformed_llff_is_refused(tmp_path):
         rows[0, column] = value
         np.save(path, rows)
         with pytest.raises(UserError, match=what):
-            read_llff(tmp_path, measure, list_files)
+            load(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -306,16 +297,17 @@ def test_points_of_a_colmap_model_project_onto_their_observations(tmp_path, synt
 def test_colmap_images_that_are_not_on_disk_are_missing(tmp_path, synthetic):
     synthetic.write_binary(str(tmp_path))
     names = sorted(image.name for image in synthetic.images.values())
-    with pytest.raises(UserError, match=r"none of the 10 images .*, such as ring 0/ä 0\.jpg"):
-        read_colmap(tmp_path, tmp_path / "images", lambda _: (1024, 768, 1))
-    touch(tmp_path / "images", *names[1:])
-    capture = read_colmap(tmp_path, tmp_path / "images", lambda _: (512, 384, 1))
-    assert capture.missing == (names[0],)
-    assert [frame.name for frame in capture.frames] == names[1:]
-    assert capture.frames[0].camera.params == (640, 256, 192, 0.05)
-    assert capture.kind == "colmap"
+    with pytest.raises(UserError, match=r"none of its 10 photos is on disk, such as ring 0/ä 0\.jpg"):
+        load(tmp_path)
+    put(tmp_path / "images", *names[1:], size=(512, 384))
+    scene = load(tmp_path)
+    assert scene.missing == (names[0],)
+    assert [frame.name for frame in scene.frames] == names[1:]
+    assert scene.frames[0].camera.params == (640, 256, 192, 0.05)
+    assert scene.kind == "colmap"
+    put(tmp_path / "images", names[1], size=(500, 500))
     with pytest.raises(UserError, match="500x500 pixels does not match a camera of 1024x768"):
-        read_colmap(tmp_path, tmp_path / "images", lambda _: (500, 500, 1))
+        load(tmp_path)
 
 
 @pytest.mark.parametrize(

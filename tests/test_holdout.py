@@ -6,13 +6,13 @@ import pytest
 
 from nerfcli import scene as scenes
 from nerfcli.errors import UserError
-from nerfcli.holdout import DEFAULT_HOLDOUT, check_holdout, names_held_out
+from nerfcli.holdout import DEFAULT_HOLDOUT, check_holdout, default_split, names_held_out
 
 NAMES = [f"frame_{index}.png" for index in range(1, 21)]
 
 
 def test_the_default_is_the_split_of_scenes():
-    assert names_held_out(DEFAULT_HOLDOUT, NAMES) == scenes.default_split(NAMES)
+    assert names_held_out(DEFAULT_HOLDOUT, NAMES) == default_split(NAMES)
 
 
 def test_every_n_counts_names_in_order():
@@ -31,7 +31,7 @@ RIG = [f"{camera}/{index:04d}.png" for camera in ("left", "right") for index in 
 def test_photos_of_a_rig_are_held_out_together():
     """The camera beside a held-out one would show nearly the same picture."""
     expected = {f"{camera}/{index:04d}.png" for camera in ("left", "right") for index in (0, 8, 16)}
-    assert names_held_out(DEFAULT_HOLDOUT, RIG) == expected == scenes.default_split(RIG)
+    assert names_held_out(DEFAULT_HOLDOUT, RIG) == expected == default_split(RIG)
     assert names_held_out("block:0.15", RIG) == {
         f"{camera}/{index:04d}.png" for camera in ("left", "right") for index in (8, 9, 10)
     }

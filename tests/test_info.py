@@ -11,10 +11,9 @@ import OpenEXR
 import pytest
 import tifffile
 from depth_maps import ALL, FULL_META, META, plain_depth
+from every_format import WITH_PHOTOS
 from PIL import Image
-from test_format_alicevision import content
-from test_format_alicevision import write as write_alicevision
-from test_format_folders import WRITERS
+from test_every_format import VIEWS
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
@@ -222,17 +221,17 @@ def test_a_text_file_of_a_run_shows_the_run(finished, capture):
 
 
 @pytest.mark.parametrize("name", ["alicevision", "pose-files", "neus"])
-def test_captures_of_other_programs_show_their_cameras_and_how_to_train_on_them(name, tmp_path):
-    if name == "alicevision":
-        path = write_alicevision(tmp_path, content())
-    else:
-        path = WRITERS[name](tmp_path)
-    shown = info(tmp_path if name == "pose-files" else path).stdout.splitlines()
-    photos = {"alicevision": ("0", "2"), "pose-files": ("3", "0"), "neus": ("3", "0")}[name]
-    assert shown[1:4] == [f"  kind: {name}", f"  photos: {photos[0]}", f"  missing: {photos[1]}"]
-    assert any("focal" in line for line in shown)
-    assert shown[-1].startswith("  to train: nerfcli convert ")
-    assert shown[-1].endswith(" SCENE --to nerfcli")
+def test_captures_of_other_programs_show_their_photos_and_cameras(name, tmp_path):
+    path = WITH_PHOTOS[name](VIEWS, tmp_path)
+    place = tmp_path if name == "pose-files" else path
+    facts = json.loads(info(place, "--json").stdout)
+    assert (facts["kind"], facts["photos"], facts["held_out"], facts["missing"]) == (name, 3, 1, 0)
+    assert any("focal" in line for line in info(place).stdout.splitlines())
+    if name == "alicevision":  # its file alone
+        for photo in (tmp_path / "images").iterdir():
+            photo.unlink()
+        facts = json.loads(info(path, "--json").stdout)
+        assert (facts["kind"], facts["photos"], facts["missing"], len(facts["cameras"])) == (name, 0, 3, 1)
 
 
 def test_headers_of_arrays_that_python_cannot_parse_are_damage(tmp_path):

@@ -23,9 +23,9 @@ from test_poses import similarity
 
 from nerfcli.cameras.calibration import Calibration, Picture, calibrated
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.registry import format_named
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.camera_files import read_calibration
-from nerfcli.convert.formats import format_named
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport

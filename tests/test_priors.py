@@ -13,6 +13,7 @@ from PIL import Image
 from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.colmap import write_colmap_binary
+from nerfcli.cameras.formats.scene_folder import MODEL_FOLDER, save
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
@@ -63,11 +64,11 @@ def capture(tmp_path: Path) -> Scene:
     rows.append((0, -1, np.array([1.0, 1.0])))  # a feature that no other photo has
     observed = Observations(*(np.array(column) for column in zip(*rows, strict=True)))
     observed.pixels[3] += (0.0, 0.5)
-    (tmp_path / scenes.MODEL_FOLDER).mkdir(parents=True)
+    (tmp_path / MODEL_FOLDER).mkdir(parents=True)
     model = Capture(tuple(frames), POINTS, (), None, "colmap", observations=observed)
-    write_colmap_binary(model, tmp_path / scenes.MODEL_FOLDER)
+    write_colmap_binary(model, tmp_path / MODEL_FOLDER)
     split = {"0.png": "train", "1.png": "train"}
-    scenes.save(tmp_path, image_folder=tmp_path / "images", provenance={}, masks=tmp_path / "masks", split=split)
+    save(tmp_path, image_folder=tmp_path / "images", provenance={}, masks=tmp_path / "masks", split=split)
     return scenes.load(tmp_path)
 
 

@@ -14,8 +14,10 @@ from nerfcli import scene as scenes
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.colmap import write_colmap_binary
+from nerfcli.cameras.formats.scene_folder import save
 from nerfcli.cameras.formats.transforms import parse_transforms
 from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.holdout import default_split
 
 POSE = np.eye(4).tolist()
 NAMES = [f"photo {index:02d}.jpg" for index in range(10)]
@@ -59,7 +61,7 @@ def own(tmp_path, model) -> Path:
         write_image(tmp_path / "photos" / name)
     folder = tmp_path / "photos-scene"
     shutil.copytree(model, folder / "sparse/0")
-    scenes.save(folder, image_folder=tmp_path / "photos", provenance={"command": "poses"})
+    save(folder, image_folder=tmp_path / "photos", provenance={"command": "poses"})
     return folder
 
 
@@ -70,8 +72,8 @@ def edit(folder: Path, **changes: object) -> None:
 
 def test_every_eighth_name_is_held_out():
     names = [f"{index:02d}" for index in range(20)]
-    assert scenes.default_split(reversed(names)) == {"00", "08", "16"}
-    assert scenes.default_split([]) == frozenset()
+    assert default_split(reversed(names)) == {"00", "08", "16"}
+    assert default_split([]) == frozenset()
 
 
 def test_transforms_by_folder_and_by_file(tmp_path):
@@ -128,7 +130,9 @@ def test_llff_folder(tmp_path):
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
 def test_colmap_project_wherever_its_model_stands(tmp_path, model, place):
     shutil.copytree(model, tmp_path / place, dirs_exist_ok=True)
-    with pytest.raises(UserError, match="has a COLMAP model but no photos"):
+    with pytest.raises(
+        UserError, match=r"colmap \(a COLMAP model\), none of its 10 photos is on disk, such as photo 00"
+    ):
         scenes.load(tmp_path)
     for name in NAMES[1:]:
         write_image(tmp_path / "images" / name)
@@ -202,7 +206,7 @@ def test_masks_are_found_by_the_photos_name(own, tmp_path):
     write_image(masks / f"{NAMES[0]}.png")
     write_image(masks / "photo 01.png")
     write_image(masks / NAMES[2])
-    scenes.save(own, image_folder=tmp_path / "photos", provenance={}, masks=masks, unit="metre", unit_source="a ruler")
+    save(own, image_folder=tmp_path / "photos", provenance={}, masks=masks, unit="metre", unit_source="a ruler")
     scene = scenes.load(own)
     assert [frame.mask for frame in scene.frames[:4]] == [
         masks / f"{NAMES[0]}.png",
@@ -218,7 +222,7 @@ def test_masks_are_found_by_the_photos_name(own, tmp_path):
     [
         ({"version": 2}, "unknown version 2"),
         ({"image_folder": 3}, "image_folder is 3"),
-        ({"image_folder": "../gone"}, "the photo folder .*gone does not exist"),
+        ({"image_folder": "../gone"}, "none of its 10 photos is on disk, such as .*gone.photo 00"),
         ({"model": None}, "model is None"),
         ({"model": "sparse/1"}, r"sparse/1.cameras\.txt: No such file"),
         ({"unit": "mile"}, "unit is 'mile'"),
@@ -235,23 +239,21 @@ def test_malformed_scene_json_is_refused(own, changes, what):
 
 def test_save_refuses_an_unknown_unit(own, tmp_path):
     with pytest.raises(ValueError, match="unit must be one of"):
-        scenes.save(own, image_folder=tmp_path, provenance={}, unit="mile")
+        save(own, image_folder=tmp_path, provenance={}, unit="mile")
 
 
 def test_what_is_no_scene_says_what_was_looked_for(tmp_path):
     with pytest.raises(UserError, match=r"nowhere does not exist"):
         scenes.load(tmp_path / "nowhere")
-    with pytest.raises(
-        UserError, match=r"not a scene; looked for scene\.json, sparse/0.*transforms\.json.*poses_bounds"
-    ) as caught:
+    with pytest.raises(UserError, match="contains no capture in a supported format") as caught:
         scenes.load(tmp_path)
     assert caught.value.exit_code == BAD_INPUT
+    assert caught.value.hint.startswith("looked for scene.json, sparse/0/cameras.bin or .txt, transforms.json")
     write_image(tmp_path / "images/a.JPG")
-    with pytest.raises(UserError, match=r"images has 1 photos but no poses") as caught:
+    with pytest.raises(UserError, match=r"images has 1 photo but no cameras") as caught:
         scenes.load(tmp_path)
-    other = f"or convert poses in another format with: nerfcli convert {tmp_path} SCENE --to nerfcli"
-    assert caught.value.hint == f"estimate them with: nerfcli poses {tmp_path / 'images'}; {other}"
-    with pytest.raises(UserError, match="is a file, not a scene"):
+    assert caught.value.hint == f"estimate them with: nerfcli poses {tmp_path / 'images'}"
+    with pytest.raises(UserError, match="contains no capture in a supported format"):
         scenes.load(tmp_path / "images/a.JPG")
 
 

@@ -21,14 +21,15 @@ from nerfcli import kernels
 from nerfcli import scene as scenes
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.registry import UserInputs, recognise
 from nerfcli.cameras.formats.run_cameras import read_cameras, write_cameras
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity, apply, rotation_from_quaternion
-from nerfcli.convert.formats import UserInputs, recognise
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model, over_white
 from nerfcli.field import hash_field
 from nerfcli.field.checkpoint import load_tensors
+from nerfcli.holdout import default_split
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image, write_png
 from nerfcli.photos.loading import load_photos
@@ -119,7 +120,7 @@ def test_photos_of_a_desk_are_learned_too(with_points, tmp_path):
         Frame(view["name"], camera, np.array(view["world_from_cam"]), desk / "images" / view["name"])
         for view in recorded["images"]
     )
-    names = scenes.default_split(frame.name for frame in frames)
+    names = default_split(frame.name for frame in frames)
     points = []
     for frame in (frame for frame in frames if frame.name in names):
         depth, _ = read_tiff(desk / "truth" / "depth" / f"{Path(frame.name).stem}.tiff")

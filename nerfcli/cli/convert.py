@@ -175,9 +175,9 @@ def convert(
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
     """
     values = dict(locals())
+    from nerfcli.cameras.formats.registry import UserInputs, format_named
     from nerfcli.convert.camera_files import read_intrinsics
     from nerfcli.convert.conversion import ConventionOverrides, TargetOptions
-    from nerfcli.convert.formats import UserInputs, format_named
     from nerfcli.convert.world_frame import WorldFrame
     from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.convert import convert_capture, detect_convention, detection_record

@@ -27,10 +27,10 @@ def info(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Show what a scene, a run or one of their files contains, as keys and values.
+    """Show what a scene, a run or one of their files contains.
 
     \b
-    scene       cameras, photos, missing files, split, unit; also of captures that nerfcli convert makes a scene
+    scene       cameras, photos, missing files, split, unit; in any format that nerfcli convert reads
     run         settings, components, decisions, time, metrics, how far refined cameras moved
     depth file  (TIFF, EXR, NPY, PNG; also pictures, videos and folders of renders) definition, axis, unit and its
                 source, invalid value, camera, run, range of values; for files of other programs, what is not stated

@@ -70,9 +70,9 @@ def train(
 ) -> None:
     """Fit a radiance field to a scene.
 
-    SCENE is a folder written by `nerfcli poses`, a COLMAP project, or a folder with transforms.json (nerfstudio,
-    instant-ngp), transforms_train.json (Blender) or poses_bounds.npy (LLFF). The held-out photos are those of the
-    scene, else every 8th photo, or those of --holdout. Writes SCENE-run/. Ctrl-C or SIGTERM saves a checkpoint;
+    SCENE is a folder written by `nerfcli poses`, or a file or folder of any other format that `nerfcli convert` reads
+    (COLMAP, nerfstudio, instant-ngp, Blender, LLFF, Metashape, ...), with photos on disk. The held-out photos are those
+    of the scene, else every 8th photo, or those of --holdout. Writes SCENE-run/. Ctrl-C or SIGTERM saves a checkpoint;
     --resume continues from it.
 
     \b

@@ -6,11 +6,11 @@ from nerfcli.cameras.calibration import Calibration
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.colmap import read_cameras
 from nerfcli.cameras.formats.fields import read_json_object
-from nerfcli.convert.finding import find_json, named
-from nerfcli.convert.formats import UserInputs, recognise
-from nerfcli.convert.stored_pixels import UPRIGHT
+from nerfcli.cameras.formats.finding import find_json, named
+from nerfcli.cameras.formats.registry import UserInputs, recognise
+from nerfcli.cameras.formats.scene_folder import MODEL_FOLDER, SCENE_FILE
+from nerfcli.cameras.stored_pixels import UPRIGHT
 from nerfcli.errors import UserError
-from nerfcli.scene import MODEL_FOLDER, SCENE_FILE
 
 _CAMERAS_FILES = ("cameras.bin", "cameras.txt")
 

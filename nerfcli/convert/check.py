@@ -7,9 +7,9 @@ import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.registry import Format
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import poses_of
-from nerfcli.convert.formats import Format
 from nerfcli.errors import GATE_NOT_MET, UserError
 
 TOLERANCE_PX = 1e-6

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.registry import Format, UserInputs, recognise, with_masks, with_photos
 from nerfcli.cameras.frame import Capture
+from nerfcli.cameras.stored_pixels import STORED, UPRIGHT, ReorientedCapture, in_pixels
 from nerfcli.convert.axes import Convention, expressed, opencv_from_axes, reinterpreted
 from nerfcli.convert.check import Check, check, differs
-from nerfcli.convert.formats import Format, UserInputs, recognise, with_masks, with_photos
-from nerfcli.convert.stored_pixels import STORED, ReorientedCapture, in_pixels
 from nerfcli.errors import GATE_NOT_MET, UserError
 
 
@@ -144,7 +144,7 @@ def _pixels(form: Format, wanted: TargetOptions) -> str:
     """Return which pixels of photos (stored or upright) the cameras of the written file refer to."""
     if form.name == "nerfcli" and wanted.pixels == STORED:
         raise UserError("the nerfcli format always uses upright photos", "remove --pixels", exit_code=2)
-    return wanted.pixels or form.pixels
+    return wanted.pixels or (UPRIGHT if form.name == "nerfcli" else STORED)
 
 
 def _orientation_notes(turned: ReorientedCapture) -> tuple[str, ...]:

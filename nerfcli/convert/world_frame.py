@@ -7,8 +7,8 @@ import numpy as np
 
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.cameras.stored_pixels import measure_of, upright
 from nerfcli.cameras.world import moved_to_origin, transformed, up_aligned
-from nerfcli.convert.stored_pixels import measure_of, upright
 from nerfcli.errors import UserError
 from nerfcli.scale.boards import CharucoBoard, scale_from_charuco, scale_from_markers
 from nerfcli.scale.distances import known_distance, scale_from_distances

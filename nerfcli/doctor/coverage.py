@@ -7,13 +7,14 @@ import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.formats.colmap import read_model
+from nerfcli.cameras.formats.finding import find_model
 from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_direction, views_of
 from nerfcli.doctor.geometry import BASELINE_BAD, BASELINE_LOOK
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
 from nerfcli.media.geodesy import east_north_up
-from nerfcli.scene import Scene, model_folder
+from nerfcli.scene import Scene
 
 # Inward-looking cameras surround the scene if they span at least this angle; otherwise they face its front.
 _AROUND_DEG = 180.0
@@ -123,7 +124,7 @@ def focal_lengths(scene: Scene) -> Finding:
 
 def points(scene: Scene) -> Finding | None:
     """Check the number of 3D points per photo; None if the format does not provide it."""
-    model = model_folder(scene.root)
+    model = find_model(scene.root)
     if scene.kind not in ("nerfcli", "colmap") or model is None:
         return None
     counts = {image.name: int((image.point_ids >= 0).sum()) for image in read_model(model).images}

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerfcli import scene as scenes
+from nerfcli.cameras.formats.registry import recognised
 from nerfcli.doctor.photo_facts import Source
 from nerfcli.errors import UserError, in_shell
 from nerfcli.media.images import list_photos, list_unreadable, name_in, where_photos_may_be
@@ -34,17 +35,17 @@ def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
     """
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a folder of photos, or a scene folder")
-    if path.is_file() and path.suffix.lower() != ".json":
-        raise UserError(
-            f"{path} is a file, neither a folder of photos nor a scene",
-            f"if it is a video, nerfcli poses {in_shell(path)} writes its frames to a folder that can be given here",
-        )
-    if path.is_file() or scenes.is_scene(path):
+    if recognised(path) is not None:
         if subfolders:
             raise UserError(f"{path}: --subfolders is for photos, and this is a scene", "leave --subfolders out")
         scene = scenes.load(path)
         sources = tuple(Source(f.name, f.image, f.mask) for f in scene.frames if f.image is not None)
         return ExaminedCapture(path, sources, scene)
+    if path.is_file():
+        raise UserError(
+            f"{path} is a file, neither a folder of photos nor a scene",
+            f"if it is a video, nerfcli poses {in_shell(path)} writes its frames to a folder that can be given here",
+        )
     photos = [*list_photos(path, subfolders=subfolders), *list_unreadable(path, subfolders=subfolders)]
     if not photos:
         raise UserError(f"no photos and no scene in {path}", where_photos_may_be(path))

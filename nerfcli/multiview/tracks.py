@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.cameras.formats.colmap import parse_colmap
+from nerfcli.cameras.formats.finding import find_model
 from nerfcli.multiview.features import Matches
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.scene import Scene, model_folder
+from nerfcli.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Tracks:
 
 def tracks_of_model(scene: Scene, photos: Sequence[LoadedPhoto]) -> Tracks:
     """Return the observations of these photos in the scene's COLMAP model; empty without such a model."""
-    folder = model_folder(scene.root)
+    folder = find_model(scene.root)
     capture = parse_colmap(folder) if folder is not None else None
     parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))]
     if capture is not None and capture.observations is not None:

@@ -13,9 +13,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from nerfcli import scene
 from nerfcli.atomic import write_json
 from nerfcli.cameras.calibration import Calibration
+from nerfcli.cameras.formats import scene_folder
 from nerfcli.errors import UserError
 from nerfcli.holdout import names_held_out
 from nerfcli.media.images import list_photos, name_in
@@ -93,7 +93,7 @@ def estimate_poses(
             provenance = {"command": "poses", "settings": asdict(settings), "versions": report.versions}
             provenance |= {} if given is None else {"intrinsics": given.to_json()}
             provenance |= {"registered": report.registered, "total": report.total}
-            scene.save(
+            scene_folder.save(
                 scene_dir,
                 image_folder=photos_dir,
                 provenance=provenance,
@@ -156,7 +156,7 @@ def is_same_scene(
 
 def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: Calibration | None) -> bool:
     report = _read_json(scene_dir / "poses_report.json")
-    made = scene_dir.resolve() / _read_json(scene_dir / scene.SCENE_FILE)["image_folder"]
+    made = scene_dir.resolve() / _read_json(scene_dir / scene_folder.SCENE_FILE)["image_folder"]
     names = [name_in(photos_dir, path) for path in list_photos(photos_dir, subfolders=settings.subfolders)]
     earlier = report.get("intrinsics")
     wanted_settings: dict[str, Any] = asdict(settings)
@@ -274,14 +274,14 @@ def _check_destination(scene_dir: Path, photos_dir: Path, *, subfolders: bool) -
         )
     if scene_dir.exists() and not scene_dir.is_dir():
         raise UserError(f"cannot write the scene {scene_dir}: a file with this name exists", hint)
-    ours = (scene_dir / scene.SCENE_FILE).is_file() or is_under_construction(scene_dir)
+    ours = (scene_dir / scene_folder.SCENE_FILE).is_file() or is_under_construction(scene_dir)
     if scene_dir.is_dir() and any(scene_dir.iterdir()) and not ours:
         raise UserError(f"cannot write the scene {scene_dir}: the folder contains other files", hint)
 
 
 def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserError:
     """Make the error for a refused result, and keep its report and its model, but not as a scene."""
-    older = (scene_dir / scene.SCENE_FILE).is_file()
+    older = (scene_dir / scene_folder.SCENE_FILE).is_file()
     folder = scene_dir / "work" if older else scene_dir
     path = folder / "poses_report.json"
     write_json(path, report.to_json())

@@ -14,9 +14,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nerfcli.atomic import atomic_folder, clear_leftovers
+from nerfcli.cameras.formats.scene_folder import SCENE_FILE
 from nerfcli.exclusive import exclusive
 from nerfcli.poses.input.job import database_path
-from nerfcli.scene import SCENE_FILE
 
 _LOCK = "poses.lock"
 # Folder of a model that the checks refused; nothing takes a folder of this name for a scene.

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli import __version__
+from nerfcli.cameras.formats.registry import photo_folder, recognised
 from nerfcli.cameras.formats.run_cameras import MEND
 from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.errors import UserError, in_shell
@@ -16,7 +17,7 @@ from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
 from nerfcli.runs.files import CONFIG, RECONSTRUCTION
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene, fingerprint, is_scene, photo_folder
+from nerfcli.scene import Scene, fingerprint
 from nerfcli.sealed import read_sealed, write_sealed
 
 
@@ -160,7 +161,7 @@ def no_run(path: Path) -> UserError:
         return UserError(f"{path} does not exist", hint)
     if path.is_file():
         return UserError(f"{path} is a file, not a run folder", hint)
-    if is_scene(path):
+    if recognised(path) is not None:
         return UserError(f"{path} is a scene, not a run", f"train it first: nerfcli train {in_shell(path)}")
     if (path / RECONSTRUCTION).exists():
         return UserError(

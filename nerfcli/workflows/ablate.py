@@ -10,6 +10,7 @@ from nerfcli import scene as scenes
 from nerfcli.ablate.results import RUNS, MeasuredTraining, refuse_foreign, rows_of, write_results
 from nerfcli.ablate.variants import AUTO, CHOSEN, CaptureTraits, Variant, variants
 from nerfcli.cameras.formats.colmap import parse_colmap
+from nerfcli.cameras.formats.finding import find_model
 from nerfcli.errors import UserError
 from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.evaluate.sampled import SampledPixels
@@ -18,7 +19,7 @@ from nerfcli.photos.exif_exposure import mean_log_exposure, relative_log_exposur
 from nerfcli.runs.files import STATE
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene, model_folder
+from nerfcli.scene import Scene
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.workflows.train import train_scene, was_interrupted
 
@@ -105,7 +106,7 @@ def ablate_scene(
 
 def _capture(scene: Scene) -> CaptureTraits:
     """Return the traits of a scene that decide which components can be varied."""
-    first, sparse = scene.train_frames[0].image, model_folder(scene.root)
+    first, sparse = scene.train_frames[0].image, find_model(scene.root)
     seen = parse_colmap(sparse).observations if sparse is not None else None
     exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
     return CaptureTraits(

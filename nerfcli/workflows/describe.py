@@ -7,10 +7,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from nerfcli import scene as scenes
 from nerfcli.cameras.camera import by_lens
+from nerfcli.cameras.formats.registry import UserInputs, recognise, recognised
 from nerfcli.cameras.formats.run_cameras import CAMERAS
 from nerfcli.cameras.frame import Frame
-from nerfcli.errors import UserError, in_shell
+from nerfcli.cameras.orientation import describe_rescaling
+from nerfcli.errors import UserError
 from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
 from nerfcli.media.model_facts import SUFFIXES as MODEL_SUFFIXES
 from nerfcli.media.model_facts import model_facts
@@ -18,12 +21,8 @@ from nerfcli.runs.files import CONFIG, DEPTH_ERRORS, LOG, METRICS, REPORT
 from nerfcli.tomography.result import is_reconstruction, load_reconstruction
 from nerfcli.tomography.volume_files import is_volume_file, volume_facts
 
-# Formats that only `nerfcli convert` reads, and the suffixes of their files; "" is that of a folder.
-_CAPTURES = (
-    *("alicevision", "opensfm", "metashape", "reality-capture", "bundler"),
-    *("polycam", "record3d", "mvsnet", "neus", "pose-files"),
-)
-_CAPTURE_SUFFIXES = ("", ".sfm", ".json", ".xml", ".csv", ".out", ".npz")
+# Suffixes of files of cameras; a .json may also be something else.
+_CAPTURE_SUFFIXES = (".sfm", ".json", ".xml", ".csv", ".out", ".npz")
 
 
 def describe(path: str | Path) -> dict[str, Any]:
@@ -48,8 +47,9 @@ def describe(path: str | Path) -> dict[str, Any]:
         from nerfcli.workflows.describe_run import describe_tensors
 
         return describe_tensors(folder)
-    if folder.suffix.lower() in _CAPTURE_SUFFIXES and (facts := _describe_capture(folder)) is not None:
-        return facts
+    may_be_capture = folder.suffix.lower() in _CAPTURE_SUFFIXES if folder.is_file() else not (folder / CONFIG).exists()
+    if may_be_capture and recognised(folder) is not None:
+        return _describe_capture(folder)
     if folder.suffix.lower() in MODEL_SUFFIXES:
         return model_facts(folder)
     if folder.is_file() and is_volume_file(folder):
@@ -59,7 +59,7 @@ def describe(path: str | Path) -> dict[str, Any]:
     if (folder / RENDERS).exists():
         return renders_facts(folder)
     if not (folder / CONFIG).exists():
-        return _describe_scene(folder)
+        return _describe_capture(folder)
     from nerfcli.runs.run import Run
     from nerfcli.workflows.describe_run import describe_run
 
@@ -100,31 +100,6 @@ def _describe_reconstruction(run: Path) -> dict[str, Any]:
     }
 
 
-def _describe_capture(path: Path) -> dict[str, Any] | None:
-    """Return the facts of a capture that only `nerfcli convert` reads; None if the path is something else."""
-    from nerfcli.convert.formats import UserInputs, format_named
-    from nerfcli.scene import is_scene
-
-    if is_scene(path) or (path / CONFIG).is_file():
-        return None
-    for form in map(format_named, _CAPTURES):
-        found = form.find(path)
-        if found is not None:
-            capture = form.parse(found, UserInputs())
-            there = sum(frame.image is not None and frame.image.is_file() for frame in capture.frames)
-            return {
-                "kind": form.name,
-                "photos": there,
-                "missing": len(capture.frames) + len(capture.missing) - there,
-                **_camera_facts(capture.frames),
-                "points": len(capture.points),
-                "unit": capture.unit,
-                "unit_source": capture.unit_source,
-                "to_train": f"nerfcli convert {in_shell(path)} SCENE --to nerfcli",
-            }
-    return None
-
-
 def _camera_facts(frames: Iterable[Frame]) -> dict[str, Any]:
     lenses = by_lens([frame.camera for frame in frames])
     return {
@@ -138,11 +113,20 @@ def _camera_facts(frames: Iterable[Frame]) -> dict[str, Any]:
     }
 
 
-def _describe_scene(folder: Path) -> dict[str, Any]:
-    from nerfcli import scene as scenes
-    from nerfcli.cameras.orientation import describe_rescaling
-
-    scene = scenes.load(folder)
+def _describe_capture(path: Path) -> dict[str, Any]:
+    form, found = recognise(path)
+    capture = form.parse(found, UserInputs())
+    if not any(frame.has_photo for frame in capture.frames):
+        return {
+            "kind": form.name,
+            "photos": 0,
+            "missing": len(capture.frames) + len(capture.missing),
+            **_camera_facts(capture.frames),
+            "points": len(capture.points),
+            "unit": capture.unit,
+            "unit_source": capture.unit_source,
+        }
+    scene = scenes.scene_of(path, form, found, capture)
     return {
         "kind": scene.kind,
         "photos": len(scene.frames),

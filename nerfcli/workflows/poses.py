@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from nerfcli.cameras.calibration import Calibration
+from nerfcli.cameras.formats.scene_folder import SCENE_FILE
 from nerfcli.convert.camera_files import read_calibration
 from nerfcli.errors import UserError, duration
 from nerfcli.poses import structure_from_motion
@@ -10,7 +11,6 @@ from nerfcli.poses.input.plan import Plan, TimeEstimate
 from nerfcli.poses.input.settings import Limits, PoseSettings
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 from nerfcli.poses.structure_from_motion import is_same_scene, photo_notes, plan_poses
-from nerfcli.scene import SCENE_FILE
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
 NAMES_SHOWN = 8

@@ -98,6 +98,7 @@ def _trained(
 ) -> Run:
     """See `train_scene`."""
     loaded = scenes.load(folder, holdout=holdout)
+    notify(scenes.describe_source(folder, loaded))
     if loaded.missing:
         names = listed(loaded.missing, NAMES_SHOWN)
         warn(f"{several(len(loaded.missing), 'missing photo')} of {folder} skipped: {names}")

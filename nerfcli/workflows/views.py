@@ -12,11 +12,11 @@ from nerfcli.atomic import cannot_write
 from nerfcli.cameras import paths
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.camera_path import losses_camera_path, read_path, write_camera_path
+from nerfcli.cameras.formats.finding import find_camera_path
+from nerfcli.cameras.formats.registry import UserInputs, recognise
 from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture, Frame, frames_named
 from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
-from nerfcli.convert.finding import find_camera_path
-from nerfcli.convert.formats import UserInputs, recognise
 from nerfcli.errors import UserError
 from nerfcli.photos.loading import downscaled_camera
 from nerfcli.render.depth import DepthRequest
@@ -28,8 +28,6 @@ PATHS = ("orbit", "ellipse", "spiral", "interpolate")
 BEHIND_FROM_DEG = 180.0
 # Files that `write_frames` writes.
 _FRAME_FILES = ("cameras.json", "camera_path.json")
-# Formats whose folders `nerfcli train` accepts.
-SCENES = ("nerfcli", "colmap", "transforms", "blender", "llff")
 
 
 @dataclass(frozen=True)
@@ -203,16 +201,17 @@ def write_frames(
 
 
 def _frames_of(path: Path) -> tuple[Frame, ...]:
-    """Return the cameras of a scene, rescaled to its photos, or of any file or folder that `nerfcli convert` reads."""
+    """Return the cameras of a capture: in a folder, those of the photos that are there, rescaled to them."""
     if not path.exists():
         raise UserError(
             f"no cameras found at {path}",
             f"give test, train, {', '.join(PATHS)}, or a file or folder of cameras that nerfcli convert reads",
         )
     form, found = recognise(path)
-    if path.is_dir() and form.name in SCENES:
-        return scenes.load(path).frames
-    return form.parse(found, UserInputs()).frames
+    capture = form.parse(found, UserInputs())
+    if path.is_dir() and form.name != "run" and any(frame.has_photo for frame in capture.frames):
+        return scenes.scene_of(path, form, found, capture).frames
+    return capture.frames
 
 
 def _within(camera: Camera, max_size: int) -> Camera:

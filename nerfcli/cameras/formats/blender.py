@@ -19,34 +19,14 @@ from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.transforms import (
     SPLITS,
-    capture_on_disk,
     check_unique_names,
-    frames_on_disk,
     listed_frames,
     relative_path,
 )
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
-from nerfcli.cameras.frame import Capture, Frame, Size
+from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure
 from nerfcli.errors import UserError
-
-
-def read_blender(folder: Path, measure: Measure) -> Capture:
-    """Read the train and test views of a Blender capture that are on disk; val views are left out.
-
-    Raises:
-        UserError: a file is malformed or lists no image that is on disk.
-    """
-    frames, missing, rescaled = list[Frame](), list[str](), list[tuple[Size, Size] | None]()
-    for split in ("train", "test"):
-        path = _file(folder, split)
-        if split == "test" and not path.exists():
-            continue
-        found, names, sizes = frames_on_disk(path, read_json_object(path), measure)
-        frames += [replace(frame, split=split) for frame in found]
-        missing += names
-        rescaled += sizes
-    return capture_on_disk(_file(folder, "train"), frames, missing, rescaled=rescaled, kind="blender")
 
 
 def parse_blender(
@@ -58,22 +38,24 @@ def parse_blender(
         measure: returns an image's upright size and EXIF orientation, which the files do not give. An image that is not
             on disk gets the size of the other images in its file.
         images: folder of the images, if they are not where the files say: under the listed paths, or their last parts.
-        camera: its picture size is taken for images that are not on disk if none of their file is.
+        camera: has the size of images that are not on disk if no image of a file is; by default the size of the first.
 
     Raises:
         UserError: a file is malformed or lists no image that is on disk, or there is no file.
     """
-    frames: list[Frame] = []
+    frames, missing = list[Frame](), list[str]()
     for split in SPLITS:
         path = _file(folder, split)
         if path.exists():
-            content, size = read_json_object(path), None if camera is None else camera.size
-            listed = listed_frames(path, content, measure, suffix=".png", images=images, size=size)
+            size = camera.size if camera else frames[0].camera.size if frames else None
+            content = read_json_object(path)
+            listed, unknown = listed_frames(path, content, measure, suffix=".png", images=images, size=size)
             frames += [replace(frame, split=split) for frame in listed]
+            missing += unknown
     if not frames:
         raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")
     check_unique_names(folder, frames)
-    return Capture(tuple(frames), np.zeros((0, 3)), (), None, "blender")
+    return Capture(tuple(frames), np.zeros((0, 3)), tuple(missing), None, "blender")
 
 
 def losses_blender(capture: Capture) -> tuple[str, ...]:

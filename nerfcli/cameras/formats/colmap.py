@@ -10,6 +10,7 @@ Source: colmap.github.io/format.html; colmap src/colmap/scene/reconstruction_io_
 import struct
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,9 +18,9 @@ from nerfcli.atomic import atomic_folder
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats import colmap_binary, colmap_text
 from nerfcli.cameras.formats.colmap_model import ColmapImage, ColmapModel, capture_of, model_of
+from nerfcli.cameras.formats.photo_names import IMAGE_FOLDERS
 from nerfcli.cameras.formats.unsupported import lost_parts
-from nerfcli.cameras.frame import Capture, Frame
-from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling
+from nerfcli.cameras.frame import Capture
 from nerfcli.errors import UserError
 
 FILES = ("cameras", "images", "points3D")
@@ -34,42 +35,6 @@ T = TypeVar("T")
 def is_model(folder: Path) -> bool:
     """Return whether a folder contains the three files of a COLMAP model, binary or text."""
     return any(all((folder / f"{name}{suffix}").is_file() for name in FILES) for suffix in _ENCODINGS)
-
-
-def read_colmap(model_dir: Path, image_dir: Path, measure: Measure) -> Capture:
-    """Read the registered images of a COLMAP model, with the pictures found under `image_dir`.
-
-    Args:
-        model_dir: holds cameras, images and points3D, as .bin (which wins) or .txt.
-        image_dir: image names are relative to it; they may contain subfolders.
-
-    Raises:
-        UserError: a file of the model is missing or damaged, or no image is on disk.
-    """
-    return colmap_on_disk(read_model(model_dir), image_dir, measure, model_dir)
-
-
-def colmap_on_disk(model: ColmapModel, image_dir: Path, measure: Measure, model_dir: Path) -> Capture:
-    """Return `read_colmap` for a model that was already read from `model_dir`."""
-    frames, missing, rescaled = [], [], []
-    for image in model.images:
-        path = image_dir / image.name
-        if not path.is_file():
-            missing.append(image.name)
-            continue
-        calibrated = model.cameras[image.camera_id]
-        camera, world_from_cam = fit_to_picture(calibrated, image.world_from_cam, path=path, measure=measure)
-        rescaled.append(rescaling(calibrated, camera))
-        frames.append(Frame(image.name, camera, world_from_cam, image=path))
-    if not frames:
-        raise UserError(
-            f"none of the {len(missing)} images of the model {model_dir} exists in {image_dir}"
-            + (f", such as {missing[0]}" if missing else ""),
-            "put the photos there, with the names listed in the model",
-        )
-    return Capture(
-        tuple(frames), model.points, tuple(missing), None, "colmap", pixels="upright", rescaled=counted(rescaled)
-    )
 
 
 def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
@@ -93,6 +58,23 @@ def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
             f"{_file(model_dir, 'images')} and {_file(model_dir, 'points3D').name} do not belong together: {error}",
             "the files come from different reconstructions; copy all of them again",
         ) from error
+
+
+def parse_model(model_dir: Path, *, images: Path | None = None) -> Capture:
+    """Read a COLMAP model, with its photos in the folder that contains most of its names.
+
+    The folders tried are the given one (`images`); or images/ and the like in the model's folder or up to three folders
+    above it, then these folders themselves, as names may include the image folder.
+    """
+    capture = parse_colmap(model_dir)
+    homes = (model_dir, *model_dir.resolve().parents[:3])
+    folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
+    places = [*folders, *homes] if images is None else [images]
+    counts = [sum((place / frame.name).is_file() for frame in capture.frames) for place in places]
+    best = places[counts.index(max(counts))] if any(counts) else next(iter(folders), None)
+    if best is None:
+        return capture
+    return replace(capture, frames=tuple(replace(frame, image=best / frame.name) for frame in capture.frames))
 
 
 def read_model(model_dir: Path) -> ColmapModel:

@@ -17,35 +17,15 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
 from nerfcli.cameras.formats.limits import checked_camera, plausible, rigid_poses
 from nerfcli.cameras.formats.npy import DAMAGED, array_of_npy
-from nerfcli.cameras.formats.photo_names import ListImages
+from nerfcli.cameras.formats.photo_names import IMAGE_FOLDERS, ListImages
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.cameras.frame import Capture, Frame
-from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling
 from nerfcli.errors import UserError
 
 FILE = "poses_bounds.npy"
-IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 
 # Percentiles of the depths of a view's points that give its depth bounds. Source: pose_utils.py, save_poses.
 _NEAR_PERCENT, _FAR_PERCENT = 0.1, 99.9
-
-
-def read_llff(folder: Path, measure: Measure, list_images: ListImages) -> Capture:
-    """Read a capture in LLFF's format, with the first image folder that holds one image per row.
-
-    Raises:
-        UserError: the array is damaged or of another shape, or no image folder has as many images as it has rows.
-    """
-    path = folder / FILE
-    rows = _read_rows(path)
-    images = _images_of_rows(folder, len(rows), list_images)
-    frames, rescaled = [], []
-    for image, (calibrated, world_from_cam) in zip(images, _views(path, rows), strict=True):
-        camera, world_from_cam = fit_to_picture(calibrated, world_from_cam, path=image, measure=measure)
-        rescaled.append(rescaling(calibrated, camera))
-        frames.append(Frame(_name(image), camera, world_from_cam, image=image))
-    bounds = rows[:, 15:].copy()
-    return Capture(tuple(frames), np.zeros((0, 3)), (), bounds, "llff", pixels="upright", rescaled=counted(rescaled))
 
 
 def parse_llff(folder: Path, list_images: ListImages) -> Capture:

@@ -17,7 +17,7 @@ from nerfcli.cameras.formats.fields import malformed
 from nerfcli.cameras.formats.lenses import camera_of_matrix
 from nerfcli.cameras.formats.limits import plausible
 from nerfcli.cameras.formats.npy import DAMAGED, array_of_npy, members_of_npz
-from nerfcli.cameras.formats.photo_names import ListImages
+from nerfcli.cameras.formats.photo_names import GIVE_PHOTOS, ListImages
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, stored_size
 from nerfcli.errors import UserError
@@ -52,7 +52,7 @@ def parse_neus(path: Path, measure: Measure, list_images: ListImages, *, images:
         raise UserError(
             f"{path} has {count} cameras, but there are {len(photos)} photos",
             "photos and cameras are paired by order: put the photos of all cameras, and no others, into image/ beside "
-            "the file, or give their folder with --images",
+            f"the file; or {GIVE_PHOTOS}",
         )
     names = [f"world_mat_{index}" for index in range(count)]
     views = [_decomposed(_projection(members[name], f"{path}: {name}"), f"{path}: {name}") for name in names]

@@ -7,6 +7,13 @@ from pathlib import Path
 from nerfcli.cameras.formats.fields import malformed, shown
 from nerfcli.cameras.orientation import Measure, stored_size
 
+# Folders of photos beside a file of cameras, in the order of preference; the numbers are factors of reduction.
+IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
+
+# Hints for a capture without photos, and without cameras.
+GIVE_PHOTOS = "give their folder: nerfcli convert IN SCENE --to nerfcli --images FOLDER"
+GIVE_CAMERA = "give the camera: nerfcli convert IN SCENE --to nerfcli --images FOLDER --intrinsics FILE"
+
 # Returns the image files of a folder, sorted by name.
 ListImages = Callable[[Path], list[Path]]
 
@@ -43,7 +50,7 @@ class PhotoOfStem:
             raise malformed(
                 where,
                 f"none of its {len(self._missing)} photos exists in {self._folder}, such as {shown(self._missing[0])}",
-                "the photos are needed, as they give the names; give their folder with --images",
+                f"the photos are needed, as they give the names; {GIVE_PHOTOS}",
             )
         return tuple(self._missing)
 
@@ -80,6 +87,6 @@ def measured_sizes(
         raise malformed(
             str(path),
             f"none of the {len(missing)} listed photos exists in {folder}, such as {shown(missing[0])}",
-            "the file does not give image sizes, so the photos are needed, with the listed names",
+            f"the photos are needed, as the file does not give their sizes; {GIVE_PHOTOS}",
         )
     return sizes, tuple(missing)

@@ -21,7 +21,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, size_of
 from nerfcli.cameras.formats.lenses import camera_of_matrix
 from nerfcli.cameras.formats.limits import checked_camera, rigid_pose
-from nerfcli.cameras.formats.photo_names import ListImages, PhotoOfStem
+from nerfcli.cameras.formats.photo_names import GIVE_CAMERA, ListImages, PhotoOfStem
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, stored_size
 from nerfcli.errors import UserError
@@ -119,7 +119,7 @@ def _cameras(folder: Path, camera: Camera | None) -> Callable[[tuple[int, int]],
     if path is None:
         raise UserError(
             f"{folder} has poses but no file of intrinsics, such as {_INTRINSICS[0]}",
-            "give the camera with --intrinsics FILE",
+            GIVE_CAMERA,
         )
     rows = [line.split() for _, line in content_lines(read_text(path, "expected a matrix of intrinsics"))]
     lengths = [len(row) for row in rows]

@@ -16,6 +16,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, shown
 from nerfcli.cameras.formats.limits import quaternion_pose, rigid_pose
+from nerfcli.cameras.formats.photo_names import GIVE_CAMERA
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import UserError
@@ -96,7 +97,7 @@ def _parse(
     if camera is None:
         raise UserError(
             f"{path}: a {kind.upper()} trajectory contains poses but no camera",
-            "give the camera with --intrinsics FILE",
+            GIVE_CAMERA,
         )
     frames = []
     for index, (number, line) in enumerate(content_lines(read_text(path, expected))):

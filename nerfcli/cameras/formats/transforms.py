@@ -27,7 +27,7 @@ from nerfcli.cameras.formats.transforms_cameras import (
 )
 from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.cameras.frame import Capture, Frame, Size
-from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling, stored_size
+from nerfcli.cameras.orientation import Measure, stored_size
 from nerfcli.errors import UserError
 
 SPLITS = ("train", "val", "test")
@@ -36,26 +36,8 @@ SPLITS = ("train", "val", "test")
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
 
 
-def read_transforms(path: Path, measure: Measure) -> Capture:
-    """Read a capture from one transforms.json (nerfstudio, instant-ngp), with the images that are on disk.
-
-    Args:
-        path: the JSON file; image paths in it are relative to its folder.
-
-    Raises:
-        UserError: the file is malformed (file and field are named), or none of its images is on disk.
-    """
-    content = read_json_object(path)
-    frames, missing, rescaled = frames_on_disk(path, content, measure)
-    splits = _listed_splits(path, content)
-    frames = [replace(frame, split=splits.get(frame.name)) for frame in frames]
-    capture = capture_on_disk(path, frames, missing, rescaled=rescaled, kind="transforms")
-    points, colours = _points_beside(path, content)
-    return replace(capture, points=points, colours=colours)
-
-
 def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
-    """Read a transforms.json, whether or not its images exist.
+    """Read a transforms.json, whether or not its images exist; those without a known size are `missing`.
 
     Poses and points stay in the file's own world. nerfstudio's applied_transform and applied_scale say how that world
     came from the original world of the poses (COLMAP's). They are not undone, since the cameras would then no longer
@@ -69,12 +51,12 @@ def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
         UserError: the file, or the PLY file of points that it names, is malformed or missing; file and field are named.
     """
     content = read_json_object(path)
-    frames = listed_frames(path, content, measure)
+    frames, missing = listed_frames(path, content, measure)
     splits = _listed_splits(path, content)
     frames = [replace(frame, split=splits.get(frame.name)) for frame in frames]
     check_unique_names(path, frames)
     points, colours = _points_beside(path, content)
-    return Capture(tuple(frames), points, (), None, "transforms", colours=colours)
+    return Capture(tuple(frames), points, tuple(missing), None, "transforms", colours=colours)
 
 
 def losses_transforms(capture: Capture) -> tuple[str, ...]:
@@ -136,45 +118,6 @@ def records_of(path: Path, content: dict[str, Any]) -> list[dict[str, Any]]:
     return records
 
 
-def frames_on_disk(
-    path: Path, content: dict[str, Any], measure: Measure
-) -> tuple[list[Frame], list[str], list[tuple[Size, Size] | None]]:
-    """Return the frames whose image is on disk, fitted to it, the names of the others, and how each was rescaled."""
-    frames, missing, rescaled = [], [], []
-    records = records_of(path, content)
-    poses = _poses(path, records)
-    for index, (record, world_from_cam) in enumerate(zip(records, poses, strict=True)):
-        where = f"{path}: frames[{index}]"
-        listed = _listed_path(record, where)
-        image = _find_image(path.parent, listed)
-        if image is None:
-            missing.append(_name_of(listed, where))
-            continue
-        merged = {**content, **record}
-        calibrated = camera_of_record(merged, given_size(merged, where) or stored_size(image, measure), where)
-        camera, world_from_cam = fit_to_picture(calibrated, world_from_cam, path=image, measure=measure)
-        rescaled.append(rescaling(calibrated, camera))
-        mask = _find_mask(path.parent, record.get("mask_path"), where)
-        name = _name_of(listed, where, suffix=image.suffix)
-        frames.append(Frame(name, camera, world_from_cam, image=image, mask=mask))
-    return frames, missing, rescaled
-
-
-def capture_on_disk(
-    path: Path, frames: list[Frame], missing: list[str], *, rescaled: list[tuple[Size, Size] | None], kind: str
-) -> Capture:
-    """Return the capture of `frames_on_disk`; raise a UserError if it has no frames or two with the same name."""
-    if not frames:
-        raise UserError(
-            f"{path}: none of the {len(missing)} listed images exists, such as {missing[0]}",
-            "put the images where file_path points, relative to this file",
-        )
-    check_unique_names(path, frames)
-    return Capture(
-        tuple(frames), np.zeros((0, 3)), tuple(missing), None, kind, pixels="upright", rescaled=counted(rescaled)
-    )
-
-
 def listed_frames(
     path: Path,
     content: dict[str, Any],
@@ -183,12 +126,14 @@ def listed_frames(
     suffix: str = "",
     images: Path | None = None,
     size: Size | None = None,
-) -> list[Frame]:
-    """Return all frames of a file as listed; frames with equal intrinsics share one camera.
+) -> tuple[list[Frame], list[str]]:
+    """Return the frames of a file as listed, and the names of images whose size is unknown, which have no frame.
+
+    Frames with equal intrinsics share one camera.
 
     Args:
         measure: returns an image's size, if the file does not give it. An image that is not on disk either gets the
-            size of the other images, if they all have the same.
+            size of the other images, if they all have the same; if none has one, it is an error.
         suffix: appended to a file_path without a suffix if no such image is on disk, as the format does.
         images: a folder where images are looked for first: under the paths that the file lists, or their last parts.
         size: of the images, if the file does not give it and none is on disk.
@@ -198,30 +143,32 @@ def listed_frames(
     merged = [{**content, **record} for record in records]
     wheres = [f"{path}: frames[{index}]" for index in range(len(records))]
     places, names = [], []
+    is_path = not any("file_path" in record for record in records)  # the views of a camera path have no photo
     for index, (record, where) in enumerate(zip(records, wheres, strict=True)):
-        # The views of a camera path have no photo.
-        listed = _listed_path({"file_path": f"frame_{index:04d}", **record}, where)
+        listed = _listed_path({"file_path": f"frame_{index:04d}"} if is_path else record, where)
         plain = listed.replace("\\", "/")
-        given = None
+        found = None
         if images is not None:
-            given = _find_image(images, plain) or _find_image(images, PurePosixPath(plain).name)
-        ending = ""
-        if not PurePosixPath(plain).suffix:
-            found = given or _find_image(path.parent, listed)
-            ending = suffix if found is None else found.suffix
+            found = _find_image(images, plain) or _find_image(images, PurePosixPath(plain).name)
+        found = found or _find_image(path.parent, listed)
+        ending = suffix if found is None and not PurePosixPath(plain).suffix else "" if found is None else found.suffix
         names.append(_name_of(listed, where, suffix=ending))
-        places.append(given or path.parent / (plain if plain.endswith(ending) else plain + ending))
+        places.append(found or path.parent / (plain if plain.endswith(ending) else plain + ending))
     sizes = _sizes(merged, places, wheres, measure=measure, default=size)
     cameras: dict[Camera, Camera] = {}
-    frames = []
-    for record, where, size, name, image, pose in zip(merged, wheres, sizes, names, places, poses, strict=True):
-        camera = camera_of_record(record, size, where)
+    frames, missing = [], []
+    for record, where, known, name, image, pose in zip(merged, wheres, sizes, names, places, poses, strict=True):
+        if known is None:
+            missing.append(name)
+            continue
+        camera = camera_of_record(record, known, where)
         mask = record.get("mask_path")
         if mask is not None and (not isinstance(mask, str) or not mask):
             raise malformed(where, f"mask_path is {mask!r:.80}", "expected the mask's path as text")
-        mask = None if mask is None else path.parent / mask.replace("\\", "/")
+        if mask is not None:
+            mask = _find_image(path.parent, mask) or path.parent / mask.replace("\\", "/")
         frames.append(Frame(name, cameras.setdefault(camera, camera), pose, image=image, mask=mask))
-    return frames
+    return frames, missing
 
 
 def relative_path(frame: Frame, folder: Path) -> str:
@@ -236,8 +183,8 @@ def _sizes(
     *,
     measure: Measure | None,
     default: Size | None,
-) -> list[Size]:
-    """Return the width and height of each frame's picture: given, else measured, else the only such size or default."""
+) -> list[Size | None]:
+    """Return the width and height of each frame's picture, given, measured, or the only ones known; None if unknown."""
     sizes = [given_size(record, where) for record, where in zip(records, wheres, strict=True)]
     if measure is not None:
         sizes = [
@@ -245,12 +192,9 @@ def _sizes(
             for size, image in zip(sizes, images, strict=True)
         ]
     given = {size for size in sizes if size is not None} or ({default} if default else set[Size]())
-    result = []
-    for size, where, image in zip(sizes, wheres, images, strict=True):
-        if size is None and len(given) != 1:
-            raise malformed(where, f"w and h are missing, and {image} does not exist", "add the image, or w and h")
-        result.append(next(iter(given)) if size is None else size)
-    return result
+    if not given:
+        raise malformed(wheres[0], f"w and h are missing, and {images[0]} does not exist", "add the image, or w and h")
+    return [next(iter(given)) if size is None and len(given) == 1 else size for size in sizes]
 
 
 def check_unique_names(path: Path, frames: list[Frame]) -> None:
@@ -285,15 +229,6 @@ def _find_image(folder: Path, listed: str) -> Path | None:
             if candidate.is_file():
                 return candidate
     return None
-
-
-def _find_mask(folder: Path, listed: Any, where: str) -> Path | None:
-    if listed is None:
-        return None
-    mask = _find_image(folder, str(listed))
-    if mask is None:
-        raise malformed(where, f"mask {listed} does not exist", "add the mask, or remove mask_path from the entry")
-    return mask
 
 
 def _poses(path: Path, records: list[dict[str, Any]]) -> np.ndarray:

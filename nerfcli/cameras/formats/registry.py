@@ -1,4 +1,7 @@
-"""The formats of captures in one table: how each is recognised, parsed, written, and what it cannot hold."""
+"""The formats of captures in one table: how each is recognised, parsed, written, and what it cannot hold.
+
+All commands that read captures go through it.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -12,6 +15,7 @@ from nerfcli.cameras.formats import (
     bundler,
     camera_path,
     colmap,
+    finding,
     llff,
     metashape,
     mvsnet,
@@ -26,12 +30,11 @@ from nerfcli.cameras.formats import (
     trajectories,
     transforms,
 )
-from nerfcli.cameras.formats.scene_json import SCENE_FILE
+from nerfcli.cameras.formats.photo_names import IMAGE_FOLDERS
+from nerfcli.cameras.formats.scene_folder import SCENE_FILE, SCENE_FILES, losses_scene, parse_scene, write_scene
 from nerfcli.cameras.frame import Capture, Frame
-from nerfcli.convert import finding
-from nerfcli.convert.scene_folder import SCENE_FILES, losses_scene, parse_model, parse_scene, write_scene
-from nerfcli.convert.stored_pixels import STORED, UPRIGHT, measure
-from nerfcli.errors import UserError, in_shell
+from nerfcli.cameras.stored_pixels import measure
+from nerfcli.errors import UserError, in_shell, several
 from nerfcli.media.images import list_images
 from nerfcli.media.masks import mask_of
 
@@ -56,6 +59,7 @@ class Format:
     """A format of captures.
 
     Args:
+        of: what it is, or which programs write it.
         looked_for: what it is recognised by, in a few words for people; "" for formats that are only written.
         find: returns where such a capture is in a file or folder; None if there is none.
         parse: reads what `find` found, or what `write` wrote.
@@ -64,14 +68,13 @@ class Format:
         open_centre: whether principal points with other pixel centres are found in such files.
         default_name: the name of its file if the target is a folder; "" for formats that fill a folder.
         files: the names of all files that it may write, where "*" stands for that file's name without its suffix.
-        pixels: which pixels of EXIF-turned photos its cameras refer to, see `Capture`.
         lacks: which of "cameras", "poses" and "points" it has no place for.
         listed_by: the order of frames in its files, as a key to sort by; by default, that of the capture.
         write, losses: None for formats that are only read.
     """
 
     name: str
-    title: str
+    of: str
     looked_for: str
     find: Callable[[Path], Path | None]
     parse: Callable[[Path, UserInputs], Capture]
@@ -80,29 +83,39 @@ class Format:
     open_centre: bool = False
     default_name: str = ""
     files: tuple[str, ...] = ()
-    pixels: str = STORED
     lacks: tuple[str, ...] = ()
     listed_by: Callable[[Frame], Any] = lambda frame: 0
     write: Callable[[Capture, Path], None] | None = None
     losses: Callable[[Capture], tuple[str, ...]] | None = None
 
 
+def recognised(path: Path) -> tuple[Format, Path] | None:
+    """Return the format of the capture in a file or folder, and the file or folder in it to parse; None without one."""
+    return next(((form, found) for form in FORMATS if (found := form.find(path)) is not None), None)
+
+
 def recognise(path: Path) -> tuple[Format, Path]:
-    """Return the format of the capture in a file or folder, and the file or folder in it to parse.
+    """Return what `recognised` returns.
 
     Raises:
         UserError: there is nothing, or nothing in a known format; the message lists what was looked for.
     """
     if not path.exists():
-        raise UserError(f"{path} does not exist", "give a file or folder of cameras")
-    for form in FORMATS:
-        found = form.find(path)
-        if found is not None:
-            return form, found
-    if path.is_dir() and list_images(path):
-        raise UserError(f"{path} contains photos but no cameras", f"estimate them with: nerfcli poses {in_shell(path)}")
+        raise UserError(f"{path} does not exist", "give a capture: a file or folder of cameras, or a scene folder")
+    if (found := recognised(path)) is not None:
+        return found
+    if photos := photo_folder(path):
+        raise UserError(
+            f"{photos} has {several(len(list_images(photos)), 'photo')} but no cameras",
+            f"estimate them with: nerfcli poses {in_shell(photos)}",
+        )
     looked_for = ", ".join(dict.fromkeys(form.looked_for for form in FORMATS if form.looked_for))
     raise UserError(f"{path} contains no capture in a supported format", f"looked for {looked_for}")
+
+
+def photo_folder(path: Path) -> Path | None:
+    """Return the folder that contains photos: `path` or its subfolder `images`; None if neither does."""
+    return next((folder for folder in (path, path / "images") if folder.is_dir() and list_images(folder)), None)
 
 
 def format_named(name: str) -> Format:
@@ -126,12 +139,16 @@ def recording(form: Format, provenance: Mapping[str, Any]) -> Format:
     return replace(form, write=lambda capture, folder: write_scene(capture, folder, provenance=provenance))
 
 
-def with_photos(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with its photos looked up in another folder, by their names or by their file names alone."""
+def with_photos(capture: Capture, *folders: Path) -> Capture:
+    """Return the capture with its photos looked up in folders, by their names, file names alone, or without suffix."""
+    stems = [{photo.stem: photo for photo in reversed(list_images(folder))} for folder in folders if folder.is_dir()]
     frames = []
     for frame in capture.frames:
-        candidates = (folder / frame.name, folder / Path(frame.name).name)
-        frames.append(replace(frame, image=next((path for path in candidates if path.is_file()), frame.image)))
+        name = Path(frame.name).name
+        paths = [*(folder / frame.name for folder in folders), *(folder / name for folder in folders)]
+        named = next((path for path in paths if path.is_file()), None)
+        image = named or next((photos[name] for photos in stems if name in photos), frame.image)
+        frames.append(replace(frame, image=image))
     return replace(capture, frames=tuple(frames))
 
 
@@ -158,24 +175,24 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
     return replace(capture, frames=tuple(frames))
 
 
+# The first format that is found in a folder counts, so those that hold more come first.
 FORMATS = (
     Format(
         "nerfcli",
-        "a scene folder of nerfcli: a COLMAP model in sparse/0, and scene.json",
+        "a scene folder",
         SCENE_FILE,
         finding.folder_of(SCENE_FILE),
         lambda path, given: parse_scene(path, images=given.images),
-        pixels=UPRIGHT,
         files=SCENE_FILES,
         write=write_scene,
         losses=losses_scene,
     ),
     Format(
         "colmap",
-        "a COLMAP model, binary; read also as text",
+        "a COLMAP model",
         "sparse/0/cameras.bin or .txt",
         finding.find_model,
-        lambda path, given: parse_model(path, images=given.images),
+        lambda path, given: colmap.parse_model(path, images=given.images),
         files=colmap.MODEL_FILES,
         write=colmap.write_colmap_binary,
         losses=colmap.losses_colmap,
@@ -185,41 +202,16 @@ FORMATS = (
         "a COLMAP model as text",
         "sparse/0/cameras.bin or .txt",
         finding.find_model,
-        lambda path, given: parse_model(path, images=given.images),
+        lambda path, given: colmap.parse_model(path, images=given.images),
         files=colmap.MODEL_FILES,
         write=colmap.write_colmap_text,
         losses=colmap.losses_colmap_text,
     ),
     Format(
-        "run",
-        "the cameras of a run, as refined by training (read)",
-        "cameras.json of a run",
-        run_cameras.find_run,
-        lambda path, given: run_cameras.parse_run(path),
-        pixels=UPRIGHT,
-    ),
-    Format(
-        "camera-path",
-        "a camera path of nerfstudio's viewer (read)",
-        "camera_path.json",
-        finding.find_camera_path,
-        lambda path, given: camera_path.parse_camera_path(path),
-        axes="opengl",
-        open_axes=True,
-        lacks=("cameras", "points"),
-    ),
-    Format(
-        "alicevision",
-        "cameras.sfm or sfm.json of AliceVision and Meshroom (read)",
-        ".sfm",
-        finding.find_alicevision,
-        lambda path, given: alicevision.parse_alicevision(path, images=given.images),
-    ),
-    Format(
         "transforms",
-        "transforms.json of nerfstudio and instant-ngp",
+        "nerfstudio, instant-ngp",
         "transforms.json",
-        lambda path: finding.find_json(path, opening="{", name="transforms.json"),
+        finding.find_transforms,
         lambda path, given: transforms.parse_transforms(path, measure),
         axes="opengl",
         open_axes=True,
@@ -231,7 +223,7 @@ FORMATS = (
     ),
     Format(
         "blender",
-        "transforms_{train,val,test}.json of NeRF's Blender scenes",
+        "NeRF's synthetic scenes",
         "transforms_train.json",
         finding.find_blender,
         lambda path, given: blender.parse_blender(path, measure, images=given.images, camera=given.camera),
@@ -245,7 +237,7 @@ FORMATS = (
     ),
     Format(
         "llff",
-        "poses_bounds.npy of LLFF",
+        "poses_bounds.npy",
         "poses_bounds.npy",
         finding.folder_of(llff.FILE),
         lambda path, given: llff.parse_llff(path, list_images),
@@ -259,7 +251,7 @@ FORMATS = (
     ),
     Format(
         "opensfm",
-        "reconstruction.json of OpenSfM and OpenDroneMap",
+        "OpenSfM, OpenDroneMap",
         "reconstruction.json",
         lambda path: finding.find_json(path, opening="[", name="reconstruction.json"),
         lambda path, given: opensfm.parse_opensfm(path),
@@ -270,21 +262,23 @@ FORMATS = (
     ),
     Format(
         "metashape",
-        "cameras of Agisoft Metashape as XML (read)",
+        "Agisoft Metashape",
         ".xml",
         finding.by_suffix(".xml", "cameras.xml"),
-        lambda path, given: metashape.parse_metashape(path),
+        lambda path, given: with_photos(
+            metashape.parse_metashape(path), *(path.parent / name for name in IMAGE_FOLDERS), path.parent
+        ),
     ),
     Format(
         "reality-capture",
-        "cameras of RealityScan or RealityCapture as CSV (read)",
+        "RealityScan, RealityCapture",
         ".csv",
-        finding.by_suffix(".csv"),
+        finding.find_reality_capture,
         lambda path, given: reality_capture.parse_reality_capture(path, measure, images=given.images),
     ),
     Format(
         "bundler",
-        "bundle.out of Bundler (read)",
+        "Bundler",
         "bundle.out",
         finding.find_bundler,
         lambda path, given: bundler.parse_bundler(path, measure, images=given.images),
@@ -292,7 +286,7 @@ FORMATS = (
     ),
     Format(
         "polycam",
-        "raw data of Polycam (read)",
+        "raw data of Polycam",
         "keyframes/",
         finding.find_polycam,
         lambda path, given: polycam.parse_polycam(path, list_images, images=given.images),
@@ -300,7 +294,7 @@ FORMATS = (
     ),
     Format(
         "record3d",
-        "an unpacked capture of Record3D (read)",
+        "Record3D",
         "metadata.json",
         finding.find_record3d,
         lambda path, given: record3d.parse_record3d(path, list_images, images=given.images),
@@ -308,26 +302,50 @@ FORMATS = (
     ),
     Format(
         "mvsnet",
-        "cams/ of MVSNet and BlendedMVS (read)",
+        "cams/ of MVSNet, BlendedMVS",
         "cams/",
         finding.find_mvsnet,
         lambda path, given: mvsnet.parse_mvsnet(path, measure, list_images, images=given.images),
     ),
     Format(
         "neus",
-        "cameras_sphere.npz of IDR and NeuS (read)",
+        "projections of IDR, NeuS",
         ".npz",
         finding.find_neus,
         lambda path, given: neus.parse_neus(path, measure, list_images, images=given.images),
     ),
     Format(
         "pose-files",
-        "a matrix per photo in text files, as in ScanNet, 7-Scenes and NSVF (read)",
+        "a matrix per photo, as in ScanNet, 7-Scenes, NSVF",
         "pose/*.txt",
         finding.find_pose_files,
         lambda path, given: pose_files.parse_pose_files(
             path, measure, list_images, camera=given.camera, images=given.images
         ),
+    ),
+    Format(
+        "alicevision",
+        "AliceVision, Meshroom",
+        ".sfm",
+        finding.find_alicevision,
+        lambda path, given: alicevision.parse_alicevision(path, images=given.images),
+    ),
+    Format(
+        "run",
+        "cameras refined by training",
+        "cameras.json of a run",
+        run_cameras.find_run,
+        lambda path, given: run_cameras.parse_run(path),
+    ),
+    Format(
+        "camera-path",
+        "a camera path of nerfstudio's viewer",
+        "camera_path.json",
+        finding.find_camera_path,
+        lambda path, given: camera_path.parse_camera_path(path),
+        axes="opengl",
+        open_axes=True,
+        lacks=("cameras", "points"),
     ),
     Format(
         "tum",
@@ -357,7 +375,7 @@ FORMATS = (
     ),
     Format(
         "ply",
-        "the points only (written)",
+        "the points only",
         "",
         lambda path: None,
         lambda path, given: Capture((), ply.read_ply_points(path)[0], (), None, "ply"),

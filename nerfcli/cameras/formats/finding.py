@@ -18,6 +18,7 @@ from nerfcli.cameras.formats import (
     polycam,
     pose_files,
     record3d,
+    run_cameras,
 )
 from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.errors import UserError
@@ -64,11 +65,18 @@ def find_blender(path: Path) -> Path | None:
 
 def find_bundler(path: Path) -> Path | None:
     """Find a file .out, Bundler's own in a folder, or the only one in it that begins as a file of Bundler does."""
-    found = by_suffix(".out", "bundle.out", "bundle/bundle.out")(path)
-    if found is not None or not path.is_dir():
-        return found
-    others = [other for other in sorted(path.glob("*.out")) if other.is_file() and _begins(other, bundler.BEGINS)]
-    return others[0] if len(others) == 1 else None
+    return by_suffix(".out", "bundle.out", "bundle/bundle.out")(path) or _only(path, "*.out", bundler.BEGINS)
+
+
+def find_reality_capture(path: Path) -> Path | None:
+    """Find a file .csv, or the only one in a folder that begins with the header of such a table."""
+    return by_suffix(".csv")(path) or _only(path, "*.csv", "#name,")
+
+
+def _only(folder: Path, pattern: str, begins: str) -> Path | None:
+    """Return the file in a folder that matches a pattern and begins with a text, if there is only one."""
+    found = [path for path in sorted(folder.glob(pattern)) if path.is_file() and _begins(path, begins)]
+    return found[0] if len(found) == 1 else None
 
 
 def _begins(path: Path, text: str) -> bool:
@@ -92,6 +100,14 @@ def find_alicevision(path: Path) -> Path | None:
     if found is None and path.is_file() and path.suffix.lower() == ".json":
         return path if _has_keys(path, b'"featuresFolders"', alicevision.is_alicevision) else None
     return found
+
+
+def find_transforms(path: Path) -> Path | None:
+    """Find transforms.json in a folder, or a JSON file of an object that is none of another format."""
+    others = (run_cameras.find_run, find_camera_path, find_alicevision, find_record3d)
+    if path.is_file() and any(find(path) is not None for find in others):
+        return None
+    return find_json(path, opening="{", name="transforms.json")
 
 
 def find_record3d(path: Path) -> Path | None:

@@ -1,0 +1,236 @@
+"""The same views and photos as a small capture in every format that training reads, written out by hand if need be."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.registry import format_named
+from nerfcli.cameras.formats.run_cameras import write_cameras
+from nerfcli.cameras.frame import Capture, Frame
+
+OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Views:
+    """Views of one PINHOLE camera.
+
+    Args:
+        poses: (N, 4, 4) world_from_cam, OpenCV axes.
+        photos: copied into the capture; None for grey pictures.
+    """
+
+    camera: Camera
+    poses: np.ndarray
+    photos: tuple[Path, ...] | None = None
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The matrix of intrinsics, (3, 3)."""
+        fx, fy, cx, cy = self.camera.params
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+    @property
+    def opengl_from_world(self) -> np.ndarray:
+        """The inverses of the poses, with OpenGL axes, (N, 3, 4)."""
+        return OPENGL @ rigid.inverse(self.poses)[:, :3]
+
+    def put(self, index: int, path: Path) -> Path:
+        """Put a photo at a path."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if self.photos is None:
+            cv2.imwrite(str(path), np.full((self.camera.height, self.camera.width, 3), 128, np.uint8))
+        else:
+            shutil.copy(self.photos[index], path)
+        return path
+
+    def frames(self, folder: Path) -> list[Frame]:
+        """Return the views as frames, with their photos in folder/images."""
+        names = [f"{index}.jpg" for index in range(len(self.poses))]
+        images = [self.put(index, folder / "images" / name) for index, name in enumerate(names)]
+        return [Frame(n, self.camera, p, image=i) for n, p, i in zip(names, self.poses, images, strict=True)]
+
+
+def numbers(values: np.ndarray) -> str:
+    return " ".join(map(repr, np.ravel(values).tolist()))
+
+
+def matrix_text(matrix: np.ndarray) -> str:
+    return "\n".join(map(numbers, matrix)) + "\n"
+
+
+def text(path: Path, content: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content, encoding="utf-8")
+    return path
+
+
+def write_by(name: str, place: str, views: Views, folder: Path) -> Path:
+    """Write a capture by the writer of its format."""
+    frames = views.frames(folder)
+    bounds = np.tile([0.1, 100.0], (len(frames), 1))
+    write = format_named(name).write
+    assert write is not None
+    write(Capture(tuple(frames), np.zeros((0, 3)), (), bounds, "made"), folder / place)
+    return folder / place
+
+
+def write_run(views: Views, folder: Path) -> Path:
+    frames = views.frames(folder)
+    write_cameras(folder, frames[1:], frames[:1])
+    text(folder / "config.json", "{}")
+    return folder / "cameras.json"
+
+
+def write_scannet(views: Views, folder: Path) -> Path:
+    """ScanNet's SensReader: 4x4 matrices everywhere."""
+    for index, pose in enumerate(views.poses):
+        views.put(index, folder / f"color/{index}.jpg")
+        text(folder / f"pose/{index}.txt", matrix_text(pose))
+    intrinsics = np.eye(4)
+    intrinsics[:3, :3] = views.matrix
+    text(folder / "intrinsic/intrinsic_color.txt", matrix_text(intrinsics))
+    return folder / "pose/0.txt"
+
+
+def write_mvsnet(views: Views, folder: Path) -> Path:
+    for index, pose in enumerate(views.poses):
+        views.put(index, folder / f"images/{index:08d}.jpg")
+        blocks = (f"extrinsic\n{matrix_text(np.linalg.inv(pose))}", f"intrinsic\n{matrix_text(views.matrix)}")
+        text(folder / f"cams/{index:08d}_cam.txt", "\n".join((*blocks, "2.5 0.01\n")))
+    return folder / "cams/00000000_cam.txt"
+
+
+def write_neus(views: Views, folder: Path) -> Path:
+    """The product K [R t] scaled by numbers of both signs, as a projection is only defined up to its scale."""
+    arrays = {}
+    for index, pose in enumerate(views.poses):
+        views.put(index, folder / f"image/{index:03d}.png")
+        views.put(index, folder / f"mask/{index:03d}.png")
+        projection = np.eye(4)
+        projection[:3] = (1.0, -2.0, 0.3)[index % 3] * views.matrix @ np.linalg.inv(pose)[:3]
+        arrays |= {f"world_mat_{index}": projection, f"scale_mat_{index}": 2 * np.eye(4)}
+    np.savez(folder / "cameras_sphere.npz", **arrays)
+    return folder / "cameras_sphere.npz"
+
+
+def write_polycam(views: Views, folder: Path) -> Path:
+    lens = dict(zip(("fx", "fy", "cx", "cy"), views.camera.params, strict=True))
+    for index, pose in enumerate(views.poses):
+        views.put(index, folder / f"keyframes/corrected_images/{1000 + index}.jpg")
+        rows = np.column_stack([pose[:3, :3] @ OPENGL, pose[:3, 3]])
+        record = {f"t_{row}{column}": rows[row, column] for row in range(3) for column in range(4)}
+        record |= {**lens, "width": views.camera.width, "height": views.camera.height, "blur_score": 71.0}
+        text(folder / f"keyframes/corrected_cameras/{1000 + index}.json", json.dumps(record))
+    return folder / "keyframes/corrected_cameras/1000.json"
+
+
+def write_record3d(views: Views, folder: Path) -> Path:
+    for index in range(len(views.poses)):
+        views.put(index, folder / f"rgb/{index}.jpg")
+    quaternions = Rotation.from_matrix(views.poses[:, :3, :3] @ OPENGL).as_quat()  # qx, qy, qz, qw first
+    content = {
+        "poses": np.concatenate([quaternions, views.poses[:, :3, 3]], axis=1).tolist(),
+        "K": views.matrix.T.ravel().tolist(),  # by columns
+        "w": views.camera.width,
+        "h": views.camera.height,
+        "fps": 60,
+    }
+    return text(folder / "metadata.json", json.dumps(content))
+
+
+def write_alicevision(views: Views, folder: Path) -> Path:
+    width, height = map(str, views.camera.size)
+    frames = views.frames(folder)
+    fx, fy, cx, cy = views.camera.params
+    lens = {
+        "intrinsicId": "77",
+        "width": width,
+        "height": height,
+        "sensorWidth": "36",
+        "sensorHeight": "24",
+        "type": "radial3",
+        "focalLength": repr(fx * 36 / views.camera.width),
+        "pixelRatio": repr(fy / fx),
+        "principalPoint": [repr(cx - views.camera.width / 2), repr(cy - views.camera.height / 2)],
+        "distortionParams": ["0", "0", "0"],
+    }
+    content = {
+        "version": ["1", "2", "6"],
+        "views": [{"poseId": f.name, "intrinsicId": "77", "path": str(f.image)} for f in frames],
+        "intrinsics": [lens],
+        "poses": [
+            {"poseId": f.name, "pose": {"transform": {"rotation": numbers(p[:3, :3]).split(), "center": c.split()}}}
+            for f, p, c in ((f, f.world_from_cam, numbers(f.centre)) for f in frames)
+        ],
+    }
+    return text(folder / "cameras.sfm", json.dumps(content))
+
+
+def write_metashape(views: Views, folder: Path) -> Path:
+    """Labels of cameras are names of photos without suffix."""
+    (width, height), (f, _, cx, cy) = views.camera.size, views.camera.params
+    size = f'<resolution width="{width}" height="{height}"/>'
+    terms = f"<f>{f!r}</f><cx>{cx - width / 2!r}</cx><cy>{cy - height / 2!r}</cy>"
+    calibration = f'<calibration type="frame" class="adjusted">{size}{terms}</calibration>'
+    cameras = "".join(
+        f'<camera id="{index}" sensor_id="0" component_id="0" label="{frame.image.stem if frame.image else ""}">'
+        f"<transform>{numbers(frame.world_from_cam)}</transform></camera>"
+        for index, frame in enumerate(views.frames(folder))
+    )
+    sensors = f'<sensors><sensor id="0" type="frame">{size}{calibration}</sensor></sensors>'
+    parts = f'{sensors}<components><component id="0"/></components><cameras>{cameras}</cameras>'
+    document = f'<document version="1.5.0"><chunk enabled="true">{parts}</chunk></document>'
+    return text(folder / "cameras.xml", document)
+
+
+def write_reality_capture(views: Views, folder: Path) -> Path:
+    rows = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+    (width, height), (f, _, cx, cy) = views.camera.size, views.camera.params
+    lens = np.array([36 * f, cx - width / 2, cy - height / 2, 0, 0, 0, 0, 0, 0]) / max(width, height)
+    for frame in views.frames(folder):
+        turn = Rotation.from_matrix(frame.world_from_cam[:3, :3] @ OPENGL).as_euler("ZXY", degrees=True)
+        values = np.concatenate([frame.centre, turn * [-1, 1, 1], lens])
+        rows.append(",".join([f"images/{frame.name}", *map(repr, values.tolist())]))
+    return text(folder / "cameras.csv", "\n".join(rows) + "\n")
+
+
+def write_bundler(views: Views, folder: Path) -> Path:
+    """A camera of Bundler has one focal length, and its principal point in the middle."""
+    text(folder / "list.txt", "".join(f"images/{frame.name}\n" for frame in views.frames(folder)))
+    lines = ["# Bundle file v0.3", f"{len(views.poses)} 0"]
+    for pose in views.opengl_from_world:
+        lines += [f"{views.camera.params[0]!r} 0 0", *map(numbers, pose[:, :3]), numbers(pose[:, 3])]
+    return text(folder / "bundle.out", "\n".join(lines) + "\n")
+
+
+# Writes the capture into a folder, and returns a file of it.
+Writer = Callable[[Views, Path], Path]
+WITH_PHOTOS: dict[str, Writer] = {
+    "nerfcli": partial(write_by, "nerfcli", "."),
+    "colmap": partial(write_by, "colmap", "sparse/0"),
+    "colmap-text": partial(write_by, "colmap-text", "sparse/0"),
+    "transforms": partial(write_by, "transforms", "transforms.json"),
+    "blender": partial(write_by, "blender", "."),
+    "llff": partial(write_by, "llff", "."),
+    "opensfm": partial(write_by, "opensfm", "reconstruction.json"),
+    "metashape": write_metashape,
+    "reality-capture": write_reality_capture,
+    "bundler": write_bundler,
+    "polycam": write_polycam,
+    "record3d": write_record3d,
+    "mvsnet": write_mvsnet,
+    "neus": write_neus,
+    "pose-files": write_scannet,
+    "alicevision": write_alicevision,
+    "run": write_run,
+}

@@ -1,0 +1,75 @@
+"""Training reads every format of captures: the same views, written in each, have the same cameras and photos."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from every_format import WITH_PHOTOS, Views
+from scipy.spatial.transform import Rotation
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.registry import FORMATS, recognise
+from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.scene import describe_source, load
+
+CAMERA = Camera.pinhole(64, 48, 70.0)  # the only kind of lens that all formats hold
+ROTATIONS = Rotation.from_rotvec([[0.1, -0.4, 0.2], [1.3, 0.2, -0.7], [-0.5, 2.1, 0.3]])
+POSES = rigid.from_parts(ROTATIONS.as_matrix(), np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 2.0], [0.1, -3.0, 1.5]]))
+VIEWS = Views(CAMERA, POSES)
+VIEW = np.eye(4).ravel().tolist()
+WITHOUT_PHOTOS = {
+    "camera-path": (
+        "camera_path.json",
+        json.dumps({"render_height": 48, "render_width": 64, "camera_path": [{"camera_to_world": VIEW, "fov": 60}]}),
+    ),
+    "tum": ("trajectory.txt", "0 1 2 3 0 0 0 1\n"),
+    "kitti": ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"),
+}
+
+
+def test_every_format_that_is_read_is_tested():
+    assert {*WITH_PHOTOS, *WITHOUT_PHOTOS} == {form.name for form in FORMATS if form.looked_for}
+
+
+@pytest.mark.parametrize("name", WITH_PHOTOS)
+def test_a_capture_with_photos_is_trained_on(name, tmp_path):
+    file = WITH_PHOTOS[name](VIEWS, tmp_path)
+    place = file if name == "run" else tmp_path  # a folder of a run is taken for a mistake
+    scene = load(place)
+    kind = name.removesuffix("-text")
+    assert (scene.kind, scene.missing, len(scene.frames)) == (kind, (), 3)
+    assert len(scene.test_frames) == 1
+    for frame in scene.frames:
+        index = int(re.findall(r"\d+", Path(frame.name).stem)[-1]) % 1000
+        np.testing.assert_allclose(frame.world_from_cam, POSES[index], rtol=0, atol=1e-9)
+        assert frame.camera.size == CAMERA.size
+        np.testing.assert_allclose(frame.camera.focal_lengths, (70, 70), rtol=1e-9)
+        np.testing.assert_allclose(frame.camera.principal_point, (32, 24), rtol=1e-9)
+        assert frame.has_photo
+    assert re.fullmatch(rf"{tmp_path}.*: {kind} \(.+\), 3 of 3 photos on disk", describe_source(place, scene))
+    if file.is_file() and name not in ("nerfcli", "polycam", "mvsnet", "pose-files"):  # found by a file, not a folder
+        assert load(file).kind == kind
+
+
+@pytest.mark.parametrize("name", WITH_PHOTOS)
+def test_a_capture_without_photos_says_how_to_give_them(name, tmp_path):
+    WITH_PHOTOS[name](VIEWS, tmp_path)
+    for photo in (*tmp_path.rglob("*.jpg"), *tmp_path.rglob("*.png")):
+        photo.unlink()
+    with pytest.raises(UserError) as caught:
+        load(tmp_path / "cameras.json" if name == "run" else tmp_path)
+    assert caught.value.exit_code == BAD_INPUT
+    assert str(tmp_path) in caught.value.message
+    assert "--images" in caught.value.hint or name in ("blender", "llff")
+
+
+@pytest.mark.parametrize("name", WITHOUT_PHOTOS)
+def test_poses_alone_are_no_scene(name, tmp_path):
+    file, content = WITHOUT_PHOTOS[name]
+    (tmp_path / file).write_text(content)
+    assert recognise(tmp_path / file)[0].name == name
+    with pytest.raises(UserError, match=file):
+        load(tmp_path / file)
