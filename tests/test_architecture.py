@@ -16,7 +16,9 @@ FOLDERS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 
 # A part is a folder of nerfcli, a subfolder of `poses`, or a module beside the folders.
 # The part on the left may import the parts on the right.
-LEAVES = {"errors", "atomic", "sealed", "exclusive", "memory", "interrupts", "finite", "child", "torchrun", "__init__"}
+LEAVES = {
+    *("errors", "atomic", "sealed", "exclusive", "memory", "interrupts", "finite", "child", "distributed", "__init__"),
+}
 MAY_IMPORT = {
     "errors": set(),
     "atomic": set(),
@@ -26,7 +28,7 @@ MAY_IMPORT = {
     "memory": set(),
     "interrupts": set(),
     "child": set(),
-    "torchrun": set(),
+    "distributed": set(),
     "__init__": set(),
     "cameras": {"holdout", "media"},
     "media": set(),
@@ -91,7 +93,7 @@ MAY_IMPORT = {
 CONFINED = {
     "torch": {
         *("kernels", "field", "render", "runs", "train", "search", "fit", "evaluate", "export"),
-        *("selftest", "bench", "workflows", "cli", "photos", "surface", "viewer", "tomography"),
+        *("selftest", "bench", "workflows", "cli", "photos", "surface", "viewer", "tomography", "distributed"),
     },
     "safetensors": {"field"},
     "numba": {"kernels"},

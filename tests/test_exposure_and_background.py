@@ -151,7 +151,7 @@ def test_a_resumed_training_keeps_the_exposures_that_auto_has_fixed(capture, tmp
     monkeypatch.setattr("nerfcli.train.evidence.matched_log_gains", lambda photos, dense: found)
     settings, notes = replace(SHORT, model="auto", components=Components()), []
     first = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
-    begun = EarlierDecisions(first.extent, Components(exposure="matched"))
+    begun = EarlierDecisions(first.extent, Components(exposure="matched"), None)
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=begun, notify=notes.append)
     np.testing.assert_array_equal(prepared.log_gains.numpy(), found)
     assert "matched pixels give the exposure of 2 of 3 photos; the others are learned" in notes

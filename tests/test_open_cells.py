@@ -8,10 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
+from nerfcli import distributed, kernels
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.fit.open_cells import FINE_SIDE, LOOK_AROUND_EVERY, OCCUPANCY_SIDE, REFRESH_EVERY, REFRESH_TURNS, OpenCells
-from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.kernels import March, Rays, numba_cpu, reference
 from nerfcli.render.model import Marching
 
@@ -46,9 +45,9 @@ def cells_of(field: Any) -> OpenCells:
     return OpenCells(field, CPU)
 
 
-def refresh(cells: OpenCells, step: int, ranks: SingleProcess = ALONE) -> None:
+def refresh(cells: OpenCells, step: int) -> None:
     generator = torch.Generator().manual_seed(step)
-    cells.refresh(step, fraction=1.0, detail=1.0, marching=MARCHING, generator=generator, ranks=ranks)
+    cells.refresh(step, fraction=1.0, detail=1.0, marching=MARCHING, generator=generator)
 
 
 def visit(cells: OpenCells, where: tuple[int, int, int], depth: float) -> None:
@@ -204,13 +203,13 @@ def test_a_field_without_detail_has_the_coarse_cells_alone():
     assert set(cells.state()) == {"optical_depth", "occupied"}
 
 
-def test_the_samples_of_every_rank_count():
-    class Two(SingleProcess):
-        def keep_largest(self, tensor: Tensor) -> None:
-            tensor[0, 0, 0] = max(float(tensor[0, 0, 0]), 0.0)  # the other rank found this cell empty
+def test_the_samples_of_every_process_count(monkeypatch):
+    def keep_largest(tensor: Tensor) -> None:
+        tensor[0, 0, 0] = max(float(tensor[0, 0, 0]), 0.0)  # the other process found this cell empty
 
+    monkeypatch.setattr(distributed, "keep_largest", keep_largest)
     cells = cells_of(Slab())
-    refresh(cells, REFRESH_EVERY, ranks=Two())
+    refresh(cells, REFRESH_EVERY)
     assert not cells.at(1)[0, 0, 0]
     assert cells.at(1)[0, 0, 1]
 

@@ -437,7 +437,7 @@ def test_a_step_of_all_hands_each_part_what_it_needs(small, monkeypatch):
     monkeypatch.setattr(
         refinement.poses,
         "step",
-        lambda slopes, losses, photos, fraction, *, rate, ranks: given.update(slopes=slopes, rate=rate),
+        lambda slopes, losses, photos, fraction, *, rate: given.update(slopes=slopes, rate=rate),
     )
     numbers = torch.arange(50)
     drawn = refinement.refined(pool.rays_of(numbers))

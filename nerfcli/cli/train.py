@@ -10,7 +10,7 @@ import typer
 from nerfcli.cli import options
 from nerfcli.cli.batch import STDIN, for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.workflows.machine import device_name, is_first, is_one_of_several, local_rank_and_size, thread_count
 
 DEFAULT_BUDGET = "2m"
 # Parameters for X-ray scans.
@@ -126,7 +126,6 @@ def train(
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.scan import is_scan
-    from nerfcli.torchrun import is_first, is_one_of_several, local_rank_and_size
     from nerfcli.workflows.train import train_scene
     from nerfcli.workflows.train_plan import plan_training
 

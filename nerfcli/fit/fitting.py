@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nerfcli import distributed
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import fresh_field
@@ -17,7 +18,6 @@ from nerfcli.fit.losses import colour_losses, distance_losses
 from nerfcli.fit.open_cells import OpenCells
 from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.fit.point_depth import PointRays, fading
-from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.fit.strides import RaySteps
 from nerfcli.fit.watch import UNWATCHED, NonFiniteError, Watch
 from nerfcli.kernels import March, Rays, Targets
@@ -66,7 +66,6 @@ class Fitting:
         points: pixels whose distance is known.
         sky: (pixels,) bool, the pixels of the pool that show a sky to be learned; None if none are known.
         size: of the field; by default, `sizes.chosen_size` for the settings and the pool.
-        ranks: the processes that train this field together, each with its own copy of this state.
     """
 
     def __init__(
@@ -83,14 +82,12 @@ class Fitting:
         points: PointRays | None = None,
         sky: Tensor | None = None,
         size: FieldSettings | None = None,
-        ranks: SingleProcess = ALONE,
     ):
         device = pool.colours.device
         torch.manual_seed(settings.seed)
         self.pool = pool
         self.marching, self.parallax = marching, parallax
         self.settings = settings
-        self.ranks = ranks
         self.step = 0
         # The largest fraction of any budget so far: a training resumed with a larger budget begins at a smaller one.
         self.largest_fraction = 0.0
@@ -143,23 +140,23 @@ class Fitting:
         watch.state(self.state)
         self.largest_fraction = max(self.largest_fraction, fraction)
         of_cameras = max(0.0, fraction - self._cameras_from) / (1.0 - self._cameras_from)
-        ranks, whole = self.ranks, self.draw(fraction)
-        drawn = self.parts.with_learning_rays(whole.every(ranks.rank, ranks.count), of_cameras)
-        rays = len(whole.origins)
+        drawn = self.parts.with_learning_rays(self.draw(fraction), of_cameras)
+        rays = len(drawn.origins)
         edges = self.ray_steps.edges(fraction, self.step)
-        loss, losses, samples = self._loss(drawn, whole=whole, edges=edges, fraction=fraction, watch=watch)
+        loss, losses, samples = self._loss(drawn, edges=edges, fraction=fraction, watch=watch)
         self.optimiser.zero_grad()
         self.parts_optimiser.zero_grad()
         if samples > 0:
             loss.backward()
         samples = self._add_up_gradients(drawn, samples)
+        losses = distributed.whole(losses, rays)
         value = self._finite_loss(loss, drawn, watch)
         rate = self.learning_rate(fraction)
         self.step += 1
         self.optimiser.step(self.step, rate, decay=self.row_decay(rays))
         self.parts_optimiser.step(rate)
         if self.parts.cameras is not None:
-            self.parts.cameras.step(drawn, losses, of_cameras, factor=self.rate_factor, ranks=ranks)
+            self.parts.cameras.step(drawn, losses, of_cameras, factor=self.rate_factor)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         watch.state(self.state)
         self.in_step = False
@@ -174,7 +171,6 @@ class Fitting:
             detail=self._detail,
             marching=self.marching,
             generator=self.generator,
-            ranks=self.ranks,
         )
         rays = min(self._most_rays, max(64, round(settings.samples_at(self.step) / max(1.0, self.samples_per_ray))))
         drawn = self.pool.draw(rays, self.generator)
@@ -204,15 +200,14 @@ class Fitting:
         """
         return self.field.row_decay * (min(1.0, DECAY_RAYS / rays) if self.pool.has_alpha else 1.0)
 
-    def _loss(
-        self, drawn: PixelBatch, *, whole: PixelBatch, edges: Tensor, fraction: float, watch: Watch
-    ) -> tuple[Tensor, Tensor, int]:
-        """Return the loss contributed by this rank's rays of the whole step, the colour loss of each ray, and the
-        number of samples.
+    def _loss(self, whole: PixelBatch, *, edges: Tensor, fraction: float, watch: Watch) -> tuple[Tensor, Tensor, int]:
+        """Return the loss that this process's rays contribute to that of the whole step, the colour loss of each of
+        these rays, and their number of samples.
         """
-        count, components, device = len(whole.origins), self.components, drawn.origins.device
-        jitter = torch.rand(count, generator=self.generator, device=device)[self.ranks.own].contiguous()
-        background = self.parts.behind(count, self.generator)[self.ranks.own].contiguous()
+        count, components, device = len(whole.origins), self.components, whole.origins.device
+        drawn = PixelBatch(*(distributed.own(rows, count) for rows in whole))
+        jitter = distributed.own(torch.rand(count, generator=self.generator, device=device), count)
+        background = distributed.own(self.parts.behind(count, self.generator), count)
         seen = self.field.backend.render_rays(
             Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
             self._march(edges, self.cells.at(self.step))._replace(least_weight=LEAST_WEIGHT),
@@ -236,7 +231,7 @@ class Fitting:
             opacity = (1.0 - seen.transmittance) * self.parts.sky[drawn.numbers]
             loss = loss + SKY_WEIGHT * opacity.sum() / count
         if self.parts.background is not None:
-            loss = loss + ROUGHNESS_WEIGHT * self.parts.background.roughness() / self.ranks.count
+            loss = loss + ROUGHNESS_WEIGHT * self.parts.background.roughness() / distributed.count()
         if watch is not UNWATCHED:
             watch.rows("rendered colour", seen.rgb, torch.arange(len(drawn.origins), device=device))
         watch.values("loss", loss)
@@ -287,13 +282,13 @@ class Fitting:
         return self.pool.cones[self.pool.photo_of(drawn.numbers)] if self.components.antialias else None
 
     def _add_up_gradients(self, drawn: PixelBatch, samples: int) -> int:
-        """Add up the gradients and the samples of all ranks, and return the number of samples."""
-        if self.ranks.count == 1:
-            return samples
-        samples = self.ranks.total(samples)
+        """Add up the gradients and the samples of all processes, and return the number of samples."""
+        samples = distributed.total(samples)
         if samples > 0:
-            learned = [*self.optimiser.weights(), *(p for p in self.parts.parameters() if p.requires_grad)]
-            self.ranks.add_up_gradients(learned, rays=(drawn.origins, drawn.directions), sink=self.optimiser.sink)
+            rays = (drawn.origins, drawn.directions)
+            distributed.add_up_gradients((*self.optimiser.weights(), *self.parts.parameters(), *rays))
+            if self.optimiser.sink is not None:
+                distributed.add_up(self.optimiser.sink)
         return samples
 
     def settle(self) -> None:
@@ -323,7 +318,7 @@ class Fitting:
         if self.optimiser.sink is not None:
             watch.values("gradient of rows", self.optimiser.sink)
         numbers = torch.stack([loss.detach(), total])
-        self.ranks.add_up(numbers)
+        distributed.add_up(numbers)
         self._take_loss(self._losses.exchange(numbers))
         if self.loss is None or watch is not UNWATCHED:
             self.settle()

@@ -3,8 +3,6 @@
 import torch
 from torch import Tensor, nn
 
-from nerfcli.fit.ranks import ALONE, SingleProcess
-
 # Decay of the running mean of the curvature per step: a photo has few rays in one step.
 MEMORY = 0.95
 # Added to losses: smaller ones, those of about one level of 255, give no reliable curvature.
@@ -33,19 +31,17 @@ class NewtonSteps(nn.Module):
         self.register_buffer("curvature", torch.zeros(count, 6, 6, dtype=torch.float64))
         self.register_buffer("weight", torch.zeros((), dtype=torch.float64))
 
-    def learn(self, gradients: Tensor, losses: Tensor, photos: Tensor, ranks: SingleProcess = ALONE) -> Tensor:
+    def learn(self, gradients: Tensor, losses: Tensor, photos: Tensor) -> Tensor:
         """Update the curvature from some rays, and return the sum (P, 6) of their gradients.
 
         Args:
             gradients: (R, 6) of each ray's own loss.
             losses: (R,) the loss of each ray.
             photos: (R,) the photo index of each ray.
-            ranks: the processes that share the step, each with its own rays.
         """
         of_ray = gradients[:, :, None] * gradients[:, None, :] / (2.0 * losses + _LEAST_LOSS)[:, None, None]
         curvature = torch.zeros_like(self.curvature).index_add_(0, photos, of_ray)
         slope = torch.zeros_like(self._picture_px).index_add_(0, photos, gradients)
-        ranks.add_up(curvature, slope)
         self.curvature.lerp_(curvature, 1.0 - MEMORY)
         self.weight.lerp_(torch.ones_like(self.weight), 1.0 - MEMORY)
         return slope

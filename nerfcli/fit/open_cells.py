@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d
 
+from nerfcli import distributed
 from nerfcli.field.interface import Field
-from nerfcli.fit.ranks import SingleProcess
 from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import Occupancy
 
@@ -70,7 +70,6 @@ class OpenCells:
         detail: float,
         marching: Marching,
         generator: torch.Generator,
-        ranks: SingleProcess,
     ) -> None:
         """Update the open cells from the field, every few steps.
 
@@ -78,7 +77,6 @@ class OpenCells:
             fraction: of the budget that is used, in [0, 1].
             detail: of the field, see `Field.medium`.
             generator: source of the random points of the coarse grid.
-            ranks: the processes whose samples are combined.
         """
         # The whole coarse grid once, after a warm-up in which everything is open; then a fraction of it at a time.
         if step == 0 or step % REFRESH_EVERY:
@@ -93,7 +91,7 @@ class OpenCells:
             generator=generator,
         )
         if self.visits is not None:
-            ranks.keep_largest(self.visits)
+            distributed.keep_largest(self.visits)
             # The host waits for a GPU to count these; computing all cells instead takes a CPU 1.6 times as long.
             visits, depths = self.visits.view(-1), self._depths.view(-1)
             visited = (visits >= 0).nonzero()[:, 0]

@@ -18,7 +18,6 @@ from nerfcli.cameras.rigid import from_parts, inverse, transform_from_twist, vec
 from nerfcli.fit.delayed import Delayed, on_device_of
 from nerfcli.fit.gauge import without_mean
 from nerfcli.fit.newton import NewtonSteps
-from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.fit.whitening import WhitenedAdam, whitening
 from nerfcli.photos.pool import PixelBatch, Pool
 
@@ -115,7 +114,6 @@ class PoseRefinement(nn.Module):
         fraction: float,
         *,
         rate: float,
-        ranks: SingleProcess = ALONE,
     ) -> None:
         """Take a step against gradients (R, 6) of losses (R,) of rays, and remove the mean similarity of all moves.
 
@@ -124,12 +122,11 @@ class PoseRefinement(nn.Module):
             photos: (R,) the photo index of each ray.
             fraction: of the budget.
             rate: fraction of the full Newton step, in [0, 1].
-            ranks: the processes that share the step, each with its own rays.
         """
         so_far = self.motions.numpy()
         so_far = np.concatenate([so_far[:, :3, 3], vector_from_rotation(so_far[:, :3, :3])], axis=1)
         twists = rate * self.newton.change(
-            self.newton.learn(gradients, losses, photos, ranks),
+            self.newton.learn(gradients, losses, photos),
             torch.from_numpy(so_far),
             damping=_between(fraction, DAMPING_FRACTIONS, DAMPINGS),
             holding=_between(fraction, HOLDING_FRACTIONS, HOLDINGS) if fraction > HOLDING_FRACTIONS[0] else 0.0,
@@ -267,19 +264,16 @@ class Refinement(nn.Module):
         return drawn._replace(origins=origins, directions=directions)
 
     @torch.no_grad()
-    def step(
-        self, drawn: PixelBatch, losses: Tensor, fraction: float, *, factor: float, ranks: SingleProcess = ALONE
-    ) -> None:
-        """Take one step against the gradients of the mean loss over the rays of all ranks.
+    def step(self, drawn: PixelBatch, losses: Tensor, fraction: float, *, factor: float) -> None:
+        """Take one step against the gradients of the mean loss over rays.
 
         On a GPU, the gradients are those of the previous step.
 
         Args:
-            drawn: the rays of this rank, from `refined`, with gradients.
+            drawn: the rays, from `refined`, with gradients.
             losses: (R,) the loss of each ray.
             fraction: of the budget, for `rate_at`.
             factor: of the learning rate.
-            ranks: the processes that share the step, each with its own rays.
         """
         by_origin, by_direction, rate = drawn.origins.grad, drawn.directions.grad, factor * rate_at(fraction)
         if rate == 0.0 or by_origin is None or by_direction is None:
@@ -296,11 +290,9 @@ class Refinement(nn.Module):
         by_lens = None
         if self.lenses is not None:
             by_lens = self.lenses.gradient(numbers, photos, turns=turns, by_direction=by_direction)
-            ranks.add_up(by_lens)
         if self.poses is not None:
             by_pose = self.poses.gradients(directions, photos, by_origin=by_origin, by_direction=by_direction)
-            of_each = ranks.total(len(by_pose)) * by_pose
-            self.poses.step(of_each, losses, photos, fraction, rate=rate, ranks=ranks)
+            self.poses.step(len(by_pose) * by_pose, losses, photos, fraction, rate=rate)
         if self.lenses is not None and by_lens is not None:
             self.lenses.step(by_lens, LENS_RATE * rate)
 

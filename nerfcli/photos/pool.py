@@ -89,17 +89,6 @@ class PixelBatch(NamedTuple):
     distances: Tensor
     trust: Tensor
 
-    def every(self, first: int, step: int) -> "PixelBatch":
-        """Return the pixels `first`, `first + step`, ...; those with known surface depth remain the last ones."""
-        if step == 1:
-            return self
-        begins = {"distances": len(self.numbers) - len(self.distances), "trust": len(self.numbers) - len(self.trust)}
-        parts = {
-            name: tensor[(first - begins.get(name, 0)) % step :: step].contiguous()
-            for name, tensor in self._asdict().items()
-        }
-        return PixelBatch(**parts)
-
 
 class Pool(Protocol):
     """Source of training pixels: photos with cameras and poses (P, 4, 4), in the training frame."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from nerfcli import distributed
 from nerfcli.cameras.formats.run_cameras import write_cameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
@@ -113,7 +114,12 @@ class Checkpoints:
         write_cameras(self._run, *self.frames(), given=given)
 
     def write(self) -> None:
-        """Write RUN/field.safetensors and RUN/state.safetensors, and the cameras that the field was trained with."""
+        """Write RUN/field.safetensors and RUN/state.safetensors, and the cameras that the field was trained with.
+
+        Of several processes that train together, the first one does.
+        """
+        if distributed.rank() > 0:
+            return
         tensors, description = self._fitting.state()
         extent = self._prepared.extent.to_json()
         description |= {"format": STATE_FORMAT, "extent": extent, "totals": vars(self._totals)}
@@ -143,7 +149,8 @@ def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]
             f"{run} was trained with --contraction {extent.contraction}, not {settings.contraction}",
             "train into a new folder with -o, or again with --overwrite",
         )
-    return EarlierDecisions(extent, read_config(run).components)
+    config = read_config(run)
+    return EarlierDecisions(extent, config.components, config.selection)
 
 
 def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> Totals:

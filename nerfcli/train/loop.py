@@ -3,28 +3,26 @@
 import resource
 import sys
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
-from nerfcli import kernels
+from nerfcli import distributed, kernels
 from nerfcli.atomic import cannot_write
 from nerfcli.errors import LOST_RANK, UserError
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.cost import field_bytes
 from nerfcli.fit.fitting import Fitting
-from nerfcli.fit.ranks import ALONE, SingleProcess
 from nerfcli.interrupts import deferred_interrupts
-from nerfcli.runs.config import RunConfig, read_config, write_config
+from nerfcli.runs.config import RunConfig, write_config
+from nerfcli.runs.decisions import Selection
 from nerfcli.runs.files import FIELD, LOG, STATE
 from nerfcli.runs.log import LogEntry, append_log, cut_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
-from nerfcli.train.following import END, SETTLE, TIMED_STEPS, describe_efficiency, start_others
 from nerfcli.train.left_out import remove_left_out, write_left_out
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
@@ -51,7 +49,6 @@ def train(
     *,
     resume: bool,
     memory_bytes: int | None = None,
-    ranks: SingleProcess = ALONE,
     notify: Callable[[str], None],
     on_progress: Callable[[Progress], None],
 ) -> None:
@@ -66,24 +63,23 @@ def train(
         resume: go on from the run's last checkpoint to the budget or step count of `settings`, which count from 0.
         memory_bytes: limit of resident memory; photos that do not fit are kept in files, and the result is the same. On
             a GPU, limit of its memory, into which everything has to fit.
-        ranks: the processes that train together; this is the first, and the others run `following.follow`.
         on_progress: called after every step.
 
     Raises:
         UserError: too little memory, unreadable photos, numbers that became non-finite, nothing to resume, a folder
-            that cannot be written, or another rank that has ended; a checkpoint has then been written.
+            that cannot be written, or another process that has ended; a checkpoint has then been written.
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     torch.set_num_threads(settings.threads)
     kernels.prepare(notify, settings.device)
-    saved = load_tensors(run / STATE, settings.device) if resume else None
-    begun = decisions_of(run, settings, saved[1]) if saved is not None else None
+    saved = distributed.from_first(lambda: load_tensors(run / STATE, settings.device) if resume else None)
+    begun = distributed.from_first(lambda: None if saved is None else decisions_of(run, settings, saved[1]))
     # A training resumed with a larger budget keeps its number of rows.
     rows = settings.log2_rows or (saved[1]["field"].get("log2_rows") if saved is not None else None)
-    of_all_ranks = replace(settings, threads=ranks.count * settings.threads)
-    settings = replace(settings, log2_rows=rows or of_all_ranks.chosen_log2_rows)
+    with_all_threads = replace(settings, threads=sum(distributed.gathered(settings.threads)))
+    settings = replace(settings, log2_rows=rows or with_all_threads.chosen_log2_rows)
     prepared = prepare(scene, settings, run=run, memory_bytes=memory_bytes, begun=begun, notify=notify)
-    fitting = prepared.fitting(ranks)
+    fitting = prepared.fitting()
     notify(f"field: {fitting.field.settings.size_text}; {field_bytes(fitting.field) / 1e6:.2f} MB")
     if saved is not None:
         totals = restore(fitting, run, *saved)
@@ -96,38 +92,36 @@ def train(
     if prepared.occluders is not None:
         named = zip(prepared.pool.frames, prepared.occluders, strict=True)
         write_left_out(run, {frame.name: ~mask for frame, mask in named}, notify=notify)
-    _describe(scene, run, settings, prepared, resume=resume)
+    selection = prepared.selection if begun is None else begun.selection
+    _describe(scene, run, settings, prepared, selection=selection)
     checkpoints = Checkpoints(run, fitting, totals, prepared=prepared, scene=scene)
     checkpoints.write_cameras()
-    start_others(fitting, prepared)
     sentinel = Sentinel(fitting, prepared.pool, run=run, notify=notify)
+    distributed.gathered(None)  # wait until all processes have loaded their photos
     with deferred_interrupts() as interrupts:
 
         def after_step(progress: Progress) -> None:
-            on_progress(progress)
-            prepared.storage.release_pages()
-            interrupts.raise_if_pending()
+            with distributed.interrupted_together():
+                on_progress(progress)
+                prepared.storage.release_pages()
+                interrupts.raise_if_pending()
 
         try:
-            seconds = _run(fitting, totals, sentinel=sentinel, checkpoints=checkpoints, run=run, on_progress=after_step)
+            _run(fitting, totals, sentinel=sentinel, checkpoints=checkpoints, run=run, on_progress=after_step)
         except KeyboardInterrupt:
             if not fitting.in_step:
-                ranks.announce(SETTLE)
                 sentinel.settle()
                 checkpoints.write()
-                ranks.announce(END)
             raise
         except UserError as error:
             if error.exit_code == LOST_RANK:  # nothing has been learned from that step
                 checkpoints.write()
             raise
         checkpoints.write()
-        ranks.announce(END)
     if fitting.rollbacks:
         notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
-    measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)
-    if ranks.count > 1 and seconds:
-        notify(describe_efficiency(fitting, seconds))
+    if distributed.rank() == 0:
+        measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)
 
 
 def _clear(run: Path) -> None:
@@ -142,17 +136,17 @@ def _clear(run: Path) -> None:
     forget_waypoints(run)
 
 
-def _describe(scene: Scene, run: Path, requested: TrainSettings, prepared: Prepared, *, resume: bool) -> None:
+def _describe(
+    scene: Scene, run: Path, requested: TrainSettings, prepared: Prepared, *, selection: Selection | None
+) -> None:
     """Write RUN/config.json."""
     described = RunConfig.describing(
         scene,
         requested,
         factor=prepared.factor,
         contraction=prepared.extent.contraction,
-        selection=prepared.selection,
+        selection=selection,
     )
-    if resume:
-        described = replace(described, selection=read_config(run).selection)
     write_config(run, described)
 
 
@@ -164,15 +158,14 @@ def _run(
     checkpoints: Checkpoints,
     run: Path,
     on_progress: Callable[[Progress], None],
-) -> Sequence[float]:
-    """Step until the budget is used up, and return the seconds that each of the last steps took.
+) -> None:
+    """Step until the budget is used up.
 
     The clock is stopped while waypoints and checkpoints are written.
     """
     settings = fitting.settings
     last_saved = totals.seconds
     loss = 0.0
-    last_steps: deque[float] = deque(maxlen=TIMED_STEPS)
     logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
 
     def speeds() -> tuple[float, float]:
@@ -200,10 +193,8 @@ def _run(
     try:
         while (fraction := _fraction(settings, fitting.step, totals)) < 1.0:
             began = time.perf_counter()
-            fitting.ranks.announce(fraction)
             result = sentinel.advance(fraction)
-            last_steps.append(time.perf_counter() - began)
-            totals.seconds += last_steps[-1]
+            totals.seconds += distributed.largest(time.perf_counter() - began)
             totals.samples += result.samples
             totals.rays += result.rays
             loss = result.loss
@@ -211,7 +202,6 @@ def _run(
             on_progress(Progress(fraction, fitting.step, totals.seconds, loss, speeds()[0]))
             checkpoint_due = totals.seconds - last_saved >= CHECKPOINT_SECONDS
             if checkpoint_due or (waypoints and fraction >= waypoints[0]):
-                fitting.ranks.announce(SETTLE)
                 sentinel.settle()
                 fraction = _fraction(settings, fitting.step, totals)
             if waypoints and fraction >= waypoints[0]:
@@ -227,7 +217,6 @@ def _run(
         # An interrupt may come before the last steps are logged, and a resumed training may have no step left to log.
         if totals.seconds > logged_seconds:
             log()
-    return last_steps
 
 
 def _fraction(settings: TrainSettings, step: int, totals: Totals) -> float:

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli import distributed
 from nerfcli.errors import UserError, reason_of
 from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
 from nerfcli.fit.fitting import Fitting
-from nerfcli.fit.point_depth import PointRays
-from nerfcli.fit.ranks import ALONE, SingleProcess
+from nerfcli.fit.point_depth import PointDepths, PointRays
 from nerfcli.memory import default_memory_limit
 from nerfcli.multiview.camera_check import CameraCheck, check_cameras
 from nerfcli.multiview.correspondences import SharedFeatures
@@ -54,6 +54,7 @@ class EarlierDecisions:
 
     extent: Extent
     components: Components
+    selection: Selection | None
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,8 @@ class Prepared:
     sky: Tensor | None
     occluders: list[np.ndarray] | None
 
-    def fitting(self, ranks: SingleProcess = ALONE) -> Fitting:
-        """Return the training before its first step, for this one of the ranks."""
+    def fitting(self) -> Fitting:
+        """Return the training before its first step."""
         return Fitting(
             self.pool,
             self.extent.marching,
@@ -102,7 +103,6 @@ class Prepared:
             log_focal=self.log_focal,
             points=self.points,
             sky=self.sky,
-            ranks=ranks,
         )
 
 
@@ -144,6 +144,8 @@ def prepare(
 ) -> Prepared:
     """Load the training photos and choose extent, components and initial exposures.
 
+    Of several processes that train together, each loads the photos, and the first one chooses.
+
     Args:
         scene: photos, cameras and split.
         run: folder for temporary files that hold what does not fit into memory.
@@ -159,12 +161,7 @@ def prepare(
     if begun is not None:
         extent, settings = begun.extent, replace(settings, components=begun.components)
     else:
-        located = scene
-        if lacks_depth(scene, settings, fills_frame=album.fills_frame):
-            frames = [photo.frame for photo in album.photos]
-            located = replace(scene, points=triangulate(frames, shared.of_matches).found)
-            notify(f"the scene has no 3D points; estimating its extent from {len(located.points)} triangulated ones")
-        extent = choose_extent(located, settings, fills_frame=album.fills_frame)
+        extent = distributed.from_first(lambda: _extent(scene, settings, album, shared, notify=notify))
     pool = PixelPool(album.photos, extent.training_from_scene, device, colours=album.colours, storage=storage)
     camera = album.photos[0].frame.camera
     notify(
@@ -177,31 +174,29 @@ def prepare(
     selection, log_focal = None, 0.0
     if begun is None and settings.model == "auto":
         began = time.perf_counter()
-        facts = _facts(scene, evidence)
-        selection = _search(scene, evidence, facts, storage=storage, began=began)
+        selection = distributed.from_first(lambda: _search(scene, evidence, storage=storage, began=began))
         settings, log_focal = replace(settings, components=selection.components), selection.log_focal
     elif begun is None and settings.components.cameras in LEARN_FOCAL:
-        _, log_focal, decisions = with_known_cameras(settings.components, _facts(scene, evidence))
-        for decision in decisions:
-            notify(decision.in_words())
-    sky = evidence.sky if settings.components.background == "sphere" else None
+        log_focal = distributed.from_first(lambda: _log_focal(scene, evidence))
+    sky = distributed.from_first(lambda: evidence.sky) if settings.components.background == "sphere" else None
     extent = extent.before(settings.components.background, sky_known=sky is not None)
     reference, gains = _exposures(scene, settings.components, notify=notify)
     if selection is not None and selection.log_gains is not None:
         gains = selection.log_gains
     elif settings.components.exposure == "matched":
-        gains = torch.from_numpy(evidence.log_gains)
+        gains = torch.from_numpy(distributed.from_first(lambda: evidence.log_gains))
         known = int(gains.isfinite().all(1).sum())
         others = "" if known == len(gains) else "; the others are learned"
         notify(f"matched pixels give the exposure of {known} of {len(gains)} photos{others}")
     elif settings.components.exposure == "learned" and settings.components.stereo:
-        gains = evidence.gains_or(gains)
-    occluders = None
+        gains = distributed.from_first(lambda: evidence.gains_or(gains))
+    occluders, points = None, None
     if settings.components.occluders:
-        pool.leave_out(evidence.occluders, storage=storage)
-        occluders = evidence.occluders
-    points = _points(scene, settings, evidence) if settings.components.points else None
-    seconds = evidence.stereo_seconds if selection is None else selection.seconds
+        occluders = distributed.from_first(lambda: evidence.occluders)
+        pool.leave_out(occluders, storage=storage)
+    if settings.components.points:
+        points = PointRays(distributed.from_first(lambda: _depths(scene, settings, evidence)), pool)
+    seconds = distributed.from_first(lambda: evidence.stereo_seconds if selection is None else selection.seconds)
     return Prepared(
         settings,
         factor,
@@ -219,17 +214,36 @@ def prepare(
     )
 
 
-def _points(scene: Scene, settings: TrainSettings, evidence: Evidence) -> PointRays:
-    """Return the pixels at known distances that are drawn in each step."""
-    points = PointRays(evidence.sets(settings.components), evidence.pool)
-    if not points.sets:
+def _extent(
+    scene: Scene, settings: TrainSettings, album: Album, shared: SharedFeatures, *, notify: Callable[[str], None]
+) -> Extent:
+    """Return the extent of the field; without 3D points, from triangulated ones if it needs any."""
+    if lacks_depth(scene, settings, fills_frame=album.fills_frame):
+        frames = [photo.frame for photo in album.photos]
+        scene = replace(scene, points=triangulate(frames, shared.of_matches).found)
+        notify(f"the scene has no 3D points; estimating its extent from {len(scene.points)} triangulated ones")
+    return choose_extent(scene, settings, fills_frame=album.fills_frame)
+
+
+def _log_focal(scene: Scene, evidence: Evidence) -> float:
+    """Return the logarithm of the initial factor of focal lengths, and report how it was found."""
+    _, log_focal, decisions = with_known_cameras(evidence.settings.components, _facts(scene, evidence))
+    for decision in decisions:
+        evidence.notify(decision.in_words())
+    return log_focal
+
+
+def _depths(scene: Scene, settings: TrainSettings, evidence: Evidence) -> list[PointDepths]:
+    """Return the sets of pixels at known distances that are drawn from in each step."""
+    sets = evidence.sets(settings.components)
+    if not any(len(depths.numbers) for depths in sets):
         raise UserError(
             f"--with points: no 3D point could be triangulated from the photos of {scene.root}",
             "use a scene written by nerfcli poses or a COLMAP model, or remove --with points",
         )
     if settings.model != "auto" or "points" in settings.fixed:  # else the decision on points reports it
         evidence.notify(f"points: {len(evidence.of_tracks.numbers):,} pixels see a 3D point at a known distance")
-    return points
+    return sets
 
 
 def _threads(count: int) -> str:
@@ -277,8 +291,9 @@ def _camera_check(evidence: Evidence) -> CameraCheck | None:
         return None
 
 
-def _search(scene: Scene, evidence: Evidence, facts: Facts, *, storage: PhotoStorage, began: float) -> Selection:
+def _search(scene: Scene, evidence: Evidence, *, storage: PhotoStorage, began: float) -> Selection:
     """Select components for the scene and report each decision."""
+    facts = _facts(scene, evidence)
     album, settings, notify = evidence.album, evidence.settings, evidence.notify
     budget, steps = settings.budget_seconds, settings.steps
     if not is_worth_a_search(budget, steps):

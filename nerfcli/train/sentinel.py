@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nerfcli import distributed
 from nerfcli.cameras.camera import Camera
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
@@ -83,7 +84,7 @@ class Sentinel:
         if not all(map(is_finite, that_must_be_finite(tensors).values())):
             raise NonFiniteError
         # Given equal sums, two kinds of processors may take steps that differ in the last bit.
-        self._fitting.ranks.copy_from_first(*tensors.values())
+        distributed.copy_from_first(*tensors.values())
         if self._tensors.keys() == tensors.keys():  # reuse the memory of the last copy
             for name, tensor in tensors.items():
                 self._tensors[name].copy_(tensor)
@@ -106,7 +107,7 @@ class Sentinel:
             if not deterministic:  # this state cannot be reproduced
                 before = _copied(*fitting.state())
             result, bad = _watched_step(fitting, self._fractions[done])
-            bad = _first_of_ranks(fitting, bad)
+            bad = _first_of_all(bad)
             done += 1
         if bad is None:
             assert result is not None
@@ -174,8 +175,7 @@ class Sentinel:
             "cameras": [camera.to_json() for camera in fitting.pool.cameras],
             "state": description,
         }
-        if fitting.ranks.rank == 0:
-            save_tensors(path, {**before, **{f"batch.{name}": value for name, value in batch.items()}}, content)
+        save_tensors(path, {**before, **{f"batch.{name}": value for name, value in batch.items()}}, content)
         return path, text
 
 
@@ -244,12 +244,11 @@ def _watched_step(fitting: Fitting, fraction: float) -> tuple[StepResult | None,
     return result, watch.found
 
 
-def _first_of_ranks(fitting: Fitting, bad: BadTensor | None) -> BadTensor | None:
-    """Return the bad tensor of the first rank that has one, with its rays numbered among those of all ranks."""
-    ranks = fitting.ranks
+def _first_of_all(bad: BadTensor | None) -> BadTensor | None:
+    """Return the bad tensor of the first process that has one, with its rays numbered among those of all processes."""
     if bad is not None:
-        bad = replace(bad, rays=tuple(ranks.rank + ranks.count * ray for ray in bad.rays))
-    return next((found for found in ranks.gathered(bad) if found is not None), None)
+        bad = replace(bad, rays=tuple(distributed.rank() + distributed.count() * ray for ray in bad.rays))
+    return next((found for found in distributed.gathered(bad) if found is not None), None)
 
 
 def _copied(tensors: dict[str, Tensor], description: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:

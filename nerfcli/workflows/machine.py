@@ -1,10 +1,24 @@
-"""Choose the number of CPU threads and the torch device."""
+"""Choose the number of CPU threads and the torch device, alone or as one of the processes that torchrun has started."""
 
 import os
 import re
 
 from nerfcli.errors import UserError
-from nerfcli.torchrun import local_rank_and_size
+
+
+def is_one_of_several() -> bool:
+    """Return True if torchrun started this process as one of several."""
+    return "TORCHELASTIC_RUN_ID" in os.environ and int(os.environ["WORLD_SIZE"]) > 1
+
+
+def is_first() -> bool:
+    """Return True if this process writes and reports: it is the only one, or the first."""
+    return not is_one_of_several() or int(os.environ["RANK"]) == 0
+
+
+def local_rank_and_size() -> tuple[int, int]:
+    """Return the number of this process on its machine, from 0, and how many are there."""
+    return (int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"])) if is_one_of_several() else (0, 1)
 
 
 def thread_count(threads: int) -> int:

@@ -1,8 +1,11 @@
 """Train a scene, keep an existing run, resume one, or refuse to overwrite another one."""
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+from nerfcli import distributed
 from nerfcli import scene as scenes
 from nerfcli.atomic import clear_leftovers
 from nerfcli.cameras.orientation import describe_rescaling
@@ -14,9 +17,8 @@ from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene, describe_unused_masks
 from nerfcli.train import loop
-from nerfcli.train.following import follow
 from nerfcli.train.left_out import OCCLUDERS
-from nerfcli.train.ranks import joined_ranks
+from nerfcli.workflows.machine import is_one_of_several
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
 NAMES_SHOWN = 8
@@ -113,15 +115,27 @@ def _trained(
         _refuse_others(run)
         notify(f"{run} has no checkpoint to resume; the training starts from the beginning")
 
-    ranks = joined_ranks(settings.device)
-    if ranks.rank > 0:
-        follow(loaded, run, settings, ranks, memory_bytes=memory_bytes)
+    if is_one_of_several():
+        distributed.join(settings.device)
+    if distributed.rank() > 0:
+        # The first process decides whether to train, keeps what comes of it, and reports.
+        if distributed.from_first(lambda: True):  # or what the first one says instead
+            with TemporaryDirectory() as nobody_reads, suppress(KeyboardInterrupt):
+                loop.train(
+                    loaded,
+                    Path(nobody_reads),
+                    settings,
+                    resume=resume,
+                    memory_bytes=memory_bytes,
+                    notify=silent,
+                    on_progress=lambda state: None,
+                )
         return Run(run)
 
     def is_kept() -> bool:
         if not _keeps(run, loaded, settings, resume=resume, overwrite=overwrite):
             return False
-        ranks.from_first(None)  # tells the other ranks that there is nothing to do
+        distributed.from_first(lambda: False)
         complete = "it is complete and has these settings; add --overwrite to train again"
         used = "its training has used this budget; give a larger --budget or --steps"
         notify(f"{run} is kept: {used if resume else complete}")
@@ -135,6 +149,7 @@ def _trained(
         clear_leftovers(run)
         if overwrite:
             (run / METRICS).unlink(missing_ok=True)  # they belong to the field that is replaced
+        distributed.from_first(lambda: True)
 
         def on_progress(state: loop.Progress) -> None:
             speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
@@ -147,7 +162,6 @@ def _trained(
             settings,
             resume=resume,
             memory_bytes=memory_bytes,
-            ranks=ranks,
             notify=notify,
             on_progress=on_progress,
         )

@@ -1,0 +1,193 @@
+"""The processes that torchrun has started to train one field together; in a single one, nothing here changes anything.
+
+Each has the whole state of the training and draws the same pixels from the same random numbers, but renders only every
+`count()`-th of them, beginning with the one of its rank. Before the optimiser steps, all add up what they have found:
+losses, gradients, numbers of samples. Equal states therefore stay equal, and match those of one process except for the
+order of float32 sums.
+"""
+
+import atexit
+import io
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from nerfcli.errors import LOST_RANK, UserError
+
+# Timeouts: long while photos are loaded and components selected, short for joining and for steps. A process that ends
+# is noticed at once by its closed connections; only a machine that goes silent takes this long.
+PREPARATION, STEP = timedelta(hours=12), timedelta(minutes=5)
+
+Value = TypeVar("Value")
+# The group with the long timeout; None in a single process, and while the first one computes something alone.
+_group: dist.ProcessGroup | None = None
+
+
+def join(device: str) -> None:
+    """Meet the other processes, once, until this one ends.
+
+    Args:
+        device: of this process.
+
+    Raises:
+        UserError: another process has ended already.
+    """
+    global _group
+    if _group is not None:
+        return
+    if device != "cpu":
+        torch.cuda.set_device(device)
+    with _lost_processes_reported():
+        dist.init_process_group("gloo" if device == "cpu" else "cpu:gloo,cuda:nccl", timeout=STEP)
+        group = dist.new_group(timeout=PREPARATION)
+    assert isinstance(group, dist.ProcessGroup)  # this process is in it
+    _group = group
+    atexit.register(_leave)
+
+
+def _leave() -> None:
+    """Disconnect before this process exits: threads that still listen would abort it."""
+    global _group
+    _group = None
+    dist.destroy_process_group()
+
+
+def rank() -> int:
+    """Return the number of this process, from 0; the first one decides, writes and reports."""
+    return 0 if _group is None else dist.get_rank()
+
+
+def count() -> int:
+    """Return the number of processes."""
+    return 1 if _group is None else dist.get_world_size()
+
+
+def own(rows: Tensor, total: int) -> Tensor:
+    """Return this process's part of rows, which are the last ones of a total."""
+    if count() == 1:
+        return rows
+    return rows[(rank() - (total - len(rows))) % count() :: count()].contiguous()
+
+
+def whole(own_rows: Tensor, total: int) -> Tensor:
+    """Return the rows of all processes, from what `own` has returned in each of a total."""
+    if count() == 1:
+        return own_rows
+    rows = own_rows.new_zeros(total, *own_rows.shape[1:])
+    rows[rank() :: count()] = own_rows
+    add_up(rows)
+    return rows
+
+
+def add_up(*tensors: Tensor) -> None:
+    """Replace tensors of one type by their sums over all processes, identical to the bit in each."""
+    if count() == 1 or not tensors:
+        return
+    with _lost_processes_reported():
+        if len(tensors) == 1:
+            dist.all_reduce(tensors[0])
+            return
+        joined = torch.cat([tensor.reshape(-1) for tensor in tensors])
+        dist.all_reduce(joined)
+    for tensor, part in zip(tensors, joined.split([tensor.numel() for tensor in tensors]), strict=True):
+        tensor.copy_(part.view_as(tensor))
+
+
+def add_up_gradients(leaves: Iterable[Tensor]) -> None:
+    """Add up gradients; a process none of whose rays has a sample contributes 0."""
+    if count() == 1:
+        return
+    gradients = []
+    for leaf in leaves:
+        if leaf.requires_grad:
+            leaf.grad = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+            gradients.append(leaf.grad)
+    add_up(*gradients)
+
+
+def total(number: int) -> int:
+    """Return the sum of a number over all processes."""
+    summed = torch.tensor(number)
+    add_up(summed)
+    return int(summed)
+
+
+def keep_largest(tensor: Tensor) -> None:
+    """Replace each element of a tensor by its maximum over all processes."""
+    if count() > 1:
+        with _lost_processes_reported():
+            dist.all_reduce(tensor, op=dist.ReduceOp.MAX)
+
+
+def largest(number: float) -> float:
+    """Return the maximum of a number over all processes."""
+    found = torch.tensor(number, dtype=torch.float64)
+    keep_largest(found)
+    return float(found)
+
+
+def gathered(value: Value) -> list[Value]:
+    """Return the values of all processes, in order of rank."""
+    values: list[Any] = [value] * count()
+    if count() > 1:
+        with _lost_processes_reported():
+            dist.all_gather_object(values, value, group=_group)
+    return values
+
+
+def from_first(compute: Callable[[], Value]) -> Value:
+    """Return what the first process computes, alone, while the others wait; tensors on its GPU come to their own."""
+    global _group
+    group = _group
+    if group is None:
+        return compute()
+    packed = io.BytesIO()
+    if rank() == 0:
+        _group = None
+        try:
+            torch.save(compute(), packed)
+        finally:
+            _group = group
+    sent = [packed.getvalue()]
+    with _lost_processes_reported():
+        dist.broadcast_object_list(sent, src=0, device=torch.device("cpu"), group=group)
+    place = {"cuda:0": f"cuda:{torch.cuda.current_device()}"} if torch.cuda.is_initialized() else None
+    return torch.load(io.BytesIO(sent[0]), map_location=place, weights_only=False)
+
+
+def copy_from_first(*tensors: Tensor) -> None:
+    """Overwrite tensors with those of the first process."""
+    if count() > 1:
+        with _lost_processes_reported():
+            for tensor in tensors:
+                dist.broadcast(tensor, src=0)
+
+
+@contextmanager
+def interrupted_together() -> Iterator[None]:
+    """Let a KeyboardInterrupt that is raised inside in any process end all of them here."""
+    came: KeyboardInterrupt | None = None
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        came = error
+    if largest(came is not None):
+        raise came or KeyboardInterrupt
+
+
+@contextmanager
+def _lost_processes_reported() -> Iterator[None]:
+    """Report a process that has ended, or does not answer, as a `UserError` with exit code `LOST_RANK`."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise UserError(
+            "another process of this training has ended, or its machine does not answer",
+            "see what it reported; if the run has a checkpoint, continue with the same command and --resume",
+            LOST_RANK,
+        ) from error
