@@ -10,8 +10,6 @@ import torch
 
 _CPU_INFO = Path("/proc/cpuinfo")
 _STATUS, _CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-# If other programs use more than this fraction of the processors, measured times suffer.
-BUSY_FRACTION = 0.25
 
 
 def describe_machine(device: str, threads: int) -> dict[str, Any]:
@@ -43,7 +41,8 @@ def load_average() -> float | None:
 
 def is_busy(load: float | None) -> bool:
     """Return whether a load average from before the start shows that other programs use the processors."""
-    return load is not None and load > BUSY_FRACTION * (os.cpu_count() or 1)
+    # Measured times suffer if other programs use more than a quarter of the processors.
+    return load is not None and load > 0.25 * (os.cpu_count() or 1)
 
 
 @dataclass(frozen=True)

@@ -37,12 +37,9 @@ MOST_PHOTOS = 3
 LEAST_ROUNDS, MOST_ROUNDS = 3, 9
 # With fewer settings there is nothing to compare; these are measured even if time is short.
 LEAST_SETTINGS = 7
-# Mean time of the first settings over that of the default.
-_MEAN_COST = 1.2
 # A rendering counts as converged with steps this many times as fine, and next to nothing left out by the early stop.
 FINER = 8
 # Seconds of a training besides the training: photos, preparation, comparison with held-out photos.
-_OVERHEAD_SECONDS = 6.0
 _WORK = ".training"
 
 # Called with the points so far, after each round of renderings and after each training.
@@ -71,7 +68,8 @@ def measure_renderings(run: Run, *, device: str, threads: int, seconds: float, s
     _render(model, photos[0], settings[0])
     once = _timed(model, photos[:1], settings[0])
     # One photo, and a smaller one, where the least number of rounds would take longer than the time.
-    needed = once * (FINER + LEAST_SETTINGS * (LEAST_ROUNDS + 1)) * _MEAN_COST
+    # The first settings take 1.2 times as long as the default.
+    needed = once * (FINER + LEAST_SETTINGS * (LEAST_ROUNDS + 1)) * 1.2
     count = max(1, min(MOST_PHOTOS, len(photos), int(seconds / needed)))
     photos = [smaller(photo, (needed / seconds) ** 0.5) for photo in photos[:: -(-len(photos) // count)]]
     tell(spent(), "rendering the converged pictures")
@@ -124,7 +122,7 @@ def measure_trainings(
     if not scene.test_frames:
         raise UserError(f"{scene_folder} has no held-out photos", "by default every 8th photo is held out")
     base = TrainSettings(device=device, threads=threads, **sizes_for(device))
-    chosen, unit = affordable(train_settings(), seconds, overhead=_OVERHEAD_SECONDS)
+    chosen, unit = affordable(train_settings(), seconds, overhead=6.0)
     points: list[Point] = []
     memory, folder = PeakMemory(device), work / _WORK
     for number, setting in enumerate(chosen):

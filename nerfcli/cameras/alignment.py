@@ -15,8 +15,6 @@ from nerfcli.cameras.rigid import Similarity
 
 # Number of hypotheses, from three points each; even with half of the points outliers, one in eight has none.
 _TRIPLES = 200
-# Residuals of so many points are computed at once.
-_POINTS_AT_ONCE = 100_000
 
 # Squared length of noise in three dimensions, in sigma^2 (chi^2 with 3 degrees of freedom): median, 99.9 % quantile.
 _MEDIAN, _QUANTILE_999 = 2.366, 16.266
@@ -89,7 +87,7 @@ def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
     apart = np.ptp(x[triples], axis=1).max(axis=1) > 0
     scales, rotations, translations = _aligned(x[triples[apart]], y[triples[apart]])
     medians = [np.array([least])]
-    at_once = max(1, _POINTS_AT_ONCE // count)
+    at_once = max(1, 100_000 // count)  # limits memory
     for some in (slice(first, first + at_once) for first in range(0, len(scales), at_once)):
         off = scales[some, None, None] * (rotations[some] @ x.T) + translations[some, :, None] - y.T  # (some, 3, N)
         medians.append(np.partition(np.sum(off**2, axis=1), half, axis=1)[:, half])

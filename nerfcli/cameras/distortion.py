@@ -15,8 +15,6 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.polynomial import polynomial
 
-# Number of radii in the table that starts the inversion of the radial part; Newton's method refines the result.
-TABLE_SIZE = 4096
 # Newton's method converges quadratically: after a step of this size, relative to the radius, only rounding is left.
 LAST_STEP = 1e-8
 # Three steps are mostly enough; if a step fails, the interval or the step is halved, which takes at most this many.
@@ -137,7 +135,8 @@ class Distortion:
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             high_enough = np.append(ends[:-1] * self._factor(ends[:-1] ** 2) > goals.max(initial=0.0), True)
             end = ends[np.argmax(high_enough)]
-            knots = np.linspace(0.0, end, TABLE_SIZE)
+            # This table starts the inversion of the radial part; Newton's method refines the result.
+            knots = np.linspace(0.0, end, 4096)
             heights = knots * self._factor(knots**2)
         finite = np.isfinite(heights)  # at a pole they are not
         return np.interp(goals, heights[finite], knots[finite]), ~(goals >= heights[-1]), float(end)

@@ -14,10 +14,6 @@ from nerfcli.cameras import rigid
 # Number of samples to measure the curve's length: of the whole curve, and at least of each piece. The speed is then
 # constant to about 1e-4 with many pieces, and to 1e-6 with few.
 _CURVE_SAMPLES = 32768
-_PIECE_SAMPLES = 64
-
-# Weight of all turning of a flight relative to all its movement.
-_TURNING_WEIGHT = 0.25
 
 
 def fly(world_from_cam: np.ndarray, count: int) -> np.ndarray:
@@ -49,13 +45,14 @@ def fly(world_from_cam: np.ndarray, count: int) -> np.ndarray:
     rotations = Rotation.from_matrix(world_from_cam[:, :3, :3])
     turns = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
     moved, turned = np.linalg.norm(moves, axis=1), np.linalg.norm(turns, axis=1)
-    per_radian = _TURNING_WEIGHT * moved.sum() / max(turned.sum(), 1e-12) if moved.sum() > 0 else 1.0
+    # All turning of a flight weighs a quarter of all its movement.
+    per_radian = 0.25 * moved.sum() / max(turned.sum(), 1e-12) if moved.sum() > 0 else 1.0
     times = np.sqrt(np.maximum(moved, per_radian * turned))
     position = _position_curve(world_from_cam[:, :3, 3], moves, times)
     rotation = _rotation_curve(rotations, turns, times)
 
     # The speed over t jumps where pieces meet, so there must be samples at these points.
-    samples = max(_PIECE_SAMPLES, -(-_CURVE_SAMPLES // len(times)))
+    samples = max(64, -(-_CURVE_SAMPLES // len(times)))
     t = np.arange(samples * len(times) + 1) / samples
     along = rotation(t)
     steps = np.maximum(

@@ -11,11 +11,6 @@ from nerfcli.errors import UserError
 
 LENSES = ("pinhole", "fisheye", "equirectangular")
 
-# Upper limit of a picture's width and height.
-MOST_PIXELS = 65536
-
-_FISHEYE_FOV_DEG = 180.0
-
 
 @dataclass(frozen=True)
 class Window:
@@ -103,7 +98,7 @@ def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
             exit_code=2,
         )
     if lens == "fisheye":
-        focal_px = width / math.radians(_FISHEYE_FOV_DEG if fov_deg is None else fov_deg)
+        focal_px = width / math.radians(180.0 if fov_deg is None else fov_deg)
         return Camera("SIMPLE_FISHEYE", width, height, (focal_px, width / 2, height / 2))
     if fov_deg is not None:
         return Camera.pinhole(width, height, width / 2 / math.tan(math.radians(fov_deg) / 2))

@@ -15,7 +15,6 @@ _PARALLEL_RAD = np.radians(3.0)
 # The mean viewing direction is shorter than this if the cameras look all around; it is 0.64 for half a circle.
 _ALL_AROUND = 0.4
 
-_DEPTH_PER_SPREAD = 5.0
 
 # The cameras surround something if no gap between neighbouring headings is wider than this.
 _WIDEST_GAP_RAD = np.radians(150.0)
@@ -57,7 +56,7 @@ def focus_point(frames: Sequence[Frame], *, depth_hint: float | None = None) -> 
     if np.linalg.norm(views.mean(axis=0)) < _ALL_AROUND:
         return centres.mean(axis=0)
     if depth_hint is None:
-        depth_hint = _DEPTH_PER_SPREAD * spread if spread > 0 else 1.0
+        depth_hint = 5.0 * spread if spread > 0 else 1.0  # parallel axes do not tell
     return centres.mean(axis=0) + depth_hint * mean_direction(views)
 
 

@@ -12,15 +12,14 @@ from nerfcli.cameras.lens import DISTORTIONS
 
 FOCAL = "focal"
 _FOCAL_NAMES = ("f", "fx", "fy")
-# Further terms are hard to tell apart from the first two, and diverge where few pixels constrain them.
-_RADIAL_TERMS = 2
 
 
 def changeable(camera: Camera) -> tuple[str, ...]:
     """List the parameters that can change: "focal" and the radial terms; none for a spherical camera."""
     radial = [name for group in DISTORTIONS[camera.model] for name in group.get("radial", ())]
     has_focal = any(name in _FOCAL_NAMES for name in camera.values)
-    return (*([FOCAL] if has_focal else []), *radial[:_RADIAL_TERMS])
+    # Further terms are hard to tell apart from the first two, and diverge where few pixels constrain them.
+    return (*([FOCAL] if has_focal else []), *radial[:2])
 
 
 def changed(camera: Camera, names: Sequence[str], values: np.ndarray) -> Camera:

@@ -27,13 +27,9 @@ from nerfcli.errors import UserError
 
 __all__ = ["ellipse", "focus_point", "interpolate", "orbit", "spiral"]
 
-# Number of samples to measure a curve's arc length; the speed is then constant to about 1e-5.
-_CURVE_SAMPLES = 8192
 
 # Fraction of the cameras' spread that a path uses: nothing was observed from beyond its rim.
 _INSIDE = 0.8
-# With fewer cameras that view the focus, their angles about it say little, and those of all cameras are used.
-_FEWEST_VIEWING = 3
 
 
 def orbit(frames: Sequence[Frame], *, count: int, depth_hint: float | None = None) -> tuple[Frame, ...]:
@@ -61,7 +57,8 @@ def orbit(frames: Sequence[Frame], *, count: int, depth_hint: float | None = Non
     else:
         viewing = _show(frames, focus) & elsewhere
         # Who walks past the focus photographs other things from behind it.
-        kept = viewing if viewing.sum() >= _FEWEST_VIEWING else elsewhere
+        # The angles of one or two cameras that view the focus say little; those of all cameras are used then.
+        kept = viewing if viewing.sum() >= 3 else elsewhere
         curve = _frontal_ellipse(offsets[kept], distances[kept], up)
     centres = focus + _equal_steps(curve, count)
     return _looking_at(frames, centres, focus, up=up, name="orbit")
@@ -211,7 +208,8 @@ def _frontal_ellipse(offsets: np.ndarray, distances: np.ndarray, up: np.ndarray)
 
 def _equal_steps(curve: Callable[[np.ndarray], np.ndarray], count: int) -> np.ndarray:
     """Return points (count, 3) at equal arc lengths along a closed curve over [0, 1], excluding its end."""
-    t = np.linspace(0.0, 1.0, _CURVE_SAMPLES + 1)
+    # With so many samples of the curve, the speed is constant to about 1e-5.
+    t = np.linspace(0.0, 1.0, 8193)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(t), axis=0), axis=1))])
     if length[-1] == 0:
         return curve(np.zeros(count))

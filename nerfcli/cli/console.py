@@ -21,13 +21,12 @@ R = TypeVar("R")
 
 # Without a terminal, progress is a plain line at most this often.
 PLAIN_LINE_SECONDS = 10.0
-# Fraction of the work that has to be done before the time left is estimated; details may state a better estimate.
-LEAST_TIMED, STATES_LEFT = 0.02, " left"
+# Details may state a better estimate of the time left.
+STATES_LEFT = " left"
 # Error numbers of a full disk and of an exhausted quota. Files that commands write have errors of their own for these.
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-# Widths of tables of findings and of numbers in a file or a pipe, which have no width of their own.
-PLAIN_TABLE_WIDTH = 140
-WIDE_TABLE_WIDTH = 200
+# Width of tables in a file or a pipe, which have no width of their own.
+TABLE_WIDTH = 200
 
 
 class Callbacks(TypedDict):
@@ -71,7 +70,7 @@ class Console:
 
     def fact_table(self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, styles: Mapping[str, str]) -> None:
         """Print results that are not files as a table on stdout; `styles` gives the styles of cells by their text."""
-        width = None if sys.stdout.isatty() else WIDE_TABLE_WIDTH
+        width = None if sys.stdout.isatty() else TABLE_WIDTH
         _print_table(columns, rows, styles=styles, width=width, file=sys.stdout)
 
     def note(self, text: str) -> None:
@@ -87,7 +86,7 @@ class Console:
         """Print a table for the user; `styles` gives the styles of cells by their text."""
         if self.quiet:
             return
-        width = None if sys.stderr.isatty() else PLAIN_TABLE_WIDTH
+        width = None if sys.stderr.isatty() else TABLE_WIDTH
         _print_table(columns, rows, styles=styles, width=width, file=sys.stderr)
 
     @contextmanager
@@ -166,7 +165,7 @@ def _plain_lines(title: str) -> Iterator[Callable[[float, str], None]]:
 
 def _time_left(seconds: float, done: float, to_do: float) -> str:
     """Return the time that the fraction `to_do` takes, for the end of a line, if `done` took these seconds."""
-    return f", about {duration(seconds * to_do / done)} left" if done >= LEAST_TIMED else ""
+    return f", about {duration(seconds * to_do / done)} left" if done >= 0.02 else ""
 
 
 def _stderr(text: str) -> None:

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from nerfcli.doctor.examination import Diagnosis
     from nerfcli.tomography.checks.examine import ScanDiagnosis
 
-_NAMES_SHOWN = 4
 _GATES = ("good", "look")
 _STYLES = {"good": "green", "look": "yellow", "bad": "bold red"}
 
@@ -108,7 +107,7 @@ def _show(
     """Print a table of the findings and the result, and raise if a finding is worse than required."""
     rows = []
     for finding in diagnosis.findings:
-        found = ": ".join(filter(None, (finding.summary, listed(finding.names, _NAMES_SHOWN))))
+        found = ": ".join(filter(None, (finding.summary, listed(finding.names))))
         rows.append((finding.check, finding.verdict, found, finding.threshold, finding.advice))
     console.table(("check", "verdict", "found", "threshold", "what to do"), rows, styles=_STYLES)
     for check, reason in diagnosis.not_checked:

@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 from nerfcli.errors import UserError
 
-WRONG_USAGE = 2
-
 
 class Removed(NamedTuple):
     """An option that a command no longer has, or no longer takes a value of.
@@ -106,7 +104,7 @@ def refuse_removed(command: str, arguments: Sequence[str]) -> None:
     for removed in REMOVED:
         option, _, value = removed.name.partition(" ")
         if removed.command == command and any(value in ("", *given) for given in _values(option, arguments)):
-            raise UserError(f"{removed.name} was removed on {removed.since}", removed.instead, WRONG_USAGE)
+            raise UserError(f"{removed.name} was removed on {removed.since}", removed.instead, 2)
 
 
 def _values(option: str, arguments: Sequence[str]) -> list[list[str]]:

@@ -17,7 +17,6 @@ from nerfcli.workflows.machine import device_name, thread_count
 if TYPE_CHECKING:
     from nerfcli.workflows.views import Views
 
-DEFAULT_FPS = 24.0
 # Parameters for reconstructions of X-ray scans.
 _OF_SCANS = "run output outputs slices cameras device threads overwrite json quiet"
 
@@ -162,6 +161,7 @@ def render(
       nerfcli render tooth-scene-run --slices z=0 --slices x=12.5
     """
     values = dict(locals())
+    from nerfcli.cameras.formats.camera_path import DEFAULT_FPS
     from nerfcli.export.settings import OUTPUTS, ExportSettings
     from nerfcli.runs.run import load_run
     from nerfcli.tomography.result import is_reconstruction

@@ -15,8 +15,6 @@ from nerfcli.errors import GATE_NOT_MET, UserError
 TOLERANCE_PX = 1e-6
 # Coordinates are rounded to 2^-53 of their size, several times, by the writer and by the parser.
 _ROUNDINGS = 64 * 2.0**-53
-# Rays of each view: those of this many columns and rows of pixels.
-_GRID = 6
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ def check(capture: Capture, again: Capture, form: Format, *, own_lenses: bool) -
 
     @cache
     def points_on_rays(camera: Camera) -> np.ndarray:
-        steps = (np.arange(_GRID) + 0.5) / _GRID
+        steps = (np.arange(6) + 0.5) / 6  # columns and rows of pixels
         directions, valid = camera.bearings(np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * camera.size)
         return directions[valid] * distance
 

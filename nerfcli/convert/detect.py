@@ -23,8 +23,6 @@ SCALES = (1.0, 0.125, 0.25, 0.5, 2.0, 4.0, 8.0)
 # factor and by more than the noise: the 99 % interval of the difference under resampling of photos.
 LEAST_FRACTION = 0.5
 LEAST_RATIO = 1.2
-_RESAMPLES = 400
-_LEAST_GROUPS = 5
 
 # The properties of a convention that each question is about.
 _FIELDS = {
@@ -221,7 +219,7 @@ def _interval(
     """
     rng = np.random.default_rng(0)
     names, members = np.unique(groups, return_inverse=True)
-    if len(names) < _LEAST_GROUPS:
+    if len(names) < 5:
         members = np.arange(len(groups))
     count = int(members.max()) + 1
     # Infinite errors are limited, because differences of infinities are undefined.
@@ -229,7 +227,7 @@ def _interval(
     # Sorted once: the median of a sample is then found by counting, in a fifth of the time.
     ascending = [(errors[order], members[order]) for errors in (second, best) for order in [np.argsort(errors)]]
     differences = []
-    for _ in range(_RESAMPLES):
+    for _ in range(400):
         times = np.bincount(rng.integers(0, count, count), minlength=count)
         of_second, of_best = (statistic(errors, times[owners]) for errors, owners in ascending)
         differences.append(of_second - of_best)

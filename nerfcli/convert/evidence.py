@@ -20,8 +20,6 @@ from nerfcli.multiview.features import Features, Matches, find_features, mutual_
 
 # The longer side of the photos in which features are detected: a larger one finds better features, but takes longer.
 LONGER_SIDE_PX = 1000
-MOST_FEATURES = 3000
-MOST_PAIRS = 24
 # Fraction of the longer side by which matched features should move: less is explained by any poses.
 LEAST_MOVE = 0.04
 
@@ -30,7 +28,6 @@ _LEAST_MATCHES = 20
 _EPIPOLAR_PX = 2.0
 # Most observations used: enough for a median, few enough to try hundreds of hypotheses.
 _MOST_OBSERVATIONS = 20_000
-_MOST_FRAMES = 60
 # The rays of a match must be this far from parallel for their distances to the intersection to be meaningful.
 _LEAST_PARALLAX_PX = 3.0
 
@@ -57,7 +54,7 @@ def match_neighbours(
             photos[present[place]] = _photo(frames[present[place]])
         return photos[present[place]]
 
-    starts = np.unique(np.linspace(0, len(present) - 2, MOST_PAIRS).round().astype(int)) if len(present) > 1 else ()
+    starts = np.unique(np.linspace(0, len(present) - 2, 24).round().astype(int)) if len(present) > 1 else ()
     pairs, stride = [], 1
     for done, start in enumerate(starts):
         progress(done / len(starts), f"photo {done} of {len(starts)}")
@@ -88,7 +85,7 @@ def _move(matched: tuple[np.ndarray, np.ndarray], camera: Camera) -> float:
 def _photo(frame: Frame) -> tuple[Camera, Features]:
     assert frame.image is not None
     grey, camera = _stored_or_shown(frame.camera, frame.image)
-    return camera, find_features(grey, longer_side_px=LONGER_SIDE_PX, most=MOST_FEATURES)
+    return camera, find_features(grey, longer_side_px=LONGER_SIDE_PX, most=3000)
 
 
 def _stored_or_shown(camera: Camera, path: Path) -> tuple[np.ndarray, Camera]:
@@ -205,7 +202,7 @@ class FrustumEvidence:
 
     def __init__(self, capture: Capture):
         rng = np.random.default_rng(0)
-        frames = np.unique(np.linspace(0, len(capture.frames) - 1, _MOST_FRAMES).round().astype(int))
+        frames = np.unique(np.linspace(0, len(capture.frames) - 1, 60).round().astype(int))
         chosen = rng.choice(len(capture.points), min(len(capture.points), 300), replace=False)
         self.groups = np.repeat(frames, len(chosen))
         self._points = np.tile(capture.points[chosen], (len(frames), 1))

@@ -4,8 +4,6 @@ import numpy as np
 
 # Values within half a grey level of 0 and 1 are saturated: they do not determine the true colour.
 EDGE = 0.5 / 255
-# The correction changes which pixels are saturated, so it is fitted this many times.
-ROUNDS = 5
 
 
 def colour_aligned(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np.ndarray:
@@ -28,7 +26,8 @@ def colour_aligned(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) 
     wanted = photo.reshape(-1, 3).astype(np.float64)
     current = picture.reshape(-1, 3).astype(np.float64)
     counted = _unsaturated(current) & used.reshape(-1, 1)
-    for _ in range(ROUNDS):
+    # The correction changes which pixels are saturated, so it is fitted several times.
+    for _ in range(5):
         terms = _quadratic(current)
         fitted = counted & _unsaturated(current) & _unsaturated(wanted)
         corrected = current.copy()

@@ -20,11 +20,6 @@ from nerfcli.render.pictures import render_picture
 from nerfcli.render.visibility import DepthMap, coverage_and_parallax, depth_maps, sees, small_frame
 from nerfcli.runs.run import Run
 
-# Surface points per photo, which determine which photos see the same surface and the range in which depth is searched.
-_POINTS = 200
-# Most measured pixels of a photo that are compared.
-_PIXELS = 20_000
-
 
 def measure_depth_errors(
     run: Run,
@@ -61,7 +56,7 @@ def measure_depth_errors(
     for number, (photo, found) in enumerate(zip(photos[len(train) :], measured[len(train) :], strict=True)):
         small = small_frame(photo.frame, LONGER_SIDE_PX).camera
         matched, pixels = matched + len(found.pixels), pixels + small.width * small.height
-        chosen = slice(None, None, 1 + len(found.pixels) // _PIXELS)
+        chosen = slice(None, None, 1 + len(found.pixels) // 20_000)
         points, median = _median_points(model, photo.frame, found.pixels[chosen])
         coverage, _ = coverage_and_parallax(photo_depths, points)
         errors = found.distances[chosen] / median - 1.0
@@ -76,7 +71,7 @@ def surface_tracks(maps: Sequence[DepthMap]) -> Tracks:
     parts = []
     for view in maps:
         points = view.points()
-        parts.append(points[:: 1 + len(points) // _POINTS])
+        parts.append(points[:: 1 + len(points) // 200])
     points = np.concatenate(parts)
     columns = []
     for number, view in enumerate(maps):

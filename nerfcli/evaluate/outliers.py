@@ -13,7 +13,6 @@ _DEVIATIONS, _LEAST_DB = 5.0, 6.0
 _NORMAL = 1.4826
 # Fewer photos do not show what is usual, and more than this fraction of them are no exceptions.
 _FEWEST, _MOST = 5, 0.25
-_NAMES_SHOWN = 4
 
 
 def outliers(images: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -37,7 +36,7 @@ def outlier_warnings(images: Sequence[Mapping[str, Any]]) -> list[str]:
     if not low:
         return []
     median = statistics.median(image["psnr"] for image in images)
-    names = listed([f"{image['name']} ({image['psnr']:.1f} dB)" for image in low], _NAMES_SHOWN)
+    names = listed([f"{image['name']} ({image['psnr']:.1f} dB)" for image in low])
     return [
         f"far below the median of {median:.1f} dB: {names}. The pose may be wrong, or the photo shows what no "
         "training photo does: nerfcli doctor SCENE checks poses, nerfcli report RUN shows the pictures"

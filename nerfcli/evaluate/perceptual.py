@@ -19,7 +19,6 @@ NAME = "LPIPS AlexNet v0.1"
 INSTALL = "pip install 'nerfcli[lpips]'"
 # AlexNet halves a picture so often that nothing is left of a smaller one.
 SMALLEST = 32
-_ANSWER_SECONDS = 20.0
 
 
 def find_perceptual(notify: Callable[[str], None]) -> Perceptual | None:
@@ -54,7 +53,7 @@ def find_perceptual(notify: Callable[[str], None]) -> Perceptual | None:
 def _socket_timeout() -> Iterator[None]:
     """Limit the wait for servers that do not answer, for which torch waits forever."""
     before = socket.getdefaulttimeout()
-    socket.setdefaulttimeout(_ANSWER_SECONDS)
+    socket.setdefaulttimeout(20.0)
     try:
         yield
     finally:

@@ -25,8 +25,6 @@ from nerfcli.render.model import Model
 from nerfcli.render.pictures import RenderedPicture, render_picture
 
 PROTOCOL = "nerfcli-2"
-NO_GAINS = (0.0, 0.0, 0.0)
-WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,7 @@ class HeldOutPhoto:
     frame: Frame
     pixels: np.ndarray
     used: np.ndarray | None
-    log_gains: tuple[float, ...] = NO_GAINS
+    log_gains: tuple[float, ...] = (0.0, 0.0, 0.0)
     gains_from: str = "none"
 
 
@@ -170,7 +168,7 @@ def mean_of(images: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
 
 def background_of(model: Model, photo: HeldOutPhoto) -> Background:
     """Return the background of pictures that are compared with a photo: white if the photo has alpha."""
-    return WHITE if photo.pixels.shape[-1] == 4 else model.background
+    return (1.0, 1.0, 1.0) if photo.pixels.shape[-1] == 4 else model.background
 
 
 def over_white(pixels: np.ndarray) -> np.ndarray:

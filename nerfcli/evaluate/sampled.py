@@ -15,7 +15,6 @@ from nerfcli.render.rays import pixel_rays
 from nerfcli.render.tracing import TOLERANCE, render_rays, uniform_cuts
 
 SAMPLED_PIXELS = 2**14
-_RAYS_AT_A_TIME = 4096
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ def render_sampled(
     *,
     cuts: Tensor,
     tolerance: float,
-    at_a_time: int = _RAYS_AT_A_TIME,
+    at_a_time: int = 4096,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return colours (N, 3) in [0, 1] at pixel centres, in the field's precision, and which of them have a ray."""
     dtype = next(model.field.parameters()).dtype

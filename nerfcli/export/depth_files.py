@@ -24,7 +24,6 @@ from nerfcli.media.quantiles import quantiles
 from nerfcli.render.pictures import RenderedPicture
 
 # Levels are chosen by this quantile of the depths of a clip, and reach up to this many times as far.
-_TYPICAL, _HEADROOM = 0.999, 2.0
 _AXES_OF_VIEW = "OpenCV: +x right, +y down, +z forward; the top-left pixel's centre is (0.5, 0.5)"
 
 
@@ -135,8 +134,8 @@ def write_levels(folder: Path, names: Sequence[str], *, meaning: DepthMeta) -> L
         for name in names:
             yield read_map(folder, name, meaning)
 
-    typical, largest = quantiles(depths, (_TYPICAL, 1.0)) or (0.0, 0.0)
-    scale = chosen_scale(min(_HEADROOM * typical, largest), meaning.unit)
+    typical, largest = quantiles(depths, (0.999, 1.0)) or (0.0, 0.0)
+    scale = chosen_scale(min(2.0 * typical, largest), meaning.unit)
     reach, pixels_beyond = LARGEST_LEVEL * scale * (1 + 1e-9), 0
     for name, depth in zip(names, depths(), strict=True):
         beyond = depth > reach

@@ -21,10 +21,6 @@ from nerfcli.media.levels import scale_in_words
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.model import Model
 
-# Frames in progress at a time, each in threads of its own: some steps of a picture use one thread. More would wait for
-# Python's lock.
-MOST_AT_A_TIME = 4
-
 
 def export_frames(
     model: Model,
@@ -134,7 +130,8 @@ def _render_missing(
         notify(f"resuming: {len(held)} of {len(part)} frames are already in {unfinished.folder}")
         on_rays(sum(map(order.rays, held)))
     render_one = partial(render_frame, model, order, unfinished=unfinished)
-    at_a_time = min(threads, MOST_AT_A_TIME, len(missing))
+    # Some steps of a picture use one thread, so several are in progress; more would wait for Python's lock.
+    at_a_time = min(threads, 4, len(missing))
     if at_a_time > 1 and model.thread_safe:
         _render_in_threads(render_one, missing, at_a_time=at_a_time, threads=threads, on_rays=on_rays)
     else:

@@ -19,11 +19,6 @@ from nerfcli.media.preview import COLOURS, preview
 from nerfcli.media.quantiles import quantiles
 from nerfcli.media.video import write_video
 
-# The ends of a colour range: quantiles of all valid pixels of the clip, so that a single speck does not stretch it.
-RANGE_QUANTILES = (0.01, 0.99)
-# Maps are read three times; as many as fit into this size are kept in memory.
-_KEPT_BYTES = 2**28
-
 
 def write_previews(folder: Path, order: Order, meta: DepthMeta, *, threads: int = 1) -> dict[str, tuple[float, float]]:
     """Write a false-colour PNG beside each measured file, with one range per output.
@@ -55,7 +50,8 @@ def _write_previews_of(
         if name in kept:
             return kept[name]
         values = read_map(folder, name, meaning)
-        if (len(kept) + 1) * values.nbytes <= _KEPT_BYTES:
+        # Maps are read three times; as many as fit into 256 MB are kept in memory.
+        if (len(kept) + 1) * values.nbytes <= 2**28:
             kept[name] = values
         return values
 
@@ -110,7 +106,8 @@ def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> tuple[
 
     (0, 1) for confidence, and if no pixel has a value.
     """
-    found = None if output == "confidence" else quantiles(maps, RANGE_QUANTILES)
+    # The ends of a colour range: quantiles of all valid pixels of the clip, so that a single speck does not stretch it.
+    found = None if output == "confidence" else quantiles(maps, (0.01, 0.99))
     if not found:
         return 0.0, 1.0
     lo, hi = found

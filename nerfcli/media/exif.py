@@ -13,7 +13,6 @@ from nerfcli.media.images import exif_entries, opened, orientation_of, upright_s
 
 # Values of EXIF's FocalPlaneResolutionUnit; 4 and 5 are not standard, but some cameras write them.
 _RESOLUTION_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_MOST_ZOOM = 100.0
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def _positive(value: Any) -> float | None:
 
 def _zoom(value: Any) -> float | None:
     zoom = _number(value)
-    return zoom if zoom is not None and 1 <= zoom <= _MOST_ZOOM else None
+    return zoom if zoom is not None and 1 <= zoom <= 100.0 else None
 
 
 def _recorded_size(camera: dict[int, Any]) -> tuple[int, int] | None:

@@ -21,10 +21,6 @@ _ROUNDING_PX = 1.5
 # Ratios of the longer to the shorter side of camera pictures; another shape without a recorded size means a crop.
 _CAMERA_SHAPES = (5 / 4, 4 / 3, 3 / 2, 16 / 9)
 _SAME_SHAPE = 0.01
-# Between a fisheye and a strong telephoto lens, relative to the picture's longer side.
-_FOCAL_RANGE = (0.25, 40.0)
-# Widths of camera sensors, from small phones to medium format.
-_SENSOR_RANGE_MM = (2.5, 60.0)
 # Zooms that differ by less say nothing about the 35 mm equivalent, which is rounded to millimetres.
 _LEAST_RANGE = 1.05
 
@@ -60,7 +56,8 @@ def focal_evidence(exif: Exif) -> FocalEvidence:
     focal_px = _focal_px(exif, whole_px)
     if focal_px is None:
         return FocalEvidence(None, not doubt, doubt, whole_px)
-    shortest, longest = (fraction * whole_px[0] for fraction in _FOCAL_RANGE)
+    # Between a fisheye and a strong telephoto lens, relative to the picture's longer side.
+    shortest, longest = (fraction * whole_px[0] for fraction in (0.25, 40.0))
     if not shortest <= focal_px <= longest:
         doubt = f"EXIF gives a focal length of {focal_px / whole_px[0]:.3g} times the longer side, which is implausible"
         return FocalEvidence(None, False, doubt, whole_px)
@@ -95,7 +92,8 @@ def _focal_px(exif: Exif, whole_px: tuple[float, float]) -> float | None:
         return None
     taken_longer = max(exif.taken_px)
     sensor_mm = taken_longer / exif.sensor_px_per_mm
-    if not _SENSOR_RANGE_MM[0] <= sensor_mm <= _SENSOR_RANGE_MM[1]:
+    # Widths of camera sensors, from small phones to medium format.
+    if not 2.5 <= sensor_mm <= 60.0:
         return None  # the resolution refers to another size than the recorded one
     return exif.focal_mm * exif.sensor_px_per_mm * whole_px[0] / taken_longer
 

@@ -11,10 +11,6 @@ from nerfcli.cameras.frame import Frame
 
 _WIDTH, _HEIGHT = 520, 230
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 10, 8, 34
-# Most points drawn per curve; more would not be visible at this size.
-_MOST_POINTS = 400
-# Length of the lines that show viewing directions, as a fraction of the drawing.
-_SIGHT = 0.05
 
 
 @dataclass(frozen=True)
@@ -100,7 +96,7 @@ def from_above(train: Sequence[Frame], test: Sequence[Frame]) -> str:
     parts = [f'<svg class="above" viewBox="0 0 {side} {side}" role="img" aria-label="cameras from above">']
     for index, frame in enumerate(frames):
         x, y = pixel(flat[index])
-        end_x, end_y = pixel(flat[index] + towards[index] * (_SIGHT * extent / 0.43))
+        end_x, end_y = pixel(flat[index] + towards[index] * (0.05 * extent / 0.43))
         kind = "train" if index < len(train) else "test"
         title = f"<title>{escape(frame.name)}, {kind}</title>"
         parts.append(
@@ -116,8 +112,8 @@ def _line(curve: Curve, places: Sequence[tuple[float, float]]) -> str:
 
 
 def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, float]]:
-    """Return about `_MOST_POINTS` of the points, evenly spaced, including the last."""
-    step = -(-len(points) // _MOST_POINTS)
+    """Return about 400 points, evenly spaced, including the last: more are not visible at this size."""
+    step = -(-len(points) // 400)
     return points if step <= 1 else [*points[:-1:step], points[-1]]
 
 

@@ -10,7 +10,6 @@ from nerfcli.report.run_facts import RunFacts, warnings_of
 from nerfcli.report.tables import last_logged, metric, registered, render_time
 from nerfcli.report.views import HeldOutRenderings
 
-_THUMBNAIL_PX = 120
 _COLUMNS = (
     ("photos", lambda run: str(len(run.frames.train) + len(run.frames.test))),
     ("poses found", registered),
@@ -43,6 +42,6 @@ def _thumbnails(look: Sequence[HeldOutRenderings]) -> str:
     if not look:
         return ""
     view = sorted(look, key=lambda view: view.psnr)[len(look) // 2]
-    both = np.hstack([fitted(view.photo, _THUMBNAIL_PX), fitted(view.picture, _THUMBNAIL_PX)])
+    both = np.hstack([fitted(view.photo, 120), fitted(view.picture, 120)])
     source = data_uri(jpeg_bytes(both), "jpeg")
     return f'<img class="thumbnail" alt="{escape(view.name)} and its rendering" src="{source}">'

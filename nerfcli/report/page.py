@@ -40,7 +40,6 @@ from nerfcli.sealed import digest
 # With more runs than this, curves share colours.
 COLOURS = 6
 DEPTH_COLOURS = "turbo"
-_PICTURE_PX = 800
 _MEGA = 1e6
 
 
@@ -172,7 +171,7 @@ def _layers(
 
 
 def _layer(label: str, picture: np.ndarray) -> dict[str, str]:
-    return {"label": label, "uri": data_uri(jpeg_bytes(picture, longest_px=_PICTURE_PX), "jpeg")}
+    return {"label": label, "uri": data_uri(jpeg_bytes(picture, longest_px=800), "jpeg")}
 
 
 def _legends_html(runs: Sequence[RunFacts], ranges: Sequence[tuple[float, float]], depths: Sequence[DepthMeta]) -> str:

@@ -13,10 +13,6 @@ from nerfcli.runs.log import LogEntry
 from nerfcli.runs.run import Run
 
 POSES_REPORT = "poses_report.json"
-# Photos named in a warning; further ones are only counted.
-_NAMED = 6
-# Blur from the uncertainty of a pose that is visible at the size of the photos.
-_VISIBLE_BLUR_PX = 1.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +79,7 @@ def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
     yield from _of_poses(facts.poses or {})
     missing = facts.config.missing_photos
     if missing:
-        yield "scene", f"{several(len(missing), 'photo')} missing: {listed(missing, _NAMED)}"
+        yield "scene", f"{several(len(missing), 'photo')} missing: {listed(missing)}"
     for note in facts.config.warnings:
         yield "training", note
     rollbacks = max((entry.get("rollbacks", 0) for entry in facts.log), default=0)
@@ -132,14 +128,14 @@ def _of_poses(poses: dict[str, Any]) -> Iterator[tuple[str, str]]:
     left_out = [image for image in poses.get("images", []) if not image.get("registered")]
     if left_out:
         reasons = [f"{image['name']} ({image.get('reason') or 'unknown reason'})" for image in left_out]
-        yield "poses", f"{several(len(left_out), 'photo')} without a pose: {listed(reasons, _NAMED)}"
+        yield "poses", f"{several(len(left_out), 'photo')} without a pose: {listed(reasons)}"
     for failure in poses.get("verdict", {}).get("failures", []):
         yield "poses", str(failure)
     attempts = poses.get("attempts", [])
     if len(attempts) > 1:
         yield "poses", f"mapping took {len(attempts)} attempts: {', '.join(str(one.get('what')) for one in attempts)}"
     blur = poses.get("pose_blur_px") or {}
-    if (blur.get("largest") or 0.0) > _VISIBLE_BLUR_PX:
+    if (blur.get("largest") or 0.0) > 1.0:  # visible at the size of the photos
         yield "poses", f"the pose of {blur.get('photo')} is uncertain by {blur['largest']:.1f} px"
 
 

@@ -24,8 +24,6 @@ ERROR_COLOURS = "viridis"
 COVERAGE_PX, COVERAGE_RANGE = 320, 8
 COVERAGE_COLOURS = "viridis"
 _COVERAGE = DepthRequest("median", "ray")
-# Percentiles of all depths at the ends of the colour range.
-_RANGE_PERCENT = (1, 99)
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ def depth_range(views: Sequence[HeldOutRenderings]) -> tuple[float, float]:
     valid = np.concatenate([np.empty(0), *(view.depth[np.isfinite(view.depth)] for view in views)])
     if not len(valid):
         return 0.0, 1.0
-    low, high = np.percentile(valid, _RANGE_PERCENT).tolist()
+    low, high = np.percentile(valid, (1, 99)).tolist()
     return low, high
 
 

@@ -6,13 +6,8 @@ import torch
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import render_rays
 
-_BLOCK = 2**15
-# Rendering tolerance, far below a level of 8-bit colours.
-_TOLERANCE = 1e-4
 # Viewing directions of a point without a surface.
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
-# Rays to a surface cover this many voxels before and behind it, in this many steps.
-_REACH_VOXELS, _STEPS = 3.0, 24
 
 
 def surface_colours(model: Model, points: np.ndarray, normals: np.ndarray, *, voxel_size: float) -> np.ndarray:
@@ -26,8 +21,9 @@ def surface_colours(model: Model, points: np.ndarray, normals: np.ndarray, *, vo
         voxel_size: scene units.
     """
     to_training = model.training_from_scene
-    reach = _REACH_VOXELS * voxel_size * to_training.scale
-    cuts = torch.linspace(0.0, 2 * reach, _STEPS + 1)
+    # Rays to a surface cover three voxels before and behind it, in 24 steps.
+    reach = 3.0 * voxel_size * to_training.scale
+    cuts = torch.linspace(0.0, 2 * reach, 25)
     inwards = -normals @ to_training.rotation.T
     starts = to_training.apply(points) - reach * inwards
     colours, opacity = _looked_at(model, starts, inwards, cuts)
@@ -54,19 +50,21 @@ def _looked_at(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Render rays between the first and last cut: colours (N, 3) without background, and opacities (N,)."""
     colours, opacities = [], []
-    for first in range(0, len(starts), _BLOCK):
-        part = slice(first, first + _BLOCK)
+    block = 2**15
+    for first in range(0, len(starts), block):
+        part = slice(first, first + block)
         origins, towards = (
             torch.from_numpy(np.array(values[part], dtype=np.float32)).to(model.device)
             for values in (starts, directions)
         )
+        # Rendering tolerance, far below a level of 8-bit colours.
         seen = render_rays(
             model,
             origins,
             towards,
             cuts=cuts.to(origins),
             background=torch.zeros(3, device=model.device),
-            tolerance=_TOLERANCE,
+            tolerance=1e-4,
         )
         opacity = seen.ends.opacity
         colours.append((seen.rgb / opacity[:, None].clamp_min(1e-9)).clamp(0.0, 1.0).cpu().numpy())

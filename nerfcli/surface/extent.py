@@ -13,16 +13,10 @@ from nerfcli.surface.views import DepthView, depth_views, spread_frames
 
 # Most voxels along a side; beyond, not even the index of the blocks fits into memory.
 MOST_CELLS = 2048
-# Number of cameras, and pixels along the longer side, for finding the extent.
-LOOK_VIEWS, LOOK_PX = 24, 64
-# Fraction of the seen points outside each side of the box, and margin by which the box is then enlarged.
-_OUTSIDE, _MARGIN = 0.01, 0.05
 # Cameras look out of the ball if it contains less than this fraction of the seen points.
 _LEAST_INSIDE = 0.05
 # Largest and smallest default number of voxels along the longest side of a box.
 FINEST_CELLS, COARSEST_CELLS = 384, 64
-# Default width of a voxel in pixels.
-_PIXELS_PER_VOXEL = 1.5
 
 
 @dataclass(frozen=True)
@@ -92,7 +86,8 @@ def scene_box(model: Model, frames: Sequence[Frame]) -> tuple[float, ...]:
     Raises:
         UserError: no ray sees a surface.
     """
-    views = depth_views(model, spread_frames(frames, LOOK_VIEWS), max_size=LOOK_PX)
+    # A few small views show the extent.
+    views = depth_views(model, spread_frames(frames, 24), max_size=64)
     points = np.concatenate([view.points()[np.isfinite(view.depth)] for view in views])
     reach = np.sqrt(3.0) if model.contraction == "none" else 1.0
     if not len(points):
@@ -104,8 +99,9 @@ def scene_box(model: Model, frames: Sequence[Frame]) -> tuple[float, ...]:
     if (distances <= reach).mean() < _LEAST_INSIDE:
         reach = 2.0 * float(np.median(distances))
     points = points[distances <= reach]
-    low, high = np.quantile(points, _OUTSIDE, axis=0), np.quantile(points, 1 - _OUTSIDE, axis=0)
-    margin = _MARGIN * float((high - low).max()) or _MARGIN / model.training_from_scene.scale
+    # Without the outermost percent on each side, and with a margin.
+    low, high = np.quantile(points, 0.01, axis=0), np.quantile(points, 0.99, axis=0)
+    margin = 0.05 * float((high - low).max()) or 0.05 / model.training_from_scene.scale
     return tuple(np.concatenate([low - margin, high + margin]).tolist())
 
 
@@ -119,5 +115,5 @@ def automatic_voxel(views: Sequence[DepthView], box: tuple[float, ...]) -> float
         inside = ((points >= low) & (points <= high)).all(-1)  # False at NaN
         if inside.any():
             widths.append(float(np.median(view.depth[inside])) / view.frame.camera.focal_px)
-    width = float(np.median(widths)) * _PIXELS_PER_VOXEL if widths else 0.0
+    width = 1.5 * float(np.median(widths)) if widths else 0.0
     return min(max(width, longest / FINEST_CELLS), longest / COARSEST_CELLS)

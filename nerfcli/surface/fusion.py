@@ -25,14 +25,10 @@ from nerfcli.surface.views import DepthView, plane_rays
 SIDE = 8
 # Truncation of the signed distance, in voxels.
 TRUNCATION = 4.0
-# Blocks processed at a time.
-_CHUNK = 2048
-# Rays with an opacity below the first see free space only; those between the two opacities are not used.
-_CLEAR, _OPAQUE = 0.02, 0.5
+# Rays see a surface from this opacity on, and free space only below 0.02; those between are not used.
+_OPAQUE = 0.5
 # Surfaces seen at a smaller cosine between normal and ray are not used.
 _FLATTEST = 0.1
-# A depth beyond every voxel, for rays that see free space only.
-_FAR = 1e9
 
 
 @dataclass(frozen=True)
@@ -130,8 +126,9 @@ def _add(view: DepthView, grid: Grid, corners: np.ndarray, *, inside: Tensor, di
     starts = (middles - turn.numpy() @ np.full((3, 1), (SIDE - 1) / 2)).T.astype(np.float32)
     steps = inside @ turn.T  # (512, 3)
     truncation = TRUNCATION * grid.voxel_size
-    for first in range(0, len(seen), _CHUNK):
-        rows = torch.from_numpy(seen[first : first + _CHUNK])
+    chunk = 2048  # blocks
+    for first in range(0, len(seen), chunk):
+        rows = torch.from_numpy(seen[first : first + chunk])
         x, y, z = (torch.from_numpy(starts)[rows][:, None, :] + steps).unbind(-1)  # (blocks, 512)
         ahead = z > 1e-6 * truncation
         deep = torch.where(ahead, z, 1.0)
@@ -161,8 +158,8 @@ def _maps(view: DepthView, voxel_size: float) -> Tensor:
     weights = pixel_weights(view, voxel_size)
     lengths = np.linalg.norm(plane_rays(view.frame.camera), axis=-1)
     slant = lengths * view.cosines()
-    clear = view.opacity < _CLEAR
-    depth = np.where(clear, _FAR, np.nan_to_num(view.depth))
+    clear = view.opacity < 0.02
+    depth = np.where(clear, 1e9, np.nan_to_num(view.depth))  # beyond every voxel
     nearest = minimum_filter(depth, size=3, mode="nearest")
     maps = np.stack([depth, np.where(clear, 1.0, slant), np.where(clear, 1.0, weights), nearest])
     return torch.from_numpy(maps.astype(np.float32))

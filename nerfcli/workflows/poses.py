@@ -13,7 +13,6 @@ from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 from nerfcli.poses.structure_from_motion import is_same_scene, photo_notes, plan_poses
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
-NAMES_SHOWN = 8
 _STAGES = {
     "read": "photos read",
     "extract": "photos, extracting features",
@@ -99,10 +98,10 @@ def estimate_poses(
         given=intrinsics,
     )
     left_out = [image for image in report.images if not image.registered]
-    for image in left_out[:NAMES_SHOWN]:
+    for image in left_out[:8]:
         warn(f"{image.name} was not registered: {image.reason}")
-    if len(left_out) > NAMES_SHOWN:
-        warn(f"{len(left_out) - NAMES_SHOWN} more are listed in {target / 'poses_report.json'}")
+    if len(left_out) > 8:
+        warn(f"{len(left_out) - 8} more are listed in {target / 'poses_report.json'}")
     notify(
         f"{target}: {report.registered} of {report.total} photos registered in {report.seconds['total']:.0f} s, "
         f"mean reprojection error {report.mean_reprojection_error_px:.2f} px"

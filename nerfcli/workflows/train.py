@@ -21,8 +21,6 @@ from nerfcli.train.left_out import OCCLUDERS
 from nerfcli.workflows.machine import is_one_of_several
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
-NAMES_SHOWN = 8
-
 
 def train_scene(
     scene: str | Path,
@@ -102,7 +100,7 @@ def _trained(
     loaded = scenes.load(folder, holdout=holdout)
     notify(scenes.describe_source(folder, loaded))
     if loaded.missing:
-        names = listed(loaded.missing, NAMES_SHOWN)
+        names = listed(loaded.missing)
         warn(f"{several(len(loaded.missing), 'missing photo')} of {folder} skipped: {names}")
     for text in describe_rescaling(loaded.rescaled):
         notify(text)

@@ -8,9 +8,6 @@ from nerfcli import scene as scenes
 from nerfcli.photos.storage import InFiles, field_bytes, needs_of, storage_for
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
 
-# The field (1), the state with both moments of the optimiser (3), and the previous state until the next is written (3).
-_FIELDS_ON_DISK = 7
-
 
 @dataclass(frozen=True)
 class TrainingPlan:
@@ -75,7 +72,8 @@ def plan_training(
         downscale=factor,
         pixels=sum((f.camera.width // factor) * (f.camera.height // factor) for f in loaded.train_frames),
         memory_bytes=min(total, memory_bytes) if memory_bytes else total,
-        disk_bytes=_FIELDS_ON_DISK * field_bytes(settings) + in_files,
+        # The field, the state with both moments of the optimiser, and the previous state until the next is written.
+        disk_bytes=(1 + 3 + 3) * field_bytes(settings) + in_files,
         seconds=settings.budget_seconds,
         steps=settings.steps,
     )

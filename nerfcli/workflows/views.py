@@ -24,8 +24,6 @@ from nerfcli.runs.run import Run
 from nerfcli.workflows.notices import Notify, warn_python
 
 PATHS = ("orbit", "ellipse", "spiral", "interpolate")
-# A lens with a larger field of view sees behind the camera.
-BEHIND_FROM_DEG = 180.0
 # Files that `write_frames` writes.
 _FRAME_FILES = ("cameras.json", "camera_path.json")
 
@@ -166,7 +164,8 @@ def refuse_z_depth_for_equirectangular(frames: Sequence[Frame], *, notify: Notif
             "use --depth-axis ray, the distance along each ray",
             exit_code=2,
         )
-    if any(max(camera.fov_deg) > BEHIND_FROM_DEG for camera in {frame.camera for frame in frames}):
+    # A lens with a larger field of view sees behind the camera.
+    if any(max(camera.fov_deg) > 180.0 for camera in {frame.camera for frame in frames}):
         notify("pixels 90 degrees or more off the optical axis have no z (NaN); use --depth-axis ray for them")
 
 

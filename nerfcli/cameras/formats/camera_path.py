@@ -35,7 +35,7 @@ from nerfcli.errors import UserError
 # A larger width or height is taken for a damaged number.
 _MOST_PIXELS = 65536
 
-_DEFAULT_FPS = 24.0
+DEFAULT_FPS = 24.0
 
 _MODELS = {"perspective": "PINHOLE", "fisheye": "OPENCV_FISHEYE", "equirectangular": "EQUIRECTANGULAR"}
 
@@ -113,7 +113,7 @@ def losses_camera_path(capture: Capture) -> tuple[str, ...]:
     return tuple(clauses)
 
 
-def write_camera_path(capture: Capture, path: Path, *, fps: float = _DEFAULT_FPS) -> None:
+def write_camera_path(capture: Capture, path: Path, *, fps: float = DEFAULT_FPS) -> None:
     """Write the capture's views as a camera path, atomically; each one is a keyframe too, so that the viewer shows it.
 
     The file has one type of lens and one picture size: those of most views. See `losses_camera_path`.
@@ -204,7 +204,7 @@ def _fps(content: dict[str, Any], count: int, path: Path) -> float:
         if not value > 0:
             raise UserError(f"{path}: {key} is {value:g}", "expected a number above 0")
         return value if key == "fps" else count / value
-    return _DEFAULT_FPS
+    return DEFAULT_FPS
 
 
 def _short(value: Any) -> str:

@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, listed
 from nerfcli.media.masks import find_mask, read_mask
 from nerfcli.poses.input.job import WorkMask
 from nerfcli.poses.input.photos import Photos
 from nerfcli.poses.input.stages import stage_key
 
-_NAMES_SHOWN = 4
 _READERS = 4
 
 
@@ -51,14 +50,14 @@ def lay_out_masks(
     wrong = [text for text in laid_out if isinstance(text, str)]
     if wrong:
         hint = "masks must have the size of their photos, upright or as stored; black is ignored"
-        raise UserError(f"{len(wrong)} masks have the wrong size: {_some(wrong, '; ')}", hint)
+        raise UserError(f"{len(wrong)} masks have the wrong size: {listed(wrong)}", hint)
     without = [name for name, mask in zip(photos.names, found, strict=True) if mask is None]
     if without:
-        notify(f"{len(without)} of {len(photos.names)} photos have no mask and are used completely: {_some(without)}")
+        notify(f"{len(without)} of {len(photos.names)} photos have no mask and are used completely: {listed(without)}")
     done = tuple(mask for mask in laid_out if isinstance(mask, WorkMask))
     hidden = [name for name, mask in zip(photos.names, done, strict=True) if mask.used_fraction == 0]
     if hidden:
-        notify(f"{len(hidden)} masks are completely black, so their photos are not used: {_some(hidden)}")
+        notify(f"{len(hidden)} masks are completely black, so their photos are not used: {listed(hidden)}")
     return done
 
 
@@ -84,8 +83,3 @@ def _check_folder(photos: Photos, masks: Path) -> None:
             f"{masks} contains photos, such as {inside[0]}",
             "put the masks into a separate folder, outside of that of the photos",
         )
-
-
-def _some(texts: Sequence[str], separator: str = ", ") -> str:
-    more = f" and {len(texts) - _NAMES_SHOWN} more" if len(texts) > _NAMES_SHOWN else ""
-    return separator.join(texts[:_NAMES_SHOWN]) + more

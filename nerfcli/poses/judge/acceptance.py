@@ -44,8 +44,6 @@ _LEAST_GAIN = 3.5
 _LEAST_OBSERVATIONS = 15
 # Cosines between directions to points that are in memory at a time.
 _COSINES = 2**20
-# Contradictions listed in the report; the fraction counts all.
-_MOST_LISTED = 20
 # Reported if the measurement failed.
 _UNKNOWN_GEOMETRY: dict[str, Any] = dict.fromkeys(
     ("triangulation_angle_deg", "share_in_front", "camera_spread_over_distance")
@@ -131,7 +129,7 @@ def judge(
             "contradicting": sum(a.contradicts for a in found),
             "share_of_matches_that_agree": sum(a.matches * a.fraction for a in found) / total if total else None,
         },
-        "strong_contradictions": [asdict(c) for c in contradictions[:_MOST_LISTED]],
+        "strong_contradictions": [asdict(c) for c in contradictions[:20]],
         "strong_contradictions_share": fraction,
         "rotations": _rotation_measure(rotations),
         "parallax_px": None if turn is None else turn.parallax_px,

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, listed
 
 SUFFIXES = (".tif", ".tiff", ".png", ".bmp")
-_NAMES_SHOWN = 3
 
 
 def numbered(folder: Path, pattern: str = "*", *, without: str | None = None) -> list[Path]:
@@ -34,7 +33,7 @@ def numbered(folder: Path, pattern: str = "*", *, without: str | None = None) ->
     twice = sorted(paths[k].name for k in range(len(present)) if present.count(present[k]) > 1)
     if twice:
         raise UserError(
-            f"{folder} has several pictures with the same number: {', '.join(twice[:_NAMES_SHOWN])}",
+            f"{folder} has several pictures with the same number: {listed(twice)}",
             "keep the projections of each scan in a folder of their own",
         )
     steps = np.diff(sorted(present))
