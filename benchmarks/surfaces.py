@@ -29,10 +29,10 @@ from nerfcli.media.float_tiff import read_any_tiff
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.runs.run import load_run
+from nerfcli.surface.depth_views import depth_views
 from nerfcli.surface.extent import Grid, scene_box
 from nerfcli.surface.fusion import fuse
 from nerfcli.surface.marching import Mesh, mesh_of, simplified, surface_of, without_small_pieces
-from nerfcli.surface.views import depth_views
 
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk" / "truth"
 THRESHOLDS = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)

@@ -23,10 +23,10 @@ from scipy import stats
 
 from nerfcli import scene as scenes
 from nerfcli.cameras.frame import Frame
+from nerfcli.render.coverage import coverage_and_parallax, depth_maps, small_frame
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
-from nerfcli.render.visibility import coverage_and_parallax, depth_maps, small_frame
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.workflows.train import train_scene, was_interrupted
 

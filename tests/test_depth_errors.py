@@ -20,10 +20,10 @@ from nerfcli.multiview.stereo import DenseDepth
 from nerfcli.multiview.tracks import Tracks
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.depth_errors import LEAST_PIXELS, DepthErrors
 from nerfcli.render.pictures import render_picture
-from nerfcli.render.visibility import depth_maps
 from nerfcli.runs.files import DEPTH_ERRORS
 from nerfcli.runs.run import Run
 

@@ -19,7 +19,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.calibration import Calibration
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.doctor import camera_motion, connectivity, coverage, inventory, quality
+from nerfcli.doctor import camera_layout, camera_motion, connectivity, inventory, quality
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.examination import Diagnosis, compare_all, content, estimated_seconds, examine, judged
 from nerfcli.doctor.page import page_html, refuse_foreign
@@ -369,13 +369,13 @@ def test_large_captures_are_not_compared_exhaustively(clean):
 
 def test_focal_lengths_of_a_scene_are_those_of_its_cameras_and_their_pixels_are_square():
     scene = ring(8, span_deg=360)
-    found = coverage.focal_lengths(scene)
+    found = camera_layout.focal_lengths(scene)
     assert (found.verdict, found.summary) == (GOOD, "0.94 times the longer side, from the scene")
     narrow = Camera("PINHOLE", 640, 480, (600.0, 720.0, 320.0, 240.0))
     fisheye = Camera("OPENCV_FISHEYE", 640, 480, (600.0, 609.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))  # 1.5 % is usual
     first, second, *others = scene.frames
     frames = (replace(first, camera=narrow), replace(second, camera=fisheye), *others)
-    found = coverage.focal_lengths(replace(scene, frames=frames))
+    found = camera_layout.focal_lengths(replace(scene, frames=frames))
     assert (found.verdict, found.photos) == (LOOK, (("0.jpg", "focal lengths along x and y differ by 20.0 %"),))
 
 
@@ -394,26 +394,26 @@ def ring(count: int, *, span_deg: float, radius: float = 3.0) -> Scene:
 
 @pytest.mark.parametrize(("span_deg", "gap_deg", "verdict"), [(360, 15, GOOD), (300, 72.5, LOOK), (240, 130, BAD)])
 def test_the_gap_in_a_ring_of_cameras_is_measured(span_deg, gap_deg, verdict):
-    found = coverage.directions(ring(24, span_deg=span_deg))
+    found = camera_layout.directions(ring(24, span_deg=span_deg))
     assert found.verdict == verdict
     np.testing.assert_allclose(found.number or 0, gap_deg, atol=1.0)
 
 
 def test_cameras_in_front_have_a_span():
-    found = coverage.directions(ring(24, span_deg=10))
+    found = camera_layout.directions(ring(24, span_deg=10))
     assert found.verdict == LOOK
     np.testing.assert_allclose(found.number or 0, 10 * 23 / 24, atol=0.6)
 
 
 def test_cameras_at_one_place_and_one_far_off_are_reported():
     scene = ring(24, span_deg=360)
-    assert coverage.spread(scene).verdict == GOOD
+    assert camera_layout.spread(scene).verdict == GOOD
     near = tuple(replace(f, world_from_cam=scene.frames[0].world_from_cam) for f in scene.frames)
-    assert coverage.spread(replace(scene, frames=near)).verdict == BAD
+    assert camera_layout.spread(replace(scene, frames=near)).verdict == BAD
     pose = scene.frames[5].world_from_cam.copy()
     pose[:3, 3] *= 40
     off = (*scene.frames[:5], replace(scene.frames[5], world_from_cam=pose), *scene.frames[6:])
-    assert coverage.spread(replace(scene, frames=off)).names == ("5.jpg",)
+    assert camera_layout.spread(replace(scene, frames=off)).names == ("5.jpg",)
 
 
 def test_weakly_determined_intrinsics_of_a_scene_are_named(tmp_path):
@@ -422,11 +422,11 @@ def test_weakly_determined_intrinsics_of_a_scene_are_named(tmp_path):
 
     def found(*cameras: dict[str, object]) -> Finding | None:
         (tmp_path / "poses_report.json").write_text(json.dumps({"cameras": cameras}))
-        return coverage.intrinsics(scene)
+        return camera_layout.intrinsics(scene)
 
     firm = {"weak": False, "focal_percent": 0.2, "distortion_border_px": 0.5}
     weak = {"weak": True, "focal_percent": 4.0, "distortion_border_px": 3.0}
-    assert coverage.intrinsics(scene) is None
+    assert camera_layout.intrinsics(scene) is None
     assert found({"model": "OPENCV"}, {"uncertainty": None}, {"uncertainty": {"weak": None}}) is None
     good, bad = found({"uncertainty": firm}), found({"uncertainty": firm}, {"uncertainty": weak})
     assert good is not None
@@ -441,7 +441,7 @@ def test_weakly_determined_intrinsics_of_a_scene_are_named(tmp_path):
 
 
 def test_missing_photos_and_masks_that_only_some_have_are_named():
-    found = {finding.check: finding for finding in coverage.belongings(ring(24, span_deg=360))}
+    found = {finding.check: finding for finding in camera_layout.check_scene_files(ring(24, span_deg=360))}
     assert found["missing photos"].names == ("gone.jpg",)
     assert found["masks"].names == ("0.jpg",)
     assert "no metric scale" in found["unit"].summary

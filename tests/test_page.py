@@ -22,7 +22,7 @@ from nerfcli.cameras.formats.camera_path import read_path
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
 from nerfcli.errors import UserError
-from nerfcli.export.one_frame import with_visibility
+from nerfcli.export.one_frame import with_coverage
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.field.hash_field import HashField, HashFieldSettings
@@ -30,16 +30,16 @@ from nerfcli.field.interface import Field
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
 from nerfcli.kernels import grid_coordinates
 from nerfcli.kernels.reference.encoding import hash_encode
+from nerfcli.render.coverage import DepthMap, depth_maps
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Marching, Model
 from nerfcli.render.pictures import render_picture
-from nerfcli.render.visibility import DepthMap, depth_maps
 from nerfcli.runs.run import Run
-from nerfcli.viewer.coverage import seen_cells
 from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_rows
 from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import PagePhotos
 from nerfcli.viewer.proof import HEIGHT, WIDTH, Proof, make_proof
+from nerfcli.viewer.seen_cells import seen_cells
 from nerfcli.workflows import photo_depths
 from nerfcli.workflows.export import export_run
 
@@ -321,7 +321,7 @@ def test_the_browser_shows_how_many_photos_see_the_surface(opened, spheres_run):
     frame = Frame("a.png", Camera("PINHOLE", WIDTH, HEIGHT, tuple(camera["lens"])), pose)
     request = DepthRequest("median", "ray")
     picture = render_picture(model, frame, background=model.background, depth=request)
-    exact = with_visibility(picture, frame, axis="ray", photo_depths=photos)
+    exact = with_coverage(picture, frame, axis="ray", photo_depths=photos)
     assert picture.depth is not None
     assert exact.coverage is not None
     there = np.isfinite(coverage) & np.isfinite(picture.depth.ravel())

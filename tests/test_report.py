@@ -19,8 +19,8 @@ from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.export.settings import depth_meta
 from nerfcli.media.colours import levels_of
+from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.visibility import depth_maps
 from nerfcli.report.drawings import Curve, curves, from_above
 from nerfcli.report.page import page_html
 from nerfcli.report.run_facts import RunFacts, captures_of, labels_of, mismatches_of, warnings_of

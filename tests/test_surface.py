@@ -23,12 +23,12 @@ from nerfcli.runs.files import FIELD
 from nerfcli.runs.run import Run
 from nerfcli.surface import extent
 from nerfcli.surface.colours import point_colours, surface_colours
+from nerfcli.surface.depth_views import DepthView, normals_of, plane_rays
 from nerfcli.surface.extent import Grid, scene_box
 from nerfcli.surface.fusion import FusedVolume, fuse
 from nerfcli.surface.marching import mesh_of, simplified, surface_of, without_small_pieces
 from nerfcli.surface.points import agreed_points
 from nerfcli.surface.settings import SurfaceSettings
-from nerfcli.surface.views import DepthView, normals_of, plane_rays
 from nerfcli.workflows.describe import describe
 from nerfcli.workflows.export import export_run
 

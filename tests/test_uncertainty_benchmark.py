@@ -6,7 +6,7 @@ import uncertainty
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.render.visibility import small_frame
+from nerfcli.render.coverage import small_frame
 
 
 @pytest.mark.parametrize("count", [2, 5, 8])

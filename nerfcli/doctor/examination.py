@@ -8,7 +8,7 @@ import numpy as np
 
 from nerfcli.cameras.calibration import Calibration, Picture, calibrated
 from nerfcli.cameras.frame import Frame
-from nerfcli.doctor import connectivity, coverage, geometry, inventory, pose_agreement, quality
+from nerfcli.doctor import camera_layout, connectivity, geometry, inventory, pose_agreement, quality
 from nerfcli.doctor.compared_pairs import Pair, compare, focal_px
 from nerfcli.doctor.misplaced_groups import misplaced_groups, nearest_pairs
 from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, read_all
@@ -183,7 +183,7 @@ def judged(
             not_checked.append(("moving content, movement, depth relief", reason))
     else:
         not_checked.append(("connectivity, movement, moving content", "a single photo is not enough"))
-    planned.append(("GPS", lambda: coverage.gps(photos)))
+    planned.append(("GPS", lambda: camera_layout.gps(photos)))
     found = [checks.run(name, compute, otherwise=None) for name, compute in planned]
     if subject.scene is None:
         not_checked.append(("directions", "needs poses: run nerfcli poses, then nerfcli doctor on the scene"))
@@ -194,22 +194,22 @@ def judged(
         compared = pairs if turning is None else []
         errors = checks.run("epipolar errors", lambda: pair_errors(frames, photos, compared), otherwise=[])
         planned = [
-            ("spread of cameras", lambda: coverage.spread(of_scene)),
-            ("directions", lambda: coverage.directions(of_scene)),
-            ("points", lambda: coverage.points(of_scene)),
-            ("intrinsics", lambda: coverage.intrinsics(of_scene)),
+            ("spread of cameras", lambda: camera_layout.spread(of_scene)),
+            ("directions", lambda: camera_layout.directions(of_scene)),
+            ("points", lambda: camera_layout.points(of_scene)),
+            ("intrinsics", lambda: camera_layout.intrinsics(of_scene)),
             ("poses", lambda: found_or_noted("poses", pose_agreement.agreement(photos, errors))),
             ("places", lambda: misplaced_groups(frames, photos, errors, pairs)),
         ]
         found += [checks.run(name, compute, otherwise=None) for name, compute in planned]
-        found += checks.run("files of the scene", lambda: coverage.belongings(of_scene), otherwise=[])
+        found += checks.run("files of the scene", lambda: camera_layout.check_scene_files(of_scene), otherwise=[])
     not_checked += [(name, f"could not be computed: {why}") for name, why in checks.not_computed.items()]
     findings = tuple(finding for finding in found if finding is not None)
     return Diagnosis(subject, findings, tuple(not_checked), tuple(photos), lack, lighter, tuple(pairs))
 
 
 def _focal_length(subject: ExaminedCapture, photos: Sequence[PhotoFacts]) -> Finding:
-    return inventory.focal_length(photos) if subject.scene is None else coverage.focal_lengths(subject.scene)
+    return inventory.focal_length(photos) if subject.scene is None else camera_layout.focal_lengths(subject.scene)
 
 
 def _frames(scene: Scene, photos: Sequence[PhotoFacts]) -> list[Frame]:

@@ -18,15 +18,15 @@ from nerfcli.media.depth_pictures import DepthMeta, limits_in_words
 from nerfcli.media.images import write_png
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.accuracy import measure_error, truncation_bounds
+from nerfcli.render.coverage import DepthMap, coverage_and_parallax
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import RenderedPicture, render_picture, straight_rgba
 from nerfcli.render.tracing import TOLERANCE
-from nerfcli.render.visibility import DepthMap, coverage_and_parallax
 
 
-def with_visibility(
+def with_coverage(
     picture: RenderedPicture, frame: Frame, *, axis: str, photo_depths: Sequence[DepthMap]
 ) -> RenderedPicture:
     """Return the picture with coverage and parallax of the points at its median depth.
@@ -134,7 +134,7 @@ def render_frame(
         picture = replace(picture, rgb=straight_rgba(picture))
     removed = {}
     if settings.needs_visibility:
-        picture = with_visibility(picture, frame, axis=settings.depth.axis, photo_depths=order.photo_depths)
+        picture = with_coverage(picture, frame, axis=settings.depth.axis, photo_depths=order.photo_depths)
         if order.depth_errors is not None:
             picture = with_measured_errors(picture, order.depth_errors)
         picture, removed = without_unseen_depth(picture, settings.depth)

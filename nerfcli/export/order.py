@@ -15,8 +15,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.export.settings import ExportSettings
 from nerfcli.media.video import check_encoders
+from nerfcli.render.coverage import DepthMap
 from nerfcli.render.depth_errors import DepthErrors
-from nerfcli.render.visibility import DepthMap
 
 DESCRIPTION = "render.json"
 _IN_WORDS = {"levels": "16-bit levels", "video": "videos"}

@@ -8,13 +8,13 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
 from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
-from nerfcli.export.one_frame import with_visibility
+from nerfcli.export.one_frame import with_coverage
 from nerfcli.media.colours import levels_of
 from nerfcli.media.preview import coloured
+from nerfcli.render.coverage import DepthMap, small_frame
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
-from nerfcli.render.visibility import DepthMap, small_frame
 from nerfcli.report.run_facts import RunFacts
 
 # Mean absolute difference of the channels at the last colour of error maps, sRGB in [0, 1].
@@ -104,7 +104,7 @@ def _coverage_map(model: Model, frame: Frame, photo_depths: Sequence[DepthMap]) 
     """Count the training photos that see the surface in each pixel of a small picture (h, w)."""
     small = small_frame(frame, COVERAGE_PX)
     picture = render_picture(model, small, background=model.background, depth=_COVERAGE)
-    seen = with_visibility(picture, small, axis=_COVERAGE.axis, photo_depths=photo_depths)
+    seen = with_coverage(picture, small, axis=_COVERAGE.axis, photo_depths=photo_depths)
     assert seen.coverage is not None
     return seen.coverage
 

@@ -9,7 +9,7 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.render.model import Model
-from nerfcli.surface.views import DepthView, depth_views, spread_frames
+from nerfcli.surface.depth_views import DepthView, depth_views, spread_frames
 
 # Most voxels along a side; beyond, not even the index of the blocks fits into memory.
 MOST_CELLS = 2048

@@ -18,8 +18,8 @@ import torch
 from scipy.ndimage import minimum_filter
 from torch import Tensor
 
+from nerfcli.surface.depth_views import DepthView, plane_rays
 from nerfcli.surface.extent import Grid
-from nerfcli.surface.views import DepthView, plane_rays
 
 # Voxels along a side of a block.
 SIDE = 8

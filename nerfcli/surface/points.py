@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerfcli.render.visibility import largest_angle_deg, sees
+from nerfcli.render.coverage import largest_angle_deg, sees
+from nerfcli.surface.depth_views import DepthView
 from nerfcli.surface.extent import Grid
-from nerfcli.surface.views import DepthView
 
 # A depth counts if the pixel is at least this opaque, and median and mean differ by at most this fraction of it.
 _OPAQUE, _AGREEING = 0.9, 0.02

@@ -12,11 +12,11 @@ from nerfcli.render.model import Model
 from nerfcli.runs.run import Run
 from nerfcli.surface.extent import check_box, scene_box
 from nerfcli.surface.settings import SurfaceSettings
-from nerfcli.viewer.coverage import seen_cells
 from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import page_photos
 from nerfcli.viewer.proof import make_proof
+from nerfcli.viewer.seen_cells import seen_cells
 from nerfcli.workflows.export_geometry import export_mesh, export_points
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent

@@ -1,27 +1,30 @@
-"""Depth maps of training photos and errors of depth: computed once per field and kept in the run."""
+"""Depth maps of training photos and errors of depth: computed once per field and kept in the run.
 
+RUN/photo_depths.npz and RUN/depth_errors.json have the digest of what they depend on, because computing them takes
+seconds.
+"""
+
+import zipfile
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
 
+from nerfcli.atomic import atomic_path
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError, several
 from nerfcli.evaluate.depth_errors import measure_depth_errors
 from nerfcli.media.masks import read_mask
+from nerfcli.render.coverage import MAX_SIZE, STEEPEST_DEG, DepthMap, depth_maps, small_frame
 from nerfcli.render.depth_errors import STRATA, DepthErrors
 from nerfcli.render.model import Model
-from nerfcli.render.visibility import MAX_SIZE, DepthMap, depth_maps
-from nerfcli.runs.photo_depths import (
-    photo_depths_digest,
-    read_depth_errors,
-    read_photo_depths,
-    write_depth_errors,
-    write_photo_depths,
-)
+from nerfcli.runs.files import DEPTH_ERRORS, PHOTO_DEPTHS
 from nerfcli.runs.run import Run
+from nerfcli.sealed import digest, read_sealed, write_sealed
 from nerfcli.workflows.notices import Notify
 
+FORMAT, ERRORS_FORMAT = "nerfcli photo depths 1", "nerfcli depth errors 1"
 # Fraction of held-out pixels that must be matched for reliable intervals. Measured: with 60 % matched, 89 % of the
 # depths are inside 90 % intervals; with 3.5 %, 69 %.
 LEAST_MATCHED = 0.2
@@ -36,10 +39,10 @@ def photo_depths(
         model: its model, with the step lengths of the training.
     """
     frames = run.cameras.train
-    expected = photo_depths_digest(model.sha256, frames, max_size=MAX_SIZE)
-    kept = read_photo_depths(run.path, frames, max_size=MAX_SIZE, expected=expected)
+    expected = _digest(model.sha256, frames)
+    kept = _read_photo_depths(run.path, frames, expected=expected)
     if kept is not None:
-        return tuple(kept)
+        return kept
     maps = depth_maps(model, frames, max_size=MAX_SIZE, on_progress=on_progress)
     if run.components.masks == "ignore":
         maps = [
@@ -47,7 +50,7 @@ def photo_depths(
             for view, frame in zip(maps, frames, strict=True)
         ]
     try:
-        write_photo_depths(run.path, maps, digest=expected)
+        _write_photo_depths(run.path, maps, digest=expected)
     except UserError as error:  # runs in read-only folders can be rendered, too
         notify(f"the depths of the training photos are not kept: {error.message}")
     return tuple(maps)
@@ -67,12 +70,12 @@ def depth_errors(
     Raises:
         UserError: see `measure_depth_errors`.
     """
-    expected = photo_depths_digest(model.sha256, [*run.cameras.train, *run.cameras.test], max_size=MAX_SIZE)
-    errors = read_depth_errors(run.path, expected=expected)
+    expected = _digest(model.sha256, [*run.cameras.train, *run.cameras.test])
+    errors = _read_depth_errors(run.path, expected=expected)
     if errors is None:
         errors = measure_depth_errors(run, model, photos, threads=threads, on_progress=on_progress)
         try:
-            write_depth_errors(run.path, errors, digest=expected)
+            write_sealed(run.path / DEPTH_ERRORS, {"format": ERRORS_FORMAT, "digest": expected, **errors.to_json()})
         except UserError as error:
             notify(f"the errors of depth are not kept: {error.message}")
     for least, pixels, quantiles in zip(STRATA, errors.pixels, errors.quantiles, strict=True):
@@ -99,3 +102,38 @@ def _without_masked(view: DepthMap, frame: Frame, notify: Notify) -> DepthMap:
     height, width = view.distances.shape
     used = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA) >= 128
     return DepthMap(view.frame, np.where(used, view.distances, np.float32(np.nan)))
+
+
+def _digest(field_sha256: str | None, frames: Sequence[Frame]) -> str:
+    """Return the hash of everything that the maps depend on: the field, the cameras of the photos, the size."""
+    cameras = [[frame.name, frame.camera.to_json(), frame.world_from_cam.tolist()] for frame in frames]
+    return digest([FORMAT, field_sha256, cameras, MAX_SIZE, STEEPEST_DEG])
+
+
+def _read_photo_depths(run: Path, frames: Sequence[Frame], *, expected: str) -> tuple[DepthMap, ...] | None:
+    """Return the stored maps; None if they are missing, damaged, or have another digest: they are rendered again."""
+    try:
+        # Opened here, because NumPy does not close a file that it cannot read.
+        with (run / PHOTO_DEPTHS).open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            if str(archive["digest"]) != expected:
+                return None
+            return tuple(DepthMap(small_frame(frame, MAX_SIZE), archive[str(i)]) for i, frame in enumerate(frames))
+    except (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _write_photo_depths(run: Path, maps: Sequence[DepthMap], *, digest: str) -> None:
+    arrays = {str(index): view.distances for index, view in enumerate(maps)}
+    with atomic_path(run / PHOTO_DEPTHS) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays, digest=np.array(digest))
+
+
+def _read_depth_errors(run: Path, *, expected: str) -> DepthErrors | None:
+    """Return the stored errors; None if they are missing, damaged, or have another digest: they are measured again."""
+    try:
+        content = read_sealed(run / DEPTH_ERRORS)
+        if (content["format"], content["digest"], content["strata"]) != (ERRORS_FORMAT, expected, list(STRATA)):
+            return None
+        return DepthErrors.from_json(content)
+    except (OSError, ValueError, LookupError, TypeError):
+        return None

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from nerfcli.findings import Finding, worst
-from nerfcli.tomography.checks import coverage, fit, values
+from nerfcli.tomography.checks import fit, values, views
 from nerfcli.tomography.checks.sample import Sample, sample_of
 from nerfcli.tomography.scan import Scan
 
@@ -15,10 +15,10 @@ CHECKS: dict[str, Check] = {
     "rings": values.rings,
     "counts": values.counts,
     "dead pixels": values.unusable,
-    "truncation": coverage.truncation,
-    "repeated angles": coverage.repeated_angles,
-    "missing wedge": coverage.missing_wedge,
-    "number of views": coverage.few_views,
+    "truncation": views.truncation,
+    "repeated angles": views.repeated_angles,
+    "missing wedge": views.missing_wedge,
+    "number of views": views.few_views,
     "centre of rotation": fit.centre,
     "beam hardening": fit.beam_hardening,
 }

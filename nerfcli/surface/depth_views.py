@@ -8,11 +8,11 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.photos.undistorted import pinhole_of
+from nerfcli.render.coverage import DepthMap
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.normals import normals_of_points
 from nerfcli.render.pictures import render_picture
-from nerfcli.render.visibility import DepthMap
 
 # The median depth: a little light that ends before or behind a surface does not change it.
 DEPTH = DepthRequest("median", "z")

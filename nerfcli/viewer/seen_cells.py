@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from nerfcli.kernels import grid_coordinates
+from nerfcli.render.coverage import DepthMap, coverage_and_parallax
 from nerfcli.render.model import Model
-from nerfcli.render.visibility import DepthMap, coverage_and_parallax
 
 # Candidate numbers of cells along each axis of the unit cube: the first with at least this many pixels per occupied
 # cell is used. Large cells mix seen and unseen places; small ones may fall between the pixels of all depth maps.

@@ -166,7 +166,7 @@ def intrinsics(scene: Scene) -> Finding | None:
     )
 
 
-def belongings(scene: Scene) -> list[Finding]:
+def check_scene_files(scene: Scene) -> list[Finding]:
     """Check for listed photos that are missing and for incomplete masks, and report the unit of length."""
     missing = scene.missing
     total = len(missing) + len(scene.frames)

@@ -1,4 +1,4 @@
-"""Checks of a scan's coverage: whole object, all directions, enough views."""
+"""Checks of the views of a scan: whole object, all directions, enough of them."""
 
 import numpy as np
 

@@ -19,7 +19,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.media.file_facts import depth_meta_of
 from nerfcli.media.mesh_files import read_ply_header
-from nerfcli.render.visibility import (
+from nerfcli.render.coverage import (
     DepthMap,
     coverage_and_parallax,
     depth_maps,
