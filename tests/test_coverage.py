@@ -295,7 +295,7 @@ def test_a_photo_sees_nothing_where_its_mask_covers_it(run, tmp_path):
 
 def test_a_mesh_says_how_many_photos_see_its_points(run, tmp_path):
     path = tmp_path / "a.ply"
-    result = nerfcli("export", run, "--to", "mesh", "--max-size", "48", "--voxel-size", "0.1", "-o", path)
+    result = nerfcli("export", run, "--to", "mesh", "--voxel-size", "0.1", "-o", path)
     assert result.exit_code == 0, result.stderr
     _, columns, comments, _ = read_ply_header(path)
     assert "photos" in str(columns)

@@ -329,8 +329,8 @@ def test_a_refused_model_stays_and_can_be_accepted(
 
 
 @pytest.mark.usefixtures("same_process")
-def test_after_the_time_limit_in_a_check_only_the_checks_are_left(photos: Path, mapped: Path, tmp_path: Path):
-    """The first call is ended in its first check, after mapping; the next call maps nothing."""
+def test_after_an_end_in_a_check_only_the_checks_are_left(photos: Path, mapped: Path, tmp_path: Path):
+    """An earlier call was ended in its first check, after mapping; this one maps nothing."""
     scene = shutil.copytree(mapped, tmp_path / "scene")
     assert pycolmap.Reconstruction(str(scene / "work/mapped/0")).num_reg_images() == len(NAMES)
     stages: set[str] = set()

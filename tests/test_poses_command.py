@@ -36,7 +36,6 @@ def test_what_is_no_amount_of_memory(text: str):
         ("--quality superb", "'superb'; choose fast, default or best"),
         ("--pairing random", "'random'; choose auto, exhaustive, sequential, retrieval or spatial"),
         ("--pairing spatial --pairs p.txt", "cannot be combined with --pairs"),
-        ("--time-limit soon", "'soon' is not a time"),
     ],
 )
 def test_bad_values_are_usage_errors(line: str, named: str):

@@ -342,7 +342,7 @@ def test_undistorted_photos_have_straight_lines_and_half_pixels():
 
 def small(scale: float, voxel: float) -> tuple[str, ...]:
     """Options for quick work: voxels in units of the training frame, and small pictures."""
-    return "--voxel-size", f"{voxel / scale:.9g}", "--max-size", "48"
+    return "--voxel-size", f"{voxel / scale:.9g}"
 
 
 @pytest.fixture
@@ -417,14 +417,12 @@ def test_wrong_usage_of_export(options, message, finished):
 
 
 def test_what_cannot_be_exported_is_refused_in_two_lines(blocked, tmp_path):
-    away = ("--box=90,90,90,91,91,91", "--voxel-size", "0.1", "--max-size", "32")
+    away = ("--box=90,90,90,91,91,91", "--voxel-size", "0.1")
     for to in ("mesh", "points"):
         result = nerfcli("export", blocked, "--to", to, *away, "-o", tmp_path / "a.ply")
         assert result.exit_code == 3
         assert error_of(result)[0].startswith("Error: no ")
-    result = nerfcli(
-        "export", blocked, "--to", "mesh", "--voxel-size", "1e-9", "--max-size", "32", "-o", tmp_path / "a.ply"
-    )
+    result = nerfcli("export", blocked, "--to", "mesh", "--voxel-size", "1e-9", "-o", tmp_path / "a.ply")
     assert "along a side of the box" in error_of(result)[0]
     assert not (tmp_path / "a.ply").exists()
     (tmp_path / "a.ply").write_text("mine")

@@ -55,7 +55,7 @@ class Console:
 
     def address(self, url: str) -> None:
         """Print the address of a page as a result on stdout."""
-        print(json.dumps({"url": url}) if self.json_lines else url, flush=True)  # noqa: T201 - a result, as above
+        print(url, flush=True)  # noqa: T201 - a result, as above
 
     def facts(self, path: Path, content: dict[str, Any], text: str) -> None:
         """Print facts about a path on stdout: `text`, or with --json the same as `result`."""

@@ -41,9 +41,6 @@ def export(
         int | None,
         typer.Option(help="Maximum number of triangles of a mesh.  [default: 300000]", min=4, show_default=False),
     ] = None,
-    max_size: Annotated[
-        int, typer.Option(help="Longer side of the depth maps that are fused, in pixels.", min=16, max=8192)
-    ] = 480,
     water: Annotated[
         float | None, typer.Option(help="Scans: attenuation of water, so that values are Hounsfield units.")
     ] = None,
@@ -117,7 +114,6 @@ def export(
     unused = {
         "--faces": (faces is not None and to != "mesh", "meshes"),
         "--voxel-size": (voxel_size is not None and to in ("page", "volume"), "meshes and points"),
-        "--max-size": (max_size != SurfaceSettings.max_size and to in ("page", "volume"), "meshes and points"),
         "--water": (water is not None, "X-ray scans"),
     }
     for option, (is_unused, suited) in unused.items():
@@ -125,9 +121,7 @@ def export(
             raise typer.BadParameter(f"it is for {suited}; remove it", param_hint=option)
     if suffix is not None and output is not None and run != STDIN and output.suffix.lower() not in ("", suffix):
         raise typer.BadParameter(f"{form!r} contradicts -o {output}; remove one of them", param_hint="--format")
-    settings = SurfaceSettings(
-        box=None if box is None else box_of(box), voxel_size=voxel_size, faces=faces or FACES, max_size=max_size
-    )
+    settings = SurfaceSettings(box=None if box is None else box_of(box), voxel_size=voxel_size, faces=faces or FACES)
 
     def work(folder: Path, one_of_many: bool) -> None:
         if is_reconstruction(folder):

@@ -60,9 +60,6 @@ def poses(
     accept_refused: Annotated[
         bool, typer.Option("--accept-refused", help="Write the scene even if the checks refuse the poses.")
     ] = False,
-    time_limit: Annotated[
-        str | None, typer.Option(help="Stop after this time: 90s, 10m, 2h. Run the command again to continue.")
-    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show what would be done and how long it would take.")
     ] = False,
@@ -96,7 +93,7 @@ def poses(
     from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.memory import default_memory_limit
     from nerfcli.poses.input.pairs import PAIRINGS
-    from nerfcli.poses.input.settings import CAMERA_MODELS, Limits, PoseSettings
+    from nerfcli.poses.input.settings import CAMERA_MODELS, PoseSettings
     from nerfcli.poses.workspace import database_bytes
     from nerfcli.workflows.poses import (
         estimate_poses,
@@ -133,10 +130,6 @@ def poses(
         accept_refused=accept_refused,
         subfolders=subfolders,
     )
-    limits = Limits(
-        memory_bytes=default_memory_limit(),
-        seconds=None if time_limit is None else options.seconds_from_text(time_limit, "--time-limit"),
-    )
 
     def work(source: Path, one_of_many: bool) -> None:
         scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
@@ -155,7 +148,7 @@ def poses(
                 folder,
                 scene,
                 settings,
-                limits=limits,
+                memory_bytes=default_memory_limit(),
                 intrinsics=given,
                 overwrite=overwrite,
                 warn=console.warn,

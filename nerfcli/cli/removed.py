@@ -43,6 +43,7 @@ REMOVED: tuple[Removed, ...] = (
     Removed("evaluate", "--seeds", "2026-11-29", "train with --seed 1, --seed 2, ... and evaluate each run"),
     Removed("export", "--format las", "2026-11-29", "use --format ply, which CloudCompare and PDAL turn into las"),
     Removed("export", "--format laz", "2026-11-29", "use --format ply, which CloudCompare and PDAL turn into laz"),
+    Removed("export", "--max-size", "2026-11-29", "set the detail of a mesh with --voxel-size"),
     Removed("export", "--to colmap-dense", "2026-11-29", "use --to points, which has normals, colours and parallax"),
     Removed("export", "--to ortho", "2026-11-29", "make maps with OpenDroneMap; see docs/formats.md, Surveys"),
     Removed("export", "--to tsdf", "2026-11-29", "use --to mesh, the surface of the signed distances"),
@@ -51,6 +52,7 @@ REMOVED: tuple[Removed, ...] = (
     Removed("poses", "--intrinsics-as", "2026-11-29", "intrinsics are kept; without --intrinsics they are estimated"),
     Removed("poses", "--max-features", "2026-11-29", "use --quality fast, default or best"),
     Removed("poses", "--memory", "2026-11-29", "4/5 of the memory are used; --quality fast takes less"),
+    Removed("poses", "--time-limit", "2026-11-29", "use timeout 10m nerfcli poses ..., and run it again to continue"),
     Removed("render", "--colour-map", "2026-11-29", "colour the depth files yourself, as docs/depth.md reads them"),
     Removed("render", "--colour-range", "2026-11-29", "colour the depth files yourself, as docs/depth.md reads them"),
     Removed("render", "--crf", "2026-11-29", "an mp4 has a constant rate factor of 16; make it smaller with ffmpeg"),
@@ -72,6 +74,7 @@ REMOVED: tuple[Removed, ...] = (
     Removed("render", "--video-layout", "2026-11-29", "put two videos beside each other with ffmpeg's filter hstack"),
     Removed("report", "--depth", "2026-11-29", "render RUN --depth shows other definitions of depth"),
     Removed("report", "--depth-axis", "2026-11-29", "depth is along the optical axis, of panoramas along the ray"),
+    Removed("report", "--device", "2026-11-29", "a GPU is used if there is one; hide it with CUDA_VISIBLE_DEVICES="),
     Removed("report", "--views", "2026-11-29", "up to eight held-out photos are shown, from the worst to the best"),
     Removed("run", "--count", "2026-11-29", "render the run: nerfcli render RUN --cameras orbit --count 120"),
     Removed("run", "--intrinsics-as", "2026-11-29", "intrinsics are kept; without --intrinsics they are estimated"),
@@ -81,6 +84,7 @@ REMOVED: tuple[Removed, ...] = (
     Removed("run", "--with", "2026-11-29", "run the stages one by one; train has --with"),
     Removed("run", "--without", "2026-11-29", "run the stages one by one; train has --without"),
     Removed("selftest", "--textbook", "2026-11-29", "the table of selftest has the textbook errors in two columns"),
+    Removed("selftest", "--threads", "2026-11-29", "all threads are used; results do not depend on their number"),
     Removed("train", "--blocks", "2026-11-29", "train one field; see docs/many-captures.md for what it bears"),
     Removed("train", "--contraction linf", "2026-11-29", "use --contraction l2, the default for what fills the frame"),
     Removed("train", "--levels", "2026-11-29", "8 levels are used; set the size of the field with --log2-rows"),
@@ -92,6 +96,8 @@ REMOVED: tuple[Removed, ...] = (
     Removed("train", "--with movers", "2026-11-29", "mask what moves; occluders are left out without it"),
     Removed("train", "--with overlap", "2026-11-29", "use --with points and --with near, which is on by default"),
     Removed("train", "--with pixels", "2026-11-29", "leave it out: pixels are drawn anywhere"),
+    Removed("view", "--json", "2026-11-29", "the address is the only line on stdout"),
+    Removed("view", "--quiet", "2026-11-29", "notes go to stderr: add 2>/dev/null"),
 )
 
 

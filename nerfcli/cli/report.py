@@ -7,8 +7,8 @@ import typer
 
 from nerfcli.cli.batch import STDIN, no_paths, stdin_paths
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads
-from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads
+from nerfcli.workflows.machine import thread_count
 
 
 @command
@@ -17,7 +17,6 @@ def report(
         list[str], typer.Argument(help="Run folders written by train, or - to read paths from standard input.")
     ],
     output: Output = None,
-    device: Device = "auto",
     threads: Threads = 0,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -45,7 +44,6 @@ def report(
         page = report_runs(
             paths,
             output,
-            device=device_name(device),
             threads=thread_count(threads),
             overwrite=overwrite,
             progress=update,

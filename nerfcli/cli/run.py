@@ -48,7 +48,7 @@ def run(
     from nerfcli.export.settings import OUTPUTS, ExportSettings, VideoSettings
     from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.memory import default_memory_limit
-    from nerfcli.poses.input.settings import Limits, PoseSettings
+    from nerfcli.poses.input.settings import PoseSettings
     from nerfcli.runs.run import load_run
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run
@@ -92,7 +92,7 @@ def run(
                 folder,
                 scene,
                 pose_settings,
-                limits=Limits(memory_bytes=default_memory_limit()),
+                memory_bytes=default_memory_limit(),
                 intrinsics=given_intrinsics(intrinsics, folder),
                 overwrite=overwrite,
                 warn=console.warn,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Device, Quiet, Threads
+from nerfcli.cli.options import Device, Quiet
 from nerfcli.errors import GATE_NOT_MET, UserError
 from nerfcli.workflows.machine import device_name, thread_count
 
@@ -32,7 +32,6 @@ _STYLES = {"met": "green", "not met": "bold red"}
 @command
 def selftest(
     device: Device = "auto",
-    threads: Threads = 0,
     json: Annotated[
         bool, typer.Option("--json", help="Print one line of JSON per row on stdout instead of the table.")
     ] = False,
@@ -57,7 +56,7 @@ def selftest(
     from nerfcli.selftest.table import rows
 
     console = Console(quiet=quiet, json_lines=json)
-    torch.set_num_threads(thread_count(threads))
+    torch.set_num_threads(thread_count(0))
     begin, measured = time.perf_counter(), []
     for row in rows(device_name(device), console.note):
         measured.append(row)

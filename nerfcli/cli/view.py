@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Json, Quiet, Threads
+from nerfcli.cli.options import Threads
 from nerfcli.workflows.machine import thread_count
 
 
@@ -24,8 +24,6 @@ def view(
         typer.Option("--browser/--no-browser", help="Open the page in this machine's browser, if it has a screen."),
     ] = True,
     threads: Threads = 0,
-    json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Show a run in a browser, during its training and after.
 
@@ -45,7 +43,7 @@ def view(
     from nerfcli.workflows.view import view_run
 
     refuse_scan(run, "view")
-    console = Console(quiet=quiet, json_lines=json)
+    console = Console(quiet=False, json_lines=False)
 
     def on_ready(url: str, from_elsewhere: str) -> None:
         console.address(url)

@@ -27,7 +27,7 @@ from nerfcli.poses.input.masks import lay_out_masks
 from nerfcli.poses.input.pairs import Pairing, choose_pairs, read_pairs
 from nerfcli.poses.input.photos import Photos, find_photos
 from nerfcli.poses.input.plan import Plan, make_plan
-from nerfcli.poses.input.settings import Limits, PoseSettings, check_settings, for_panoramas
+from nerfcli.poses.input.settings import PoseSettings, check_settings, for_panoramas
 from nerfcli.poses.input.stages import file_key
 from nerfcli.poses.input.work_photos import lay_out
 from nerfcli.poses.judge.checks import UNDERWAY
@@ -43,7 +43,7 @@ def estimate_poses(
     settings: PoseSettings,
     notify: Callable[[str], None],
     progress: Callable[[str, int, int], None],
-    limits: Limits = Limits(),
+    memory_bytes: int | None = None,
     planned: Callable[[Plan], None] = lambda plan: None,
     given: Calibration | None = None,
 ) -> PosesReport:
@@ -78,7 +78,7 @@ def estimate_poses(
     work = scene_dir / "work"
     with workspace(scene_dir) as lock:
         job = _prepare(photos, _searched(settings, grouped), grouped=grouped, pairing=pairing, work=work, notify=notify)
-        _work(job, work, limits=limits, lock=lock, progress=progress, notify=notify)
+        _work(job, work, memory_bytes=memory_bytes, lock=lock, progress=progress, notify=notify)
         result = _read_json(work / "result.json")["content"]  # written by the worker, or complete from before
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
         matching = {"rule": pairing.rule, "pairs": result["pairs"], **_file_keys(settings)}
@@ -183,13 +183,12 @@ def _work(
     job: Job,
     work: Path,
     *,
-    limits: Limits,
+    memory_bytes: int | None,
     lock: int,
     progress: Callable[[str, int, int], None],
     notify: Callable[[str], None],
 ) -> None:
     """Run the worker; if a check ends it, run it again without that check, since the model is on disk by then."""
-    since = time.monotonic()
     while True:
         (work / UNDERWAY).unlink(missing_ok=True)
         write_job(work / "job.json", job)
@@ -198,8 +197,7 @@ def _work(
                 work / "job.json",
                 threads=job.threads,
                 progress=progress,
-                limits=limits,
-                since=since,
+                memory_bytes=memory_bytes,
                 lock=lock,
                 notify=notify,
             )

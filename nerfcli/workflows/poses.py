@@ -8,7 +8,7 @@ from nerfcli.convert.camera_files import read_calibration
 from nerfcli.errors import UserError, duration
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.input.plan import Plan, TimeEstimate
-from nerfcli.poses.input.settings import Limits, PoseSettings
+from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 from nerfcli.poses.structure_from_motion import is_same_scene, photo_notes, plan_poses
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
@@ -36,7 +36,7 @@ def estimate_poses(
     scene: str | Path,
     settings: PoseSettings = PoseSettings(),
     *,
-    limits: Limits = Limits(),
+    memory_bytes: int | None = None,
     intrinsics: Calibration | None = None,
     overwrite: bool = False,
     notify: Notify = silent,
@@ -54,7 +54,7 @@ def estimate_poses(
         photos: a folder of photos; for a video see `folder_of_photos`.
         scene: the folder to write.
         settings: features, pairs, seed, threads; by default those of `nerfcli poses`.
-        limits: on memory and time.
+        memory_bytes: limit of the memory of structure from motion; None for no limit.
         intrinsics: known intrinsics of the cameras, see `given_intrinsics`; None to estimate them.
         overwrite: replace an existing scene at `scene`.
         notify, warn: called with lines for the user.
@@ -93,7 +93,7 @@ def estimate_poses(
         settings=settings,
         notify=notify,
         progress=on_stage,
-        limits=limits,
+        memory_bytes=memory_bytes,
         planned=planned,
         given=intrinsics,
     )

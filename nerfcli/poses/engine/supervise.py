@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli import child
-from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError, duration
+from nerfcli.errors import OUT_OF_MEMORY, UserError, duration
 from nerfcli.memory import resident_bytes
-from nerfcli.poses.input.settings import Limits
 from nerfcli.poses.judge.checks import UNDERWAY
 
 _STAGES = {
@@ -55,8 +54,7 @@ def run_worker(
     *,
     threads: int,
     progress: Callable[[str, int, int], None],
-    limits: Limits = Limits(),
-    since: float | None = None,
+    memory_bytes: int | None = None,
     lock: int | None = None,
     notify: Callable[[str], None] = lambda note: None,
 ) -> None:
@@ -65,14 +63,13 @@ def run_worker(
     Args:
         job_path: the job's JSON file; the worker's log is written beside it.
         threads: for OpenMP inside pycolmap, -1 for all.
-        limits: the worker is stopped when it exceeds one of them.
-        since: the start of the time limit, by `time.monotonic`; None for now.
+        memory_bytes: the worker is stopped when its resident memory exceeds this; None for no limit.
         lock: a descriptor that the worker inherits.
 
     Raises:
         WorkerDiedError: the worker died; the message has the stage, and the last lines of its log. Or it was stopped
             because a check exceeded its time limit.
-        UserError: it was stopped at a limit, or the disk is full.
+        UserError: it needed too much memory, or the disk is full.
     """
     log = job_path.with_name("worker.log")
     stage = "starting"
@@ -85,7 +82,7 @@ def run_worker(
             descriptors=() if lock is None else (lock,),
         )
         underway = job_path.with_name(UNDERWAY)
-        guard = _Guard(worker, limits, time.monotonic() if since is None else since, underway=underway)
+        guard = _Guard(worker, memory_bytes, underway=underway)
         messages = child.messages(worker)
         try:
             for message in messages:
@@ -104,7 +101,7 @@ def run_worker(
         overdue.check = guard.check["check"]
         raise overdue
     if guard.reached is not None:
-        raise _limit_reached(guard.reached, limits, stage)
+        raise _too_large(memory_bytes, stage)
     free_bytes = shutil.disk_usage(job_path.parent).free
     error = explain_death(worker.returncode, stage, log.read_text(encoding="utf-8", errors="replace"), free_bytes)
     if isinstance(error, WorkerDiedError) and underway.exists():
@@ -145,14 +142,13 @@ class _Guard:
     check: the content of `UNDERWAY` when it was last read.
     """
 
-    def __init__(self, worker: subprocess.Popen[bytes], limits: Limits, since: float, *, underway: Path):
+    def __init__(self, worker: subprocess.Popen[bytes], most_bytes: int | None, *, underway: Path):
         self.reached: str | None = None
         self.check: dict[str, Any] = {}
         self._underway = underway
         self._check_written, self._check_seen = 0, 0.0
         self._worker = worker
-        self._most_bytes = limits.memory_bytes
-        self._end = None if limits.seconds is None else since + limits.seconds
+        self._most_bytes = most_bytes
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
@@ -164,9 +160,7 @@ class _Guard:
 
     def _watch(self) -> None:
         while not self._stopped.wait(_LOOK_EVERY_SECONDS):
-            if self._end is not None and time.monotonic() > self._end:
-                self.reached = "time"
-            elif self._most_bytes is not None and resident_bytes(self._worker.pid) > self._most_bytes:
+            if self._most_bytes is not None and resident_bytes(self._worker.pid) > self._most_bytes:
                 self.reached = "memory"
             elif self._is_overdue():
                 self.reached = "check"
@@ -187,20 +181,12 @@ class _Guard:
         return most is not None and time.monotonic() - self._check_seen > most
 
 
-def _limit_reached(which: str, limits: Limits, stage: str) -> UserError:
-    if which == "memory":
-        assert limits.memory_bytes is not None
-        size = f"{limits.memory_bytes / 1e9:.3g} GB"
-        return UserError(
-            f"structure from motion was stopped while {stage}: it needed more than the limit of {size} (--memory)",
-            f"{_LESS_MEMORY}, or raise --memory; {_GO_ON}",
-            OUT_OF_MEMORY,
-        )
+def _too_large(memory_bytes: int | None, stage: str) -> UserError:
+    assert memory_bytes is not None
     return UserError(
-        f"structure from motion was stopped while {stage}: the time limit of {limits.seconds:.3g} s is over "
-        "(--time-limit)",
-        f"allow more time or use --quality fast; {_GO_ON}",
-        GATE_NOT_MET,
+        f"structure from motion was stopped while {stage}: it needed more than {memory_bytes / 1e9:.3g} GB of memory",
+        f"{_LESS_MEMORY}; {_GO_ON}",
+        OUT_OF_MEMORY,
     )
 
 

@@ -1,4 +1,4 @@
-"""Settings and limits of structure from motion."""
+"""Settings of structure from motion."""
 
 from dataclasses import dataclass, replace
 
@@ -60,14 +60,6 @@ class PoseSettings:
 def for_panoramas(settings: PoseSettings) -> PoseSettings:
     """Return the settings for panoramas, which show about six times as much as a photo, at a smaller scale."""
     return replace(settings, max_image_size=2 * settings.max_image_size, max_features=2 * settings.max_features)
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits of resident memory in bytes and of time in seconds; None for no limit. Results do not depend on them."""
-
-    memory_bytes: int | None = None
-    seconds: float | None = None
 
 
 def check_settings(settings: PoseSettings) -> None:
