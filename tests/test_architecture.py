@@ -52,6 +52,7 @@ MAY_IMPORT = {
             "poses.engine",
             "poses.judge",
             "poses.model",
+            "poses.input",
             "scale",
             "scene",
             "cameras",

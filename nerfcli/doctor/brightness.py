@@ -13,8 +13,6 @@ BLACK_LEVEL = 3
 
 # Linear light of each 8-bit sRGB level.
 _LINEAR = linear_light(np.arange(256) / 255).astype(np.float32)
-_WINDOW_PX = 4.0
-_CLIPPED_WINDOW_PX = 15
 # Linear light below which noise and the black level dominate.
 _DARKEST = 4e-3
 # A colour is pale if its weakest channel is at least this fraction of its strongest.
@@ -46,9 +44,9 @@ def local_light(rgb: np.ndarray) -> np.ndarray:
     Second log2 of red over blue, which white balance shifts; NaN also where the colour is saturated, since a small
     highlight on it shifts the ratio by more than the white balance does. The picture is (H, W, 3) uint8 sRGB.
     """
-    light = np.maximum(cv2.GaussianBlur(cv2.LUT(rgb, _LINEAR), (0, 0), _WINDOW_PX), 1e-6)
+    light = np.maximum(cv2.GaussianBlur(cv2.LUT(rgb, _LINEAR), (0, 0), 4.0), 1e-6)
     clipped = 255 * np.any((rgb >= WHITE_LEVEL) | (rgb <= BLACK_LEVEL), axis=2).astype(np.uint8)
-    unsure = (cv2.blur(clipped, (_CLIPPED_WINDOW_PX, _CLIPPED_WINDOW_PX)) > 0.05 * 255) | (light.min(axis=2) < _DARKEST)
+    unsure = (cv2.blur(clipped, (15, 15)) > 0.05 * 255) | (light.min(axis=2) < _DARKEST)
     luminance = np.log2(light @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32))
     redness = np.log2(light[..., 0] / light[..., 2])
     luminance[unsure] = np.nan

@@ -14,6 +14,7 @@ from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
 from nerfcli.media.geodesy import east_north_up
+from nerfcli.poses.model.reasons import FEW_FEATURES
 from nerfcli.scene import Scene
 
 # Inward-looking cameras surround the scene if they span at least this angle; otherwise they face its front.
@@ -22,11 +23,9 @@ _GAP_LOOK, _GAP_BAD = 45.0, 100.0
 _SPAN_LOOK, _SPAN_BAD = 20.0, 6.0
 # A camera is an outlier beyond this many times the median distance from the median camera position.
 _FAR_OFF = 8.0
-_POINTS_LOOK = 100
 # Focal lengths along x and y that differ by more than this mean pixels that are not square, or a wrong calibration.
 _ASPECT_LOOK = 0.02
 # GPS of phones is off by 5 m under open sky and by tens of metres indoors; a metric scale needs a wider capture.
-_GPS_NOISE = 5.0
 _GPS_WIDE = 100.0
 
 
@@ -128,14 +127,14 @@ def points(scene: Scene) -> Finding | None:
     if scene.kind not in ("nerfcli", "colmap") or model is None:
         return None
     counts = {image.name: int((image.point_ids >= 0).sum()) for image in read_model(model).images}
-    few = sorted((count, name) for name, count in counts.items() if count < _POINTS_LOOK)
+    few = sorted((count, name) for name, count in counts.items() if count < FEW_FEATURES)
     middle = float(np.median(list(counts.values()))) if counts else 0.0
     return Finding(
         "points",
         LOOK if few else GOOD,
         f"{middle:.0f} 3D points in the median photo" + (f", {several(len(few), 'photo')} with few" if few else ""),
         middle,
-        f"per photo: look below {_POINTS_LOOK}",
+        f"per photo: look below {FEW_FEATURES}",
         "their poses are uncertain: check renderings from there" if few else "",
         tuple((name, several(count, "point")) for count, name in few),
     )
@@ -220,10 +219,7 @@ def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
         "for information",
         ""
         if widest > _GPS_WIDE
-        else (
-            f"GPS errors are about {_GPS_NOISE:g} m outdoors and tens of metres indoors; use a known distance for "
-            "metres"
-        ),
+        else "GPS errors are about 5 m outdoors and tens of metres indoors; use a known distance for metres",
     )
 
 

@@ -12,8 +12,6 @@ import numpy as np
 WITHIN_PX = 2.5
 # A homography explains a pair if it fits this fraction of the inliers.
 _EXPLAINS = 0.9
-# Focal lengths to try, relative to the given one, which may be wrong in EXIF.
-_FOCAL_TRIALS = np.geomspace(0.7, 1.45, 15)
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,8 @@ def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float]) -> Tw
 def _of_homography(homography: np.ndarray, focals_px: tuple[float, float]) -> tuple[float, float]:
     """Return the rotation angle in degrees and |t| / d of a homography between pixels relative to the centres."""
     found = []
-    for trial in _FOCAL_TRIALS:
+    # Focal lengths to try, relative to the given one, which may be wrong in EXIF.
+    for trial in np.geomspace(0.7, 1.45, 15):
         first, second = (np.diag([focal * trial, focal * trial, 1.0]) for focal in focals_px)
         normalised = np.linalg.solve(second, homography @ first)
         left, singular, right = np.linalg.svd(normalised)

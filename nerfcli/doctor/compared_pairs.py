@@ -11,7 +11,7 @@ import numpy as np
 
 from nerfcli.doctor import camera_motion
 from nerfcli.doctor.moving import Patch, moving_patches
-from nerfcli.doctor.photo_facts import PhotoFacts, PhotoFeatures
+from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, PhotoFeatures
 from nerfcli.media.exif import Exif
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.multiview.epipolar import fundamental_matrix
@@ -19,16 +19,12 @@ from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.stationary import Motions, in_place, motions
 from nerfcli.poses.model.two_views import panorama_inliers
 
-# Features of each photo that are compared at first; all of them if these do not connect the photo to the rest.
-QUICK_FEATURES = 1000
 # Epipolar tolerance of an inlier, pixels.
 EPIPOLAR_PX = 2.0
 # Fewer inliers than this may agree on a geometry by chance.
 LEAST_MATCHES = 20
-# Matches of a pair that are kept, to compare them with cameras: enough for a median, and 40 MB for a thousand photos.
-MOST_KEPT = 200
-# Fewest inliers for estimating camera motion and moving patches.
-_LEAST_FOR_GEOMETRY = 40
+# Fewer pairs than this do not decide on a photo or the scene: each of them may be wrong.
+FEWEST_PAIRS = 3
 # Detail is compared at features of about the same size in both photos: their ratio is within this many octaves.
 _SAME_SIZE_OCTAVES = 0.4
 _LEAST_COMPARED = 12
@@ -50,7 +46,7 @@ class Pair:
         views: camera motion between the photos; None with too few inliers.
         patches: parts that moved independently.
         motions: static and moving matches, see `stationary`; None if no match stays in place.
-        agreeing: pixels (N, 2) in each photo of the matches that agree on one geometry, at most `MOST_KEPT` of them.
+        agreeing: pixels (N, 2) in each photo of the matches that agree on one geometry, at most 200 of them.
     """
 
     first: int
@@ -78,13 +74,13 @@ def compare(
     numbers: tuple[int, int],
     focals_px: tuple[float, float],
     *,
-    most_features: int = QUICK_FEATURES,
+    most_features: int = MOST_FEATURES // 2,
 ) -> Pair:
     """Match two photos and analyse their matches.
 
     Args:
         focals_px: best known focal lengths, at the size at which features were detected.
-        most_features: number of features of each photo to use, strongest first.
+        most_features: number of features of each photo to use, strongest first; by default half of them.
     """
     one, other = (photo.features for photo in photos)
     a, b = mutual_matches(one.descriptors[:most_features], other.descriptors[:most_features], ratio=LOOSE_RATIO)
@@ -104,7 +100,7 @@ def compare(
     views, patches, still = None, (), None
     if pinholes and one.size == other.size and in_place(x, y, one.size)[0].any():
         still = motions(x, y, one.size)
-    if pinholes and count >= _LEAST_FOR_GEOMETRY:
+    if pinholes and count >= 2 * LEAST_MATCHES:
         centres = [np.array(features.size) / 2 for features in (one, other)]
         views = camera_motion.estimate(x[agree] - centres[0], y[agree] - centres[1], focals_px)
         patches = moving_patches(x, y, agree, within_px=EPIPOLAR_PX)
@@ -132,8 +128,8 @@ def focal_px(features: PhotoFeatures, exif: Exif) -> float:
 
 
 def _some(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most `MOST_KEPT` of the matches, evenly chosen."""
-    kept = slice(None, None, -(-len(x) // MOST_KEPT))
+    """Return at most 200 of the matches, evenly chosen: enough for a median."""
+    kept = slice(None, None, -(-len(x) // 200))
     return x[kept].copy(), y[kept].copy()
 
 

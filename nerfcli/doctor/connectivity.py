@@ -11,11 +11,10 @@ from nerfcli.errors import several
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, worst
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.retrieval import alike, likeness
+from nerfcli.poses.input.pairs import EXHAUSTIVE_UP_TO
 
-# Captures of up to this many photos are compared exhaustively.
-EXHAUSTIVE_UP_TO = 60
-# In larger ones, each photo is compared with some later ones by name and with its most similar ones. The camera hardly
-# moves between consecutive frames of a video, so there are wide steps, too.
+# In captures that are not compared exhaustively, each photo is compared with some later ones by name and with its most
+# similar ones. The camera hardly moves between consecutive frames of a video, so there are wide steps, too.
 STEPS_BY_NAME = (1, 2, 8, 20, 50)
 LOOK_ALIKES = 6
 # Similar photos are found by this many features of each photo, the largest ones; fewer miss some, more take longer.
@@ -23,7 +22,6 @@ _COARSEST = 96
 
 # A photo is weakly connected with fewer matches than this in its best pair, or with fewer partners than this.
 WEAK_MATCHES = 35
-_FEWEST_PARTNERS = 2
 
 
 def choose_pairs(photos: Sequence[PhotoFacts]) -> list[tuple[int, int]]:
@@ -66,7 +64,7 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
     weak = [
         i
         for i in sorted(parts[0], key=lambda photo: (best[photo], partners[photo]))
-        if len(photos) > 2 and (best[i] < WEAK_MATCHES or partners[i] < _FEWEST_PARTNERS) and i not in loose
+        if len(photos) > 2 and (best[i] < WEAK_MATCHES or partners[i] < 2) and i not in loose
     ]
     remarks += [(photos[i].name, f"{several(partners[i], 'partner')}, best {best[i]} matches") for i in weak]
     fraction = len(parts[0]) / len(photos)
@@ -83,7 +81,7 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
         summary,
         fraction,
         f"fraction of photos in the largest part: look below 1, bad below 0.9; per photo: look below {WEAK_MATCHES} "
-        f"matches with its best partner or fewer than {_FEWEST_PARTNERS} partners",
+        f"matches with its best partner or fewer than 2 partners",
         "" if verdict == GOOD else "add photos in between, so that each overlaps its neighbours by two thirds",
         tuple(remarks),
     )

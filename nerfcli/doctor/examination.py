@@ -18,12 +18,6 @@ from nerfcli.findings import Finding, as_json, worst
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.scene import Scene
 
-# Measured on one core of a 2-core server; within a factor of two on other CPUs.
-_SECONDS_PER_PHOTO = 0.45
-_SECONDS_PER_PAIR = 0.03
-# Disconnected photos are compared again with all features if they are at most this many, or a tenth of the capture.
-_FEW_APART = 3
-
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -53,7 +47,12 @@ class Diagnosis:
 
 def estimated_seconds(count: int, threads: int) -> float:
     """Estimate how many seconds the examination of `count` photos takes."""
-    return (count * _SECONDS_PER_PHOTO + connectivity.pair_count(count) * _SECONDS_PER_PAIR) / threads
+    return sum(_cpu_seconds(count)) / threads
+
+
+def _cpu_seconds(count: int) -> tuple[float, float]:
+    """Estimate the time to read the photos and to compare them."""
+    return 0.45 * count, 0.03 * connectivity.pair_count(count)
 
 
 def examine(
@@ -71,8 +70,8 @@ def examine(
         UserError: the intrinsics do not fit a photo.
     """
     count = len(subject.sources)
-    reading = count * _SECONDS_PER_PHOTO
-    fraction = reading / (reading + connectivity.pair_count(count) * _SECONDS_PER_PAIR)
+    reading, comparing = _cpu_seconds(count)
+    fraction = reading / (reading + comparing)
 
     def on_photo(done: int) -> None:
         progress(fraction * done / count, f"photo {done} of {count}")
@@ -120,7 +119,7 @@ def compare_all(
 def _second_look(photos: Sequence[PhotoFacts], pairs: list[Pair], focals_px: Sequence[float]) -> list[Pair]:
     """Return the pairs after comparing a few disconnected photos with the rest again, using all features."""
     apart = connectivity.apart(len(photos), pairs)
-    if not 0 < len(apart) <= max(_FEW_APART, len(photos) // 10):
+    if not 0 < len(apart) <= max(3, len(photos) // 10):
         return pairs
     again = []
     for pair in pairs:

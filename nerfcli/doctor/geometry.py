@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from nerfcli.doctor.compared_pairs import Pair
+from nerfcli.doctor.compared_pairs import FEWEST_PAIRS, Pair
 from nerfcli.doctor.moving import Patch
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
@@ -17,9 +17,6 @@ BASELINE_LOOK, BASELINE_BAD = 0.08, 0.03
 # Pairs with at least this baseline over depth show depth, unless the scene is flat.
 _MOVED = 0.1
 _FLAT_LOOK = 0.8
-_LEAST_PAIRS = 3
-# A patch counts if this many pairs find it at the same place in a photo.
-_PAIRS_FOR_PATCH = 3
 
 
 def baselines(count: int, pairs: Sequence[Pair]) -> np.ndarray:
@@ -67,7 +64,7 @@ def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | N
 def flatness(pairs: Sequence[Pair]) -> Finding | None:
     """Check whether the scene is flat; None if too few pairs have a large enough baseline."""
     moved = [pair.views for pair in pairs if pair.views is not None and pair.views.baseline_over_depth > _MOVED]
-    if len(moved) < _LEAST_PAIRS:
+    if len(moved) < FEWEST_PAIRS:
         return None
     fraction = float(np.mean([views.flat for views in moved]))
     verdict = LOOK if fraction >= _FLAT_LOOK else GOOD
@@ -94,7 +91,7 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
     still = False
     for photo, boxes in seen.items():
         confirmed = [
-            (box, patch) for box, patch in boxes if sum(_overlap(box, other) for other, _ in boxes) >= _PAIRS_FOR_PATCH
+            (box, patch) for box, patch in boxes if sum(_overlap(box, other) for other, _ in boxes) >= FEWEST_PAIRS
         ]
         if confirmed:
             (left, top, right, bottom), patch = max(confirmed, key=lambda item: item[1].matches)

@@ -1,6 +1,5 @@
 """Check the files: readability, number, size, cameras, orientation, duplicates."""
 
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
@@ -11,14 +10,11 @@ from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_above, verdict_below
-from nerfcli.media.focal_evidence import focal_evidence
+from nerfcli.media.focal_evidence import focal_evidence, same_focal
+from nerfcli.poses.input.photos import MIN_PHOTOS
 
-FEWEST_PHOTOS = 4
 ENOUGH_PHOTOS = 20
 SMALL_PX = 640
-_TINY_PX = 320
-# Focal lengths that differ by less belong to one lens: autofocus moves them a little.
-_SAME_FOCAL = 0.02
 # Two pictures show the same view if their thumbnails are at least this similar (cosine) and their matches moved by less
 # than this fraction of the diagonal.
 _ALIKE = 0.985
@@ -45,7 +41,7 @@ def readable(unreadable: Mapping[str, str], count: int) -> Finding:
 
 def enough(count: int) -> Finding:
     """Check whether there are enough photos for a reconstruction with held-out photos."""
-    verdict = verdict_below(count, look=ENOUGH_PHOTOS, bad=FEWEST_PHOTOS)
+    verdict = verdict_below(count, look=ENOUGH_PHOTOS, bad=MIN_PHOTOS)
     advice = {
         GOOD: "",
         LOOK: "more photos with two-thirds overlap give better results",
@@ -56,7 +52,7 @@ def enough(count: int) -> Finding:
         verdict,
         several(count, "readable photo"),
         count,
-        f"look below {ENOUGH_PHOTOS}, bad below {FEWEST_PHOTOS}",
+        f"look below {ENOUGH_PHOTOS}, bad below {MIN_PHOTOS}",
         advice[verdict],
     )
 
@@ -67,14 +63,14 @@ def size(photos: Sequence[PhotoFacts]) -> Finding:
     smallest = min(longer)
     sizes = Counter(f"{photo.exif.width} x {photo.exif.height}" for photo in photos)
     listed = ", ".join(f"{text} ({number})" for text, number in sizes.most_common(3))
-    verdict = verdict_below(smallest, look=SMALL_PX, bad=_TINY_PX)
+    verdict = verdict_below(smallest, look=SMALL_PX, bad=SMALL_PX // 2)
     small = [(photo.name, f"{side} px") for photo, side in zip(photos, longer, strict=True) if side < SMALL_PX]
     return Finding(
         "size",
         verdict,
         listed + (f" and {len(sizes) - 3} other sizes" if len(sizes) > 3 else ""),
         smallest,
-        f"longer side: look below {SMALL_PX} px, bad below {_TINY_PX} px",
+        f"longer side: look below {SMALL_PX} px, bad below {SMALL_PX // 2} px",
         "" if verdict == GOOD else "use the original files, not previews or downloads from a messenger",
         tuple(sorted(small, key=lambda item: item[1])),
     )
@@ -214,10 +210,7 @@ def _camera_groups(photos: Sequence[PhotoFacts]) -> dict[str, list[str]]:
         longer, shorter = max(exif.width, exif.height), min(exif.width, exif.height)
         body = " ".join(text for text in (exif.make, exif.model) if text)
         parts = [body, exif.lens] if body or exif.lens else ["unknown (no EXIF)"]
-        focal = exif.focal_mm or exif.focal_35mm
-        if focal:
-            focal = next((other for other in focals if abs(math.log(focal / other)) < _SAME_FOCAL), focal)
-            focals.append(focal)
+        if focal := same_focal(exif.focal_mm or exif.focal_35mm, focals):
             parts.append(f"{focal:.3g} mm")
         if exif.focal_mm and exif.focal_35mm:  # also shows digital zoom
             parts.append(f"({exif.focal_35mm:.3g} mm on film)")

@@ -26,7 +26,6 @@ _DOMINANT = 0.7
 _LARGEST_FRACTION = 0.35
 # A candidate is rejected if one geometry explains more than this fraction of both the patch and the rest.
 _EXPLAINED = 0.8
-_STILL_PX = 1.5
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ def moving_patches(x: np.ndarray, y: np.ndarray, agree: np.ndarray, *, within_px
         members = away[group]
         if len(members) <= _LARGEST_FRACTION * len(x) and _is_patch(x, y, agree, members=members, within_px=within_px):
             shift = np.median(np.linalg.norm(y[members] - x[members], axis=1))
-            found.append(Patch(_box(x[members]), _box(y[members]), len(members), bool(shift < _STILL_PX)))
+            found.append(Patch(_box(x[members]), _box(y[members]), len(members), bool(shift < _MOTION_PX / 2)))
     return tuple(found)
 
 

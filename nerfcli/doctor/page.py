@@ -6,7 +6,6 @@ from html import escape
 from pathlib import Path
 from string import Template
 
-import cv2
 import numpy as np
 
 from nerfcli.doctor.examination import Diagnosis
@@ -15,16 +14,8 @@ from nerfcli.doctor.quality import BLURRED, STOPS_LOOK
 from nerfcli.errors import several
 from nerfcli.findings import BAD, GOOD, LOOK, VERDICTS, Finding, worst
 from nerfcli.pages import page
-from nerfcli.pages.embedded_pictures import data_uri, jpeg_bytes, picture_rule, png_bytes
+from nerfcli.pages.embedded_pictures import data_uri, picture_rule, png_bytes
 
-# Thumbnails are smaller in captures of more photos than this, so that a page of a thousand photos has about 5 MB.
-_SMALL_THUMBNAILS_FROM, _SMALL_THUMBNAIL_PX = 200, 120
-# Photos shown with a finding; further ones are only named.
-_SHOWN_PER_FINDING = 12
-# Of a chart, pixels.
-_WIDTH, _HEIGHT, _LEFT = 1040, 150, 44
-# The scale of a chart is at least this wide, so that noise does not look like a finding.
-_LEAST_RANGE = 1.0
 _WORDS = {GOOD: "good", LOOK: "worth a look", BAD: "fix this first"}
 
 
@@ -67,7 +58,7 @@ def page_html(diagnosis: Diagnosis) -> str:
         charts=_charts_html(diagnosis),
         grid="\n".join(_photo_html(index, diagnosis) for index in range(len(photos))),
     )
-    thumbnails = "\n".join(_thumbnail_rule(index, photo, len(photos)) for index, photo in enumerate(photos))
+    thumbnails = "\n".join(_thumbnail_rule(index, photo) for index, photo in enumerate(photos))
     return page.page_html(
         title=_title(diagnosis.subject.path),
         mark=_mark(diagnosis.subject.path),
@@ -85,21 +76,14 @@ def _title(capture: Path) -> str:
     return f"{folder.parent.name}/{folder.name}" if folder.name in ("images", "photos") else folder.name
 
 
-def _thumbnail_rule(index: int, photo: PhotoFacts, count: int) -> str:
+def _thumbnail_rule(index: int, photo: PhotoFacts) -> str:
     """Return a CSS rule that contains the picture, so that a photo shown twice is stored once."""
-    data = photo.thumbnail
-    if count > _SMALL_THUMBNAILS_FROM:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        assert picture is not None
-        data = jpeg_bytes(picture[..., ::-1], longest_px=_SMALL_THUMBNAIL_PX, quality=70)
-    return picture_rule(f"p{index}", data_uri(data, "jpeg"))
+    return picture_rule(f"p{index}", data_uri(photo.thumbnail, "jpeg"))
 
 
 def _finding_html(finding: Finding, number: dict[str, int]) -> str:
-    shown = "".join(
-        _figure(number.get(name), name, what, link=True) for name, what in finding.photos[:_SHOWN_PER_FINDING]
-    )
-    rest = finding.photos[_SHOWN_PER_FINDING:]
+    pictured, rest = finding.photos[:12], finding.photos[12:]
+    shown = "".join(_figure(number.get(name), name, what, link=True) for name, what in pictured)
     more = ""
     if rest:
         names = "".join(f"<li>{escape(name)} <span>{escape(what)}</span></li>" for name, what in rest)
@@ -170,23 +154,25 @@ def _charts_html(diagnosis: Diagnosis) -> str:
 def _bars(names: Sequence[str], values: np.ndarray, *, marked: np.ndarray, unit: str) -> str:
     """Return an SVG chart with a bar per photo, up or down from 0; marked bars are coloured, NaN is left out."""
     measured = values[~np.isnan(values)]
-    low = min(-_LEAST_RANGE / 2, float(measured.min(initial=0.0)) * 1.1)
-    high = max(_LEAST_RANGE / 2, float(measured.max(initial=0.0)) * 1.1)
-    step = (_WIDTH - _LEFT) / max(len(values), 1)
+    # The scale is at least 1 wide, so that noise does not look like a finding.
+    low = min(-0.5, float(measured.min(initial=0.0)) * 1.1)
+    high = max(0.5, float(measured.max(initial=0.0)) * 1.1)
+    width, height, left = 1040, 150, 44
+    step = (width - left) / max(len(values), 1)
 
     def row(value: float) -> float:
-        return (high - value) / (high - low) * _HEIGHT
+        return (high - value) / (high - low) * height
 
-    parts = [f'<svg viewBox="0 -8 {_WIDTH} {_HEIGHT + 16}" role="img">']
+    parts = [f'<svg viewBox="0 -8 {width} {height + 16}" role="img">']
     for tick in _ticks(low, high):
-        line = f'y1="{row(tick):.1f}" x2="{_WIDTH}" y2="{row(tick):.1f}" stroke="var(--line)"'
-        parts.append(f'<line x1="{_LEFT}" {line}/><text x="0" y="{row(tick) + 4:.1f}">{_tick(tick)}</text>')
+        line = f'y1="{row(tick):.1f}" x2="{width}" y2="{row(tick):.1f}" stroke="var(--line)"'
+        parts.append(f'<line x1="{left}" {line}/><text x="0" y="{row(tick) + 4:.1f}">{_tick(tick)}</text>')
     for index, (name, value) in enumerate(zip(names, values, strict=True)):
         if np.isnan(value):
             continue
         top, bottom = sorted((row(float(value)), row(0.0)))
         colour = "var(--look)" if marked[index] else "var(--bar)"
-        place = f'x="{_LEFT + index * step + 0.1 * step:.2f}" y="{top:.1f}" width="{min(0.8 * step, 24):.2f}"'
+        place = f'x="{left + index * step + 0.1 * step:.2f}" y="{top:.1f}" width="{min(0.8 * step, 24):.2f}"'
         title = f"<title>{escape(name)}: {value:+.2f} {unit}</title>"
         parts.append(f'<rect {place} height="{max(bottom - top, 1):.1f}" fill="{colour}">{title}</rect>')
     return "".join([*parts, "</svg>"])

@@ -20,14 +20,6 @@ from nerfcli.multiview.features import find_features
 # Longer side of the pictures in which features are detected; all thresholds in pixels refer to this size.
 LONGER_SIDE_PX = 800
 MOST_FEATURES = 2000
-# With more photos than this, fewer features of each are kept, so that all fit into memory.
-MANY_PHOTOS = 200
-_FEATURES_OF_MANY = 1000
-
-_THUMBNAIL_PX = 240
-_THUMBNAIL_QUALITY = 72
-# Side of the tiny grey picture for finding duplicates.
-_TINY_PX = 32
 
 
 @dataclass(frozen=True)
@@ -93,7 +85,8 @@ def read_all(
     """
     facts: list[PhotoFacts] = []
     unreadable: dict[str, str] = {}
-    most_features = MOST_FEATURES if len(sources) <= MANY_PHOTOS else _FEATURES_OF_MANY
+    # Fewer features of many photos, so that all fit into memory.
+    most_features = MOST_FEATURES if len(sources) <= 200 else MOST_FEATURES // 2
     with ThreadPoolExecutor(threads) as readers:
         for index, found in enumerate(readers.map(lambda source: _examine(source, most_features), sources)):
             if isinstance(found, PhotoFacts):
@@ -133,7 +126,7 @@ def read_photo(source: Source, most_features: int) -> PhotoFacts:
         name=source.name,
         exif=exif,
         digest=digest,
-        thumbnail=_jpeg(_shrunk(small, _THUMBNAIL_PX)),
+        thumbnail=_jpeg(_shrunk(small, 160)),
         tiny=_tiny(small_grey),
         sharpness=sharp,
         exposure=brightness.measure(rgb, used),
@@ -182,13 +175,14 @@ def _features(rgb: np.ndarray, seen: np.ndarray, *, local_detail: np.ndarray, mo
 
 
 def _tiny(grey: np.ndarray) -> np.ndarray:
-    tiny = cv2.resize(grey, (_TINY_PX, _TINY_PX), interpolation=cv2.INTER_AREA).astype(np.float32)
+    side = 32
+    tiny = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA).astype(np.float32)
     tiny -= tiny.mean()
     norm = float(np.linalg.norm(tiny))
-    return tiny / norm if norm > _TINY_PX else np.zeros_like(tiny)
+    return tiny / norm if norm > side else np.zeros_like(tiny)
 
 
 def _jpeg(rgb: np.ndarray) -> bytes:
-    encoded, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _THUMBNAIL_QUALITY])
+    encoded, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
     assert encoded
     return data.tobytes()

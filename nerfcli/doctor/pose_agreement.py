@@ -11,28 +11,24 @@ import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.frame import Frame
-from nerfcli.doctor.compared_pairs import Pair
+from nerfcli.doctor.compared_pairs import FEWEST_PAIRS, Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
 from nerfcli.findings import BAD, GOOD, LOOK, Finding
 from nerfcli.multiview.epipolar import sampson_angles
 
-# Photos that look alike match at the wrong place, too: of the pairs of fox, 18 % are off by more than 10 px. They have
-# fewer matches than true neighbours, so the strongest pairs of a photo decide.
+# Photos that look alike match at the wrong place, too. They have fewer matches than true neighbours, so the strongest
+# pairs of a photo decide.
 _STRONGEST = 6
-_FEWEST_PAIRS = 3
 # Fewer matches than this may be of things that look alike.
 _LEAST_MATCHES = 30
 # A pair contradicts its poses from this median error on, or from this multiple of the capture's, since poses by
-# tracking are off by pixels everywhere. The strongest pairs of sound captures are off by 0.1 to 1 px.
+# tracking are off by pixels everywhere.
 _CONTRADICTS_PX, _TIMES_USUAL = 4.0, 5.0
-# For the whole capture: 0.1 to 0.3 px where poses are sound, 2 px where a Kinect tracked them, 9 to 70 px where they
-# were read with wrong conventions.
+# For the whole capture; poses by tracking are off by pixels, and those read with wrong conventions by tens of pixels.
 USUAL_LOOK_PX, USUAL_BAD_PX = 1.0, 5.0
 # The two rays of a match must differ by this much for it to mean anything that they meet behind a camera.
 _LEAST_PARALLAX_PX = 10.0
-# The cameras as a whole are wrong if this fraction of the photos contradicts them.
-_MOST = 0.5
 
 _ALL_WRONG = (
     "nerfcli convert SCENE --detect tests whether the cameras were read with the right conventions; nerfcli poses "
@@ -90,8 +86,8 @@ def agreement(photos: Sequence[PhotoFacts], errors: Sequence[PairError]) -> Find
         f"all photos: look from {USUAL_LOOK_PX:g} px, bad from {USUAL_BAD_PX:g} px; a photo: bad if most of its "
         f"{_STRONGEST} strongest pairs are off by {limit_px:.2g} px"
     )
-    if usual_px >= USUAL_BAD_PX or len(named) > _MOST * measured or behind > _MOST:
-        where = f", and {100 * behind:.0f} % of the pairs meet behind a camera" if behind > _MOST else ""
+    if usual_px >= USUAL_BAD_PX or len(named) > 0.5 * measured or behind > 0.5:
+        where = f", and {100 * behind:.0f} % of the pairs meet behind a camera" if behind > 0.5 else ""
         summary = f"the matches contradict the cameras as a whole: {summary}{where}"
         return Finding("poses", BAD, summary, usual_px, threshold, _ALL_WRONG)
     if named:
@@ -112,7 +108,7 @@ def contradicting(errors: Sequence[PairError], count: int, *, limit_px: float) -
     while True:
         suspects = []
         for index, values in enumerate(_strongest(left, count)):
-            if len(values) >= _FEWEST_PAIRS and np.mean(np.array(values) > limit_px) > _MOST:
+            if len(values) >= FEWEST_PAIRS and np.mean(np.array(values) > limit_px) > 0.5:
                 suspects.append((float(np.mean(np.array(values) > limit_px)), float(np.median(values)), index))
         if not suspects:
             return sorted(named, key=lambda item: -item[1])
@@ -128,7 +124,7 @@ def contradicts_from_px(usual_px: float) -> float:
 
 def usual(errors: Sequence[PairError], count: int) -> tuple[float, int]:
     """Return the median over photos of the median error of their strongest pairs, and how many photos have enough."""
-    medians = [np.median(values) for values in _strongest(errors, count) if len(values) >= _FEWEST_PAIRS]
+    medians = [np.median(values) for values in _strongest(errors, count) if len(values) >= FEWEST_PAIRS]
     return (float(np.median(medians)) if medians else float("nan")), len(medians)
 
 
@@ -165,4 +161,4 @@ def _compared_with_poses(pair: Pair, frames: Sequence[Frame], photos: Sequence[P
     meet_behind = behind & (parallax * focal_px > _LEAST_PARALLAX_PX)
     # Without a baseline both rays should have the same direction.
     errors = np.where(np.isnan(angles), parallax, angles)
-    return focal_px * float(np.median(errors)), float(np.mean(meet_behind)) > _MOST
+    return focal_px * float(np.median(errors)), float(np.mean(meet_behind)) > 0.5

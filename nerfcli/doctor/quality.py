@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerfcli.doctor.compared_pairs import Pair
+from nerfcli.doctor.compared_pairs import FEWEST_PAIRS, Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_above, verdict_below, worst
@@ -13,9 +13,6 @@ from nerfcli.multiview.graph import connected_groups
 # log2 of the detail that a photo lacks relative to the others: a Gaussian blur of about 0.8 px takes 0.3 from a sharp
 # photo of 1600 px, one of 1.5 px takes 0.7.
 BLURRED, VERY_BLURRED = 0.3, 0.7
-# A photo without enough neighbours that show the same must lack more, since its content also plays a part.
-_ALONE = 0.1
-_NEIGHBOURS_TELL = 3
 # A photo is smeared if its direction ratio exceeds this multiple of the capture's median and it lacks this much detail.
 _SMEARED, _SMEARED_LACK = 1.25, 0.2
 # For the whole capture: detail after a Gaussian blur of about 2 px and of 4 px at 1600 px.
@@ -27,8 +24,6 @@ STOPS_LOOK, STOPS_BAD = 1.0, 2.5
 _BALANCE_LOOK, _BALANCE_BAD = 0.5, 1.5
 CLIPPED_LOOK, CLIPPED_BAD = 0.1, 0.5
 _DARK, _VERY_DARK = 0.15, 0.05
-# Of `potentials`.
-_ROUNDS = 10
 # Differences between photos are off by about this much; larger residuals weigh less.
 _TYPICAL_ERROR = 0.1
 
@@ -47,7 +42,8 @@ def lacking_detail(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> np.nd
     matched, backing = potentials(len(photos), places, np.array([pair.detail for pair in linked]), trust=trust)
     alone = reference - own
     both = (alone - matched) / 2
-    return np.where((backing >= _NEIGHBOURS_TELL) & ~np.isnan(both), both, alone - _ALONE)
+    # A photo without enough neighbours must lack more, since its content also plays a part.
+    return np.where((backing >= FEWEST_PAIRS) & ~np.isnan(both), both, alone - _TYPICAL_ERROR)
 
 
 def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
@@ -235,7 +231,7 @@ def potentials(
     backing = np.bincount(np.concatenate([i, j]), minlength=count)
     values = np.zeros(count)
     weights = trust / max(trust.mean(), 1e-9) if len(trust) else trust
-    for _ in range(_ROUNDS):
+    for _ in range(10):
         laplacian = np.zeros((count, count))
         np.add.at(laplacian, (i, i), weights)
         np.add.at(laplacian, (j, j), weights)

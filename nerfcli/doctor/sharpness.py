@@ -13,17 +13,12 @@ import numpy as np
 
 LONGER_SIDE_PX = 1600
 
-# Standard deviations in pixels of the Gaussian blurs whose differences are the two octaves.
-_SMOOTHINGS = (0.8, 1.6, 3.2)
 # Tiles per side; the sharpest quarter of those with texture decides, since the background may be out of focus.
 _TILES = 12
-_SHARPEST_QUARTILE = 75
 # A pixel has enough texture if the root mean square of the coarse octave around it exceeds this, in levels of 255.
 _TEXTURE_LEVELS = 1.2
-_LEAST_TEXTURED_TILES = 6
 # Noise of the sensor and of JPEG, in levels, which must not count as fine detail.
 _NOISE_LEVELS = 0.35
-_WINDOW_PX = 12.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +39,7 @@ class Sharpness:
 
 def octaves(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the fine and coarse octaves of a grey picture (H, W) in levels of 255, float32."""
-    fine, middle, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in _SMOOTHINGS)
+    fine, middle, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (0.8, 1.6, 3.2))
     return fine - middle, middle - coarse
 
 
@@ -54,7 +49,7 @@ def measure(grey: np.ndarray) -> tuple[Sharpness, np.ndarray]:
     The photo is (H, W) float32 in levels of 255, at most `LONGER_SIDE_PX` long.
     """
     fine, coarse = octaves(grey)
-    fine_power, coarse_power = (cv2.GaussianBlur(band * band, (0, 0), _WINDOW_PX) for band in (fine, coarse))
+    fine_power, coarse_power = (cv2.GaussianBlur(band * band, (0, 0), 12.0) for band in (fine, coarse))
     textured = coarse_power > _TEXTURE_LEVELS**2
     local = 0.5 * np.log2(np.maximum(fine_power - _NOISE_LEVELS**2, 1e-3) / np.maximum(coarse_power, 1e-3))
     local[~textured] = np.nan
@@ -65,9 +60,9 @@ def measure(grey: np.ndarray) -> tuple[Sharpness, np.ndarray]:
         if tile.size and np.mean(~np.isnan(tile)) > 0.3
     ]
     fraction = len(tiles) / _TILES**2
-    if len(tiles) < _LEAST_TEXTURED_TILES:
+    if len(tiles) < 6:
         return Sharpness(float("nan"), 1.0, fraction), local
-    detail = float(np.percentile([tile[0] for tile in tiles], _SHARPEST_QUARTILE))
+    detail = float(np.percentile([tile[0] for tile in tiles], 75))
     return Sharpness(detail, _direction_ratio(fine, coarse, textured), fraction), local
 
 

@@ -102,6 +102,17 @@ def _same(side: float, other: float) -> bool:
     return abs(side - other) <= max(_ROUNDING_PX, _SAME_SIDE * other)
 
 
+def same_focal(focal: float | None, earlier: list[float]) -> float | None:
+    """Return the first of the earlier focal lengths that counts as the same; without one, add and return this one."""
+    if focal is None:
+        return None
+    for other in earlier:
+        if abs(math.log(focal / other)) < 0.02:  # autofocus moves them a little
+            return other
+    earlier.append(focal)
+    return focal
+
+
 def with_digital_zoom(exifs: Sequence[Exif]) -> list[Exif]:
     """Return EXIF of a capture's photos with focal lengths that include the digital zoom.
 

@@ -19,9 +19,6 @@ import pycolmap
 from nerfcli.poses.input.job import CameraGroup, Job, usual_focal_px
 from nerfcli.poses.model.two_views import count_matches
 
-# In pycolmap a pair's id is this times the smaller image id, plus the larger one.
-_PAIR_FACTOR = 2147483647
-
 
 def register_photos(job: Job) -> None:
     """Make the database hold exactly the job's photos, with the ids and cameras of the job.
@@ -167,7 +164,8 @@ def _verified_with(camera: pycolmap.Camera) -> tuple[Any, ...]:
 
 
 def _forget(job: Job, image_ids: Iterable[int], *tables: str) -> None:
-    of_pairs = f"pair_id / {_PAIR_FACTOR} = :photo OR pair_id % {_PAIR_FACTOR} = :photo"
+    most_ids = 2**31 - 1  # a pair's id is this times the smaller image id, plus the larger one
+    of_pairs = f"pair_id / {most_ids} = :photo OR pair_id % {most_ids} = :photo"
     with _edited(job) as database:
         for image_id in image_ids:
             for table in tables:

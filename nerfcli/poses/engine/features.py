@@ -17,12 +17,8 @@ from nerfcli.poses.input.job import Job, Report, WorkMask
 from nerfcli.poses.input.plan import limit_seconds, matching_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
-# Largest factor by which a mask raises the feature limit: more would only add fine features at noise level.
-_MOST_FEATURES_FOR_MASK = 8
-# Matches are written after each block, so that progress is visible and kept.
-_PAIRS_PER_BLOCK = 128
 # The time limit is checked after this many pairs; it is at least this many seconds, however few pairs there are.
-_PAIRS_PER_CALL = 8 * _PAIRS_PER_BLOCK
+_PAIRS_PER_CALL = 1024
 _LEAST_LIMIT_SECONDS = 300
 # Change these whenever this module would find other features in the same photo, or other matches of the same features.
 _FEATURES_VERSION = "octaves 0, then -1 below half, then 0 and -1 with a quarter of the contrast below an eighth"
@@ -50,8 +46,7 @@ class _Search:
 
 # Searching the enlarged picture, pycolmap's default, takes three times as long. Photos with many features gain nothing
 # from it, since pycolmap keeps the coarsest, and measured poses are no better with more than half of those requested.
-# Photos of dark, blurred or uniform surfaces have hardly any feature with the usual contrast. 108 photos of a sea floor
-# under a lamp: median 175 features, 24 of 54 stereo pairs verified; with a quarter of the contrast, 4,842 and all 54.
+# Photos of dark, blurred or uniform surfaces have hardly any feature with the usual contrast, but match with a quarter.
 _SEARCHES = (
     _Search("extract", below=math.inf, first_octave=0, contrast=_CONTRAST),
     _Search("enlarge", below=1 / 2, first_octave=-1, contrast=_CONTRAST),
@@ -123,7 +118,8 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.seed
     pair_list = Path(job.folder) / "pairs.txt"
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list, block_size=_PAIRS_PER_BLOCK)
+    # Matches are written after each block, so that progress is visible and kept.
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list, block_size=_PAIRS_PER_CALL // 8)
     ids = job.image_ids
     cut_short = None
     with pycolmap.Database.open(job.database) as database:
@@ -194,7 +190,8 @@ def _by_limit(job: Job, numbers: Iterable[int]) -> dict[int, list[str]]:
     limits: dict[int, list[str]] = {}
     for number in numbers:
         fraction = job.masks[number].used_fraction if job.masks else 1.0
-        factor = min(_MOST_FEATURES_FOR_MASK, 2 ** int(math.log2(1 / fraction))) if fraction > 0 else 1
+        # A larger factor would only add fine features at noise level.
+        factor = min(8, 2 ** int(math.log2(1 / fraction))) if fraction > 0 else 1
         limits.setdefault(job.max_features * factor, []).append(job.files[number])
     return limits
 

@@ -23,7 +23,7 @@ from nerfcli.poses.engine.mapping import MapperOptions, map_photos, mapper_limit
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
 from nerfcli.poses.input.plan import extraction_seconds, mapping_seconds, matching_seconds
-from nerfcli.poses.input.settings import FULL_SIZE
+from nerfcli.poses.input.settings import FULL_SIZE, QUALITIES
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model.intrinsics import field_of_view_deg
 from nerfcli.poses.model.lens_evidence import lenses_of
@@ -39,16 +39,11 @@ _GOOD_FRACTION = 0.9
 _FEW_FRACTION = 0.75
 # From this many photos, mapping from scratch takes two minutes and more, which is not worth it for a few photos.
 _MANY_PHOTOS = 250
-# Below this registered fraction, the initial focal length from EXIF is doubted.
-_LITTLE_FRACTION = 0.5
 # Beyond this, comparing every pair, or searching full-size photos, takes longer than taking better photos.
 _MOST_PAIRS = 12_000
 _MOST_FULL_SIZE = 150
-_MORE_FEATURES = 8192
 # Searching larger pictures may take this many times as long as the first search, times the fraction of missing photos.
 _MOST_FOR_MORE = 5.0
-# Time limit of all attempts together, as a multiple of the limit of one run of the mapper.
-_MOST_RUNS = 2
 # A focal length that differs from EXIF's by more than this factor (its logarithm) is reported.
 _FAR_FROM_EXIF = 0.1
 # From this field of view, a lens mapped as perspective may be a fisheye.
@@ -77,7 +72,7 @@ class _Ladder:
 
     def has_time(self) -> bool:
         """Return whether there is time for another attempt; the first time there is none, tell the user."""
-        most = _MOST_RUNS * mapper_limit_seconds(self._photos)
+        most = 2 * mapper_limit_seconds(self._photos)
         if not self._is_over and time.perf_counter() - self._start > most:
             self._is_over = True
             self._cut(f"no further attempts to place photos after {duration(most)}")
@@ -275,7 +270,7 @@ def _only_turns(job: Job) -> bool:
 def _with_more_features(ladder: _Ladder, job: Job, *, missing: float) -> None:
     """Search larger pictures for more features, within a time that grows with the fraction of missing photos."""
     longest = max(max(group.width, group.height) for group in job.groups)
-    more = replace(job, rung="full-size", max_features=_MORE_FEATURES, pairs=all_pairs(len(job.files)))
+    more = replace(job, rung="full-size", max_features=QUALITIES["best"][1], pairs=all_pairs(len(job.files)))
     so_far = _search_seconds(job)
     matching = _search_seconds(replace(more, max_image_size=0))
     full = _search_seconds(replace(more, max_image_size=FULL_SIZE)) - matching
@@ -321,9 +316,9 @@ def _other_starts(ladder: _Ladder, job: Job) -> None:
 
 
 def _without_exif(ladder: _Ladder, job: Job, *, fraction: float) -> Job:
-    """Map without EXIF's focal lengths if few photos are placed with them; return the job of the better result."""
+    """Map without EXIF's focal lengths if fewer than half of the photos are placed; return the better result's job."""
     bare = replace(job, groups=tuple(group.without_exif() for group in job.groups))
-    if fraction >= _LITTLE_FRACTION or bare.groups == job.groups or not ladder.has_time():
+    if fraction >= 0.5 or bare.groups == job.groups or not ladder.has_time():
         return job
     what = "without EXIF's focal length"
     ladder.announce(what)
@@ -370,7 +365,7 @@ def _strong_pairs(job: Job) -> list[tuple[int, int, int]]:
 def _can_have_more_features(job: Job) -> bool:
     """Return whether larger pictures or a higher limit would give any photo more features."""
     larger = any(max(group.width, group.height) > job.max_image_size for group in job.groups)
-    limited = job.max_features < _MORE_FEATURES and max(feature_counts(job), default=0) >= job.max_features
+    limited = job.max_features < QUALITIES["best"][1] and max(feature_counts(job), default=0) >= job.max_features
     return (larger or limited) and len(job.files) <= _MOST_FULL_SIZE
 
 

@@ -18,9 +18,6 @@ from nerfcli.poses.judge.examine import examine
 from nerfcli.poses.model.reasons import FEW_MATCHES
 from nerfcli.poses.model.two_views import count_matches
 
-# A component has at least this many photos of its own.
-_LEAST_PHOTOS = 3
-
 
 def choose_model(mapped: MappedModels, report: Report, tell: Tell, *, checks: Callable[[], Checks]) -> ChosenModel:
     """Examine the largest model, and give it a second chance if pairs of photos contradict it, or let it grow.
@@ -50,7 +47,7 @@ def _with_photos_of_their_own(
     for model in sorted(others, key=lambda model: -model.num_reg_images()):
         photos = set(model.reg_image_ids())
         own = photos - taken
-        if len(own) >= _LEAST_PHOTOS and 2 * len(own) > len(photos):
+        if len(own) >= 3 and 2 * len(own) > len(photos):
             kept.append(model)
             taken |= photos
     return kept

@@ -24,28 +24,23 @@ from nerfcli.poses.engine.mapping import (
     mapper_limit_seconds,
 )
 from nerfcli.poses.input.job import Job, Report, Tell
-from nerfcli.poses.input.pairs import capture_order
+from nerfcli.poses.input.pairs import FOLLOWERS, capture_order
 from nerfcli.poses.input.plan import at_once_seconds, mapping_seconds
 from nerfcli.poses.input.stages import stage_key
-from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict
+from nerfcli.poses.judge.acceptance import Verdict
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import without_photos
 from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import NO_PARALLAX_PX
 from nerfcli.poses.model.intrinsics import settle
+from nerfcli.poses.model.reasons import MIN_MATCHES
 from nerfcli.poses.model.two_views import agreements, count_matches, read_verified_pairs
 
-# First number of the mapper's runs here, after those of the ladder; the numbers are added to the seed.
-_FIRST_ATTEMPT = 100
 # Least fraction of the placed photos in a consistent core that is worth extending.
 _LEAST_CORE = 0.3
 # Least time limit of a hypothesis that has no limit of its own, however little time is left.
 _LEAST_LIMIT_SECONDS = 120
-# In an ordered capture, photos at most this many places apart are taken to be neighbours in space.
-_NEAR_IN_ORDER = 10
 _ALL_AT_ONCE = "all photos at once (global mapper)"
-# Time limit of all hypotheses together, as a multiple of the time of the first mapping.
-_MOST_TIME = 2.0
 # Photos in smaller models, as a fraction of those in the accepted one, from which `grow` tries to add them.
 _LEAST_APART = 0.05
 
@@ -82,7 +77,7 @@ def second_chance(
     if not pairs["contradicting"]:
         against = first.verdict.failures[0].evidence
     scratch = mapped.seconds
-    most = _MOST_TIME * scratch
+    most = 2 * scratch
     tell(f"{against}: mapping again, for at most {duration(most)}")
     attempts = list(mapped.attempts)
     core = _core(mapped.models[0], mapped.job)
@@ -260,7 +255,7 @@ def _neighbours_in_order(job: Job, pairs: Iterable[tuple[int, int]]) -> set[tupl
     if order is None:
         return set()
     place = {number: index for index, number in enumerate(order)}
-    return {(one, other) for one, other in pairs if abs(place[one] - place[other]) <= _NEAR_IN_ORDER}
+    return {(one, other) for one, other in pairs if abs(place[one] - place[other]) <= FOLLOWERS}
 
 
 def _regrown(mapped: MappedModels, core: _Core, report: Report) -> MappedModels | None:
@@ -281,11 +276,12 @@ def _mapped_without(
 ) -> MappedModels:
     """Extend a model without the suspects, or map from scratch with another seed and a smaller initial baseline."""
     job = _with_own_database(mapped.job, without=suspects)
+    attempt = 100  # after those of the ladder; it is added to the seed
     if base is None:
-        models = map_photos(job, report, attempt=_FIRST_ATTEMPT + 1, start=SMALLER_BASELINE)
+        models = map_photos(job, report, attempt=attempt + 1, start=SMALLER_BASELINE)
     else:
         _set_cameras(job, base)
-        models = map_photos(job, report, attempt=_FIRST_ATTEMPT, start=MapperOptions(), base=base)
+        models = map_photos(job, report, attempt=attempt, start=MapperOptions(), base=base)
     job.database.unlink()
     return MappedModels(models, mapped.job, mapped.attempts)
 

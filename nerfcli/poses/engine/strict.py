@@ -18,13 +18,10 @@ from nerfcli.poses.engine.features import extract, match, start_matching
 from nerfcli.poses.engine.retrieval import with_neighbours
 from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.input.stages import stage_key
+from nerfcli.poses.model.held_out import MAPPER
 from nerfcli.poses.model.localise import place
 from nerfcli.poses.model.principal_points import LEAST_OBSERVATIONS, camera_of_lens, refine_with_principal_point
 from nerfcli.poses.model.reasons import FEW_MATCHES, NO_TRAINING_PHOTO
-
-# As in pycolmap's mapper (abs_pose_max_error, abs_pose_min_inlier_ratio).
-_MOST_ERROR_PX = 12.0
-_LEAST_INLIERS = 0.25
 
 
 def held_out_last(job: Job) -> Job:
@@ -143,8 +140,8 @@ def _place(
     camera = camera_of_lens(model, placed)
     pixels, points = _seen_points(model, job, number, pairs)
     options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error = _MOST_ERROR_PX
-    options.ransac.min_inlier_ratio = _LEAST_INLIERS
+    options.ransac.max_error = MAPPER.abs_pose_max_error
+    options.ransac.min_inlier_ratio = MAPPER.abs_pose_min_inlier_ratio
     options.ransac.random_seed = job.seed
     refinement = pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=False, refine_extra_params=False)
     found = None

@@ -34,10 +34,6 @@ _STAGES = {
 }
 _GO_ON = "completed work is kept; run the same command again to continue"
 _LESS_MEMORY = "use smaller photos (--max-size), fewer features (--quality fast) or fewer threads (--threads)"
-# Memory can double in a second or two, when a photo is decoded or a bundle adjustment begins.
-_LOOK_EVERY_SECONDS = 0.1
-# With less free space, SQLite and pycolmap cannot write the next part.
-_FULL_DISK_BYTES = 2_000_000
 
 
 class WorkerDiedError(UserError):
@@ -114,7 +110,8 @@ def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> Use
 
     If the disk that it wrote to is full, by its `free_bytes`, the log may be empty.
     """
-    if free_bytes < _FULL_DISK_BYTES or "disk is full" in log or os.strerror(ENOSPC) in log:
+    # With less free space, SQLite and pycolmap cannot write the next part.
+    if free_bytes < 2_000_000 or "disk is full" in log or os.strerror(ENOSPC) in log:
         return UserError(
             f"structure from motion stopped while {stage}: the disk is full ({free_bytes / 1000000.0:.1f} MB free)",
             f"free some disk space, or choose another disk with -o; {_GO_ON}",
@@ -159,7 +156,8 @@ class _Guard:
         self._thread.join()
 
     def _watch(self) -> None:
-        while not self._stopped.wait(_LOOK_EVERY_SECONDS):
+        # Memory can double in a second or two, when a photo is decoded or a bundle adjustment begins.
+        while not self._stopped.wait(0.1):
             if self._most_bytes is not None and resident_bytes(self._worker.pid) > self._most_bytes:
                 self.reached = "memory"
             elif self._is_overdue():

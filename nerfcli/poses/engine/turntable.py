@@ -32,11 +32,6 @@ from nerfcli.poses.input.job import Job, Tell, WorkMask
 from nerfcli.poses.input.masks import write_mask, write_no_mask
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
-# Evenly chosen photos, each compared with those that follow it by these numbers of places, and with one far away.
-_ANCHORS, _FIRST_ANCHORS = 24, 8
-_STEPS = (1, 2, 4)
-# Features per photo, the largest ones.
-_FEATURES = 1200
 # If fewer than this fraction of the first pairs have static matches, no further pairs are compared.
 _FEW_STILL = 0.25
 # A photo from the same camera position agrees with at least this fraction of the background that some photos show.
@@ -158,7 +153,7 @@ def _compared(job: Job) -> list[ComparedPair]:
     @cache
     def features(number: int) -> tuple[np.ndarray, np.ndarray]:
         with pycolmap.Database.open(job.database) as database:
-            return coarsest(database, job.image_ids[number], _FEATURES)
+            return coarsest(database, job.image_ids[number], 1200)
 
     def compare(chosen: Iterable[tuple[int, int]]) -> list[ComparedPair]:
         found = []
@@ -171,14 +166,15 @@ def _compared(job: Job) -> list[ComparedPair]:
         return found
 
     sizes = [job.sizes[image_id] for image_id in job.image_ids]
-    few, more = _pairs(len(sizes), _FIRST_ANCHORS), _pairs(len(sizes), _ANCHORS)
+    few_anchors, anchors = 8, 24
+    few, more = _pairs(len(sizes), few_anchors), _pairs(len(sizes), anchors)
     pairs = compare(few)
     if sum(pair.motions.still > 0 for pair in pairs) < _FEW_STILL * len(pairs):
         return pairs
     pairs += compare(more - few)
     found = _together(pairs)
     if found.still > found.moved and not found.two_motions:
-        pairs += compare(set(combinations(_anchors(len(sizes), _ANCHORS), 2)) - more - few)
+        pairs += compare(set(combinations(_anchors(len(sizes), anchors), 2)) - more - few)
     return pairs
 
 
@@ -191,8 +187,9 @@ def _anchors(count: int, most: int) -> list[int]:
 
 
 def _pairs(count: int, most: int) -> set[tuple[int, int]]:
+    """Return pairs of evenly chosen photos with those that soon follow them, and with one far away."""
     anchors = _anchors(count, most)
-    near = {(i, i + step) for i in anchors for step in _STEPS if i + step < count}
+    near = {(i, i + step) for i in anchors for step in (1, 2, 4) if i + step < count}
     far = {(anchors[k], anchors[k + len(anchors) // 2]) for k in range(len(anchors) - len(anchors) // 2)}
     return {pair for pair in near | far if pair[0] < pair[1]}
 

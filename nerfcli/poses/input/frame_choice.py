@@ -15,7 +15,6 @@ from nerfcli.media.images import downscale
 
 # Longer sides, in pixels, of the pictures for measuring sharpness (about the size for extracting features) and motion.
 SHARPNESS_SIZE_PX = 960
-_MOTION_SIZE_PX = 320
 
 # The picture has moved when half of its corners moved by this fraction of its longer side: about what is needed for
 # parallax, and more than the shake of a hand that holds still.
@@ -26,8 +25,6 @@ _FEW_STEPS, _LEAST_STEP = 24, 0.25
 # Fewer corners than this do not measure motion; then pictures that differ by less than this, of 255, are the same.
 _MIN_CORNERS = 12
 _SAME_LEVELS = 3.0
-# If less than this fraction of the corners is found again, another part of the scene is in view.
-_LOST_FRACTION = 0.5
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,7 @@ class MotionPicture:
     def __init__(self, picture: np.ndarray):
         """picture: uint8, grey or RGB."""
         grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-        self._grey = downscale(grey, max(1.0, max(grey.shape) / _MOTION_SIZE_PX))
+        self._grey = downscale(grey, max(1.0, max(grey.shape) / (SHARPNESS_SIZE_PX / 3)))
         self._corners: np.ndarray | None = None
 
     def moved_to(self, other: "MotionPicture") -> float:
@@ -79,7 +76,7 @@ class MotionPicture:
             self._grey, other._grey, self._corners, room, winSize=(15, 15), maxLevel=4
         )
         found = status.ravel() == 1
-        if found.mean() < _LOST_FRACTION:
+        if found.mean() < 0.5:  # another part of the scene is in view
             return float("inf")
         lengths = np.linalg.norm((followed - self._corners)[found].reshape(-1, 2), axis=1)
         return float(np.median(lengths) / max(self._grey.shape))

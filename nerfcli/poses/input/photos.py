@@ -1,6 +1,5 @@
 """The photos that poses are estimated from: readability, upright size, groups with a common camera."""
 
-import math
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -8,16 +7,12 @@ from pathlib import Path, PurePosixPath
 
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError, several
 from nerfcli.media.exif import Exif, read_exif
-from nerfcli.media.focal_evidence import focal_evidence, with_digital_zoom
+from nerfcli.media.focal_evidence import focal_evidence, same_focal, with_digital_zoom
 from nerfcli.media.images import list_photos, list_unreadable, name_in, read_image, where_photos_may_be
 from nerfcli.media.panoramas import is_panorama
 
 # Three views determine a scene up to scale, but leave nothing to check them with; four are the fewest that do.
 MIN_PHOTOS = 4
-
-# Decoded photos are large; more readers than this only hold more of them in memory at once.
-_READERS = 4
-_SAME_FOCAL = 0.02
 
 
 @dataclass(frozen=True)
@@ -74,7 +69,7 @@ def find_photos(
         else "a link to a file that does not exist"
         for path in hopeless
     }
-    with ThreadPoolExecutor(_READERS) as readers:
+    with ThreadPoolExecutor(4) as readers:  # each holds a decoded photo in memory
         for index, found in enumerate(readers.map(lambda path: _examine(path, name_in(folder, path)), paths)):
             if isinstance(found, Photo):
                 photos.append(found)
@@ -101,21 +96,16 @@ def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
         exif = photo.exif
         evidence = focal_evidence(exif)
         crop = evidence.whole_px if evidence.doubt else None
-        optics = (exif.make, exif.model, exif.lens, _same_as(exif.focal_mm, focals), _same_as(exif.focal_35mm, focals))
+        optics = (
+            exif.make,
+            exif.model,
+            exif.lens,
+            same_focal(exif.focal_mm, focals),
+            same_focal(exif.focal_35mm, focals),
+        )
         key = (PurePosixPath(photo.name).parent, *optics, crop, photo.width, photo.height)
         groups.setdefault(key, []).append(photo.name)
     return tuple(tuple(names) for names in groups.values())
-
-
-def _same_as(focal: float | None, focals: list[float]) -> float | None:
-    """Return the first of the earlier focal lengths that counts as the same; without one, add and return this one."""
-    if focal is None:
-        return None
-    for earlier in focals:
-        if abs(math.log(focal / earlier)) < _SAME_FOCAL:
-            return earlier
-    focals.append(focal)
-    return focal
 
 
 def _examine(path: Path, name: str) -> Photo | str:

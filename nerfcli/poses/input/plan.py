@@ -1,4 +1,7 @@
-"""Plan of structure from motion with an estimate of its time, reported before it starts."""
+"""Plan of structure from motion with an estimate of its time, reported before it starts.
+
+The seconds and bytes are those of a 2-core server; other machines are within a factor of two.
+"""
 
 import math
 import time
@@ -15,41 +18,6 @@ from nerfcli.poses.input.settings import PoseSettings
 _SEARCH_FACTORS = {"enlarge": 3.0, "faint": 1.0, "faint-enlarged": 3.0}
 # All stages that take time, in the order of the work.
 _ORDER = ("extract", *_SEARCH_FACTORS, "pair", "match", "map", "merge", "locate", "check", "stabilise", "settle")
-# CPU seconds, measured on one core of a 2-core server; within a factor of two on others.
-_SECONDS_PER_MEGAPIXEL = 0.4
-_SECONDS_PER_PAIR = 0.045
-_FEATURES_PER_PAIR = 4096
-_SECONDS_PER_LOOK = 0.0006
-_FEATURES_PER_LOOK = 256
-# About this many per pixel of the picture that is searched.
-_FEATURES_PER_PIXEL = 0.015
-# Mapper: the first for few photos; the second for each other photo, since all are adjusted again and again. Starting
-# from the right focal length, 302 frames of a walk took 149 s including the merging of sub-models, 200 synthetic ones
-# 54 s.
-_MAP_SECONDS_PER_PHOTO, _MAP_SECONDS_PER_TWO = 0.38, 0.0005
-# Time for merging sub-models, as a fraction of the mapping time.
-_MERGE_FRACTION = 0.2
-# For each photo that is located from 3D points.
-_SECONDS_PER_LOCATED = 0.7
-# For the global mapper.
-_AT_ONCE_SECONDS_PER_PHOTO = 0.5
-_CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.13
-# For trying a principal point for each photo, measured on 7 to 100 photos, and for going on with them, as a multiple of
-# it, measured on 20 and 97.
-_STABILISE_SECONDS, _STABILISE_SECONDS_PER_PHOTO, _SETTLE_FACTOR = 2.5, 0.075, 5.0
-# Exponent with which the time of a stage grows with the work done: the mapper takes longer and longer per photo.
-_GROWTH = {"map": 1.3}
-# Fraction of the time of the checks after 0...4 of the four steps: single photos take 2 %, lens models half.
-# Measured on 11, 16, 20 and 50 photos.
-_CHECK_FRACTIONS = (0.0, 0.02, 0.5, 0.8, 1.0)
-# Time limit as a multiple of the planned seconds: most captures take a third to twice these, more on a busy machine.
-_MOST_TIMES_PLANNED = 10
-# Memory: of the libraries, per photo in the mapper, and per pixel of a picture that a thread searches enlarged.
-# Fitted to 50 photos of 270x480 (0.60 GB), 18 of 4000x2250 on one thread and on two (0.67, 0.77), and 1,000 (2.0).
-_BYTES, _BYTES_PER_PHOTO, _BYTES_PER_PIXEL = 500_000_000, 1_500_000, 70
-# Fraction of a stage after which its speed is informative. The time of one sub-model says nothing about the next, and
-# the first check, which depends much on the photos, says little about the others.
-_TELLING, _TELLING_OF = 0.05, {"merge": 1.0, "check": 0.25}
 
 
 @dataclass(frozen=True)
@@ -66,7 +34,7 @@ class Plan:
     rule: str
     pairs: int
     seconds: dict[str, float]
-    features: int = _FEATURES_PER_PAIR
+    features: int = 4096
     memory_bytes: int = 0
 
     def to_json(self) -> dict[str, Any]:
@@ -99,15 +67,17 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
     pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
     sizes = [(photo.width, photo.height) for photo in photos.photos]
     searched = _searched_pixels(sizes, max_image_size=settings.max_image_size)
-    features = min(settings.max_features, round(_FEATURES_PER_PIXEL * sum(searched) / max(count, 1)))
+    features = min(settings.max_features, round(0.015 * sum(searched) / max(count, 1)))
     seconds = {
         "extract": extraction_seconds(sizes, max_image_size=settings.max_image_size) / threads,
         "pair": retrieval_seconds(count) / threads if pairing.neighbours else 0.0,
         "match": matching_seconds(pairs, max_features=features) / threads,
         "map": mapping_seconds(count),
         "check": checking_seconds(count),
-        "stabilise": _STABILISE_SECONDS + count * _STABILISE_SECONDS_PER_PHOTO,
+        "stabilise": 2.5 + count * 0.075,
     }
+    # The libraries, each photo in the mapper, and the picture that each thread searches enlarged.
+    memory_bytes = 500e6 + count * 1.5e6 + threads * max(searched, default=0.0) * 70
     return Plan(
         photos=count,
         max_image_size=settings.max_image_size,
@@ -116,13 +86,13 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
         pairs=pairs,
         seconds={stage: round(value, 1) for stage, value in seconds.items() if value > 0},
         features=features,
-        memory_bytes=round(_BYTES + count * _BYTES_PER_PHOTO + threads * max(searched, default=0.0) * _BYTES_PER_PIXEL),
+        memory_bytes=round(memory_bytes),
     )
 
 
 def extraction_seconds(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -> float:
     """Estimate the CPU seconds to extract features from photos of these sizes (width, height)."""
-    return sum(_searched_pixels(sizes, max_image_size=max_image_size)) / 1e6 * _SECONDS_PER_MEGAPIXEL
+    return sum(_searched_pixels(sizes, max_image_size=max_image_size)) / 1e6 * 0.4
 
 
 def _searched_pixels(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -> list[float]:
@@ -131,32 +101,32 @@ def _searched_pixels(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -
 
 def retrieval_seconds(photos: int) -> float:
     """Estimate the CPU seconds to find look-alikes among this many photos."""
-    return math.comb(photos, 2) * _SECONDS_PER_LOOK * (retrieval_feature_count(photos) / _FEATURES_PER_LOOK) ** 2
+    return math.comb(photos, 2) * 0.0006 * (retrieval_feature_count(photos) / 256) ** 2
 
 
 def matching_seconds(pairs: int, *, max_features: int) -> float:
     """Estimate the CPU seconds to match this many pairs of photos with up to `max_features` features each."""
-    return pairs * _SECONDS_PER_PAIR * max_features / _FEATURES_PER_PAIR
+    return pairs * 0.045 * max_features / 4096
 
 
 def mapping_seconds(photos: int) -> float:
     """Estimate the CPU seconds to place this many photos one after the other."""
-    return photos * (_MAP_SECONDS_PER_PHOTO + photos * _MAP_SECONDS_PER_TWO)
+    return photos * (0.38 + photos * 0.0005)  # all photos are adjusted again and again
 
 
 def at_once_seconds(photos: int) -> float:
     """Estimate the CPU seconds to place this many photos with the global mapper."""
-    return photos * _AT_ONCE_SECONDS_PER_PHOTO
+    return photos * 0.5
 
 
 def limit_seconds(planned: float, *, least: float) -> float:
     """Return the time limit of a step: if it takes 10 times as long as planned, it may never end."""
-    return max(_MOST_TIMES_PLANNED * planned, least)
+    return max(10 * planned, least)
 
 
 def checking_seconds(photos: int) -> float:
     """Estimate the CPU seconds to check the poses of this many photos."""
-    return _CHECK_SECONDS + photos * _CHECK_SECONDS_PER_PHOTO
+    return 5 + photos * 0.13
 
 
 class TimeEstimate:
@@ -199,11 +169,11 @@ class TimeEstimate:
             searches[stage] = _SEARCH_FACTORS[stage] * self._planned["extract"] * total / max(self._plan.photos, 1)
             self._seconds = self._planned | searches
         elif stage == "merge":
-            self._seconds[stage] = _MERGE_FRACTION * self._planned["map"]
+            self._seconds[stage] = 0.2 * self._planned["map"]
         elif stage == "locate":
-            self._seconds[stage] = _SECONDS_PER_LOCATED * total
+            self._seconds[stage] = 0.7 * total
         elif stage == "settle":
-            self._seconds[stage] = _SETTLE_FACTOR * self._planned["stabilise"]
+            self._seconds[stage] = 5 * self._planned["stabilise"]
         ratio = _fraction_done(stage, done, total)
         place = _ORDER.index(stage) if stage in _ORDER else len(_ORDER)
         if (place, ratio) < (self._place, self._ratio):  # the work has gone back for another attempt
@@ -235,10 +205,15 @@ class TimeEstimate:
 
 def _fraction_done(stage: str, done: int, total: int) -> float:
     """Return the fraction of a stage's time that has passed."""
-    if stage == "check" and total == len(_CHECK_FRACTIONS) - 1:
-        return _CHECK_FRACTIONS[done]
-    return (done / total) ** _GROWTH.get(stage, 1.0) if total else 1.0
+    if stage == "check" and total == 4:
+        return (0.0, 0.02, 0.5, 0.8, 1.0)[done]  # lens models take half
+    return (done / total) ** (1.3 if stage == "map" else 1.0) if total else 1.0  # mapping slows down
 
 
 def _telling(stage: str) -> float:
-    return _TELLING_OF.get(stage, _TELLING)
+    """Return the fraction of a stage after which its speed is informative.
+
+    The time of one sub-model says nothing about the next, and the first check, which depends much on the photos, says
+    little about the others.
+    """
+    return {"merge": 1.0, "check": 0.25}.get(stage, 0.05)

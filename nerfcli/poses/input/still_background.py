@@ -19,8 +19,7 @@ from scipy.ndimage import binary_fill_holes
 
 # The longer side of the pictures that are compared.
 SIDE_PX = 480
-# At most this many photos, evenly chosen, are used to find the background; fewer than the second number are too few.
-_MOST_PHOTOS = 40
+# Fewer photos than this are too few to find the background.
 LEAST_PHOTOS = 6
 # The background is the colour that a pixel has most consistently in this fraction of the photos.
 _FRACTION = 0.3
@@ -28,17 +27,13 @@ _FRACTION = 0.3
 _LEVELS = 9.0
 _NOISES = 3.0
 _DISPLACED_PX = 0.5
-# No background is visible where colours vary more than at the background's features, by this factor and these levels;
-# the last number is the quantile of the features' noise that is compared with.
+# No background is visible where colours vary more than at the background's features, by this factor.
 _LESS_PRECISE = 2.0
-_LESS_PRECISE_LEVELS = 2.0
-_AT_MOST_WORST = 0.9
 # Parts smaller than these fractions of the largest part, or of the picture, are not objects.
 _LEAST_OF_LARGEST = 0.02
 _LEAST_OF_PICTURE = 0.0005
-# Gaps of this many pixels are closed, and the mask is dilated by this many.
+# Gaps of this many pixels are closed, and the mask is dilated by half as many.
 _CLOSED_PX = 4
-_WIDER_PX = 2
 
 
 @dataclass(frozen=True)
@@ -66,7 +61,7 @@ def background(pictures: Sequence[np.ndarray], places: np.ndarray) -> Background
         pictures: of equal size, see `small`.
         places: (N, 2) positions of static features of the background, as fractions of width and height, 0...1.
     """
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), _MOST_PHOTOS)).astype(int))
+    chosen = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), 40)).astype(int))
     stack = np.stack([pictures[index] for index in chosen]).astype(np.float32)  # (n, h, w, 3)
     window = max(3, round(_FRACTION * len(stack)))
     light = stack.mean(axis=3)
@@ -80,8 +75,8 @@ def background(pictures: Sequence[np.ndarray], places: np.ndarray) -> Background
     noise = cv2.GaussianBlur(np.median(np.abs(values - colours), axis=0).max(axis=2), (0, 0), 2)
     height, width = noise.shape
     columns, rows = (places * (width, height)).astype(int).clip(0, (width - 1, height - 1)).T
-    usual = float(np.quantile(noise[rows, columns], _AT_MOST_WORST))
-    most = _LESS_PRECISE * usual + _LESS_PRECISE_LEVELS
+    usual = float(np.quantile(noise[rows, columns], 0.9))  # but for the worst
+    most = _LESS_PRECISE * (usual + 1)
     grey = colours.mean(axis=2)
     across, down = cv2.Sobel(grey, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(grey, cv2.CV_32F, 0, 1) / 8
     edges = cv2.dilate(np.hypot(across, down), np.ones((3, 3), np.uint8))
@@ -101,7 +96,7 @@ def differs(picture: np.ndarray, behind: Background) -> np.ndarray:
     areas[0] = 0
     least = max(_LEAST_OF_LARGEST * areas.max(), _LEAST_OF_PICTURE * whole.size)
     kept = np.isin(labels, [label for label in range(1, count) if areas[label] >= least])
-    return cv2.dilate(kept.astype(np.uint8), _disc(_WIDER_PX)) > 0
+    return cv2.dilate(kept.astype(np.uint8), _disc(_CLOSED_PX // 2)) > 0
 
 
 def agreement(picture: np.ndarray, behind: Background) -> float:

@@ -30,10 +30,6 @@ FRAMES_FILE = "frames.json"
 DEFAULT_FRAMES = 120
 
 _JPEG_QUALITY = 97
-# A file is identified without reading all of it, by its size and this many bytes at each end.
-_END_BYTES = 1 << 20
-# Approximate fraction of the time for measuring, which decodes and examines every frame; extracting only decodes.
-_MEASURING_FRACTION = 0.7
 
 
 def frames_folder(scene_dir: Path) -> Path:
@@ -74,11 +70,12 @@ def extract_frames(
     if video.hdr:
         notify(f"{path.name} is HDR; its colours are used as stored, which looks pale")
     meter = FrameMeter()
+    # Measuring takes most of the time, since it also examines every frame; extracting only decodes.
     measured = measure_frames(
         video,
         meter.measure,
         longer_side=SHARPNESS_SIZE_PX,
-        progress=lambda fraction: progress(_MEASURING_FRACTION * fraction, "looking for sharp frames"),
+        progress=lambda fraction: progress(0.7 * fraction, "looking for sharp frames"),
     )
     if measured.errors:
         notify(f"{path.name} is damaged in {measured.errors} places; nearby frames may show block artifacts")
@@ -94,7 +91,7 @@ def extract_frames(
             numbers,
             measured,
             step,
-            lambda fraction: progress(_MEASURING_FRACTION + (1 - _MEASURING_FRACTION) * fraction, "writing frames"),
+            lambda fraction: progress(0.7 + 0.3 * fraction, "writing frames"),
         )
         if len(frames) < MIN_PHOTOS:
             raise UserError(
@@ -194,11 +191,12 @@ def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool,
 
 
 def _identity(path: Path) -> dict[str, Any]:
-    """Return data that identifies a video, whatever its folder."""
+    """Return data that identifies a video, whatever its folder, without reading all of it."""
+    end_bytes = 1 << 20
     size = path.stat().st_size
     digest = hashlib.sha256()
     with path.open("rb") as file:
-        digest.update(file.read(_END_BYTES))
-        file.seek(max(0, size - _END_BYTES))
-        digest.update(file.read(_END_BYTES))
+        digest.update(file.read(end_bytes))
+        file.seek(max(0, size - end_bytes))
+        digest.update(file.read(end_bytes))
     return {"name": path.name, "bytes": size, "sha256_of_ends": digest.hexdigest()}

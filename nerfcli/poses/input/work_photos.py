@@ -14,8 +14,6 @@ from nerfcli.poses.input.stages import file_key, read_stage, write_stage
 
 # Formats that pycolmap reads as we do, if stored upright. For all others (CMYK, 16 bit, alpha, TIFF) it gets JPEGs.
 _PLAIN = {("JPEG", ".jpg"), ("JPEG", ".jpeg"), ("MPO", ".jpg"), ("MPO", ".jpeg"), ("PNG", ".png")}
-# Each copier holds a decoded photo in memory.
-_COPIERS = 4
 # Change this whenever copies are made differently.
 _VERSION = "JPEG 97"
 
@@ -49,7 +47,7 @@ def lay_out(photos: Photos, work: Path) -> tuple[WorkPhoto, ...]:
     def lay_out_one(photo: Photo) -> WorkPhoto:
         return _laid_out(photos.folder, photo, folder, number=numbers[photo.name], earlier=earlier.get(photo.name))
 
-    with ThreadPoolExecutor(_COPIERS) as copiers:
+    with ThreadPoolExecutor(4) as copiers:  # each holds a decoded photo in memory
         laid_out = tuple(copiers.map(lay_out_one, photos.photos))
     listed = {photo.name: asdict(found) for photo, found in zip(photos.photos, laid_out, strict=True)}
     write_stage(stage, _VERSION, {"next": following, "photos": listed})

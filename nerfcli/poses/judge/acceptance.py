@@ -18,32 +18,22 @@ from nerfcli.poses.judge.parallax import RotationFit
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.lens_observability import is_centred
+from nerfcli.poses.model.reasons import MIN_MATCHES
 from nerfcli.poses.model.two_views import Agreement, RotationError, VerifiedPair, agreements, rotation_errors
 
-# Pairs with fewer verified matches neither support nor contradict a model.
-MIN_MATCHES = 15
-# Largest fraction of all matches in pairs that strongly contradict the model. Measured: up to 0.013 in correct models,
-# 0.14 for a scene that repeats itself.
+# Largest fraction of all matches in pairs that strongly contradict the model, as of a scene that repeats itself.
 _MOST_RIVALS = 0.05
 _GROSS_DEG = 10.0
-# Measured: at most 0.08 in correct models, including one with many wrong pairs; 0.1 to 0.56 in wrong models.
 _MOST_GROSS = 0.2
-_LEAST_ANGLE_DEG = 1.5
-_LEAST_IN_FRONT = 0.95
 # Root mean square distance of the cameras from their centre, over the median distance to the points.
 _LEAST_SPREAD = 0.003
 # Focal lengths over the longer side. A model without depth may have any; if only cameras of a few photos are outside
 # the usual range, the points of the others determine them. Photos from the internet have up to 3 times and more, and so
 # do cropped photos by macro lenses: a focal length that the photos determine may also be in the wider range.
 _FOCAL_RANGE, _WIDER_FOCAL_RANGE, _FEW = (0.3, 3.0), (0.2, 10.0), 0.1
-_MOST_HELD_OUT_PX = 4.0
 # Parallax over the error of unused observations: with less, the points of a model explain matches hardly better than a
-# rotation does. Measured where a rotation explains all to 3 px: up to 2.7 in wrong models, 3.8 to 11 in models whose
-# cameras are right within 16 % of their spread.
+# rotation does.
 _LEAST_GAIN = 3.5
-_LEAST_OBSERVATIONS = 15
-# Cosines between directions to points that are in memory at a time.
-_COSINES = 2**20
 # Reported if the measurement failed.
 _UNKNOWN_GEOMETRY: dict[str, Any] = dict.fromkeys(
     ("triangulation_angle_deg", "share_in_front", "camera_spread_over_distance")
@@ -166,7 +156,8 @@ def _geometry(model: pycolmap.Reconstruction) -> dict[str, Any]:
         seen = [places[photo] for photo in {element.image_id for element in point.track.elements}]
         by_count.setdefault(len(seen), []).append((point.xyz, seen))
     angles, distances, in_front, observations = [], [], 0, 0
-    for part in (part for count, alike in by_count.items() for part in _parts(alike, _COSINES // count**2)):
+    # A million cosines between directions to points are in memory at a time.
+    for part in (part for count, alike in by_count.items() for part in _parts(alike, 2**20 // count**2)):
         positions, seen_by = (np.array(each) for each in zip(*part, strict=True))  # (n, 3) and (n, photos)
         to = positions[:, None] - centres[seen_by]
         lengths = np.linalg.norm(to, axis=2)
@@ -295,13 +286,13 @@ def _implausible(
     checks = [
         (
             measures["triangulation_angle_deg"],
-            _LEAST_ANGLE_DEG,
+            held_out.LEAST_ANGLE_DEG,
             False,
             "points are seen at {:.2f} degrees in the median",
         ),
-        (measures["share_in_front"], _LEAST_IN_FRONT, False, "only {:.0%} of the observations lie before their camera"),
-        (measures["held_out"]["median_px"], _MOST_HELD_OUT_PX, True, "unused observations are {:.1f} px off"),
-        (measures["observations_per_photo"]["median"], _LEAST_OBSERVATIONS, False, "photos see {:.0f} points each"),
+        (measures["share_in_front"], 0.95, False, "only {:.0%} of the observations lie before their camera"),
+        (measures["held_out"]["median_px"], held_out.MOST_ERROR_PX, True, "unused observations are {:.1f} px off"),
+        (measures["observations_per_photo"]["median"], MIN_MATCHES, False, "photos see {:.0f} points each"),
     ]
     advice = "take photos with more overlap while moving sideways"
     failures = [

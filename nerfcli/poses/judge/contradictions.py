@@ -7,19 +7,16 @@ import numpy as np
 import pycolmap
 
 from nerfcli.multiview.graph import Bottlenecks, connected_groups, spanning_tree
-from nerfcli.poses.model.two_views import Agreement, VerifiedPair, agreements
+from nerfcli.poses.model.two_views import LEAST_ANGLE_DEG, Agreement, VerifiedPair, agreements
 
-# A pair with fewer may be wrong even if no other pair joins its photos: measured, up to 81 between different walls.
+# A pair with fewer may be wrong even if no other pair joins its photos.
 _CERTAIN_MATCHES = 100
 # A pair this strong, relative to the best chain that contradicts it, is a serious rival and not a mistake; up to the
-# second factor, the chain is equally credible.
+# inverse, the chain is equally credible.
 _RIVAL_STRENGTH = 0.5
-_RIVAL_OF_EQUALS = 2.0
 # Largest fraction of the photos that may be left out because they contradict the others.
 _MOST_LEFT_OUT = 0.2
 _FARTHEST = 10.0
-# A pair whose rays meet at a smaller angle, in the median, says little about how far away its cameras are.
-_LEAST_ANGLE_DEG = 2.0
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,7 @@ class Contradiction:
     @property
     def is_rival(self) -> bool:
         """True if pair and chain are about equally strong, so that either may be wrong."""
-        return self.matches <= _RIVAL_OF_EQUALS * self.agreeing_chain
+        return self.matches <= self.agreeing_chain / _RIVAL_STRENGTH
 
 
 def leave_out_contradicting(
@@ -100,7 +97,7 @@ def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[Agreem
 def _is_held(photo: int, found: Sequence[Agreement]) -> bool:
     """Return whether more matches of a photo determine its position than contradict it."""
     own = [a for a in found if photo in (a.one, a.other)]
-    supporting = sum(a.matches for a in own if not a.contradicts and a.angle_deg > _LEAST_ANGLE_DEG)
+    supporting = sum(a.matches for a in own if not a.contradicts and a.angle_deg > LEAST_ANGLE_DEG)
     return supporting > sum(a.matches for a in own if a.contradicts)
 
 

@@ -9,7 +9,7 @@ import pycolmap
 
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.input.job import Job
-from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict, judge, nothing_placed
+from nerfcli.poses.judge.acceptance import Verdict, judge, nothing_placed
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting, without_photos
 from nerfcli.poses.judge.parallax import RotationFit, best_rotation_fit, panorama_rotation_fit
@@ -17,11 +17,8 @@ from nerfcli.poses.judge.uncertainty import pose_blur_px
 from nerfcli.poses.model.intrinsics import ModelLenses, choose_lenses
 from nerfcli.poses.model.lens_observability import focal_is_determined
 from nerfcli.poses.model.localise import shared_pairs
-from nerfcli.poses.model.reasons import FEW_MATCHES
+from nerfcli.poses.model.reasons import FEW_MATCHES, MIN_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, read_verified_pairs
-
-# With more photos, the joint covariance of all poses takes minutes.
-_MOST_PHOTOS_FOR_BLUR = 500
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,7 @@ def examine(
     )
     report("check", 3, 4)
     blur: dict[int, float] = {}
-    if verdict.accepted and model.num_reg_images() <= _MOST_PHOTOS_FOR_BLUR:
+    if verdict.accepted and model.num_reg_images() <= 500:  # with more photos, the joint covariance takes minutes
         blur = checks.run(
             "pose uncertainty",
             lambda: pose_blur_px(model, threads=job.threads, fixed=job.fixed_cameras),

@@ -25,11 +25,8 @@ _MOST_MATCHES = 150
 # The focal length is searched within these multiples of the longer side; beyond them, any pair looks like a rotation.
 _FOCAL_RANGE = (0.3, 4.0)
 _FOCAL_STARTS = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
-# Largest values and first steps of the two radial terms, and of the principal point's distance from the centre over
-# the longer side.
+# Largest values of the two radial terms, and of the principal point's distance from the centre over the longer side.
 _MOST = np.array([0.4, 0.4, 0.1, 0.1])
-_FIRST_STEPS = (0.15, 0.05, 0.05, 0.01, 0.01)
-_STEPS = 200
 
 
 @dataclass(frozen=True)
@@ -73,8 +70,8 @@ def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[i
 
     start = np.zeros(5)
     start[0] = min(np.log(_FOCAL_STARTS), key=lambda value: left_over(np.array([value, 0.0, 0.0, 0.0, 0.0])))
-    simplex = np.vstack([start, start + np.diag(_FIRST_STEPS)])
-    options = {"maxiter": _STEPS, "initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2}
+    simplex = np.vstack([start, start + np.diag((0.15, 0.05, 0.05, 0.01, 0.01))])
+    options = {"maxiter": 200, "initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2}
     found = minimize(left_over, start, method="Nelder-Mead", options=options)
     return RotationFit(float(found.fun), float(np.exp(found.x[0]) * longest))
 

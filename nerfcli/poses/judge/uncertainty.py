@@ -17,8 +17,6 @@ from nerfcli.poses.model import held_out
 from nerfcli.poses.model.lens_evidence import projection_jacobians
 from nerfcli.poses.model.projection import Array
 
-# Points per photo used to measure how a picture moves.
-_POINTS_PER_PHOTO = 60
 # pycolmap's tangent space of a quaternion is half the angle.
 _ANGLE_FROM_TANGENT = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 
@@ -76,7 +74,7 @@ def _pixel_metric(model: pycolmap.Reconstruction, photo: int) -> Array:
     image = model.image(photo)
     camera = model.camera(image.camera_id)
     seen = image.get_observation_points2D()
-    chosen = seen[:: max(1, len(seen) // _POINTS_PER_PHOTO)]
+    chosen = seen[:: max(1, len(seen) // 60)]  # enough to measure how the picture moves
     pose = image.cam_from_world()
     points = np.array([model.point3D(point.point3D_id).xyz for point in chosen]).reshape(-1, 3)
     rotated = points @ pose.rotation.matrix().T

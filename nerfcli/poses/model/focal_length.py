@@ -16,17 +16,14 @@ from nerfcli.poses.model.two_views import VerifiedPair
 
 # Focal lengths that are compared, over the longer side: fields of view from 103 to 14 degrees.
 _GRID = np.geomspace(0.4, 4.0, 48)
-# Number of pairs used, drawn at random, and of matches of each.
-_MOST_PAIRS, _MATCHES = 300, 50
+# Number of matches of each pair that is used.
+_MATCHES = 50
 _LEAST_PAIRS = 20
 _VERIFIED_PX = 2.0
 # Distances from the epipolar line beyond this count by their logarithm.
 _NOISE_PX = 1.5
 # Largest cost of a pair for a focal length, px^2: one with wrong matches, or of a moving object, must not decide.
 _MOST_PER_PAIR = 3.0
-_FITTING_STEPS = 6
-_RESAMPLED = 100
-_AWAY = 1.2
 _TWO = np.array([1.0, 1.0, 0.0])
 
 
@@ -56,7 +53,7 @@ def focal_length(pairs: Sequence[VerifiedPair], size: tuple[int, int], *, seed: 
     """
     rng = np.random.default_rng(seed)
     usable = [pair for pair in pairs if pair.matches >= _MATCHES]
-    drawn = [usable[index] for index in rng.permutation(len(usable))[:_MOST_PAIRS]]
+    drawn = [usable[index] for index in rng.permutation(len(usable))[:300]]
     found = [two_views for pair in drawn if (two_views := _two_views(pair, size, rng)) is not None]
     if len(found) < _LEAST_PAIRS:
         return None
@@ -64,11 +61,11 @@ def focal_length(pairs: Sequence[VerifiedPair], size: tuple[int, int], *, seed: 
     focal_px = _GRID * max(size)
     costs = np.array([_fitted_cost(F, p, q, each) for each in focal_px]).T  # (pairs, focal lengths)
     costs = np.minimum(costs - costs.min(axis=1, keepdims=True), _MOST_PER_PAIR)
-    again = [_lowest(focal_px, costs[rng.integers(len(costs), size=len(costs))].sum(axis=0)) for _ in range(_RESAMPLED)]
+    again = [_lowest(focal_px, costs[rng.integers(len(costs), size=len(costs))].sum(axis=0)) for _ in range(100)]
     low, high = np.quantile(np.log(again), [0.1, 0.9])
     mean = costs.mean(axis=0)
     px = _lowest(focal_px, mean)
-    away = np.interp(np.log([px / _AWAY, px * _AWAY]), np.log(focal_px), mean)
+    away = np.interp(np.log([px / 1.2, px * 1.2]), np.log(focal_px), mean)
     return FocalLength(px, len(found), float(high - low) / 2, float(away.min() - mean.min()))
 
 
@@ -98,7 +95,7 @@ def _fitted_cost(F: Array, p: Array, q: Array, focal_px: float) -> Array:
     U, _, V = np.linalg.svd(scale @ F @ scale)
     p, q = (np.insert(pixels / focal_px, 2, 1.0, axis=-1) for pixels in (p, q))
     best = np.full(len(F), np.inf)
-    for _ in range(_FITTING_STEPS):
+    for _ in range(6):
         a, b = q @ U, p @ np.swapaxes(V, 1, 2)  # (pairs, matches, 3)
         there, back = (b * _TWO) @ np.swapaxes(U, 1, 2), (a * _TWO) @ V  # E p and E^T q
         slope = np.sqrt(there[..., 0] ** 2 + there[..., 1] ** 2 + back[..., 0] ** 2 + back[..., 1] ** 2)

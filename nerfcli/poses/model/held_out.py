@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from nerfcli.poses.model.projection import Array, across_edge, offsets_px
 
-_FRACTION = 0.1
 # Beyond this, more observations cost time and change nothing; a part of the points is adjusted instead.
 _MOST_OBSERVATIONS = 40_000
 # A robust adjustment downweights observations from this many times the usual error: 95 % efficient for normal noise.
@@ -21,10 +20,10 @@ _LOSS_FROM = 2.4
 _LEAST_LOSS_PX = 0.3
 # A point with fewer observations gives none away: at least two must remain to determine it.
 _MIN_TRACK = 3
+MAPPER = pycolmap.IncrementalMapperOptions()
 # Observations with larger errors do not fit a model. Errors are clipped at this value: one wrong match must not decide.
-MOST_ERROR_PX = 4.0
-# As in pycolmap's mapper.
-_LEAST_ANGLE_DEG = 1.5
+MOST_ERROR_PX = MAPPER.filter_max_reproj_error
+LEAST_ANGLE_DEG = MAPPER.filter_min_tri_angle
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ def split(model: pycolmap.Reconstruction, *, seed: int) -> tuple[pycolmap.Recons
         copy.delete_point3D(int(point_id))
     lengths = np.array([copy.point3D(int(point_id)).track.length() for point_id in point_ids[~dropped]])
     # One observation of each of as many points as needed to take a tenth of all observations.
-    taken = (lengths >= _MIN_TRACK) & (rng.uniform(size=len(lengths)) < _FRACTION * lengths)
+    taken = (lengths >= _MIN_TRACK) & (rng.uniform(size=len(lengths)) < 0.1 * lengths)
     images, points, pixels = [], [], []
     for point_id, length in zip(point_ids[~dropped][taken], lengths[taken], strict=True):
         element = copy.point3D(int(point_id)).track.elements[int(rng.integers(length))]
@@ -86,7 +85,7 @@ def gain(before: Array, after: Array) -> float:
 
 def drop_misfits(model: pycolmap.Reconstruction) -> None:
     """Drop the observations of a model that do not fit it, and the points with too small an angle, in place."""
-    pycolmap.ObservationManager(model).filter_all_points3D(MOST_ERROR_PX, _LEAST_ANGLE_DEG)
+    pycolmap.ObservationManager(model).filter_all_points3D(MOST_ERROR_PX, LEAST_ANGLE_DEG)
     model.update_point_3d_errors()
 
 

@@ -43,13 +43,9 @@ _GAIN_FRACTION = 0.001
 _PARAMETER_DEVIATIONS = 3.0
 # Each lens costs some adjustments; beyond this many lenses, and for those with fewer photos, the simplest model stays.
 _MOST_CAMERAS = 4
-_LEAST_PHOTOS = 3
+LEAST_PHOTOS = 3
 # Lenses whose uncertainty the report has.
 MOST_DESCRIBED = 8
-# Tolerances of the two adjustments of `settle`. Measured on 261 frames of a walk: the robust one ends after 19
-# iterations instead of 328, with cameras within 4e-5 of the radius from where these take them; with 1e-4 it is 1.3e-4.
-_TOLERANCE, _ROBUST_TOLERANCE = 1e-6, 1e-5
-_FIT_GRID = 15
 
 
 @dataclass(frozen=True)
@@ -86,7 +82,7 @@ def choose_lenses(
         exif_focal_px: by camera id, the focal length to keep if the observations do not determine it.
     """
     photos = Counter(lenses_of(model).values())
-    cameras = sorted((c for c in photos if c not in fixed and photos[c] >= _LEAST_PHOTOS), key=lambda c: -photos[c])
+    cameras = sorted((c for c in photos if c not in fixed and photos[c] >= LEAST_PHOTOS), key=lambda c: -photos[c])
     candidates: list[Candidate] = []
     freed: list[int] = []
     held: dict[int, DeterminedLens] = {}
@@ -200,10 +196,10 @@ def settle(
     in the same way in many photos; with squared errors, they would bias the lens.
     """
     adjust = partial(held_out.adjust, model, threads=threads, principal_points=principal_points, fixed=fixed)
-    adjust(tolerance=_TOLERANCE)
+    adjust(tolerance=1e-6)
     held_out.drop_misfits(model)
     scale_px = held_out.loss_scale_px(held_out.observation_errors_px(model))
-    adjust(robust_px=scale_px, tolerance=_ROBUST_TOLERANCE)
+    adjust(robust_px=scale_px, tolerance=1e-5)  # a smaller one takes many times as long and moves no camera
     held_out.drop_misfits(model)
 
 
@@ -214,7 +210,7 @@ def converted(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
     )
     start.principal_point_x, start.principal_point_y = camera.principal_point_x, camera.principal_point_y
     start.has_prior_focal_length = camera.has_prior_focal_length
-    columns, rows = np.meshgrid(np.linspace(0, camera.width, _FIT_GRID), np.linspace(0, camera.height, _FIT_GRID))
+    columns, rows = np.meshgrid(np.linspace(0, camera.width, 15), np.linspace(0, camera.height, 15))
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
     rays = np.asarray(camera.cam_ray_from_img(pixels), dtype=np.float64).reshape(-1, 3)
     good = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.05)

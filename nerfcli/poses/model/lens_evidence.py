@@ -29,7 +29,6 @@ from nerfcli.poses.model.projection import Array, projected
 NAMES = ("f", "fa", "cx", "cy", "k1", "k2", "p1", "p2")
 # Beyond this, more observations cost time and change little: clusters, not their members, determine the uncertainty.
 _MOST_OBSERVATIONS = 30_000
-_SCENE_CLUSTERS = 8
 # Other cameras whose focal length and distortion are free too; if there are more, the rest is taken as exact.
 _MOST_OTHERS = 12
 # Relative to the diagonal: the seven directions in which all poses move together are free, and do not affect the lens.
@@ -356,7 +355,7 @@ def _scene_clusters(seen: _Seen, *, seed: int) -> NDArray[np.int64]:
     distances = np.linalg.norm(offsets, axis=1)
     typical = np.median(distances) + 1e-300
     drawn = offsets / np.maximum(distances / (3 * typical), 1)[:, None]
-    count = min(_SCENE_CLUSTERS, len(drawn))
+    count = min(8, len(drawn))
     _, labels = kmeans2(drawn / typical, count, minit="++", rng=np.random.default_rng(seed), missing="warn")
     return labels.astype(np.int64)[seen.points]
 

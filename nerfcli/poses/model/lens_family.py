@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 
 from nerfcli.poses.input.job import CameraGroup, Job
+from nerfcli.poses.model.held_out import MOST_ERROR_PX
 from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL
 from nerfcli.poses.model.projection import Array
 
@@ -20,10 +21,7 @@ from nerfcli.poses.model.projection import Array
 _FOCAL_FRACTIONS = np.geomspace(0.25, 0.85, 8)
 # More matches must agree by this factor.
 _CLEARLY = 1.1
-_PAIRS_ASKED = 8
 _LEAST_MATCHES = 60
-_MOST_MATCHES = 400
-_MAX_ERROR_PX = 4.0
 
 
 def as_fisheye(job: Job) -> Job | None:
@@ -52,7 +50,7 @@ def _fisheye_focal_px(group: CameraGroup, job: Job, database: pycolmap.Database)
         return None
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job.seed
-    options.ransac.max_error = _MAX_ERROR_PX
+    options.ransac.max_error = MOST_ERROR_PX
     options.ransac.max_num_trials = 1000
     camera = pycolmap.Camera.create_from_model_name(1, START_MODEL, 1.2 * group.width, group.width, group.height)
     freely = sum(_agreeing(pycolmap.estimate_two_view_geometry, camera, pair, options) for pair in pairs)
@@ -88,12 +86,12 @@ def _strongest_pairs(images: set[int], database: pycolmap.Database) -> list[tupl
     pairs = [(count, *pycolmap.pair_id_to_image_pair(pair_id)) for pair_id, count in zip(pair_ids, counts, strict=True)]
     chosen: list[tuple[Array, Array]] = []
     for count, one, other in sorted(pairs, reverse=True):
-        if count < _LEAST_MATCHES or len(chosen) == _PAIRS_ASKED:
+        if count < _LEAST_MATCHES or len(chosen) == 8:
             break
         if {one, other} <= images:
             images = images - {one, other}
             matches = np.asarray(database.read_matches(one, other), dtype=np.int64)
-            matches = matches[:: max(1, len(matches) // _MOST_MATCHES)]
+            matches = matches[:: max(1, len(matches) // 400)]
             first, second = (np.asarray(database.read_keypoints(i), dtype=np.float64)[:, :2] for i in (one, other))
             chosen.append((first[matches[:, 0]], second[matches[:, 1]]))
     return chosen

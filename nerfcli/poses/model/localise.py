@@ -29,33 +29,24 @@ from nerfcli.poses.model.point_descriptors import (
     votes,
 )
 from nerfcli.poses.model.projection import Array, is_ahead, offsets_px, projected
-from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
+from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES, MIN_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs
 
 Indices = NDArray[np.int64]
 
-_TRIALS = 40_000
 # A photo needs at least this many agreeing votes, and this many features found, to be placed.
 _LEAST_VOTES = 10
 _LEAST_FOUND = 25
-# Search radii for features, in tolerances: larger at first, since the first pose is rough.
-_WITHIN = (2.0, 1.0)
 # At offsets in eight directions from the predicted positions, in tolerances, at least `_CLEARLY` times fewer features
 # must match.
 _BESIDE = [(6.0, 9.0)[i % 2] * np.array([np.cos(i * np.pi / 4), np.sin(i * np.pi / 4)]) for i in range(8)]
 _HERE = np.zeros(2)
 _CLEARLY = 2.5
-# A second pose with this fraction of the votes makes the first one ambiguous.
-_RIVAL_FRACTION = 0.5
-# Least fraction of the picture over which the found features must spread. Measured: 0.02 where a detail looks like one
-# that is elsewhere, 0.13 and more where the pose was right.
+# Least fraction of the picture over which the found features must spread. A detail that looks
+# like one that is elsewhere covers less.
 _LEAST_AREA = 0.05
 # Largest standard deviations of a pose: of its angles, and of its position relative to the distance of its points.
 _MOST_TURN_DEG, _MOST_SHIFT = 0.5, 0.02
-# Fraction of `_LEAST_FOUND` features that must be left after the adjustment.
-_LEAST_KEPT = 0.6
-# Rounds of attempts, since a placed photo may make it possible to place others.
-_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -103,9 +94,10 @@ def localise(
     left = sorted(image_ids)
     files = dict(zip(job.image_ids, job.files, strict=True))
     with pycolmap.Database.open(job.database) as database:
-        total = _ROUNDS * len(left)
+        rounds = 3  # a placed photo may make it possible to place others
+        total = rounds * len(left)
         placed_before: list[int] = []
-        for turn in range(_ROUNDS):
+        for turn in range(rounds):
             model_points = known_points(grown, database)
             fresh = np.isin(model_points.photos, placed_before)
             placed_now = []
@@ -175,7 +167,7 @@ def shared_pairs(model: pycolmap.Reconstruction, image_ids: Sequence[int], *, mi
 def _doubt(model: pycolmap.Reconstruction, image_id: int, pairs: Sequence[VerifiedPair]) -> str:
     """Return the evidence against a photo's pose after the adjustment, "" if there is none."""
     observations = model.image(image_id).num_points3D
-    if observations < _LEAST_KEPT * _LEAST_FOUND:
+    if observations < MIN_MATCHES:
         return f"only {observations} of its points remain after the adjustment"
     own = [pair for pair in pairs if image_id in (pair.one, pair.other)]
     against = [agreement for agreement in agreements(model, own) if agreement.contradicts]
@@ -197,10 +189,10 @@ def _place(photo: PhotoFeatures, model_points: KnownPoints, *, seed: int) -> tup
     others = ~np.isin(features, first.features)
     second = _pose(photo, model_points, features[others], points[others], seed=seed)
     rivals = 0 if second is None or _alike(first, second, model_points) else len(second.features)
-    if rivals >= _RIVAL_FRACTION * agreeing:
+    if rivals >= agreeing / 2:
         return refused(f"{rivals} features agree on a different pose than the {agreeing} others")
     placed = first
-    for within in _WITHIN:
+    for within in (2.0, 1.0):  # in tolerances: larger at first, since the first pose is rough
         found = _pose(photo, model_points, *_expected(photo, model_points, placed.pose, within=within), seed=seed)
         if found is None:
             break
@@ -227,7 +219,7 @@ def _pose(
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = photo.tolerance_px
     options.ransac.random_seed = seed
-    options.ransac.max_num_trials = _TRIALS
+    options.ransac.max_num_trials = 40_000
     options.ransac.confidence = 0.9999
     found = pycolmap.estimate_and_refine_absolute_pose(
         photo.pixels[features], model_points.places[points], photo.camera, estimation_options=options

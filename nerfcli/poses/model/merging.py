@@ -18,17 +18,12 @@ from numpy.typing import NDArray
 from nerfcli.cameras.alignment import align as similarity
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import duration
+from nerfcli.poses.model.held_out import MAPPER
 from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.localise import pixels_of, place
 from nerfcli.poses.model.projection import Array, is_ahead, offsets_px
+from nerfcli.poses.model.reasons import MIN_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, count_matches, read_verified_pairs
-
-# A similarity has seven unknowns; this many points agreeing within the tolerance is no accident.
-_LEAST_COMMON = 15
-_TOLERANCE_PX = 12.0
-_TRIALS = 500
-# Fraction of the matches between the two parts that must agree with the joined model.
-_LEAST_AGREEMENT = 0.5
 
 
 @dataclass(frozen=True)
@@ -128,18 +123,18 @@ def align(first: pycolmap.Reconstruction, common: CommonPoints, *, seed: int) ->
     Returns None if too few points agree.
     """
     count = len(common.first)
-    if count < _LEAST_COMMON:
+    if count < MIN_MATCHES:
         return None
     rng = np.random.default_rng(seed)
     best = np.zeros(count, dtype=bool)
-    for _ in range(_TRIALS):
+    for _ in range(500):
         sample = rng.choice(count, 3, replace=False)
         if not np.ptp(common.second[sample], axis=0).any():  # one point, seen in three photos
             continue
         fits = _fits(first, common, similarity(common.second[sample], common.first[sample]))
         if fits.sum() > best.sum():
             best = fits
-    if best.sum() < _LEAST_COMMON:
+    if best.sum() < MIN_MATCHES:
         return None
     found = similarity(common.second[best], common.first[best])
     return pycolmap.Sim3d(found.scale, pycolmap.Rotation3d(found.rotation), found.translation)
@@ -155,7 +150,7 @@ def _fits(first: pycolmap.Reconstruction, common: CommonPoints, first_from_secon
         local = moved[rows] @ pose.rotation.matrix().T + pose.translation
         camera = first.camera(image.camera_id)
         distances = np.linalg.norm(offsets_px(camera, local, common.pixels[rows]), axis=1)
-        fits[rows] = is_ahead(camera, local) & (distances < _TOLERANCE_PX)  # NaN is not smaller
+        fits[rows] = is_ahead(camera, local) & (distances < MAPPER.abs_pose_max_error)  # NaN is not smaller
     return fits
 
 
@@ -198,7 +193,7 @@ def _holds(joined: pycolmap.Reconstruction, first: pycolmap.Reconstruction, pair
     between = [pair for pair in pairs if (pair.one in old) != (pair.other in old)]
     found = agreements(joined, between)
     matches = sum(a.matches for a in found)
-    return matches > 0 and sum(a.matches * a.fraction for a in found) > _LEAST_AGREEMENT * matches
+    return matches > 0 and sum(a.matches * a.fraction for a in found) > matches / 2
 
 
 def _matched_keypoints(database: Path) -> dict[tuple[int, int], NDArray[np.int64]]:

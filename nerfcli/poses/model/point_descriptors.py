@@ -11,14 +11,10 @@ Indices = NDArray[np.int64]
 
 # Largest distance of a point from its predicted position, as a fraction of the longer side, and at least in pixels.
 _TOLERANCE_FRACTION, _LEAST_TOLERANCE_PX = 0.004, 3.0
-# A vote counts if the ratio of its distance to that of the nearest other point is below this. Measured on photos 40
-# degrees apart: at 0.8 one vote in four is right and there are too few, at 0.95 one in thirty.
+# A vote counts if the ratio of its distance to that of the nearest other point is below this.
 _RATIO = 0.9
-_MOST_VOTES = 600
 # A feature at the predicted position of a point is that point if their descriptors of length 1 are nearer than this.
 ALIKE = 0.5
-# Descriptors of points that are compared with; more take time and memory.
-_MOST_DESCRIPTORS = 150_000
 # Features compared at a time.
 BLOCK = 256
 
@@ -55,7 +51,7 @@ class PhotoFeatures:
 def known_points(model: pycolmap.Reconstruction, database: pycolmap.Database) -> KnownPoints:
     """Return the points of a model with their descriptors."""
     ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
-    most = max(1, _MOST_DESCRIPTORS // max(len(ids), 1))
+    most = max(1, 150_000 // max(len(ids), 1))  # more take time and memory
     features: dict[int, tuple[list[int], list[int]]] = {}  # by photo: features, and their points
     for index, point_id in enumerate(ids):
         for element in model.point3D(int(point_id)).track.elements[:most]:
@@ -111,7 +107,7 @@ def votes(photo: PhotoFeatures, model_points: KnownPoints) -> tuple[Indices, Ind
     features = np.flatnonzero(ratios < _RATIO)
     features = features[np.argsort(ratios[features], kind="stable")]
     _, first = np.unique(nearest[features], return_index=True)
-    features = features[np.sort(first)][:_MOST_VOTES]
+    features = features[np.sort(first)][:600]
     return features, nearest[features]
 
 

@@ -17,14 +17,14 @@ from scipy.optimize import least_squares
 from nerfcli.cameras.rigid import transform_from_twist
 from nerfcli.poses.input.job import Report
 from nerfcli.poses.model import held_out
-from nerfcli.poses.model.intrinsics import MOST_DESCRIBED
+from nerfcli.poses.model.intrinsics import LEAST_PHOTOS, MOST_DESCRIBED
 from nerfcli.poses.model.lens_evidence import lenses_of
-from nerfcli.poses.model.lens_observability import uncertainty, with_own_principal_points
+from nerfcli.poses.model.lens_observability import PRINCIPAL_POINT_RANGE, uncertainty, with_own_principal_points
 from nerfcli.poses.model.localise import pixels_of, place
 from nerfcli.poses.model.projection import Array, projected
 
 # The principal points stay shared unless their own ones reduce the error of held-out observations by this fraction, and
-# by this many standard errors. Measured: 16 and 20 % with two stabilised phones, at most 5 % on nine other captures.
+# by this many standard errors.
 _GAIN_FRACTION = 0.1
 _GAIN_DEVIATIONS = 3.0
 # Errors are clipped at this multiple of their median: wrong matches must not decide.
@@ -32,8 +32,6 @@ _CLIP = 4.0
 # Photos with fewer observations keep the shared principal point, as do those whose own would be farther from it than
 # this fraction of the picture's size, many times what stabilisers shift: it fits something else, or is undetermined.
 LEAST_OBSERVATIONS = 60
-_FARTHEST = 0.1
-_LEAST_PHOTOS = 3
 # Robust adjustments. The first ones reduce the errors by so much that what counts as an outlier changes.
 _ROUNDS = 3
 
@@ -84,7 +82,7 @@ def choose_principal_points(
     report("stabilise", 0, 2)
     shared, held = held_out.split(model, seed=seed)
     free = _free_photos(shared, fixed)
-    if len(free) < _LEAST_PHOTOS or len(held.points) == 0:
+    if len(free) < LEAST_PHOTOS or len(held.points) == 0:
         report("stabilise", 2, 2)
         return StabilisedModel(model, None, {})
     scale_px = held_out.loss_scale_px(held_out.observation_errors_px(shared))
@@ -200,7 +198,7 @@ def _anchored(own: pycolmap.Reconstruction, model: pycolmap.Reconstruction, free
         points = np.array([(own.cameras[p].principal_point_x, own.cameras[p].principal_point_y) for p in photos])
         anchor = int(np.linalg.norm(points - np.median(points, axis=0), axis=1).argmin())
         shifts = points - points[anchor]
-        far = np.linalg.norm(shifts / [camera.width, camera.height], axis=1) > _FARTHEST
+        far = np.linalg.norm(shifts / [camera.width, camera.height], axis=1) > PRINCIPAL_POINT_RANGE
         shifts[far] = 0.0
         for photo, (x, y) in zip(photos, shared + shifts, strict=True):
             own.cameras[photo].principal_point_x, own.cameras[photo].principal_point_y = float(x), float(y)

@@ -7,6 +7,8 @@ from collections.abc import Iterable
 FEW_FEATURES = 100
 # pycolmap's mapper places a photo only with this many of its points known (abs_pose_min_num_inliers).
 FEW_MATCHES = 30
+# pycolmap verifies a pair from this many matches (min_num_inliers); with fewer, agreement may be accidental.
+MIN_MATCHES = 15
 # A held-out photo is placed with the lens that the training photos of its camera gave.
 NO_TRAINING_PHOTO = "its camera took no training photo"
 

@@ -15,14 +15,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from nerfcli.poses.model.held_out import MOST_ERROR_PX
 from nerfcli.poses.model.projection import Array, panorama_camera, px_per_radian
 
-# COLMAP verifies matches within 4 px of the epipolar line; a model that fits more than the pair may leave twice that.
-TOLERANCE_PX = 8.0
-# Pairs per photo whose relative pose is estimated again.
-_ROTATIONS_PER_PHOTO = 4
 # Below this median angle between the rays of a match, the relative pose of a pair is too weak to contradict anything.
-_ROTATION_MIN_ANGLE_DEG = 2.0
+LEAST_ANGLE_DEG = 2.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,7 @@ class VerifiedPair:
 class Agreement:
     """Agreement of a pair's matches with the poses of a model.
 
-    matches: how many can be judged. fraction: of them within `TOLERANCE_PX` of the epipolar line and in front
+    matches: how many can be judged. fraction: of them within 8 px of the epipolar line and in front
     of both cameras, or with rays that are parallel within the tolerance, as for a far point whatever the baseline.
     angle_deg: the median angle between the rays of a match.
     """
@@ -94,6 +91,8 @@ def placed_pairs(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) 
 def agreements(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) -> list[Agreement]:
     """Compare each pair's matches with the model's poses and intrinsics; pairs without a finite ray are left out."""
     found = []
+    # Matches are verified within this error; a model that fits more than the pair may leave twice that.
+    most_px = 2 * MOST_ERROR_PX
     for pair in placed_pairs(model, pairs):
         first, second = model.image(pair.one), model.image(pair.other)
         camera, other_camera = model.camera(first.camera_id), model.camera(second.camera_id)
@@ -107,8 +106,8 @@ def agreements(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) ->
         focal_px = 0.5 * (px_per_radian(camera) + px_per_radian(other_camera))
         angles = _angles(p, q)
         # Noise decides on which side of the cameras nearly parallel rays meet.
-        far = angles * focal_px < TOLERANCE_PX
-        fits = far | ((epipolar_angles(p, q, t) * focal_px < TOLERANCE_PX) & _in_front(p, q, t))
+        far = angles * focal_px < most_px
+        fits = far | ((epipolar_angles(p, q, t) * focal_px < most_px) & _in_front(p, q, t))
         found.append(Agreement(pair.one, pair.other, len(p), float(fits.mean()), float(np.degrees(np.median(angles)))))
     return found
 
@@ -148,9 +147,9 @@ def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair
     five-point algorithm may turn a camera around.
     """
     # The matches are verified; few trials are enough, and pycolmap's own number takes ten times as long.
-    options = pycolmap.RANSACOptions(max_error=4.0, min_num_trials=50, max_num_trials=500, random_seed=seed)
+    options = pycolmap.RANSACOptions(max_error=MOST_ERROR_PX, min_num_trials=50, max_num_trials=500, random_seed=seed)
     errors = []
-    for pair in strongest(placed_pairs(model, pairs), per_photo=_ROTATIONS_PER_PHOTO):
+    for pair in strongest(placed_pairs(model, pairs), per_photo=4):
         first, second = model.image(pair.one), model.image(pair.other)
         camera, other_camera = model.camera(first.camera_id), model.camera(second.camera_id)
         found = pycolmap.estimate_relative_pose(
@@ -162,7 +161,7 @@ def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair
         inliers = np.asarray(found["inlier_mask"])
         p = rays(camera, pair.pixels_one[inliers]) @ own.rotation.matrix().T
         q = rays(other_camera, pair.pixels_other[inliers])
-        if not len(p) or np.degrees(np.nanmedian(_angles(p, q))) < _ROTATION_MIN_ANGLE_DEG:
+        if not len(p) or np.degrees(np.nanmedian(_angles(p, q))) < LEAST_ANGLE_DEG:
             continue
         pose = second.cam_from_world() * first.cam_from_world().inverse()
         degrees = float(np.degrees((own.rotation * pose.rotation.inverse()).angle()))
