@@ -104,7 +104,7 @@ def test_masks_that_do_not_fit_are_named(photos, masks, tmp_path):
     write_png(masks / "p 1.png", np.full((HEIGHT, WIDTH - 1), 255, np.uint8))
     write_png(masks / "p 3.png", np.full((WIDTH, HEIGHT), 255, np.uint8))  # the photo is stored upright: not turned
     with pytest.raises(
-        UserError, match=r"2 masks have the wrong size: .*p 1\.png is 119x80, but its photo is 120x80; .*p 3\.png"
+        UserError, match=r"2 masks have the wrong size: .*p 1\.png is 119x80, but its photo is 120x80, .*p 3\.png"
     ):
         laid_out(photos, masks, tmp_path / "work")
 

@@ -161,13 +161,13 @@ def no_run(path: Path) -> UserError:
         return UserError(f"{path} does not exist", hint)
     if path.is_file():
         return UserError(f"{path} is a file, not a run folder", hint)
-    if recognised(path) is not None:
-        return UserError(f"{path} is a scene, not a run", f"train it first: nerfcli train {in_shell(path)}")
     if (path / RECONSTRUCTION).exists():
         return UserError(
             f"{path} is the reconstruction of an X-ray scan, not a run of photos",
             "evaluate, render, export and info work with it",
         )
+    if recognised(path) is not None:
+        return UserError(f"{path} is a scene, not a run", f"train it first: nerfcli train {in_shell(path)}")
     if photos := photo_folder(path):
         return UserError(
             f"{photos} is a folder of photos, not a run", f"make a run of it first: nerfcli run {in_shell(photos)}"
