@@ -13,7 +13,7 @@ from nerfcli.doctor import camera_motion
 from nerfcli.doctor.moving import Patch, moving_patches
 from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, PhotoFeatures
 from nerfcli.media.exif import Exif
-from nerfcli.media.focal_evidence import focal_evidence
+from nerfcli.media.focal_evidence import focal_evidence, usual_focal_px
 from nerfcli.multiview.epipolar import fundamental_matrix
 from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.stationary import Motions, in_place, motions
@@ -122,9 +122,10 @@ def compare(
 
 def focal_px(features: PhotoFeatures, exif: Exif) -> float:
     """Return the focal length at the feature-detection size: from EXIF, else a typical value."""
-    longer = max(features.size)
     known_px = focal_evidence(exif).focal_px
-    return longer * (1.0 if known_px is None else known_px / max(exif.width, exif.height))
+    if known_px is None:
+        return usual_focal_px(*features.size)
+    return max(features.size) * (known_px / max(exif.width, exif.height))
 
 
 def _some(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -43,6 +43,11 @@ class FocalEvidence:
     whole_px: tuple[float, float]
 
 
+def usual_focal_px(width: int, height: int) -> float:
+    """Return the initial focal length if nothing is known about it, as in COLMAP."""
+    return 1.2 * max(width, height)
+
+
 def focal_evidence(exif: Exif) -> FocalEvidence:
     """Return the focal length of a photo from EXIF, and whether it applies to the file as it is.
 

@@ -16,7 +16,8 @@ from typing import Any
 
 import pycolmap
 
-from nerfcli.poses.input.job import CameraGroup, Job, usual_focal_px
+from nerfcli.media.focal_evidence import usual_focal_px
+from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.model.two_views import count_matches
 
 

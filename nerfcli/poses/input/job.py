@@ -46,11 +46,6 @@ class CameraGroup:
         return replace(self, focal_px=None, focal_is_prior=False)
 
 
-def usual_focal_px(width: int, height: int) -> float:
-    """Return the initial focal length if nothing is known about it, as in COLMAP."""
-    return 1.2 * max(width, height)
-
-
 @dataclass(frozen=True)
 class WorkMask:
     """Mask of one photo: a hash of the used pixels, "" without a mask, and their fraction."""
