@@ -296,7 +296,7 @@ def seen(points: np.ndarray, turn_deg: float, centre: tuple[float, float, float]
 def test_a_pure_rotation_is_recognized_at_any_focal_length(focal_px):
     points, noise = two_view_points()
     x, y = seen(points, 0, (0, 0, 0)) + noise[0], seen(points, 12, (0, 0, 0)) + noise[1]
-    views = camera_motion.estimate(x, y, (focal_px, focal_px))
+    views = camera_motion.estimate(x, y, (focal_px, focal_px), within_px=2.0)
     assert views is not None
     assert views.flat
     assert views.baseline_over_depth < 0.02
@@ -306,7 +306,7 @@ def test_a_pure_rotation_is_recognized_at_any_focal_length(focal_px):
 def test_the_baseline_over_the_depth_is_measured(baseline):
     points, noise = two_view_points()
     x, y = seen(points, 0, (0, 0, 0)) + noise[0], seen(points, 5, (baseline, 0, 0)) + noise[1]
-    views = camera_motion.estimate(x, y, (700.0, 700.0))
+    views = camera_motion.estimate(x, y, (700.0, 700.0), within_px=2.0)
     assert views is not None
     assert not views.flat
     np.testing.assert_allclose(views.baseline_over_depth, baseline / np.median(points[:, 2]), rtol=0.1)
@@ -317,7 +317,7 @@ def test_a_plane_gives_no_more_than_its_baseline_over_its_distance():
     """The ratio is 0.2; if the focal length may be 1.45 times the given one, 0.2 / 1.45 explains the same pixels."""
     points, _ = two_view_points()
     flat = np.column_stack([points[:, :2], np.full(len(points), 5.0)])
-    views = camera_motion.estimate(seen(flat, 0, (0, 0, 0)), seen(flat, 0, (1.0, 0, 0)), (700.0, 700.0))
+    views = camera_motion.estimate(seen(flat, 0, (0, 0, 0)), seen(flat, 0, (1.0, 0, 0)), (700.0, 700.0), within_px=2.0)
     assert views is not None
     assert views.flat
     assert 0.2 / 1.46 < views.baseline_over_depth < 0.201

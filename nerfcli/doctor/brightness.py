@@ -7,9 +7,8 @@ import numpy as np
 
 from nerfcli.media.colours import linear_light
 
-# A channel shows no detail at or above the first level, or at or below the second, of 255.
+# A channel shows no detail from this level on, of 255, or as near to 0.
 WHITE_LEVEL = 253
-BLACK_LEVEL = 3
 
 # Linear light of each 8-bit sRGB level.
 _LINEAR = linear_light(np.arange(256) / 255).astype(np.float32)
@@ -33,7 +32,7 @@ def measure(rgb: np.ndarray, used: np.ndarray) -> Brightness:
     pixels = rgb[used]
     if not len(pixels):
         return Brightness(float("nan"), 0.0, 0.0)
-    white, black = (pixels >= WHITE_LEVEL).all(axis=1).mean(), (pixels <= BLACK_LEVEL).all(axis=1).mean()
+    white, black = (pixels >= WHITE_LEVEL).all(axis=1).mean(), (pixels <= 255 - WHITE_LEVEL).all(axis=1).mean()
     return Brightness(float(pixels.mean() / 255), float(white), float(black))
 
 
@@ -45,7 +44,7 @@ def local_light(rgb: np.ndarray) -> np.ndarray:
     highlight on it shifts the ratio by more than the white balance does. The picture is (H, W, 3) uint8 sRGB.
     """
     light = np.maximum(cv2.GaussianBlur(cv2.LUT(rgb, _LINEAR), (0, 0), 4.0), 1e-6)
-    clipped = 255 * np.any((rgb >= WHITE_LEVEL) | (rgb <= BLACK_LEVEL), axis=2).astype(np.uint8)
+    clipped = 255 * np.any((rgb >= WHITE_LEVEL) | (rgb <= 255 - WHITE_LEVEL), axis=2).astype(np.uint8)
     unsure = (cv2.blur(clipped, (15, 15)) > 0.05 * 255) | (light.min(axis=2) < _DARKEST)
     luminance = np.log2(light @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32))
     redness = np.log2(light[..., 0] / light[..., 2])

@@ -14,6 +14,7 @@ from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
 from nerfcli.media.geodesy import east_north_up
+from nerfcli.poses.judge.contradictions import FARTHEST
 from nerfcli.poses.model.reasons import FEW_FEATURES
 from nerfcli.scene import Scene
 
@@ -21,8 +22,6 @@ from nerfcli.scene import Scene
 _AROUND_DEG = 180.0
 _GAP_LOOK, _GAP_BAD = 45.0, 100.0
 _SPAN_LOOK, _SPAN_BAD = 20.0, 6.0
-# A camera is an outlier beyond this many times the median distance from the median camera position.
-_FAR_OFF = 8.0
 # Focal lengths along x and y that differ by more than this mean pixels that are not square, or a wrong calibration.
 _ASPECT_LOOK = 0.02
 # GPS of phones is off by 5 m under open sky and by tens of metres indoors; a metric scale needs a wider capture.
@@ -37,7 +36,7 @@ def spread(scene: Scene) -> Finding:
     distances = np.linalg.norm(centres - middle, axis=1)
     ratio = float(np.sqrt(np.mean(distances**2)) / np.median(depths))
     typical = float(np.median(distances))
-    far = [i for i in np.argsort(-distances) if distances[i] > _FAR_OFF * typical and typical > 0]
+    far = [i for i in np.argsort(-distances) if distances[i] > FARTHEST * typical and typical > 0]
     nearest = np.linalg.norm(centres[:, None] - centres, axis=2)
     np.fill_diagonal(nearest, np.inf)
     step = float(np.median(nearest.min(axis=1) / depths)) if len(centres) > 1 else 0.0
@@ -53,7 +52,7 @@ def spread(scene: Scene) -> Finding:
         summary,
         ratio,
         f"camera spread / depth: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}; a camera: look from "
-        f"{_FAR_OFF:g} times the median distance",
+        f"{FARTHEST:g} times the median distance",
         advice,
         tuple((scene.frames[i].name, f"{distances[i] / typical:.0f} times the median distance") for i in far),
     )

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-WITHIN_PX = 2.5
 # A homography explains a pair if it fits this fraction of the inliers.
 _EXPLAINS = 0.9
 
@@ -19,7 +18,7 @@ class TwoViews:
     """Camera motion between two photos.
 
     Args:
-        homography_fraction: of the matches that one homography fits within `WITHIN_PX`: near 1 if the camera only
+        homography_fraction: of the matches that one homography fits: near 1 if the camera only
             turned, or if everything it saw is flat.
         baseline_over_depth: distance between the camera positions, relative to the distance of the scene.
     """
@@ -34,7 +33,7 @@ class TwoViews:
         return self.homography_fraction >= _EXPLAINS
 
 
-def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float]) -> TwoViews | None:
+def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float], *, within_px: float) -> TwoViews | None:
     """Estimate the motion between two photos from inlier matches (N, 2); None if they do not determine it.
 
     If a homography H explains the matches, K^-1 H K = R + t n^T / d: its middle singular value is about 1, and the
@@ -44,13 +43,13 @@ def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float]) -> Tw
 
     Accuracy: if the focal lengths are off by 20 %, baseline over depth is off by about as much.
     """
-    homography, inside = cv2.findHomography(x, y, cv2.USAC_MAGSAC, WITHIN_PX, None, 1000, 0.999)
+    homography, inside = cv2.findHomography(x, y, cv2.USAC_MAGSAC, within_px, None, 1000, 0.999)
     fraction = 0.0 if homography is None or inside is None else float(inside.mean())
     if homography is not None and fraction >= _EXPLAINS:
         rotation_deg, ratio = _of_homography(homography, focals_px)
         return TwoViews(fraction, rotation_deg, ratio)
     one, other = x / focals_px[0], y / focals_px[1]
-    threshold = WITHIN_PX / max(focals_px)
+    threshold = within_px / max(focals_px)
     essential, _ = cv2.findEssentialMat(one, other, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold, 500)
     if essential is None or essential.shape != (3, 3):
         return None

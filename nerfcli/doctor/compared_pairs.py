@@ -27,7 +27,6 @@ LEAST_MATCHES = 20
 FEWEST_PAIRS = 3
 # Detail is compared at features of about the same size in both photos: their ratio is within this many octaves.
 _SAME_SIZE_OCTAVES = 0.4
-_LEAST_COMPARED = 12
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def compare(
         still = motions(x, y, one.size)
     if pinholes and count >= 2 * LEAST_MATCHES:
         centres = [np.array(features.size) / 2 for features in (one, other)]
-        views = camera_motion.estimate(x[agree] - centres[0], y[agree] - centres[1], focals_px)
+        views = camera_motion.estimate(x[agree] - centres[0], y[agree] - centres[1], focals_px, within_px=EPIPOLAR_PX)
         patches = moving_patches(x, y, agree, within_px=EPIPOLAR_PX)
     return Pair(
         *numbers,
@@ -136,4 +135,4 @@ def _some(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _median(values: np.ndarray) -> float:
     measured = values[~np.isnan(values)]
-    return float(np.median(measured)) if len(measured) >= _LEAST_COMPARED else float("nan")
+    return float(np.median(measured)) if len(measured) >= LEAST_MATCHES // 2 else float("nan")

@@ -12,6 +12,7 @@ from nerfcli.findings import BAD, GOOD, LOOK, Finding, worst
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.retrieval import alike, likeness
 from nerfcli.poses.input.pairs import EXHAUSTIVE_UP_TO
+from nerfcli.poses.model.reasons import FEW_MATCHES
 
 # In captures that are not compared exhaustively, each photo is compared with some later ones by name and with its most
 # similar ones. The camera hardly moves between consecutive frames of a video, so there are wide steps, too.
@@ -19,9 +20,6 @@ STEPS_BY_NAME = (1, 2, 8, 20, 50)
 LOOK_ALIKES = 6
 # Similar photos are found by this many features of each photo, the largest ones; fewer miss some, more take longer.
 _COARSEST = 96
-
-# A photo is weakly connected with fewer matches than this in its best pair, or with fewer partners than this.
-WEAK_MATCHES = 35
 
 
 def choose_pairs(photos: Sequence[PhotoFacts]) -> list[tuple[int, int]]:
@@ -64,7 +62,7 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
     weak = [
         i
         for i in sorted(parts[0], key=lambda photo: (best[photo], partners[photo]))
-        if len(photos) > 2 and (best[i] < WEAK_MATCHES or partners[i] < 2) and i not in loose
+        if len(photos) > 2 and (best[i] < FEW_MATCHES or partners[i] < 2) and i not in loose
     ]
     remarks += [(photos[i].name, f"{several(partners[i], 'partner')}, best {best[i]} matches") for i in weak]
     fraction = len(parts[0]) / len(photos)
@@ -80,7 +78,7 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
         verdict,
         summary,
         fraction,
-        f"fraction of photos in the largest part: look below 1, bad below 0.9; per photo: look below {WEAK_MATCHES} "
+        f"fraction of photos in the largest part: look below 1, bad below 0.9; per photo: look below {FEW_MATCHES} "
         f"matches with its best partner or fewer than 2 partners",
         "" if verdict == GOOD else "add photos in between, so that each overlaps its neighbours by two thirds",
         tuple(remarks),

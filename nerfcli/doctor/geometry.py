@@ -14,8 +14,6 @@ from nerfcli.multiview.stationary import LEAST_FRACTION, together
 
 # Baseline over depth: 0.1 is an angle of 6 degrees between two rays to the same point.
 BASELINE_LOOK, BASELINE_BAD = 0.08, 0.03
-# Pairs with at least this baseline over depth show depth, unless the scene is flat.
-_MOVED = 0.1
 _FLAT_LOOK = 0.8
 
 
@@ -63,7 +61,7 @@ def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | N
 
 def flatness(pairs: Sequence[Pair]) -> Finding | None:
     """Check whether the scene is flat; None if too few pairs have a large enough baseline."""
-    moved = [pair.views for pair in pairs if pair.views is not None and pair.views.baseline_over_depth > _MOVED]
+    moved = [pair.views for pair in pairs if pair.views is not None and pair.views.baseline_over_depth > BASELINE_LOOK]
     if len(moved) < FEWEST_PAIRS:
         return None
     fraction = float(np.mean([views.flat for views in moved]))

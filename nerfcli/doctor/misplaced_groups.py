@@ -26,8 +26,6 @@ NEAREST = 4
 _NEAR, _SAME_WAY_COS = 2.0, np.cos(np.radians(20.0))
 # Only where neighbours nearly always match does it mean anything that some do not.
 _USUALLY_MATCH, _FEWEST_NEIGHBOURS = 0.95, 20
-# A group is misplaced if this many neighbours of at least two of its photos match nothing of it.
-_STRANGERS = 4
 
 
 def nearest_pairs(frames: Sequence[Frame]) -> set[tuple[int, int]]:
@@ -75,7 +73,7 @@ def misplaced_groups(
         BAD if misplaced else GOOD,
         summary,
         total,
-        f"a group of photos: bad if none of its {_STRANGERS} neighbouring pairs or more match, where "
+        f"a group of photos: bad if none of its {NEAREST} neighbouring pairs or more match, where "
         f"{100 * _USUALLY_MATCH:.0f} % of the others do",
         "compare these photos with their neighbours: things that look alike, such as two sides of an object, mislead "
         "structure from motion; remove them from the scene, or estimate poses from the photos with nerfcli poses"
@@ -97,7 +95,7 @@ def _strangers(group: Sequence[int], main: set[int], neighbours: Sequence[tuple[
     inside = set(group)
     across = [pair for pair in neighbours if len(inside & set(pair)) == 1 and len(main & set(pair)) == 1]
     own = {index for pair in across for index in pair if index in inside}
-    return len(across) if len(own) > 1 and len(across) >= _STRANGERS else 0
+    return len(across) if len(own) > 1 and len(across) >= NEAREST else 0
 
 
 def _neighbours(frames: Sequence[Frame], compared: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -16,12 +16,11 @@ from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
 from nerfcli.findings import BAD, GOOD, LOOK, Finding
 from nerfcli.multiview.epipolar import sampson_angles
+from nerfcli.poses.model.reasons import FEW_MATCHES
 
 # Photos that look alike match at the wrong place, too. They have fewer matches than true neighbours, so the strongest
 # pairs of a photo decide.
 _STRONGEST = 6
-# Fewer matches than this may be of things that look alike.
-_LEAST_MATCHES = 30
 # A pair contradicts its poses from this median error on, or from this multiple of the capture's, since poses by
 # tracking are off by pixels everywhere.
 _CONTRADICTS_PX, _TIMES_USUAL = 4.0, 5.0
@@ -80,7 +79,7 @@ def agreement(photos: Sequence[PhotoFacts], errors: Sequence[PairError]) -> Find
         return None
     limit_px = contradicts_from_px(usual_px)
     named = contradicting(errors, len(photos), limit_px=limit_px)
-    behind = float(np.mean([pair.behind for pair in errors if pair.matches >= _LEAST_MATCHES]))
+    behind = float(np.mean([pair.behind for pair in errors if pair.matches >= FEW_MATCHES]))
     summary = f"median epipolar error {usual_px:.2g} px"
     threshold = (
         f"all photos: look from {USUAL_LOOK_PX:g} px, bad from {USUAL_BAD_PX:g} px; a photo: bad if most of its "
@@ -133,7 +132,7 @@ def _strongest(errors: Sequence[PairError], count: int) -> list[list[float]]:
     of_photo: list[list[float]] = [[] for _ in range(count)]
     for pair in sorted(errors, key=lambda pair: -pair.matches):
         for index in (pair.first, pair.second):
-            if pair.matches >= _LEAST_MATCHES and len(of_photo[index]) < _STRONGEST:
+            if pair.matches >= FEW_MATCHES and len(of_photo[index]) < _STRONGEST:
                 of_photo[index].append(pair.error_px)
     return of_photo
 

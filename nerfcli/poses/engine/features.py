@@ -17,16 +17,15 @@ from nerfcli.poses.input.job import Job, Report, WorkMask
 from nerfcli.poses.input.plan import limit_seconds, matching_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
-# The time limit is checked after this many pairs; it is at least this many seconds, however few pairs there are.
+# The time limit is checked after this many pairs.
 _PAIRS_PER_CALL = 1024
-_LEAST_LIMIT_SECONDS = 300
 # Change these whenever this module would find other features in the same photo, or other matches of the same features.
 _FEATURES_VERSION = "octaves 0, then -1 below half, then 0 and -1 with a quarter of the contrast below an eighth"
 _MATCHES_VERSION = "ratio 0.8, cross-checked"
 
 
-# Contrast that a feature needs, of 1 between black and white; pycolmap's default.
-_CONTRAST = 0.02 / 3
+# Contrast that a feature needs, of 1 between black and white.
+_CONTRAST = pycolmap.SiftExtractionOptions().peak_threshold
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
     matching was cut short after ten times the planned time, so that the last pairs have no matches.
     """
     planned = matching_seconds(len(pairs), max_features=job.max_features) / max(job.threads, 1)
-    most, start = limit_seconds(planned, least=_LEAST_LIMIT_SECONDS), time.perf_counter()
+    most, start = limit_seconds(planned), time.perf_counter()
     options = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.seed

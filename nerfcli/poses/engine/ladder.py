@@ -25,7 +25,7 @@ from nerfcli.poses.input.pairs import all_pairs
 from nerfcli.poses.input.plan import extraction_seconds, mapping_seconds, matching_seconds
 from nerfcli.poses.input.settings import FULL_SIZE, QUALITIES
 from nerfcli.poses.judge.parallax import best_rotation_fit
-from nerfcli.poses.model.intrinsics import field_of_view_deg
+from nerfcli.poses.model.intrinsics import FISHEYE_FROM_DEG, field_of_view_deg
 from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.lens_family import as_fisheye
 from nerfcli.poses.model.localise import left_out, localise
@@ -39,15 +39,12 @@ _GOOD_FRACTION = 0.9
 _FEW_FRACTION = 0.75
 # From this many photos, mapping from scratch takes two minutes and more, which is not worth it for a few photos.
 _MANY_PHOTOS = 250
-# Beyond this, comparing every pair, or searching full-size photos, takes longer than taking better photos.
-_MOST_PAIRS = 12_000
-_MOST_FULL_SIZE = 150
+# With more photos, comparing every pair, or searching full-size photos, takes longer than taking better photos.
+_MOST_FOR_ALL = 150
 # Searching larger pictures may take this many times as long as the first search, times the fraction of missing photos.
 _MOST_FOR_MORE = 5.0
 # A focal length that differs from EXIF's by more than this factor (its logarithm) is reported.
 _FAR_FROM_EXIF = 0.1
-# From this field of view, a lens mapped as perspective may be a fisheye.
-_WIDE_DEG = 100.0
 # Each single photo takes some seconds; if more than this are missing, the problem is not one of single photos.
 _MOST_SINGLE_PHOTOS = 60
 
@@ -130,7 +127,7 @@ class _Ladder:
     def is_wide(self) -> bool:
         """Return whether a camera of the best model has such a wide field of view that it may be a fisheye."""
         return any(
-            field_of_view_deg(model.camera(camera_id)) > _WIDE_DEG
+            field_of_view_deg(model.camera(camera_id)) > FISHEYE_FROM_DEG
             for model in self.best.models[:1]
             for camera_id in set(lenses_of(model).values())
         )
@@ -228,7 +225,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> MappedMod
     job = _with_fisheye(ladder, job, fraction=ladder.fraction(featured))
     _other_starts(ladder, job)
     compared = set(job.pairs)
-    few_more = 0 < math.comb(len(job.files), 2) - len(compared) <= _MOST_PAIRS
+    few_more = len(compared) < math.comb(len(job.files), 2) and len(job.files) <= _MOST_FOR_ALL
     if few_more and ladder.fraction(featured) < _GOOD_FRACTION and ladder.has_time():
         rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
         job = replace(job, pairs=(*job.pairs, *rest))
@@ -366,7 +363,7 @@ def _can_have_more_features(job: Job) -> bool:
     """Return whether larger pictures or a higher limit would give any photo more features."""
     larger = any(max(group.width, group.height) > job.max_image_size for group in job.groups)
     limited = job.max_features < QUALITIES["best"][1] and max(feature_counts(job), default=0) >= job.max_features
-    return (larger or limited) and len(job.files) <= _MOST_FULL_SIZE
+    return (larger or limited) and len(job.files) <= _MOST_FOR_ALL
 
 
 def _placed(models: list[pycolmap.Reconstruction]) -> int:

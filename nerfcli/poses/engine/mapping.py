@@ -17,9 +17,6 @@ from nerfcli.poses.input.stages import stage_key
 from nerfcli.poses.model.principal_points import camera_of_lens
 from nerfcli.poses.model.reasons import FEW_MATCHES
 
-# Least time limit of one run of the mapper, however few the photos.
-_LEAST_LIMIT_SECONDS = 120
-
 
 @dataclass(frozen=True)
 class MapperOptions:
@@ -127,7 +124,7 @@ def map_photos(
 
 def mapper_limit_seconds(photos: int) -> int:
     """Return the time limit of one run of the mapper, which then ends with the photos placed so far."""
-    return round(limit_seconds(mapping_seconds(photos), least=_LEAST_LIMIT_SECONDS))
+    return round(limit_seconds(mapping_seconds(photos)))
 
 
 def map_globally(job: Job) -> list[pycolmap.Reconstruction]:

@@ -25,7 +25,7 @@ from nerfcli.poses.engine.mapping import (
 )
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import FOLLOWERS, capture_order
-from nerfcli.poses.input.plan import at_once_seconds, mapping_seconds
+from nerfcli.poses.input.plan import LEAST_LIMIT_SECONDS, at_once_seconds, mapping_seconds
 from nerfcli.poses.input.stages import stage_key
 from nerfcli.poses.judge.acceptance import Verdict
 from nerfcli.poses.judge.checks import Checks
@@ -38,8 +38,6 @@ from nerfcli.poses.model.two_views import agreements, count_matches, read_verifi
 
 # Least fraction of the placed photos in a consistent core that is worth extending.
 _LEAST_CORE = 0.3
-# Least time limit of a hypothesis that has no limit of its own, however little time is left.
-_LEAST_LIMIT_SECONDS = 120
 _ALL_AT_ONCE = "all photos at once (global mapper)"
 # Photos in smaller models, as a fraction of those in the accepted one, from which `grow` tries to add them.
 _LEAST_APART = 0.05
@@ -109,7 +107,7 @@ def second_chance(
             continue
         tell(f"next: {what}" + (f" (about {duration(takes)})" if takes else ""))
         runner = checks()
-        limit = max(left, _LEAST_LIMIT_SECONDS) if what == _ALL_AT_ONCE else _mapping_limit_seconds(mapped.job)
+        limit = max(left, LEAST_LIMIT_SECONDS) if what == _ALL_AT_ONCE else _mapping_limit_seconds(mapped.job)
         found = _tried(what, make, mapped.job, tell, name=f"second-chance-{number}", runner=runner, seconds=limit)
         if found is None:
             continue

@@ -42,9 +42,7 @@ from nerfcli.poses.model.principal_points import StabilisedModel, choose_princip
 # The last stage's file, with the data for the report. The model is beside it, in sparse/0.
 RESULT = "result.json"
 # Increased when the same models would give another result, so that scenes of earlier versions are checked again.
-_RESULT_VERSION = 2
-# Least time limit of each check in seconds, however few the photos.
-_LEAST_LIMIT_SECONDS = 300
+_RESULT_VERSION = 3
 
 
 def main(job_path: str) -> None:
@@ -208,7 +206,7 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
 
 def _checks(job: Job) -> Checks:
     """Make a check runner for one model."""
-    most = limit_seconds(checking_seconds(len(job.files)), least=_LEAST_LIMIT_SECONDS)
+    most = limit_seconds(checking_seconds(len(job.files)))
     return Checks(Path(job.folder), skip=dict(job.skipped_checks), seconds=most)
 
 

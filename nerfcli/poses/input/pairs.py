@@ -20,15 +20,13 @@ PAIRINGS = ("auto", "exhaustive", "sequential", "retrieval", "spatial")
 
 # Up to this many photos, every photo is compared with every other one, whatever their names.
 EXHAUSTIVE_UP_TO = 60
-# In an ordered capture, each photo is compared with this many that follow it...
+# In an ordered capture, each photo is compared with this many that follow it; with GPS, with this many nearest ones...
 FOLLOWERS = 10
-# ...and with this many look-alikes that are not near it in the order, which closes loops.
+_NEAREST = 20
+# ...and in both with this many look-alikes that are not near it, which closes loops.
 _LOOP_NEIGHBOURS = 8
 # In an unordered capture, with this many look-alikes.
 _NEIGHBOURS = 25
-# With GPS, with this many nearest photos, and this many look-alikes.
-_NEAREST = 20
-_SPATIAL_NEIGHBOURS = 5
 # A phone's GPS cannot tell apart neighbours that are all nearer than this.
 _GPS_ERROR_METRES = 10.0
 # Largest median time from one photo to the next for which the order in time is an order in space.
@@ -67,7 +65,7 @@ def choose_pairs(photos: Sequence[Photo], *, rule: str = "auto") -> Pairing:
     if rule == "retrieval":
         return Pairing("retrieval", (), _NEIGHBOURS)
     if rule == "spatial":
-        return Pairing("spatial", nearest_pairs(_positions(photos), _NEAREST), _SPATIAL_NEIGHBOURS)
+        return Pairing("spatial", nearest_pairs(_positions(photos), _NEAREST), _LOOP_NEIGHBOURS)
     raise ValueError(f"pairing must be one of {', '.join(PAIRINGS)}, got {rule}")
 
 

@@ -16,6 +16,8 @@ from nerfcli.poses.input.settings import PoseSettings
 
 # Time of the further searches for features, relative to the first, see `engine.features`.
 _SEARCH_FACTORS = {"enlarge": 3.0, "faint": 1.0, "faint-enlarged": 3.0}
+# Least time limit of a step, however few the photos.
+LEAST_LIMIT_SECONDS = 120
 # All stages that take time, in the order of the work.
 _ORDER = ("extract", *_SEARCH_FACTORS, "pair", "match", "map", "merge", "locate", "check", "stabilise", "settle")
 
@@ -119,9 +121,9 @@ def at_once_seconds(photos: int) -> float:
     return photos * 0.5
 
 
-def limit_seconds(planned: float, *, least: float) -> float:
+def limit_seconds(planned: float) -> float:
     """Return the time limit of a step: if it takes 10 times as long as planned, it may never end."""
-    return max(10 * planned, least)
+    return max(10 * planned, LEAST_LIMIT_SECONDS)
 
 
 def checking_seconds(photos: int) -> float:

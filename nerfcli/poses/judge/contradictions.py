@@ -16,7 +16,8 @@ _CERTAIN_MATCHES = 100
 _RIVAL_STRENGTH = 0.5
 # Largest fraction of the photos that may be left out because they contradict the others.
 _MOST_LEFT_OUT = 0.2
-_FARTHEST = 10.0
+# Cameras farther from the median position than this many times the median distance are misplaced.
+FARTHEST = 10.0
 
 
 @dataclass(frozen=True)
@@ -110,5 +111,5 @@ def _far_away(model: pycolmap.Reconstruction) -> dict[int, str]:
     return {
         photo: f"contradicts the rest: {distance / radius:.0f} times as far away as the other cameras"
         for photo, distance in zip(photos, distances, strict=True)
-        if radius > 0 and distance > _FARTHEST * radius
+        if radius > 0 and distance > FARTHEST * radius
     }

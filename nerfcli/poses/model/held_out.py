@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from nerfcli.poses.model.projection import Array, across_edge, offsets_px
 
 # Beyond this, more observations cost time and change nothing; a part of the points is adjusted instead.
-_MOST_OBSERVATIONS = 40_000
+MOST_OBSERVATIONS = 30_000
 # A robust adjustment downweights observations from this many times the usual error: 95 % efficient for normal noise.
 _LOSS_FROM = 2.4
 _LEAST_LOSS_PX = 0.3
@@ -43,7 +43,7 @@ def split(model: pycolmap.Reconstruction, *, seed: int) -> tuple[pycolmap.Recons
     rng = np.random.default_rng(seed)
     copy = pycolmap.Reconstruction(model)
     point_ids = np.array(sorted(copy.point3D_ids()), dtype=np.int64)
-    kept_fraction = min(1.0, _MOST_OBSERVATIONS / max(copy.compute_num_observations(), 1))
+    kept_fraction = min(1.0, MOST_OBSERVATIONS / max(copy.compute_num_observations(), 1))
     dropped = rng.uniform(size=len(point_ids)) >= kept_fraction
     for point_id in point_ids[dropped]:
         copy.delete_point3D(int(point_id))

@@ -31,21 +31,19 @@ from nerfcli.poses.model.projection import Array, projected
 # From simple to rich. A fisheye model is a candidate if the field of view is wide enough to distinguish it.
 PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE")
-_FISHEYE_FROM_DEG = 90.0
+FISHEYE_FROM_DEG = 90.0
 # Initial models for the mapper, for perspective and fisheye lenses.
 START_MODEL = "SIMPLE_RADIAL"
 START_FISHEYE = "OPENCV_FISHEYE"
 
-# The gain must be this many standard errors, and this fraction of the error; a smaller one changes no picture.
-_GAIN_DEVIATIONS = 2.0
+# A gain, and an added parameter, must be this many standard deviations from zero.
+DEVIATIONS = 3.0
+# The gain must be this fraction of the error; a smaller one changes no picture.
 _GAIN_FRACTION = 0.001
-# An added parameter must be this many standard deviations from zero.
-_PARAMETER_DEVIATIONS = 3.0
 # Each lens costs some adjustments; beyond this many lenses, and for those with fewer photos, the simplest model stays.
-_MOST_CAMERAS = 4
+# The report has the uncertainty of as many.
+MOST_CAMERAS = 8
 LEAST_PHOTOS = 3
-# Lenses whose uncertainty the report has.
-MOST_DESCRIBED = 8
 
 
 @dataclass(frozen=True)
@@ -88,10 +86,10 @@ def choose_lenses(
     held: dict[int, DeterminedLens] = {}
     result = pycolmap.Reconstruction(model)
     held_out.adjust(result, threads=threads, fixed=fixed)
-    for camera_id in cameras[:_MOST_CAMERAS]:
+    for camera_id in cameras[:MOST_CAMERAS]:
         camera = result.cameras[camera_id]
         exif = (exif_focal_px or {}).get(camera_id)
-        wide = _field_by_exif_deg(camera, exif) > _FISHEYE_FROM_DEG
+        wide = _field_by_exif_deg(camera, exif) > FISHEYE_FROM_DEG
         found = None
         if parameters_of(camera):
             try:
@@ -141,7 +139,7 @@ def choose_lenses(
         camera_id: uncertainty(
             result, camera_id, principal_point=camera_id in freed and camera_id not in strayed, seed=seed, fixed=fixed
         )
-        for camera_id in sorted(photos)[:MOST_DESCRIBED]
+        for camera_id in sorted(photos)[:MOST_CAMERAS]
     }
     return ModelLenses(result, candidates, certain)
 
@@ -263,7 +261,7 @@ class _Choice:
         the axis, and that rotates the poses.
         """
         camera = training.cameras[self.camera_id]
-        wide = field_of_view_deg(camera) > _FISHEYE_FROM_DEG
+        wide = field_of_view_deg(camera) > FISHEYE_FROM_DEG
         if named:
             simple, richer, others = camera.model.name, (camera.model.name,), ()
         elif camera.is_perspective_fisheye():
@@ -285,9 +283,9 @@ class _Choice:
         trial = self._trial(best.model, name, principal_point=principal_point)
         gain, significance = held_out.gain(best.errors, trial.errors), _significance(best, trial, self.camera_id)
         pays = bool(
-            gain > _GAIN_DEVIATIONS
+            gain > DEVIATIONS
             and trial.errors.mean() < (1 - _GAIN_FRACTION) * best.errors.mean()
-            and significance > _PARAMETER_DEVIATIONS
+            and significance > DEVIATIONS
             and is_centred(trial.model.cameras[self.camera_id])
         )
         self._note(trial, gain=gain, significance=significance, kept=pays)

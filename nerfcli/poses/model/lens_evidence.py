@@ -24,11 +24,10 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
 from nerfcli.poses.model import held_out
+from nerfcli.poses.model.held_out import MOST_OBSERVATIONS
 from nerfcli.poses.model.projection import Array, projected
 
 NAMES = ("f", "fa", "cx", "cy", "k1", "k2", "p1", "p2")
-# Beyond this, more observations cost time and change little: clusters, not their members, determine the uncertainty.
-_MOST_OBSERVATIONS = 30_000
 # Other cameras whose focal length and distortion are free too; if there are more, the rest is taken as exact.
 _MOST_OTHERS = 12
 # Relative to the diagonal: the seven directions in which all poses move together are free, and do not affect the lens.
@@ -223,7 +222,7 @@ class _Seen:
 def _observations(model: pycolmap.Reconstruction, lens_of: Mapping[int, int], *, seed: int) -> _Seen:
     finite = [i for i, point in model.points3D.items() if np.isfinite(point.xyz).all()]
     ids = np.array(sorted(finite), dtype=np.int64)
-    kept = _MOST_OBSERVATIONS / max(model.compute_num_observations(), 1)
+    kept = MOST_OBSERVATIONS / max(model.compute_num_observations(), 1)
     if kept < 1:
         ids = ids[np.random.default_rng(seed).uniform(size=len(ids)) < kept]
     images = sorted(model.reg_image_ids())

@@ -28,7 +28,7 @@ from nerfcli.poses.model.lens_evidence import (
 # Probability of freeing a parameter that is in fact zero; it must be small, since eight parts of a scene are few.
 _CHANCE = 5e-4
 # If the standard deviation of the distortion term moves the corner by less than this fraction of its distance from the
-# centre, the term is harmless, and may be free without being significant.
+# centre, the term is harmless, and may be free without being significant; a lens is weakly determined beyond it.
 _HARMLESS = 0.003
 # Relative standard deviation of a focal length by EXIF, and of an unknown one, between a fisheye and a small telephoto
 # lens; the deviation above which a focal length without EXIF is held; and those above which focal length and distortion
@@ -37,7 +37,6 @@ _EXIF_DEVIATION = 0.03
 _UNKNOWN_DEVIATION = 0.35
 _OPEN_DEVIATION = 0.05
 _WEAK_FOCAL = 0.01
-_WEAK_BORDER = 0.005
 # A principal point farther than this from the centre, as a fraction of the size, is a fit to something else.
 PRINCIPAL_POINT_RANGE = 0.1
 
@@ -204,7 +203,7 @@ def uncertainty(
         return nothing | {"reason": str(error)}
     focal = found.deviation("f") / camera.mean_focal_length()
     border = max((_border_px(evidence, found, name) for name in free if name[0] in "kp"), default=None)
-    harmless = _WEAK_BORDER * np.hypot(camera.width, camera.height) / 2
+    harmless = _HARMLESS * np.hypot(camera.width, camera.height) / 2
     return {
         "focal_percent": 100 * focal,
         "principal_point_px": [freed.deviation(name) for name in _PRINCIPAL_POINT],

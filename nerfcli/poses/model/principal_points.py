@@ -17,16 +17,15 @@ from scipy.optimize import least_squares
 from nerfcli.cameras.rigid import transform_from_twist
 from nerfcli.poses.input.job import Report
 from nerfcli.poses.model import held_out
-from nerfcli.poses.model.intrinsics import LEAST_PHOTOS, MOST_DESCRIBED
+from nerfcli.poses.model.intrinsics import DEVIATIONS, LEAST_PHOTOS, MOST_CAMERAS
 from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.lens_observability import PRINCIPAL_POINT_RANGE, uncertainty, with_own_principal_points
 from nerfcli.poses.model.localise import pixels_of, place
 from nerfcli.poses.model.projection import Array, projected
 
-# The principal points stay shared unless their own ones reduce the error of held-out observations by this fraction, and
-# by this many standard errors.
+# The principal points stay shared unless their own ones clearly reduce the error of held-out observations, and by this
+# fraction.
 _GAIN_FRACTION = 0.1
-_GAIN_DEVIATIONS = 3.0
 # Errors are clipped at this multiple of their median: wrong matches must not decide.
 _CLIP = 4.0
 # Photos with fewer observations keep the shared principal point, as do those whose own would be farther from it than
@@ -94,7 +93,7 @@ def choose_principal_points(
     most = _CLIP * float(np.median(before))
     before, after = np.minimum(before, most), np.minimum(after, most)
     gain = held_out.gain(before, after)
-    kept = gain > _GAIN_DEVIATIONS and after.mean() < (1 - _GAIN_FRACTION) * before.mean()
+    kept = gain > DEVIATIONS and after.mean() < (1 - _GAIN_FRACTION) * before.mean()
     evidence = PrincipalPoints(float(before.mean()), float(after.mean()), gain, len(free), bool(kept))
     if not kept:
         report("stabilise", 2, 2)
@@ -178,7 +177,7 @@ def _settled(
         lens: uncertainty(
             own, lens, principal_point=False, seed=seed, fixed=fixed, lens_of=lens_of, shifting=free - held
         )
-        for lens in sorted(set(lens_of.values()))[:MOST_DESCRIBED]
+        for lens in sorted(set(lens_of.values()))[:MOST_CAMERAS]
     }
     return StabilisedModel(own, evidence, certain)
 
