@@ -16,16 +16,11 @@ from nerfcli.multiview.correspondences import radians_per_pixel
 from nerfcli.multiview.features import Matches
 from nerfcli.photos.loading import LoadedPhoto
 
-# Logarithms of factors of the focal length: the limit and the two step sizes of the search. A wrong unit or crop is off
-# by more, and is obvious in every photo.
-FARTHEST, COARSE, FINE = 0.1, 0.01, 0.001
-# Scale of the robust cost in pixels: the larger a miss, the more likely the match is wrong.
-MISS_PX = 1.0
+# Limit of the search in logarithms of factors of the focal length. A wrong unit or crop is off by more, and is obvious
+# in every photo.
+FARTHEST = 0.1
 # The check needs at least this many matches and pairs of photos.
 FEWEST_MATCHES, FEWEST_PAIRS = 60, 10
-MOST_MATCHES = 4000
-# The jackknife divides the photos into this many parts and leaves out one part at a time.
-PARTS = 10
 # Log factors at which rays are computed (Chebyshev nodes); interpolation between them is accurate to 1e-6 rad.
 NODES = FARTHEST * np.cos(np.pi * (np.arange(6) + 0.5) / 6)
 
@@ -50,8 +45,9 @@ class CameraCheck:
 def check_cameras(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> CameraCheck | None:
     """Check cameras against matches; None where there are too few.
 
-    The factor minimises the sum of log(1 + (miss / MISS_PX)^2) over all matches. Its error comes from a jackknife over
-    photos, because a wrong pose moves all matches of a photo alike. Some of the matches may be wrong.
+    The factor minimises the sum of log(1 + miss^2) over all matches, with misses in pixels: the larger a miss, the more
+    likely the match is wrong. Its error comes from a jackknife over photos, because a wrong pose moves all matches of a
+    photo alike.
     """
     usable = [
         matches
@@ -61,22 +57,24 @@ def check_cameras(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> 
     count = sum(len(matches.pixels[0]) for matches in usable)
     if count < FEWEST_MATCHES or len(usable) < FEWEST_PAIRS:
         return None
-    rays = _Rays(photos, usable, every=-(-count // MOST_MATCHES))
+    rays = _Rays(photos, usable, every=-(-count // 4000))  # thousands of matches are enough
 
     def costs(places: np.ndarray) -> np.ndarray:
         """Return the costs (places, pairs) of log factors (places,)."""
         return np.array([rays.sums(np.log1p(np.square(rays.misses(place)))) for place in places])
 
-    coarse = np.arange(-FARTHEST, FARTHEST + COARSE / 2, COARSE)
+    step, fine_step = 0.01, 0.001
+    coarse = np.arange(-FARTHEST, FARTHEST + step / 2, step)
     lowest = int(costs(coarse).sum(1).argmin())
     if lowest in (0, len(coarse) - 1):
         miss = _median_miss(rays, 0.0)
         return CameraCheck(0.0, math.inf, (miss, miss), count)
-    fine = coarse[lowest] + np.arange(-COARSE, COARSE + FINE / 2, FINE)
+    fine = coarse[lowest] + np.arange(-step, step + fine_step / 2, fine_step)
     by_pair = costs(fine)
-    part = np.array([matches.photos for matches in usable]) % PARTS
-    without = np.array([_lowest(fine, by_pair[:, (part != left).all(1)].sum(1)) for left in range(PARTS)])
-    error = float(np.sqrt((PARTS - 1) / PARTS * np.square(without - without.mean()).sum()))
+    parts = 10  # of the photos, of which the jackknife leaves out one at a time
+    part = np.array([matches.photos for matches in usable]) % parts
+    without = np.array([_lowest(fine, by_pair[:, (part != left).all(1)].sum(1)) for left in range(parts)])
+    error = float(np.sqrt((parts - 1) / parts * np.square(without - without.mean()).sum()))
     best = _lowest(fine, by_pair.sum(1))
     return CameraCheck(best, error, (_median_miss(rays, 0.0), _median_miss(rays, best)), count)
 
@@ -96,14 +94,14 @@ class _Rays:
         centres = np.array([photo.frame.centre for photo in photos])
         angles = np.array([radians_per_pixel(photo.frame.camera) for photo in photos])
         self._baselines = centres[indices[:, 1]] - centres[indices[:, 0]]
-        self._units = MISS_PX * angles[indices].max(axis=1)
+        self._pixels = angles[indices].max(axis=1)
 
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Return the sums (pairs,) of values (N,) of the matches of each pair."""
         return np.bincount(self._pair, values, minlength=self._pairs)
 
     def misses(self, log_focal: float) -> np.ndarray:
-        """Return the angles (N,) between rays and their epipolar planes, in units of MISS_PX."""
+        """Return the angles (N,) between rays and their epipolar planes, in pixels."""
         # Lagrange polynomials of the nodes.
         apart = NODES[:, None] - NODES[None, :] + np.eye(len(NODES))
         fractions = np.prod(np.where(np.eye(len(NODES), dtype=bool), 1.0, (log_focal - NODES[None, :]) / apart), axis=1)
@@ -114,7 +112,7 @@ class _Rays:
             length = np.linalg.norm(normal, axis=1)
             # A ray along the baseline has no epipolar plane: its miss is 0.
             away.append(np.abs(np.einsum("ni,ni->n", ray, normal)) / np.maximum(length, 1e-300))
-        return np.maximum(*away) / self._units
+        return np.maximum(*away) / self._pixels
 
 
 def _rays_at_nodes(photos: Sequence[LoadedPhoto], indices: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -133,7 +131,7 @@ def _rays_at_nodes(photos: Sequence[LoadedPhoto], indices: np.ndarray, pixels: n
 
 def _median_miss(rays: _Rays, log_focal: float) -> float:
     """Return the median miss of all matches, pixels."""
-    return MISS_PX * float(np.median(rays.misses(log_focal)))
+    return float(np.median(rays.misses(log_focal)))
 
 
 def _lowest(places: np.ndarray, costs: np.ndarray) -> float:

@@ -14,20 +14,12 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.layout import centres_of, views_of
 from nerfcli.multiview.features import Features, Matches, find_features, mutual_matches
 from nerfcli.multiview.tracks import Tracks, tracks_of_matches, tracks_of_model
+from nerfcli.multiview.triangulation import SAME_SIDE_COS
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.scene import Scene
 
-# Time on one thread to find and match features, per pixel of the photos that are searched: 0.5 to 0.8 us were measured.
-# It only serves to decide whether there is enough time.
-SECONDS_PER_PIXEL = 0.7e-6
 # Photos are reduced to this longer side to find features, so that it takes seconds.
 LONGER_SIDE_PX = 600
-MOST_FEATURES = 1500
-# Number of evenly chosen photos that are compared with others, and the ranks of these others by distance among the
-# photos that look about the same way. Near ones have the most in common, far ones constrain the geometry the most.
-MOST_PHOTOS = 16
-PARTNERS = (1, 3, 9)
-SAME_WAY_COS = np.cos(np.radians(40.0))
 
 
 class SharedFeatures:
@@ -44,7 +36,7 @@ class SharedFeatures:
         wanted = {index for pair in chosen_pairs(self._photos) for index in pair}
         sides = [self._photos[index].pixels.shape[:2] for index in wanted]
         pixels = [height * width * min(1.0, LONGER_SIDE_PX / max(height, width)) ** 2 for height, width in sides]
-        return SECONDS_PER_PIXEL * sum(pixels) / self._threads
+        return 0.7e-6 * sum(pixels) / self._threads  # on one thread, a pixel takes 0.5 to 0.8 us
 
     @cached_property
     def matched(self) -> tuple[Matches, ...]:
@@ -87,11 +79,11 @@ def chosen_pairs(photos: Sequence[LoadedPhoto]) -> list[tuple[int, int]]:
     frames = [photo.frame for photo in photos]
     centres, views = centres_of(frames), views_of(frames)
     pairs: set[tuple[int, int]] = set()
-    for index in np.unique(np.linspace(0, len(frames) - 1, MOST_PHOTOS).round().astype(int)):
+    for index in np.unique(np.linspace(0, len(frames) - 1, 16).round().astype(int)):
         baselines = np.linalg.norm(centres - centres[index], axis=1)
-        candidates = np.flatnonzero((views @ views[index] > SAME_WAY_COS) & (baselines > 0))
+        candidates = np.flatnonzero((views @ views[index] > SAME_SIDE_COS) & (baselines > 0))
         candidates = candidates[np.argsort(baselines[candidates], kind="stable")]
-        for place in PARTNERS:
+        for place in (1, 3, 9):  # near photos have the most in common, far ones constrain the geometry the most
             if place <= len(candidates):
                 other = int(candidates[place - 1])
                 pairs.add((min(int(index), other), max(int(index), other)))
@@ -100,7 +92,7 @@ def chosen_pairs(photos: Sequence[LoadedPhoto]) -> list[tuple[int, int]]:
 
 def _features(photo: LoadedPhoto) -> Features:
     grey = cv2.cvtColor(np.ascontiguousarray(photo.pixels[..., :3]), cv2.COLOR_RGB2GRAY)
-    return find_features(grey, longer_side_px=LONGER_SIDE_PX, most=MOST_FEATURES, used=photo.used)
+    return find_features(grey, longer_side_px=LONGER_SIDE_PX, most=1500, used=photo.used)
 
 
 def _in_common(pair: tuple[int, int], features: tuple[Features, Features]) -> Matches:

@@ -8,21 +8,13 @@ import numpy as np
 from nerfcli.cameras.rigid import apply, inverse
 from nerfcli.media.colours import linear_light
 from nerfcli.multiview.graph import connected_groups
-from nerfcli.multiview.stereo import DenseDepth
+from nerfcli.multiview.stereo import CONSISTENT, DenseDepth
 from nerfcli.photos.loading import LoadedPhoto
 
-# Number of pixels of each photo that are looked up in other photos, and number of other photos (the nearest ones).
-MOST_PIXELS, OTHERS = 2000, 12
-# Two depths of a point agree within this fraction. Only levels between the other two numbers are used.
-CONSISTENT, DARKEST, BRIGHTEST = 0.02, 20, 240
-# Pairs with fewer common pixels are ignored; the weight of a pair is their number, capped because the errors of
-# neighbouring pixels are correlated.
-FEWEST, MOST_WEIGHT = 50, 500
-# Window over which levels are averaged, so that misalignments by a pixel hardly matter.
-WINDOW_PX = 3
-ROUNDS = 5
-# Lower bound of sRGB values (0 to 1), so that logarithms are finite.
-LEAST_LIGHT = 1e-3
+# Only levels between these are used.
+DARKEST, BRIGHTEST = 20, 240
+# Fewer common pixels do not tell the difference of two photos' exposures.
+FEWEST_PIXELS = 50
 
 
 def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]) -> np.ndarray:
@@ -32,8 +24,9 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
     least absolute errors. NaN for photos that share too little with the others to be compared.
     """
     levels = [np.ascontiguousarray(photo.pixels[..., :3]) for photo in photos]
-    around = [cv2.blur(pixels, (WINDOW_PX, WINDOW_PX)).astype(np.float64) / 255.0 for pixels in levels]
-    light = [linear_light(np.maximum(pixels, LEAST_LIGHT)) for pixels in around]
+    # Averaged, so that misalignments by a pixel hardly matter, and not 0, so that logarithms are finite.
+    around = [cv2.blur(pixels, (3, 3)).astype(np.float64) / 255.0 for pixels in levels]
+    light = [linear_light(np.maximum(pixels, 1e-3)) for pixels in around]
     maps = []
     for photo, depth in zip(photos, dense, strict=True):
         distances = np.full(photo.pixels.shape[:2], np.nan)
@@ -43,12 +36,12 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
     pairs, ratios, counts = [], [], []
     generator = np.random.default_rng(0)
     for one, (photo, depth) in enumerate(zip(photos, dense, strict=True)):
-        chosen = generator.permutation(len(depth.pixels))[:MOST_PIXELS]
+        chosen = generator.permutation(len(depth.pixels))[:2000]
         pixels = depth.pixels[chosen]
         bearings, _ = photo.frame.camera.bearings(pixels + 0.5)
         points = apply(photo.frame.world_from_cam, bearings * depth.distances[chosen][:, None])
-        near = np.argsort(np.linalg.norm(centres - centres[one], axis=1), kind="stable")[1 : OTHERS + 1]
-        for other in near.tolist():
+        apart = np.linalg.norm(centres - centres[one], axis=1)
+        for other in np.argsort(apart, kind="stable")[1:13].tolist():  # the nearest twelve
             second = photos[other]
             camera = second.frame.camera
             away = np.linalg.norm(points - second.frame.centre, axis=1)
@@ -59,12 +52,12 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
                 seen &= np.abs(maps[other][row, column] / np.maximum(away, 1e-12) - 1.0) < CONSISTENT
             both = np.concatenate([levels[one][pixels[:, 1], pixels[:, 0]], levels[other][row, column]], axis=1)
             seen &= ((both > DARKEST) & (both < BRIGHTEST)).all(1)
-            if seen.sum() < FEWEST:
+            if seen.sum() < FEWEST_PIXELS:
                 continue
             ratio = light[other][row[seen], column[seen]] / light[one][pixels[seen, 1], pixels[seen, 0]]
             pairs.append((one, other))
             ratios.append(np.median(np.log(ratio), axis=0))
-            counts.append(min(int(seen.sum()), MOST_WEIGHT))
+            counts.append(min(int(seen.sum()), 500))  # errors of neighbouring pixels are correlated
     return _gains(len(photos), np.array(pairs).reshape(-1, 2), np.array(ratios).reshape(-1, 3), np.array(counts))
 
 
@@ -85,7 +78,7 @@ def _gains(count: int, pairs: np.ndarray, ratios: np.ndarray, weights: np.ndarra
     for channel in range(3):
         wanted = np.append(ratios[inside, channel], 0.0)
         robust, found = np.ones(len(first)), np.zeros(len(group))
-        for _ in range(ROUNDS):
+        for _ in range(5):
             root = np.append(np.sqrt(weights[inside] * robust), 1.0)
             found = np.linalg.lstsq(design * root[:, None], wanted * root, rcond=None)[0]
             robust = 1.0 / np.maximum(np.abs(design[:-1] @ found - wanted[:-1]), 0.01)

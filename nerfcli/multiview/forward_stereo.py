@@ -28,11 +28,6 @@ LEAST_FORWARD_COS = 0.5
 LEAST_TANGENT, MOST_TANGENT = 0.05, 3.7
 # The largest magnification from one photo to the other that is searched.
 MOST_MAGNIFICATION = 3.0
-# Pixels of the sampled picture, as a multiple of the photo's, and how much finer its columns are than its rows: with 1
-# and 1, 72 % of the depths of a room are within 2 %, with 1 and 2 75 %, with 2 and 2 81 % in 1.5 times the time.
-ENLARGEMENT, NARROWING = 1.0, 2.0
-# Directions around the baseline are counted in this many sectors, to find those that the photo shows.
-SECTORS = 360
 
 
 def forward_depths(one: View, other: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -145,8 +140,9 @@ def _grid(logs: np.ndarray, around: np.ndarray, span: tuple[float, float], *, fo
     first, angle = _sector(around)
     extent = float(np.ptp(logs))
     full = focal * math.exp(float(logs.max()))  # as fine as the photo where that is coarsest
-    by_area = math.sqrt(ENLARGEMENT * logs.size / (angle * max(extent, 1e-3)))
-    scale, row_scale = (min(full, by_area * factor) for factor in (math.sqrt(NARROWING), 1.0 / math.sqrt(NARROWING)))
+    by_area = math.sqrt(logs.size / (angle * max(extent, 1e-3)))  # as many pixels as the photo
+    finer = math.sqrt(2.0)  # columns are twice as fine as rows
+    scale, row_scale = (min(full, by_area * factor) for factor in (finer, 1.0 / finer))
     count = disparity_count((span[1] - span[0]) * scale)
     return _Grid(
         float(logs.max() if is_ahead else logs.min()),
@@ -182,11 +178,11 @@ def _range(seen: np.ndarray, baseline: float) -> tuple[float, float] | None:
 
 def _sector(angles: np.ndarray) -> tuple[float, float]:
     """Return where the sector that contains these angles (N,) begins, and how large it is, radians; 2 pi at most."""
-    numbers = np.unique(np.floor(angles * (SECTORS / (2.0 * math.pi))).astype(np.int64) % SECTORS)
-    gaps = np.diff(numbers, append=numbers[0] + SECTORS)
+    degrees = np.unique(np.floor(angles * (360 / (2.0 * math.pi))).astype(np.int64) % 360)
+    gaps = np.diff(degrees, append=degrees[0] + 360)
     largest = int(gaps.argmax())
-    size = SECTORS + 1 - int(gaps[largest])
-    return 2.0 * math.pi / SECTORS * float(numbers[(largest + 1) % len(numbers)]), 2.0 * math.pi / SECTORS * size
+    size = 361 - int(gaps[largest])
+    return 2.0 * math.pi / 360 * float(degrees[(largest + 1) % len(degrees)]), 2.0 * math.pi / 360 * size
 
 
 def _sampled(view: View, axes: np.ndarray, u: np.ndarray, phi: np.ndarray) -> np.ndarray:

@@ -13,21 +13,20 @@ import cv2
 import numpy as np
 
 from nerfcli.cameras.rigid import apply, inverse
+from nerfcli.multiview.sky import LONGER_SIDE_PX, MOST_DIFFERENCE, OTHERS, WINDOW_PX
 from nerfcli.multiview.stereo import DenseDepth
+from nerfcli.multiview.triangulation import MOST_POINTS
 from nerfcli.photos.loading import LoadedPhoto
 
-# Size at which photos are compared, the number of other photos that each is compared with (the nearest ones), and the
-# most pixels with a known depth that are used of each.
-LONGER_SIDE_PX, OTHERS, MOST_POINTS = 160, 6, 20_000
 # Two depths at the same place are of one surface if they differ by less than this fraction. Depths with larger expected
 # errors are not used: a wrong surface is contradicted, too.
 SAME_SURFACE = 0.03
-# Levels that differ by more than the first number do not agree, nor by more than this many standard deviations between
-# the other photos; levels that differ by less than the third number agree.
-DIFFERENT, DIFFERENT_SPREADS, ALIKE = 32.0, 2.0, 16.0
-# The window in which detail is compared, its correlation below which it is different and above which it is the same,
-# and the standard deviation of levels below which there is no detail.
-WINDOW_PX, UNLIKE, LIKE, LEAST_DETAIL = 7, 0.4, 0.8, 8.0
+# Levels that differ by more than `MOST_DIFFERENCE` and by more than this many standard deviations between the other
+# photos do not agree; levels that differ by less than the second number agree.
+DIFFERENT_SPREADS, ALIKE = 2.0, 16.0
+# The correlation of detail below which it is different and above which it is the same, and the standard deviation of
+# levels below which there is no detail.
+UNLIKE, LIKE, LEAST_DETAIL = 0.4, 0.8, 8.0
 # A photo is not judged if less than this fraction of the pixels that agree with others has a depth of its own: stereo
 # matching with it has failed, as with a wrong pose.
 LEAST_KNOWN = 0.5
@@ -42,11 +41,6 @@ MOST_OPEN = 0.25
 # A region with a border of which more than the second number is nearer than this fraction of what it hides continues a
 # known surface.
 NEARER, MOST_NEARER = 0.94, 0.25
-# Narrower gaps in an occluder look like what it hides by chance. Pixels at its edge are mixed with what is behind it:
-# this many pixels around it belong to it.
-GAP_PX, MARGIN_PX = 7, 2
-# sRGB levels are about this power of light.
-GAMMA = 1.0 / 2.2
 
 
 def occluder_masks(
@@ -68,7 +62,7 @@ def occluder_masks(
         skies: (H, W) masks of pixels that may show the sky, which hides nothing.
         log_gains: (photos, 3) logarithms of the photos' exposures; NaN where unknown.
     """
-    gains = np.exp(GAMMA * np.nan_to_num(log_gains))
+    gains = np.exp((1.0 / 2.2) * np.nan_to_num(log_gains))  # of sRGB levels, about this power of light
     centres = np.array([photo.frame.centre for photo in photos])
     with ThreadPoolExecutor(max(1, threads)) as pool:
         small = list(pool.map(_Small, photos, dense, skies, gains))
@@ -183,9 +177,9 @@ def _hidden(own: _Small, others: Sequence[_Small]) -> np.ndarray:
         if core.sum() < enough or unknown[edge].mean() > MOST_OPEN or _continues(own, expected, core):
             continue
         mask |= region
-    whole = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))
-    side = 2 * MARGIN_PX + 1
-    return cv2.dilate(whole, np.ones((side, side), np.uint8)) > 0
+    # Narrow gaps look like what is hidden by chance; pixels at the edge are mixed with what is behind.
+    whole = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((WINDOW_PX, WINDOW_PX), np.uint8))
+    return cv2.dilate(whole, np.ones((5, 5), np.uint8)) > 0
 
 
 def _compared(own: _Small, expected: _Expected, compared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -198,7 +192,7 @@ def _compared(own: _Small, expected: _Expected, compared: np.ndarray) -> tuple[n
     correlation, detail = _correlation(own.levels.mean(-1), expected.levels.mean(-1), compared)
     with np.errstate(invalid="ignore"):  # NaN, where nothing is expected, is neither
         agrees = compared & ((outside < ALIKE) | (correlation > LIKE))
-        differs = outside > np.maximum(DIFFERENT, DIFFERENT_SPREADS * expected.spreads)
+        differs = outside > np.maximum(MOST_DIFFERENCE, DIFFERENT_SPREADS * expected.spreads)
     return agrees, compared & differs & (correlation < UNLIKE) & (detail > LEAST_DETAIL)
 
 

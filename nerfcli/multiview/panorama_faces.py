@@ -10,9 +10,8 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.multiview.tracks import Tracks
 from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.photos.undistorted import WIDEST_DEG
 
-# Field of view of a face; neighbouring faces overlap.
-FACE_DEG = 100.0
 # Rotations panorama_from_face: front, right, back, left, up, down.
 _TURNS = np.array(
     [
@@ -84,7 +83,7 @@ def _face(photo: LoadedPhoto, turn: np.ndarray) -> LoadedPhoto:
     """Return a face of a panorama, at the panorama's resolution in the middle."""
     camera = photo.frame.camera
     focal_px = camera.width / (2 * math.pi)
-    side = max(1, round(2 * focal_px * math.tan(math.radians(FACE_DEG / 2))))
+    side = max(1, round(2 * focal_px * math.tan(math.radians(WIDEST_DEG / 2))))  # neighbouring faces overlap
     pinhole = Camera.pinhole(side, side, focal_px)
     directions, _ = pinhole.pixel_bearings()
     # The centre of the first pixel is at 0.5 here and at 0 in OpenCV.

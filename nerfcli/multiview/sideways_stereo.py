@@ -16,12 +16,10 @@ from nerfcli.multiview.stereo_view import (
     range_of,
 )
 
-PLANE_ROUNDS = 10
 # If the plane is narrower or wider than this in the other photo, its view is too oblique for the plane to be used.
 LEAST_NARROWING, MOST_NARROWING = 0.3, 3.0
 # Pairs cannot be rectified if the cosine between the baseline and the viewing direction is larger than this.
 MOST_FORWARD_COS = 0.85
-MOST_ENLARGEMENT = 4.0
 # Points at a smaller cosine to the common viewing direction of a pair are left out.
 LEAST_RISE = 0.2
 
@@ -64,7 +62,7 @@ def sideways_depths(one: View, other: View, points: np.ndarray) -> tuple[np.ndar
     top, bottom = max(low[1], other_low[1]), min(high[1], other_high[1])
     # The matcher skips as many columns on the left as there are disparities. The least disparity is made 0.
     width, height = int(high[0] - low[0]) + 1 + count, int(bottom - top)
-    if height < 2 * BLOCK_PX or width * height > MOST_ENLARGEMENT * one.grey.size:
+    if height < 2 * BLOCK_PX or width * height > 4 * one.grey.size:
         return None
     picture = np.array([[focal, 0.0, count - low[0]], [0.0, focal, -top], [0.0, 0.0, 1.0]])
     homography = picture @ turned @ one.turn.T @ np.linalg.inv(one.matrix)
@@ -96,7 +94,7 @@ def _fitted_plane(places: np.ndarray, values: np.ndarray) -> np.ndarray:
     floor = 1e-3 * float(np.median(np.abs(values)))
     weights = np.ones(len(values))
     plane = np.zeros(3)
-    for _ in range(PLANE_ROUNDS):
+    for _ in range(10):
         plane = np.linalg.lstsq(design * np.sqrt(weights)[:, None], values * np.sqrt(weights), rcond=None)[0]
         weights = 1.0 / np.maximum(np.abs(design @ plane - values), floor)
     return plane

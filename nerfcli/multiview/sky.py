@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from nerfcli.multiview.exposures import FEWEST_PIXELS
 from nerfcli.multiview.tracks import Tracks
-from nerfcli.multiview.triangulation import triangulate
+from nerfcli.multiview.triangulation import MOST_POINTS, triangulate
 from nerfcli.photos.loading import LoadedPhoto
 
 # Size at which photos are compared, and number of other photos that each is compared with.
@@ -24,20 +25,15 @@ MOST_SPREAD, WINDOW_PX = 6.0, 7
 MOST_DIFFERENCE, WHITE = 32.0, 245.0
 # Photos that look elsewhere show another part of the sky.
 SAME_WAY_COS = np.cos(np.radians(60.0))
-# Regions are one sky if less than this separates them: a line of 2 pixels, around which a window has texture.
-LINKED_PX = WINDOW_PX + 2
-# Smallest sky region, as a fraction of the photo. Fewest pixels for a gain, and fewest in a region that must agree.
-LEAST_PART, FEWEST_SHARED = 0.005, 50
+# Smallest sky region, as a fraction of the photo.
+LEAST_PART = 0.005
 # A region may be sky if more than this fraction of its pixels that other photos see agrees with them.
 MOST_OF = 0.25
 # Fewest photos that see a point: among matches of two photos are wrong ones.
 FEWEST_SIGHTINGS = 3
 # A sky has fewer points before it than this fraction of what it would have as a surface, and fewer than the second
-# number: measured 0, 0 and 0.4 % for three skies, 1.3, 3.1 and 8.9 % for the white walls and ceilings of three rooms.
-# With fewer points than the third number to expect, a wall might have none either.
+# number. With fewer points than the third number to expect, a wall might have none either.
 MOST_BEFORE, FEWEST_BEFORE, FEWEST_EXPECTED = 0.008, 3, 400.0
-# More points than this are thinned out evenly.
-MOST_POINTS = 20_000
 # Poses are not exact: points within this fraction of the longer side of the region's border do not count.
 BORDER = 0.02
 
@@ -155,7 +151,7 @@ def _agreed(own: _Small, others: Sequence[_Small], up: np.ndarray) -> np.ndarray
         theirs, plain = other.levels[row, column], other.plain[row, column] & seen
         for_gain = plain & (mine < WHITE).all(1) & (theirs < WHITE).all(1)
         gain = np.ones(3)
-        if for_gain.sum() >= FEWEST_SHARED:
+        if for_gain.sum() >= FEWEST_PIXELS:
             gain = np.median(theirs[for_gain] / np.maximum(mine[for_gain], 1.0), axis=0)
         expected = np.minimum(mine * gain, 255.0)
         off = np.abs(np.where(theirs < WHITE, expected - theirs, np.minimum(expected - WHITE, 0.0))).max(1)
@@ -177,10 +173,11 @@ def _regions(
     labels = labels.astype(np.int64)
     of_candidate = labels.ravel()[candidate]
     sizes, agreeing, visible = (np.bincount(of_candidate, which, count) for which in (None, agreed, seen))
-    kept = (agreeing > MOST_OF * visible) & (agreeing >= FEWEST_SHARED) & (sizes >= LEAST_PART * mask.size)
+    kept = (agreeing > MOST_OF * visible) & (agreeing >= FEWEST_PIXELS) & (sizes >= LEAST_PART * mask.size)
     kept[0] = False
-    # Wires and poles divide a sky, but do not bound it.
-    linked = cv2.connectedComponents(cv2.dilate(mask.reshape(shape), np.ones((LINKED_PX, LINKED_PX), np.uint8)))[1]
+    # Wires and poles, up to 2 pixels wide and with texture in a window around them, divide a sky, but do not bound it.
+    window = np.ones((WINDOW_PX + 2, WINDOW_PX + 2), np.uint8)
+    linked = cv2.connectedComponents(cv2.dilate(mask.reshape(shape), window))[1]
     return kept[labels] & np.isin(linked, linked[uppermost & (labels > 0)])
 
 

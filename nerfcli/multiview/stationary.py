@@ -24,20 +24,18 @@ _LEAST_STILL_PX = 0.75
 # motion that changes smoothly over the picture, eight times as many would have moved that far as stayed still.
 _RING = 3.0
 _LEAST_PEAK = 2.0
-# Largest shift of the whole background, as from a tripod that gives way, in tolerances.
-_SHAKEN = 4.0
-# A match that moved by more than this many tolerances moved for certain.
+# A match that moved by more than this many tolerances moved for certain. The whole background may be shifted by less,
+# as from a tripod that gives way.
 _MOVED = 4.0
 _LEAST_MATCHES = 15
-_LEAST_FOR_GEOMETRY = 12
 # If one geometry explains this fraction of the still and of the moving matches to within 2 tolerances, they are one
 # motion.
 _MOST_AGREEING = 0.7
 # Cells (columns, rows) of the picture in which still matches are counted.
 _CELLS = (16, 12)
 
-# Least `Stationary.fraction`, the fraction of the pairs with any motion that show two motions. Measured: all of them on
-# turntables, none on captures with a moving camera.
+# Least `Stationary.fraction`, the fraction of the pairs with any motion that show two motions. All pairs of
+# turntables do, none of captures with a moving camera.
 LEAST_FRACTION = 0.5
 _LEAST_PAIRS = 3
 # Still matches that cover less of the picture are a time stamp or a watermark, not a background.
@@ -140,7 +138,7 @@ def in_place(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> tuple[np.nd
     """
     within = still_px(size)
     motion = y - x
-    small = motion[np.linalg.norm(motion, axis=1) < _SHAKEN * within]
+    small = motion[np.linalg.norm(motion, axis=1) < _MOVED * within]
     shift = np.zeros(2)
     if len(small) >= _LEAST_MATCHES:
         starts = np.zeros(2), np.median(small, axis=0)
@@ -220,4 +218,4 @@ def _common(x: np.ndarray, y: np.ndarray, *, one: np.ndarray, other: np.ndarray,
 
 
 def _geometry(x: np.ndarray, y: np.ndarray, within: float) -> tuple[np.ndarray, np.ndarray]:
-    return fundamental_matrix(x, y, within_px=within, least=_LEAST_FOR_GEOMETRY)
+    return fundamental_matrix(x, y, within_px=within, least=_LEAST_MATCHES)

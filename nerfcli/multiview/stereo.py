@@ -17,29 +17,19 @@ from nerfcli.multiview.panorama_faces import FACES, Faces
 from nerfcli.multiview.sideways_stereo import sideways_depths
 from nerfcli.multiview.stereo_view import BLOCK_PX, FEWEST_SHARED, View, seen_by, view_of
 from nerfcli.multiview.tracks import Tracks
-from nerfcli.multiview.triangulation import LEAST_ANGLE_RAD, triangulate
+from nerfcli.multiview.triangulation import LEAST_ANGLE_RAD, MOST_POINTS, SAME_SIDE_COS, triangulate
 from nerfcli.photos.loading import LoadedPhoto
 
-# Photos that each photo is matched with, and how many of them have to agree on a depth. On the desk scene, 44 % of the
-# pixels are within 1 % of the truth with three neighbours and 52 % with four, in 1.3 times the time.
+# Photos that each photo is matched with, and how many of them have to agree on a depth.
 NEIGHBOURS, LEAST_AGREEING = 4, 2
 # Largest size at which pictures are matched; below the smaller size, matching finds too little. The size is chosen by
 # the measured time per pixel on one thread, which is only an estimate.
 LONGER_SIDE_PX, LEAST_SIDE_PX = 480, 160
 SECONDS_PER_PIXEL = 1.5e-6
-# Best angle between rays of two photos, and how fast pairs at smaller and larger angles get worse. Source: Yao et al.
-# 2018, MVSNet, arXiv:1804.02505, section 4.1.
-BEST_ANGLE_DEG, SMALLER_DEG, LARGER_DEG = 5.0, 1.0, 10.0
-# A point counts as seen by photos that look at it within this angle of a photo in which it was found.
-SAME_SIDE_COS = np.cos(np.radians(40.0))
-# More points take time and memory, but do not change the result.
-MOST_POINTS = 20_000
 # Depths of two photos at the same place agree within this fraction.
 CONSISTENT = 0.02
 # Two depths agree within this many times the sum of their standard errors plus this fraction of the depth.
 AGREE_ERRORS, AGREE_PART = 0.7, 0.005
-# Where grey levels spread by less than this, there is nothing to match.
-LEAST_SPREAD = 3.0
 
 
 @dataclass(frozen=True)
@@ -146,15 +136,19 @@ def _points_shown(photos: Sequence[LoadedPhoto], tracks: Tracks) -> tuple[np.nda
 
 
 def _neighbours(points: np.ndarray, shown: np.ndarray, centres: np.ndarray) -> list[list[int]]:
-    """Return for each photo the photos to match it with, the best first."""
+    """Return for each photo the photos to match it with, the best first.
+
+    Rays at an angle of 5 degrees are best, and smaller angles worse than larger ones.
+    Source: Yao et al. 2018, MVSNet, arXiv:1804.02505, section 4.1.
+    """
     rays = (points - centres[:, None]).astype(np.float32)
     rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
     found = []
     for index in range(len(centres)):
         both = shown & shown[index]
         angles = np.arccos(np.clip(np.einsum("opi,pi->op", rays, rays[index]), -1.0, 1.0))
-        off = np.degrees(angles) - BEST_ANGLE_DEG
-        fits = np.exp(-0.5 * np.square(off / np.where(off < 0, SMALLER_DEG, LARGER_DEG)))
+        off = np.degrees(angles) - 5.0
+        fits = np.exp(-0.5 * np.square(off / np.where(off < 0, 1.0, 10.0)))
         scores = np.where(both & (angles > LEAST_ANGLE_RAD), fits, 0.0).sum(1)
         scores[(both.sum(1) < FEWEST_SHARED) | (np.arange(len(centres)) == index)] = 0.0
         order = np.argsort(-scores, kind="stable")[:NEIGHBOURS]
@@ -207,7 +201,7 @@ def _has_texture(grey: np.ndarray) -> np.ndarray:
     levels = grey.astype(np.float32)
     window = (2 * BLOCK_PX + 1, 2 * BLOCK_PX + 1)
     mean = cv2.blur(levels, window)
-    return cv2.blur(levels * levels, window) - mean * mean > LEAST_SPREAD**2
+    return cv2.blur(levels * levels, window) - mean * mean > 3.0**2
 
 
 def _agreed(

@@ -14,15 +14,10 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.undistorted import pinhole_of, undistorted
 
-# The fewest points that determine the range of disparities of a pair, and the most disparities that are searched.
-FEWEST_SHARED, MOST_DISPARITIES = 12, 256
-# The range is between these percentiles of the points' values, extended at either end by this fraction of their
-# difference.
-RANGE_PERCENTILES, BEYOND = (0.5, 99.5), 0.5
-# Least extension at either end, as a fraction of the typical value.
-LEAST_RANGE = 0.15
+# The fewest points that determine the range of disparities of a pair.
+FEWEST_SHARED = 12
 BLOCK_PX = 5
-# Error of a disparity, pixels: two thirds of the pixels of the desk scene have at most this error.
+# Error of a disparity, pixels: two thirds of the pixels have at most this error.
 DISPARITY_ERROR_PX = 0.8
 
 
@@ -82,14 +77,14 @@ def seen_by(
 
 def range_of(values: np.ndarray, typical: float) -> tuple[float, float]:
     """Return the range in which to search, from the values (N,) of the points and the typical size of such values."""
-    least, most = np.percentile(values, RANGE_PERCENTILES)
-    margin = max(BEYOND * (most - least), LEAST_RANGE * typical)
+    least, most = np.percentile(values, (0.5, 99.5))
+    margin = max(0.5 * (most - least), 0.15 * typical)  # surfaces between the points may be nearer or farther
     return least - margin, most + margin
 
 
 def disparity_count(columns: float) -> int:
-    """Return how many disparities to search for a range in columns; the matcher needs a multiple of 16."""
-    return 16 * int(np.clip(math.ceil(columns / 16), 1, MOST_DISPARITIES // 16))
+    """Return how many disparities to search for a range in columns: a multiple of 16, 256 at most."""
+    return 16 * int(np.clip(math.ceil(columns / 16), 1, 16))
 
 
 def disparities(left: np.ndarray, right: np.ndarray, count: int) -> np.ndarray:

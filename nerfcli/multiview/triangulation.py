@@ -12,8 +12,10 @@ from nerfcli.multiview.tracks import Tracks
 WITHIN_PX = 3.0
 # Rays that meet at a smaller angle do not determine the distance: half a pixel would change it by a tenth or more.
 LEAST_ANGLE_RAD = np.radians(1.0)
-# After the first round, sightings that were far off are left out.
-ROUNDS = 2
+# A point counts as seen by photos that look at it within this angle of a photo in which it was found.
+SAME_SIDE_COS = np.cos(np.radians(40.0))
+# More points take time and memory, but do not change what they are used for.
+MOST_POINTS = 20_000
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ def triangulate(frames: Sequence[Frame], tracks: Tracks) -> Surface:
     px = np.array([1.0 / frame.camera.focal_px for frame in frames])[tracks.photos]
     misses = np.where(np.isfinite(tracks.rays).all(axis=1), 0.0, np.nan)
     points = np.full((tracks.count, 3), np.nan)
-    for _ in range(ROUNDS):
+    for _ in range(2):  # the second time without sightings that were far off
         points = _nearest(origins, tracks, np.isfinite(misses))
         away = points[tracks.points] - origins
         across = np.linalg.norm(np.cross(tracks.rays, away), axis=1)
