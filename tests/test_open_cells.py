@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerfcli import distributed, kernels
 from nerfcli.field.hash_field import HashField, HashFieldSettings
-from nerfcli.fit.open_cells import FINE_SIDE, LOOK_AROUND_EVERY, OCCUPANCY_SIDE, REFRESH_EVERY, REFRESH_TURNS, OpenCells
+from nerfcli.fit.open_cells import FINE_SIDE, OCCUPANCY_SIDE, REFRESH_EVERY, REFRESH_TURNS, OpenCells
 from nerfcli.kernels import March, Rays, numba_cpu, reference
 from nerfcli.render.model import Marching
 
@@ -113,7 +113,7 @@ def test_cells_close_where_samples_found_nothing_and_only_there():
     visit(cells, full, 0.5)
     visit(cells, empty, 1e-3)
     refresh(cells, REFRESH_EVERY)
-    fine, coarse = cells.at(1), cells.at(LOOK_AROUND_EVERY)
+    fine, coarse = cells.at(1), cells.at(REFRESH_EVERY)
     assert fine.shape == (FINE_SIDE,) * 3
     assert coarse.shape == (OCCUPANCY_SIDE,) * 3
     assert coarse[:, :, : OCCUPANCY_SIDE // 2].all()
@@ -225,7 +225,7 @@ def test_a_restored_state_goes_on_as_the_saved_one():
         if turn == 2:
             refresh(first, turn * REFRESH_EVERY)
             refresh(second, turn * REFRESH_EVERY)
-        for step in (1, LOOK_AROUND_EVERY):
+        for step in (1, REFRESH_EVERY):
             assert torch.equal(first.at(step), second.at(step))
     assert not second.at(1)[0, 0, 1]
 

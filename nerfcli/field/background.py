@@ -5,9 +5,6 @@ from torch import Tensor, nn
 
 Colour = tuple[float, float, float]
 
-# Vertices per axis of the grid of a sphere: its cells are 3.7 degrees wide.
-SPHERE_SIDE = 32
-
 
 class SphereBackground(nn.Module):
     """sRGB by direction: a grid over the cube around the unit sphere, interpolated at the direction, then a sigmoid.
@@ -15,10 +12,10 @@ class SphereBackground(nn.Module):
     Interpolation is trilinear, with no seam and no pole. A grid of a single vertex is one learned colour.
 
     Args:
-        side: vertices per axis.
+        side: vertices per axis; with 32, cells are 3.7 degrees wide.
     """
 
-    def __init__(self, side: int = SPHERE_SIDE):
+    def __init__(self, side: int = 32):
         super().__init__()
         self.logits = nn.Parameter(torch.zeros(3, side, side, side))
 

@@ -7,20 +7,20 @@ have mean 0 over the photos: what all photos have in common is left to the field
 import torch
 from torch import Tensor, nn
 
-# The end of the linear piece of the sRGB curve, in sRGB and in linear light, IEC 61966-2-1.
-_SRGB_BORDER, _LINEAR_BORDER = 0.04045, 0.0031308
-
 
 def linear_from_srgb(levels: Tensor) -> Tensor:
-    """Convert sRGB levels >= 0 to linear light; levels above 1 continue along the curve. Differentiable."""
-    curved = ((levels.clamp_min(_SRGB_BORDER) + 0.055) / 1.055) ** 2.4
-    return torch.where(levels <= _SRGB_BORDER, levels / 12.92, curved)
+    """Convert sRGB levels >= 0 to linear light; levels above 1 continue along the curve. Differentiable.
+
+    Source: IEC 61966-2-1.
+    """
+    curved = ((levels.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(levels <= 0.04045, levels / 12.92, curved)
 
 
 def srgb_from_linear(light: Tensor) -> Tensor:
     """Convert linear light >= 0 to sRGB levels, not clipped. Differentiable."""
-    curved = 1.055 * light.clamp_min(_LINEAR_BORDER) ** (1 / 2.4) - 0.055
-    return torch.where(light <= _LINEAR_BORDER, light * 12.92, curved)
+    curved = 1.055 * light.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(light <= 0.0031308, light * 12.92, curved)
 
 
 def exposed(rgb: Tensor, log_gains: Tensor) -> Tensor:

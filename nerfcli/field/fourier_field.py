@@ -8,14 +8,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from nerfcli.field.hash_field import HARMONICS
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.kernels import spherical_harmonics
 from nerfcli.kernels.activations import density_from_log
-
-HARMONICS = 16
-# Wide layers change more by the same step: the rate is proportional to 1 / width, and is RATE at RATE_WIDTH.
-# Source: Yang et al. 2022, Tensor programs V, arXiv:2203.03466, table 3.
-RATE, RATE_WIDTH = 0.3, 64
 
 
 @dataclass(frozen=True)
@@ -53,7 +49,9 @@ class FourierField(Field):
     def __init__(self, settings: FourierFieldSettings):
         super().__init__(settings)
         width = settings.width
-        self.rate_factor = RATE * RATE_WIDTH / width
+        # Wide layers change more by the same step: the rate is proportional to 1 / width.
+        # Source: Yang et al. 2022, Tensor programs V, arXiv:2203.03466, table 3.
+        self.rate_factor = 0.3 * 64 / width
         sizes = (6 * settings.octaves, *[width] * settings.layers)
         self.trunk = nn.Sequential()
         for inputs, outputs in pairwise(sizes):

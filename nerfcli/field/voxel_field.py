@@ -9,9 +9,7 @@ from torch import Tensor, nn
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.kernels import spherical_harmonics
 from nerfcli.kernels.activations import density_from_log
-
-# Row width of the compiled interpolation.
-FEATURES = 4
+from nerfcli.kernels.interface import FEATURES
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,8 @@ import numpy as np
 
 from nerfcli.cameras.rigid import Similarity, rotation_from_vector, vector_from_rotation
 
-# Cameras whose spread is below this distance are in one place: they have only a rotation and a translation in common.
-LEAST_REACH = 1e-9
 # Fewer cameras leave too few residuals to weight rotations against translations.
 LEAST_TOLD = 6
-_ROUNDS, _MOST_WEIGHT = 10, 100.0
 
 
 def mean_similarity(before: np.ndarray, after: np.ndarray) -> Similarity:
@@ -36,7 +33,7 @@ def mean_similarity(before: np.ndarray, after: np.ndarray) -> Similarity:
     middle = centres.mean(axis=0)
     arms = centres - middle
     reach = float(np.sqrt((arms**2).sum(axis=1).mean()))
-    reach = reach if reach > LEAST_REACH else 1.0
+    reach = reach if reach > 1e-9 else 1.0  # cameras in one place have only a rotation and a translation in common
     turns = reach * vector_from_rotation(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], -1, -2))
     moves = after[:, :3, 3] - centres
     rows = np.zeros((len(before), 6, 7))
@@ -47,11 +44,11 @@ def mean_similarity(before: np.ndarray, after: np.ndarray) -> Similarity:
     wanted = np.concatenate([turns, moves], axis=1)
     weights = np.ones(6)
     found = _least_squares(rows, wanted, weights)
-    for _ in range(_ROUNDS if len(before) >= LEAST_TOLD else 0):
+    for _ in range(10 if len(before) >= LEAST_TOLD else 0):
         left = ((wanted - rows @ found) ** 2).reshape(-1, 2, 3).mean(axis=(0, 2)) ** 0.5
         if not left.any():
             break
-        weights = np.repeat(left.max() / np.maximum(left, left.max() / _MOST_WEIGHT), 3)
+        weights = np.repeat(left.max() / np.maximum(left, left.max() / 100.0), 3)
         found = _least_squares(rows, wanted, weights)
     rotation, scale = rotation_from_vector(found[:3]), float(np.exp(found[6]))
     return Similarity(scale, rotation, middle + found[3:6] - scale * rotation @ middle)

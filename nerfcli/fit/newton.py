@@ -7,7 +7,6 @@ from torch import Tensor, nn
 MEMORY = 0.95
 # Added to losses: smaller ones, those of about one level of 255, give no reliable curvature.
 _LEAST_LOSS = 3e-5
-_FLOOR = 1e-12
 # In square pixels. Photos are held no tighter when their mean motion is below this.
 _LEAST_SPREAD = 0.05
 
@@ -61,9 +60,10 @@ class NewtonSteps(nn.Module):
             damping: of each parameter by itself; poorly determined ones move slowly.
             holding: strength with which changes of less than a pixel are held back.
         """
-        curvature = self.curvature / self.weight.clamp_min(_FLOOR)
+        floor = 1e-12
+        curvature = self.curvature / self.weight.clamp_min(floor)
         diagonal = torch.diagonal(curvature, dim1=-2, dim2=-1)
         spread = (self._picture_px * so_far.square()).view(-1, 2, 3).sum(-1).mean(0)
         held = holding * diagonal.mean(0) / spread.clamp_min(_LEAST_SPREAD).square().repeat_interleave(3)
-        matrix = curvature + torch.diag_embed(damping * diagonal + held + _FLOOR)
+        matrix = curvature + torch.diag_embed(damping * diagonal + held + floor)
         return -torch.linalg.solve(matrix, slope + held * so_far)

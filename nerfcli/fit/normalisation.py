@@ -26,7 +26,7 @@ NEAR_PER_POINT, NEAR_PER_BOUND, NEAR_IN_BOX = 0.3, 0.9, 0.5
 # Rays begin at most this far away: depths larger than the unit ball do not tell how near a surface may be.
 MOST_NEAR = 0.5
 # The radius of the unit ball is at least this fraction of the depth of a typical pixel. Around an object, camera
-# distance and depth are similar, and the cameras decide; a ball around most points of a desk in a room cost 0.4 dB.
+# distance and depth are similar, and the cameras decide.
 BALL_PER_DEPTH = 0.75
 # Cameras that are all closer to their mean than this fraction of the nearest depth see a scene from one side, or all
 # around from one place.
@@ -35,9 +35,6 @@ NARROW_SPREAD = 0.5
 NARROW_BACKGROUND = 2.5
 # Fewer points do not tell where a scene ends.
 LEAST_POINTS = 50
-# A box is trimmed by this percentile at each end, where wrong points are, and then enlarged by this fraction.
-BOX_PERCENTILE = 0.5
-BOX_MARGIN = 0.1
 
 
 def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
@@ -119,8 +116,9 @@ def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
             f"the extent of {scene.root} cannot be estimated from its {len(scene.points)} points",
             "use --contraction l2",
         )
-    low, high = np.percentile(scene.points, (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
-    centre, radius = (low + high) / 2, max(float((high - low).max()) / 2 * (1 + BOX_MARGIN), 1e-12)
+    percentile = 0.5  # at each end, where wrong points are
+    low, high = np.percentile(scene.points, (percentile, 100 - percentile), axis=0)
+    centre, radius = (low + high) / 2, max(float((high - low).max()) / 2 * 1.1, 1e-12)
     reach = math.sqrt(3.0)  # the cube's corners
     depths = _typical_depths(scene)
     near = NEAREST if depths is None else max(NEAR_IN_BOX * float(depths[:, 0].min()) / radius, NEAREST)

@@ -7,7 +7,7 @@ from torch.nn.functional import max_pool3d
 from nerfcli import distributed
 from nerfcli.field.interface import Field
 from nerfcli.render.model import Marching
-from nerfcli.render.occupancy import Occupancy
+from nerfcli.render.occupancy import DECAY, Occupancy
 
 OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8
@@ -17,12 +17,9 @@ REFRESH_TURNS = 8
 FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
 # The final threshold is reached by this fraction of the budget at the latest, however few steps that is.
 CLOSING_FRACTION = 0.3
-# Detailed fields also have a fine grid. At a refresh, the optical depth of a visited cell decays by this factor, unless
-# the samples there were larger. Every few steps, rays sample all cells that the coarse grid leaves open, so that closed
-# fine cells can open again.
-FINE_SIDE = 128
-DECAY = 0.8
-LOOK_AROUND_EVERY = 8
+# Detailed fields also have a fine grid. At a refresh, the optical depth of a visited cell decays, unless the samples
+# there were larger. Rays then sample all cells that the coarse grid leaves open, so that closed fine ones can reopen.
+FINE_SIDE = 2 * OCCUPANCY_SIDE
 UNVISITED = -1.0
 
 
@@ -46,7 +43,7 @@ class OpenCells:
 
     def at(self, step: int) -> Tensor:
         """Return the open cells (G, G, G) for one step: those of the fine grid, if there is one, in most steps."""
-        return self.coarse if self.visits is None or step % LOOK_AROUND_EVERY == 0 else self._fine
+        return self.coarse if self.visits is None or step % REFRESH_EVERY == 0 else self._fine
 
     @property
     def visited(self) -> Tensor:

@@ -21,11 +21,7 @@ from nerfcli.fit.newton import NewtonSteps
 from nerfcli.fit.whitening import WhitenedAdam, whitening
 from nerfcli.photos.pool import PixelBatch, Pool
 
-# Points that represent what a camera sees: this many pixels along each side, at these multiples of the camera's
-# distance from the origin of the training frame.
-_PIXELS_A_SIDE = 6
-_DISTANCES = (2 / 3, 1.0, 2.0)
-# Least value of that distance, for cameras near the origin.
+# Least distance of a camera from the origin of the training frame, about which its points are.
 _LEAST_DISTANCE = 0.2
 # Radians by which a whitened step of a lens moves the picture, at most.
 LENS_RATE = 3e-4
@@ -339,10 +335,13 @@ def _picture_by_twist(camera: Camera) -> np.ndarray:
 
 
 def _points(camera: Camera) -> np.ndarray:
-    """Return points (M, 3) in the camera's axes, at pixels for which the lens has a direction."""
-    x, y = ((np.arange(_PIXELS_A_SIDE) + 0.5) / _PIXELS_A_SIDE * side for side in (camera.width, camera.height))
+    """Return points (M, 3) in the camera's axes that represent what it sees, at pixels where the lens has a direction.
+
+    Their distances are multiples of the camera's from the origin of the training frame.
+    """
+    x, y = ((np.arange(6) + 0.5) / 6 * side for side in (camera.width, camera.height))
     bearings, valid = camera.bearings(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    return np.concatenate([bearings[valid] * distance for distance in _DISTANCES])
+    return np.concatenate([bearings[valid] * distance for distance in (2 / 3, 1.0, 2.0)])
 
 
 def _per_point(by_parameters: np.ndarray, camera: Camera) -> np.ndarray:

@@ -11,10 +11,6 @@ from torch import Tensor, nn
 
 from nerfcli.fit.adam import BETAS, EPS
 
-# Relative damping of the sums of squares, so that poorly determined parameters do not move far: CamP's value.
-DAMPING = 0.1
-_FLOOR = 1e-8
-
 
 def whitening(jacobian: np.ndarray) -> np.ndarray:
     """Return the symmetric (K, K) map from whitened to parameter steps: (S + 0.1 diag(S) + 1e-8)^(-1/2), S = J^T J.
@@ -25,7 +21,7 @@ def whitening(jacobian: np.ndarray) -> np.ndarray:
     Source: Park et al. 2023, CamP: camera preconditioning for neural radiance fields, arXiv:2308.10902, eq. 8.
     """
     squares = jacobian.T @ jacobian
-    squares = squares + np.diag(DAMPING * np.diag(squares) + _FLOOR)
+    squares = squares + np.diag(0.1 * np.diag(squares) + 1e-8)  # poorly determined parameters do not move far
     values, vectors = np.linalg.eigh(squares)
     return (vectors / np.sqrt(values)) @ vectors.T
 

@@ -29,9 +29,6 @@ from nerfcli.kernels.interface import (
 )
 from nerfcli.kernels.reference.compositing import contracted_distance, off_target, scale_gradients, sum_along_rays
 
-# Samples whose densities are computed at a time, for media whose marching cannot stop at opaque samples.
-CHUNK = 2**16
-
 
 class Backend(abc.ABC):
     """The hot operations on one kind of device.
@@ -262,7 +259,7 @@ class Backend(abc.ABC):
             return self._visible_in_grid(rays, march, medium, visits)
         with torch.no_grad():  # samples behind surfaces are computed, then left out
             starts, ends, coordinates, offsets = self.parts.occupied_samples(rays, march)
-            density = torch.cat([medium.density(chunk) for chunk in coordinates.split(CHUNK)])
+            density = torch.cat([medium.density(chunk) for chunk in coordinates.split(2**16)])
             reached = self.parts.optical_depth_before(density, ends - starts, offsets) < march.max_optical_depth
             kept = torch.nn.functional.pad(reached.cumsum(0), (1, 0))[offsets]
             if visits is not None:

@@ -10,6 +10,9 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
+# Widths that compiled kernels are written for: of rows of a table, of codes and hidden layers, of the density network's
+# outputs and of spherical harmonics.
+FEATURES, WIDTH, OUT = 4, 32, 16
 # Assumed colour of samples whose colour is not evaluated; the error is at most half of their weight.
 UNSEEN = 0.5
 

@@ -14,9 +14,6 @@ from nerfcli.cameras.camera import Camera, by_lens
 from nerfcli.kernels import BearingGrids
 from nerfcli.photos.storage import PhotoStorage
 
-# Bearings are computed in blocks: in float64, those of a whole large photo would take more memory than the photo.
-_PIXELS_AT_A_TIME = 2**18
-
 
 class BearingTables:
     """The bearings of the pixels of P photos.
@@ -99,8 +96,9 @@ def _fill(table: Camera, values: np.ndarray, storage: PhotoStorage) -> np.ndarra
     Most lenses have a bearing everywhere: then nothing more is kept in memory.
     """
     valid = np.empty(len(values), dtype=bool)
-    for begin in range(0, len(values), _PIXELS_AT_A_TIME):
-        part = slice(begin, min(begin + _PIXELS_AT_A_TIME, len(values)))
+    block = 2**18  # in float64, the bearings of a whole large photo would take more memory than the photo
+    for begin in range(0, len(values), block):
+        part = slice(begin, min(begin + block, len(values)))
         numbers = np.arange(part.start, part.stop)
         centres = np.stack([numbers % table.width, numbers // table.width], axis=-1) + 0.5
         values[part], valid[part] = table.bearings(centres)

@@ -12,9 +12,6 @@ from nerfcli.render.model import Model
 # the training photos taken before and after; those training photos alone; the mean of all training photos.
 SOURCES = ("none", "EXIF", "EXIF and training photos around", "training photos around", "their mean")
 
-# Log exposures that differ by less are the same but for rounding: a hundredth of a stop is 0.007.
-SAME_EXPOSURE = 1e-4
-
 
 def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Interpolate log gains (T, 3) from photos taken before and after, or return 0, the mean, if that is better.
@@ -97,7 +94,7 @@ def _slope(exif: np.ndarray, log_gains: np.ndarray) -> float:
 
 def _slope_through_zero(exif: np.ndarray, log_gains: np.ndarray) -> float:
     """Return the slope of log gains (P, 3) over differences of `exif` (P,), clipped to [0, 1]; 0 if these are equal."""
-    if not (np.abs(exif) > SAME_EXPOSURE).any():
+    if not (np.abs(exif) > 1e-4).any():  # the same but for rounding: a hundredth of a stop is 0.007
         return 0.0
     return float(np.clip((exif[:, None] * log_gains).sum() / (3.0 * np.square(exif).sum()), 0.0, 1.0))
 

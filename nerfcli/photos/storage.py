@@ -21,15 +21,6 @@ from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.memory import resident_bytes
 from nerfcli.runs.settings import TrainSettings
 
-# Resident memory of a training step per sample, measured: 0.35 GB at 65536 samples.
-_BYTES_PER_SAMPLE = 6000
-# The field, its gradient and two moments, plus the sentinel's copy of all of these except the gradient.
-_COPIES_OF_FIELD = 7
-# Default size of fields other than the hash grid.
-_LARGEST_FIELD_BYTES = 64 * 2**20
-# Memory to decode a photo: Pillow's picture, the array, and the intermediate results of downscaling.
-_BYTES_PER_DECODED_PIXEL = 12
-
 
 @dataclass(frozen=True)
 class MemoryNeeds:
@@ -60,15 +51,17 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     if settings.model == "auto":  # trials train on a list of pixels, those they are not scored on
         photos += 9 * sum(sizes) + 12 * sum(of_cameras.values())
     largest = max(frame.camera.width * frame.camera.height for frame in frames)
-    step = _COPIES_OF_FIELD * field_bytes(settings) + _BYTES_PER_SAMPLE * settings.samples_per_step
-    rest = _BYTES_PER_DECODED_PIXEL * largest * min(settings.threads, len(frames)) + step
+    # The field, its gradient and two moments, and the sentinel's copy of all of these except the gradient.
+    step = 7 * field_bytes(settings) + 6000 * settings.samples_per_step
+    # To decode a photo: Pillow's picture, the array, and the intermediate results of downscaling.
+    rest = 12 * largest * min(settings.threads, len(frames)) + step
     return MemoryNeeds(photos, step, rest + resident_bytes(os.getpid()))
 
 
 def field_bytes(settings: TrainSettings) -> int:
     """Estimate the memory of one copy of a field's parameters."""
     hash_rows = 8 * 16 * 2**settings.chosen_log2_rows  # 8 levels of 4 float32
-    return settings.field_memory_bytes or (hash_rows if settings.field == "hash" else _LARGEST_FIELD_BYTES)
+    return settings.field_memory_bytes or (hash_rows if settings.field == "hash" else 64 * 2**20)
 
 
 class InMemory:

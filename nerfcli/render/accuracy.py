@@ -26,7 +26,6 @@ IN_WORDS = (
     "the early stop and negligible samples left out of a channel, truncation_of_depth and quadrature measure on "
     "random pixels what deeper stops and finer samples change"
 )
-PIXELS = 256
 # Tolerance of the renderings that are compared with each other: their truncation must be negligible.
 TIGHT = 1e-6
 
@@ -96,7 +95,7 @@ def measure_error(
         tolerance: tolerance of the rendering that `depth_stop` is about.
     """
     total = frame.camera.width * frame.camera.height
-    pixels = np.sort(np.random.default_rng(seed).choice(total, size=min(total, PIXELS), replace=False))
+    pixels = np.sort(np.random.default_rng(seed).choice(total, size=min(total, 256), replace=False))
     rgb, distances = (
         values.double().cpu().numpy() for values in _renderings(model, frame, pixels, depth=depth, tolerance=tolerance)
     )

@@ -16,10 +16,6 @@ from nerfcli.render.rays import PictureRays, successive_rays
 from nerfcli.render.tracing import TOLERANCE, render_rays
 
 RAYS_PER_TILE = 2**14
-RAYS_PER_GPU_TILE = 2**16
-# A tile on a GPU takes at most this fraction of its memory, even if every step of its rays is in an occupied cell and
-# takes this many bytes.
-FRACTION_OF_GPU, BYTES_PER_STEP = 1 / 8, 110
 # Rays and their background are computed in blocks of this many, so that their last bits do not depend on the tile.
 RAYS_PER_BLOCK = 2**18
 
@@ -112,8 +108,9 @@ def default_rays_per_tile(model: Model) -> int:
     if model.device.type != "cuda":
         return RAYS_PER_TILE
     total = torch.cuda.get_device_properties(model.device).total_memory
-    fitting = int(FRACTION_OF_GPU * total / (BYTES_PER_STEP * len(model.marching.edges())))
-    return min(RAYS_PER_GPU_TILE, max(RAYS_PER_TILE, fitting))
+    # An eighth of the memory is enough even if every step of the rays, of 110 bytes, is in an occupied cell.
+    fitting = int(total / 8 / (110 * len(model.marching.edges())))
+    return min(2**16, max(RAYS_PER_TILE, fitting))
 
 
 def _refuse_non_finite(frame: Frame, maps: dict[str, np.ndarray]) -> None:

@@ -18,9 +18,9 @@ DOWNSCALES = (1, 2, 4, 8)
 AUTO_LONGER_SIDE_PX = 800
 # Sizes of a training on a GPU, which small steps do not keep busy, and which has room for large tables.
 GPU_SIZES: dict[str, Any] = {"first_samples_per_step": 2**16, "samples_per_step": 2**18, "log2_rows": 19}
-# Number of steps in which the samples per step double, and the largest number of doublings. Small steps learn more per
-# sample at first, so short trainings have many of them; later, large steps are better and cost less per sample.
-DOUBLING_STEPS, MOST_DOUBLINGS = 600, 16
+# Number of steps in which the samples per step double. Small steps learn more per sample at first, so short trainings
+# have many of them; later, large steps are better and cost less per sample.
+DOUBLING_STEPS = 600
 # Expected number of samples per second and CPU thread, for trainings with a time budget.
 SAMPLES_PER_SECOND = 1e6
 # Short trainings learn more with few rows, each of which is seen often; long ones need more rows for the detail in the
@@ -104,7 +104,7 @@ class TrainSettings:
 
     def samples_at(self, step: float) -> float:
         """Return the target number of samples of a step; the first is step 0."""
-        growth = 2.0 ** min(step / DOUBLING_STEPS, MOST_DOUBLINGS)
+        growth = 2.0 ** min(step / DOUBLING_STEPS, 16)  # finite for any step
         return min(self.samples_per_step, growth * self.first_samples_per_step)
 
     @property

@@ -7,14 +7,10 @@ import torch
 from torch import Tensor
 
 from nerfcli.field.exposure import linear_from_srgb
-from nerfcli.search.sky import explained_by_direction
+from nerfcli.search.sky import FEWEST_PIXELS, explained_by_direction
 
 # Levels that are compared in brightness: lower ones are noise, higher ones saturated.
 DARKEST, BRIGHTEST = 0.06, 0.95
-# A photo with fewer such pixels tells nothing about its exposure.
-FEWEST_PIXELS = 12
-# Standard error of a median in units of that of a mean; standard deviation in units of the median absolute deviation.
-_OF_MEDIAN, _OF_DEVIATION = 1.2533, 1.4826
 
 
 @dataclass(frozen=True)
@@ -63,8 +59,9 @@ def diagnose(
         if good.sum() >= FEWEST_PIXELS:
             gains[photo] = np.median(ratios[good], axis=0)
             common = ratios[good].mean(-1)
-            deviation = _OF_DEVIATION * np.median(np.abs(common - np.median(common)))
-            errors[photo] = _OF_MEDIAN * deviation / np.sqrt(good.sum())
+            # Of a normal distribution: its deviation from the median absolute one, and the error of its median.
+            deviation = 1.4826 * np.median(np.abs(common - np.median(common)))
+            errors[photo] = 1.2533 * deviation / np.sqrt(good.sum())
     finite = np.isfinite(errors)
     if finite.sum() < 2:
         return Diagnostics(torch.zeros(count, 3), 0.0, far_fraction, sky_psnr)

@@ -15,19 +15,17 @@ from nerfcli.search.trials import Trial
 STANDARD_ERRORS = 2.0
 # The same for a gain that diagnostics suggest, as well as the trial.
 LIKELY_ERRORS = 1.0
-# The same for a gain with one seed only, and its standard deviation between seeds: measured 0.03 dB on the desk, and
-# 0.15 dB on balls in front of nothing, which learn faster.
+# The same for a gain with one seed only, and its standard deviation between seeds.
 CLEAR_ERRORS, SEED_DB = 5.0, 0.1
 LEAST_GAIN_DB = 0.05
 # Loss that is accepted for a simpler model.
 MOST_LOSS_DB = 0.1
-# Loss in a trial that is accepted for components that rest on measurements of the photos. After 120 steps a field is
-# still fog: in one capture, known distances gained 6 dB by the end of the training, and -0.3 to +0.5 dB in the trials.
+# Loss in a trial that is accepted for components that rest on measurements of the photos: in a trial, a field is
+# still fog, which does not show what known distances gain by the end of the training.
 MOST_LOSS_OF_EVIDENCE_DB = 1.0
 # Photos that show next to nothing have hardly any error, and its logarithm is noise: this fraction of the mean error is
 # added to that of every photo.
 FLOOR = 0.1
-ROUNDING_DB = 1e-6
 
 
 class Rule(Protocol):
@@ -133,7 +131,7 @@ def _against(gain: float, error: float, *, errors: float, trend: float, at_equal
         return "loses"
     if not gain > LEAST_GAIN_DB + errors * error:
         return "no gain above the noise"
-    if trend < -error - ROUNDING_DB:
+    if trend < -error - 1e-6:  # not for rounding
         return "the gain vanishes during the trial"
     if at_equal_time <= LEAST_GAIN_DB:
         return "gains less than spending the same time on more steps"

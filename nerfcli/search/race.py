@@ -26,8 +26,7 @@ STEPS_OF_START = 0.5
 SEEDS = 2
 # A removal saves only a little time in the training: its trials have to end within this fraction of a time budget.
 REMOVAL_FRACTION = 0.65
-# They may take this fraction of the budget: 2 % of a training whose search has 15 %. View dependence takes 5 % of the
-# time, and was removed on one scene of three.
+# They may take this fraction of the budget: 2 % of a training whose search has 15 %.
 REMOVAL_COST = 0.13
 NO_TIME, ONCE = "not tried, no time left", "not clear with one seed, and no time left for a second one"
 COSTS_MORE = "not tried, the trial would take longer than it could save"

@@ -26,31 +26,26 @@ SEARCH_FRACTION, START_FRACTION = 0.15, 0.2
 FEWEST_STEPS = 120
 # No machine takes that many steps in less time than this, and a vain attempt would cost the training time.
 LEAST_START_SECONDS = 0.3
-# A start of this many steps tells as much as a longer one: with 200, the right component is found in 9 or 10 of 10
-# seeds, on scenes of all kinds.
+# A start of this many steps tells as much as a longer one.
 MOST_START_STEPS = 250
 # Spread of the photos' brightness, in logarithms of light. Below the first number, exposures do not help; above the
-# second, they are likely, and a smaller gain in the trial is enough. Measured after 120 and 250 steps: 0.12 to 0.23
-# where exposures are needed, up to 0.10 and 0.06 where not.
+# second, they are likely, and a smaller gain in the trial is enough.
 LEAST_EXPOSURE_SPREAD, LIKELY_EXPOSURE_SPREAD = 0.06, 0.11
 # With up to this many photos, as many as there are harmonics, view dependence explains exposures as well, and learned
 # ones drift towards none: they stay at the values from matched pixels. With more photos, learning also corrects what
-# adds up along a ring of cameras: fixed ones change PSNR by +0.31, -0.12 and -0.45 dB with 20, 21 and 21 photos.
+# adds up along a ring of cameras.
 FEW_PHOTOS = (MOST_DEGREES + 1) ** 2
 # Fraction of pixels that show distant things. Below the first number, the field itself shows a sky as well; above the
-# second, a sky is likely, and a smaller gain in the trial is enough. Measured after 120 to 500 steps: 14 to 26 % with a
-# sky, 0 to 3 % on most real captures.
+# second, a sky is likely, and a smaller gain in the trial is enough.
 LEAST_FAR_FRACTION, LIKELY_FAR_FRACTION = 0.01, 0.1
-# If a larger fraction of pixels looks like a sky, there is one: measured 28, 17 and 13 % with a sky, at most 3.6 % on
-# eight captures without.
+# If a larger fraction of pixels looks like a sky, there is one.
 LEAST_SKY_FRACTION = 0.05
-# A colour by direction predicts a sky better than one colour by at least this: measured 7.0 to 10.2 dB for a sky, 0.0
-# to 0.8 on surfaces that a coarse field has put far away. Or it predicts it this well: an overcast sky has one colour.
+# A colour by direction predicts a sky better than one colour by at least this, unlike surfaces that a coarse field has
+# put far away. Or it predicts it this well: an overcast sky has one colour.
 LEAST_SKY_DB, LEAST_SKY_PSNR = 1.0, 22.0
 # Cameras with an epipolar error below this are as good as the features: structure from motion leaves 0.1 to 0.4.
 LEAST_MISS_PX = 0.6
-# Poses with at least this epipolar error at any focal length are wrong; in between, a trial decides. Rotated by half a
-# degree, photos of the desk have 1.5 to 2.3, at 400 pixels of width.
+# Poses with at least this epipolar error at any focal length are wrong; in between, a trial decides.
 SURELY_MISSED_PX = 1.2
 # The focal length from matches is used if it differs from the given one by this many standard errors and this much in
 # the logarithm, and reduces the epipolar error to this fraction.

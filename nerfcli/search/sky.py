@@ -8,15 +8,11 @@ from torch import Tensor
 
 from nerfcli.field.background import SphereBackground
 from nerfcli.fit.adam import Adam
+from nerfcli.fit.appearance import LEAST_LEVEL
 from nerfcli.photos.psnr import psnr_of
 
-PAINT_RATE, PAINT_STEPS = 0.3, 30
-# Grid vertices per axis for estimates from few pixels: with 32, noise costs a sky of one colour 6 dB.
-COARSE_SIDE = 8
-# Fewer pixels in either half of the photos tell nothing.
+# Fewer pixels tell nothing about a sky, nor about the exposure of a photo.
 FEWEST_PIXELS = 12
-# Initial levels are clipped to this range, as a sigmoid does not reach 0 and 1.
-DARKEST, BRIGHTEST = 0.02, 0.98
 
 
 def paint(background: SphereBackground, seen: Callable[[], tuple[Tensor, Tensor]]) -> None:
@@ -26,11 +22,11 @@ def paint(background: SphereBackground, seen: Callable[[], tuple[Tensor, Tensor]
         seen: returns directions (N, 3) and the sRGB colours (N, 3) along them; called once per step.
     """
     adam = Adam(background.parameters())
-    for _ in range(PAINT_STEPS):
+    for _ in range(30):
         directions, colours = seen()
         adam.zero_grad()
         (background(directions) - colours).abs().sum().backward()
-        adam.step(PAINT_RATE)
+        adam.step(0.3)
     adam.zero_grad()
 
 
@@ -53,8 +49,8 @@ def explained_by_direction(directions: Tensor, colours: Tensor, photos: Tensor) 
         return math.inf, math.inf
     one = colours[tells].median(0).values
     with torch.enable_grad():
-        background = SphereBackground(COARSE_SIDE).to(colours.device)
-        background.logits.data += torch.logit(one.clamp(DARKEST, BRIGHTEST))[:, None, None, None]
+        background = SphereBackground(8).to(colours.device)  # coarse, because of the noise of few pixels
+        background.logits.data += torch.logit(one.clamp(LEAST_LEVEL, 1.0 - LEAST_LEVEL))[:, None, None, None]
         paint(background, lambda: (directions[tells], colours[tells]))
     with torch.no_grad():
         predictions = (one, background(directions[~tells]))

@@ -31,16 +31,9 @@ from nerfcli.runs.settings import FEWEST_LOG2_ROWS, TrainSettings
 from nerfcli.search.diagnostics import Diagnostics, diagnose
 from nerfcli.search.sky import paint
 
-# Photos are judged on squares of this side, or of a quarter of a small photo's side: single pixels between known
-# neighbours would test interpolation only.
-BLOCK_PX = 12
-BLOCK_FRACTION = 0.06
 JUDGED_PIXELS = 8192
 # Fraction of the schedule at which the first training stops and the trials continue.
 FORK_FRACTION = 0.6
-# After this many steps, the number of steps that the time allows is known within this factor, even on a machine slowed
-# down by other work. If it is too small, the rest would be in vain.
-PROBE_STEPS, PROBE_FACTOR = 10, 1.25
 # Seed of the choice of blocks and pixels: the same for all candidates of a scene, and not that of any training.
 SEED = 20_211
 
@@ -165,7 +158,8 @@ class Trials:
             return max(fitting.step / steps, sum(took) / (2.0 * seconds), min(sum(took) / seconds, enough))
 
         def is_in_vain() -> bool:
-            return len(took) == PROBE_STEPS and statistics.median(took) * fewest > 2.0 * PROBE_FACTOR * seconds
+            # Ten steps tell within a factor of 1.25 how many the time allows, even on a machine slowed by other work.
+            return len(took) == 10 and statistics.median(took) * fewest > 2.0 * 1.25 * seconds
 
         while fraction() < 1.0 and not is_in_vain():
             took.append(self._advance(fitting, FORK_FRACTION * fraction()))
@@ -275,9 +269,10 @@ class Trials:
 
 def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:
     """Return the pixels of a photo in judged blocks, (H, W) bool; there is at least one block."""
-    block = max(1, min(BLOCK_PX, min(shape[:2]) // 4))
+    # Single pixels between known neighbours would test interpolation only.
+    block = max(1, min(12, min(shape[:2]) // 4))
     rows, columns = (-(-side // block) for side in shape[:2])
-    chosen = generator.random((rows, columns)) < BLOCK_FRACTION
+    chosen = generator.random((rows, columns)) < 0.06
     chosen.flat[generator.integers(chosen.size)] = True
     return np.kron(chosen, np.ones((block, block), bool))[: shape[0], : shape[1]]
 

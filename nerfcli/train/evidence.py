@@ -26,8 +26,6 @@ from nerfcli.search.selection import LEAST_SKY_FRACTION
 
 # Fraction of the budget that stereo matching may take.
 STEREO_FRACTION = 0.06
-# Seconds that it may take if the budget is one of steps only.
-MOST_SECONDS = 60.0
 # Fewer photos with EXIF exposures cannot confirm the matched ones.
 FEWEST_EXIF = 5
 
@@ -56,7 +54,7 @@ class Evidence:
         self.stereo_seconds = 0.0
         budget = settings.budget_seconds
         # A training by steps must give the same result on all machines: without a time budget, ignore the threads.
-        seconds, threads = (MOST_SECONDS, 1) if budget is None else (STEREO_FRACTION * budget, settings.threads)
+        seconds, threads = (60.0, 1) if budget is None else (STEREO_FRACTION * budget, settings.threads)
         self.side_px = affordable_side_px(album.photos, seconds=seconds, threads=threads)
 
     @cached_property

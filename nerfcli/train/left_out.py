@@ -10,8 +10,6 @@ from nerfcli.photos.mask_files import write_masks
 
 # Folder of a run, named like the component that leaves pixels out.
 OCCLUDERS = "occluders"
-# Number of photos named in the message.
-_NAMED = 3
 
 
 def remove_left_out(run: Path) -> None:
@@ -38,7 +36,7 @@ def write_left_out(run: Path, masks: Mapping[str, np.ndarray], *, notify: Callab
     if not most:
         notify("occluders: none found")
         return
-    named = ", ".join(f"{name} {left_out[name]:.0f} %" for name in most[:_NAMED])
+    named = ", ".join(f"{name} {left_out[name]:.0f} %" for name in most[:3])
     mean = np.mean(list(left_out.values()))
     notify(
         f"occluders: {mean:.1f} % of the pixels left out, in {len(most)} of {len(masks)} photos, most in {named}; "

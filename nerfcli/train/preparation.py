@@ -42,8 +42,6 @@ from nerfcli.search.selection import (
 from nerfcli.search.trials import Trials
 from nerfcli.train.evidence import Evidence
 
-# Budget of a search that has no time left.
-LEAST_SECONDS = 1e-3
 # Fraction of a search that matching photos may take.
 MATCHING_FRACTION = 0.5
 
@@ -320,7 +318,7 @@ def _search(scene: Scene, evidence: Evidence, *, storage: PhotoStorage, began: f
     took = time.perf_counter() - began
     seconds = None
     if budget is not None:
-        seconds = max(LEAST_SECONDS, SEARCH_FRACTION * budget - took + evidence.stereo_seconds)
+        seconds = max(1e-3, SEARCH_FRACTION * budget - took + evidence.stereo_seconds)
     notify(f"selecting components, for up to {100 * SEARCH_FRACTION:.0f} % of the budget")
     selection = select(
         trials,

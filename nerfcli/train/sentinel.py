@@ -33,7 +33,6 @@ FAILURE_FORMAT = "nerfcli failure 1"
 FAILURES = "failure-*.safetensors"
 SNAPSHOT_EVERY = 256
 MOST_ROLLBACKS = 3
-PIXELS_NAMED = 8
 
 
 class Sentinel:
@@ -156,7 +155,7 @@ class Sentinel:
             "poses": fitting.pool.poses,
             "after_draw": fitting.generator.get_state(),
         }
-        pixels = [self._pool.place(int(drawn.numbers[ray])) for ray in bad.rays[:PIXELS_NAMED]]
+        pixels = [self._pool.place(int(drawn.numbers[ray])) for ray in bad.rays[:8]]
         text = f"{bad.name} is not finite at step {fitting.step + 1}: {bad.count} of {bad.total} numbers"
         if pixels:
             name, x, y = pixels[0]

@@ -29,10 +29,8 @@ from nerfcli.train.preparation import Prepared
 
 FRACTIONS = (0.25, 0.5, 0.75, 1.0)
 FOLDER = "waypoints"
-# Number of held-out pixels that are measured, and the seed of their choice.
-PIXELS, SEED = 4096, 1
-# All rays at once would take half a gigabyte while space is still full of fog.
-RAYS_AT_A_TIME = 512
+# Number of held-out pixels that are measured.
+PIXELS = 4096
 
 
 def keep_waypoint(run: Path, step: int, model: Model) -> None:
@@ -109,7 +107,7 @@ class HeldoutPixels:
         storage: PhotoStorage = IN_MEMORY,
     ):
         pool = PixelPool(photos, training_from_scene, device, colours=colours, storage=storage)
-        generator = torch.Generator(device=device).manual_seed(SEED)
+        generator = torch.Generator(device=device).manual_seed(1)
         numbers = pool.numbers(PIXELS, generator).unique()
         self.origins, self.directions, self.colours = pool.rays_of(numbers)[:3]
         self.cones = pool.cones[pool.photo_of(numbers)]
@@ -123,8 +121,9 @@ class HeldoutPixels:
             log_gains: (photos, 3) of the photos relative to the model's pictures; see `held_out_exposure`.
         """
         background = colours_behind(model.background, self.directions)
+        # All rays at once would take half a gigabyte while space is still full of fog.
         parts = zip(
-            *(rays.split(RAYS_AT_A_TIME) for rays in (self.origins, self.directions, self.cones, background)),
+            *(rays.split(512) for rays in (self.origins, self.directions, self.cones, background)),
             strict=True,
         )
         rendered = torch.cat(

@@ -10,8 +10,7 @@ from torch import Tensor
 from nerfcli.kernels import numba_cpu, reference
 from nerfcli.kernels.composition import Backend
 from nerfcli.kernels.harmonics import spherical_harmonics
-from nerfcli.kernels.interface import AdamStep, HashGrid, March, Medium, Rays, RaysSeen, Samples
-from nerfcli.kernels.numba_cpu.row_adam import FEATURES
+from nerfcli.kernels.interface import FEATURES, AdamStep, HashGrid, March, Medium, Rays, RaysSeen, Samples
 from nerfcli.kernels.reference.backend import encode_into
 
 

@@ -11,9 +11,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from nerfcli.kernels.numba_cpu.vector import FLOAT, FLOATS, INT, INTS, floats, in_all_lanes, ints, vector_at
-
-# Factors of the hash; the first axis has none. Source: Müller et al. 2022, arXiv:2201.05989, eq. 4.
-HASH_FACTORS = (2654435761, 805459861)
+from nerfcli.kernels.reference.encoding import HASH_PRIMES
 
 
 def _cells(builder: Any, coordinates: Any, resolution: Any) -> tuple[list[Any], list[Any]]:
@@ -38,7 +36,7 @@ def _hashed_rows(builder: Any, cells: Any, resolution: Any, rows: Any) -> list[A
     x = [cells[0], builder.add(cells[0], ints(1))]
     y, z = (
         [product := builder.mul(cell, ints(factor)), builder.add(product, ints(factor))]
-        for cell, factor in zip(cells[1:], HASH_FACTORS, strict=True)
+        for cell, factor in zip(cells[1:], HASH_PRIMES[1:], strict=True)
     )
     yz = [builder.xor(y[corner & 1], z[corner >> 1]) for corner in range(4)]
     return [builder.and_(builder.xor(x[corner & 1], yz[corner >> 1]), mask) for corner in range(8)]

@@ -43,7 +43,6 @@ def _variance_fraction(x: Any, alpha: Any) -> Any:
 # Columns of the running sums of a ray: optical depth, weight, mean and sum of squared differences from it, mean of
 # the heaviest interval and its weight, number of quantiles passed.
 DEPTH, MASS, MEAN, SQUARES, HEAVIEST, LARGEST, PASSED = range(7)
-COLUMNS = 7
 
 
 @numba.njit(inline="always")
@@ -94,9 +93,9 @@ def light_ends(
 
 
 def new_sums(rays: int, fractions: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return sums (R, COLUMNS) of 0, quantiles (R, Q) of NaN, and the sorted optical depths of the quantiles (Q,)."""
+    """Return sums (R, 7) of 0, quantiles (R, Q) of NaN, and the sorted optical depths of the quantiles (Q,)."""
     targets = np.sort(-np.log1p(-np.asarray(fractions, dtype=np.float64)), kind="stable")
-    return np.zeros((rays, COLUMNS)), np.full((rays, len(fractions)), np.nan, np.float32), targets
+    return np.zeros((rays, PASSED + 1)), np.full((rays, len(fractions)), np.nan, np.float32), targets
 
 
 def light_ends_of(sums: np.ndarray, quantiles: np.ndarray, fractions: tuple[float, ...]) -> LightEnds:

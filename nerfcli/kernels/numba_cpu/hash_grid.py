@@ -13,13 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli.kernels.interface import FEATURES
 from nerfcli.kernels.numba_cpu.corners import dense_corners, hashed_corners
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.vector import LANES, ROW, dot_rows, gather_rows, prefetch, scatter_rows
+from nerfcli.kernels.numba_cpu.vector import LANES, dot_rows, gather_rows, prefetch, scatter_rows
 
-# Row width that the kernels are written for, and samples in a block: in smaller blocks, a sample's row numbers would be
-# read before the processor has stored them.
-FEATURES = ROW
+# Samples in a block: in smaller blocks, a sample's row numbers would be read before the processor has stored them.
 BLOCK = 128
 
 

@@ -6,6 +6,7 @@ order of the threads.
 """
 
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import Any
 
 import numba
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT
+from nerfcli.kernels.interface import OUT, WIDTH
 from nerfcli.kernels.numba_cpu.exponential import exponential, sigmoid, sigmoid_slope
 from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.vector import (
@@ -26,16 +28,12 @@ from nerfcli.kernels.numba_cpu.vector import (
     rectified_product_32,
 )
 
-# Widths that the kernels are written for: encoded features, hidden layers, and the padded width of the outputs.
-WIDTH = 32
-OUT = 16
 TILE = 64
 LIMIT = np.float32(LOG_DENSITY_LIMIT)
 
 # Offsets of each layer's weights in the flat arrays: encoded-hidden, hidden-density, inputs-hidden, hidden-hidden,
-# hidden-colour.
-D1, D2, C1, C2, C3 = 0, 1024, 1536, 2560, 3584
-WEIGHTS = 4096
+# hidden-colour; and their end.
+D1, D2, C1, C2, C3, WEIGHTS = accumulate((WIDTH * outputs for outputs in (WIDTH, OUT, WIDTH, WIDTH, OUT)), initial=0)
 
 
 @numba.njit(nogil=True, error_model="numpy")

@@ -18,8 +18,6 @@ from nerfcli.kernels.interface import AdamStep
 from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.vector import FLOATS, INTS, LANES, floats, in_all_lanes, ints, of_each
 
-FEATURES = 4
-
 
 def _touched(builder: Any, gradient: Any) -> Any:
     """Return -1 in all lanes of a row if any of its numbers is nonzero or NaN, else 0."""

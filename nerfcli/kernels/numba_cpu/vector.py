@@ -10,6 +10,8 @@ from llvmlite.binding import get_host_cpu_features
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
+from nerfcli.kernels.interface import FEATURES
+
 # Lanes of a vector; LLVM splits it into the processor's registers (AVX-512: one register, AVX2: two, NEON: four).
 LANES = 16
 # Rows of a block of a matrix product, for rows of 32 and of 16 numbers. The block's sums fill at most half of the
@@ -70,10 +72,7 @@ def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
 prefetch: Callable[[Any, Any], None] = cast(Any, _prefetch)
 
 
-# Width of a table row in `gather_rows`, `scatter_rows` and `dot_rows`.
-ROW = 4
-ROW_FLOATS = ir.VectorType(FLOAT, ROW)
-CORNERS = 8
+ROW_FLOATS = ir.VectorType(FLOAT, FEATURES)
 
 
 def _row_access(generate: Callable[..., None]) -> Any:
@@ -97,10 +96,10 @@ def _row_access(generate: Callable[..., None]) -> Any:
                 context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 4, 5, 7)
             )
             corners = []
-            for corner in range(CORNERS):
+            for corner in range(8):
                 place = builder.add(at, builder.mul(stride, ir.Constant(LONG, corner)))
                 number = builder.zext(builder.load(builder.gep(index_data, [place])), LONG)
-                pointer = vector_at(builder, flat_data, offset, number, ROW, ROW_FLOATS)
+                pointer = vector_at(builder, flat_data, offset, number, FEATURES, ROW_FLOATS)
                 corners.append((pointer, builder.gep(weight_data, [place])))
             generate(builder, corners, builder.bitcast(builder.gep(row_data, [row_at]), ROW_FLOATS.as_pointer()))
             return context.get_dummy_value()
@@ -130,7 +129,7 @@ def _scatter(builder: Any, corners: Any, row: Any) -> None:
 
 def _dot(builder: Any, corners: Any, row: Any) -> None:
     vector = builder.load(row, align=4)
-    lanes = [ir.Constant(INT, lane) for lane in range(ROW)]
+    lanes = [ir.Constant(INT, lane) for lane in range(FEATURES)]
     sums = []
     for pointer, _ in corners:
         product = builder.fmul(vector, builder.load(pointer, align=4))

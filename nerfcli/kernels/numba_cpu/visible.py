@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from nerfcli.kernels.contraction import CONTRACTIONS
-from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
+from nerfcli.kernels.interface import OUT, WIDTH, HashGrid, March, Rays, Samples
 from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
 from nerfcli.kernels.numba_cpu.marching import keep_largest
-from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, density_range, flat_weights
+from nerfcli.kernels.numba_cpu.networks import TILE, density_range, flat_weights
 from nerfcli.kernels.numba_cpu.rays import CHUNK, cube, cut, look_ahead, padded
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
@@ -26,14 +26,12 @@ ROUND = LANES * AHEAD
 # Room for the samples of each thread, 92 MB; if there are more, all are found again with room for every step of every
 # ray. That would be up to 1.7 GB in each step, and trainings would keep the pages that any of them has touched.
 USUAL_SAMPLES = 2**19
-# Empty blocks of cells are skipped as a whole: blocks along a side of the grid, and smallest width of one in cells.
-BLOCKS, LEAST_BLOCK = 16, 4
 
 
 @numba.njit(inline="always")
 def _block_side(side: Any) -> Any:
-    """Return the width of a block in cells."""
-    return max(side // BLOCKS, LEAST_BLOCK)
+    """Return the width, in cells, of the blocks that are skipped as a whole if they are empty."""
+    return max(side // 16, 4)
 
 
 @numba.njit(inline="always")

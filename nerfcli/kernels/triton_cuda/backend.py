@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels import reference
-from nerfcli.kernels.interface import AdamStep, HashGrid, March, Rays, Samples
+from nerfcli.kernels.interface import FEATURES, AdamStep, HashGrid, March, Rays, Samples
 from nerfcli.kernels.reference.backend import ReferenceBackend
 from nerfcli.kernels.triton_cuda import compositing, hash_grid, marching, networks, operations, rays
 from nerfcli.kernels.triton_cuda.coordinates import sample_coordinates
@@ -54,7 +54,7 @@ class TritonBackend(ReferenceBackend):
         return super().hash_encode(points, table, resolutions, sink=sink)
 
     def adam_rows(self, table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, step: AdamStep) -> None:
-        if table.shape[-1] == hash_grid.FEATURES:
+        if table.shape[-1] == FEATURES:
             adam_rows(table, gradient, first, second, half=self._half.of(table), step=step)
         else:
             super().adam_rows(table, gradient, first, second, step=step)

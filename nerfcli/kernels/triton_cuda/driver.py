@@ -14,11 +14,6 @@ from typing import Any
 from nerfcli.kernels.triton_cuda.cubin import Cubin
 
 LIBRARY = "libcuda.so.1"
-MAX_DYNAMIC_SHARED_SIZE_BYTES = 8
-# A kernel that needs more shared memory than this has to request it.
-SHARED_BYTES_AT_ONCE = 48 * 1024
-# Keys of a launch's list of extras.
-END, BUFFER, BUFFER_SIZE = 0, 1, 2
 Extras = ctypes.c_void_p * 5
 
 _of_thread = threading.local()
@@ -53,7 +48,8 @@ class Function:
         packed = self._buffer.from_buffer_copy(
             self._parameters.pack(*values, *(0,) * (self._count - len(values)))
         )  # fmt: skip
-        extra = Extras(BUFFER, ctypes.addressof(packed), BUFFER_SIZE, ctypes.addressof(self._size), END)
+        buffer, buffer_size, end = 1, 2, 0  # the keys of this list
+        extra = Extras(buffer, ctypes.addressof(packed), buffer_size, ctypes.addressof(self._size), end)
         shape = (x, y, z, self._threads, 1, 1, self._shared_bytes)
         call("cuLaunchKernel", self._handle, *shape, ctypes.c_void_p(stream), None, extra)
 
@@ -68,8 +64,9 @@ def load(cubin: Cubin, device: int) -> Function:
     module, handle = ctypes.c_void_p(), ctypes.c_void_p()
     call("cuModuleLoadData", ctypes.byref(module), cubin.code)
     call("cuModuleGetFunction", ctypes.byref(handle), module, cubin.name.encode())
-    if cubin.shared_bytes > SHARED_BYTES_AT_ONCE:
-        call("cuFuncSetAttribute", handle, MAX_DYNAMIC_SHARED_SIZE_BYTES, cubin.shared_bytes)
+    if cubin.shared_bytes > 48 * 1024:  # more has to be requested
+        max_dynamic_shared_size_bytes = 8
+        call("cuFuncSetAttribute", handle, max_dynamic_shared_size_bytes, cubin.shared_bytes)
     return Function(handle, cubin, device)
 
 

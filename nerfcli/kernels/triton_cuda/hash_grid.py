@@ -11,10 +11,10 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
+from nerfcli.kernels.interface import FEATURES
 from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
 
-# Row width that the kernels are written for, and samples of a program.
-FEATURES = 4
+# Samples of a program.
 BLOCK = Size.of(128, interpreted=1024)
 
 

@@ -12,15 +12,13 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfcli.kernels.contraction import CONTRACTIONS, sample_widths
-from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
+from nerfcli.kernels.interface import WIDTH, HashGrid, March, Rays, Samples
 from nerfcli.kernels.triton_cuda import hash_grid, networks
 from nerfcli.kernels.triton_cuda.launch import INTERPRETED, blocks, jit, launch
 from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, cube, fill_ray_indices, ray_indices, span_of
 
 # Room for samples is a multiple of ROOM, about SPARE times the number needed last.
 ROOM, SPARE = 2**6 if INTERPRETED else 2**14, 1.25
-WIDTH = networks.WIDTH
-COMPACTED = 128
 
 
 @dataclass
@@ -208,8 +206,8 @@ def visible_samples(
     places = torch.empty(samples, 3, device=device)
     codes = torch.empty(samples, WIDTH, dtype=torch.float16, device=device)
     launch(
-        _compact, (blocks(samples, COMPACTED),), sources, starts, ends, density, coordinates, code,
-        *reached, places, codes, samples, BLOCK=COMPACTED,
+        _compact, (blocks(samples, 128),), sources, starts, ends, density, coordinates, code,
+        *reached, places, codes, samples, BLOCK=128,
     )  # fmt: skip
     return Samples(reached[0], reached[1], reached[2], codes, places, kept, index)
 

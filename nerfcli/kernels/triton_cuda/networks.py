@@ -12,13 +12,11 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT
+from nerfcli.kernels.interface import OUT, WIDTH
 from nerfcli.kernels.triton_cuda.harmonics import harmonics, harmonics_slopes
 from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
 
-# Widths that the kernels are written for: codes, hidden layers, and the outputs of the density network.
-WIDTH, HIDDEN, GEOMETRY = 32, (32, 64), 16
 BLOCK = Size.of(64, interpreted=256)
-PROGRAMS_PER_PROCESSOR = 4
 LIMIT = tl.constexpr(LOG_DENSITY_LIMIT)
 # Scaled value of the largest gradient of an output: 2^12 below float16's largest number, 2^28 above its smallest.
 LARGEST = tl.constexpr(16.0)
@@ -182,10 +180,10 @@ def _backward(
 def can_radiance(code_width: int, layers: tuple[Tensor, ...]) -> bool:
     """Return whether this module supports these layers behind codes of this width; if not, the reference is used."""
     hidden = len(layers[0])
-    shapes = ((hidden, WIDTH), (GEOMETRY, hidden), (hidden, 2 * GEOMETRY), (hidden, hidden), (3, hidden))
+    shapes = ((hidden, WIDTH), (OUT, hidden), (hidden, 2 * OUT), (hidden, hidden), (3, hidden))
     return (
         code_width == WIDTH
-        and hidden in HIDDEN
+        and hidden in (32, 64)
         and all(tuple(layer.shape) == shape for layer, shape in zip(layers, shapes, strict=False))
     )
 
@@ -261,7 +259,7 @@ def plain(layers: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
 
 def programs(samples: int, device: torch.device) -> tuple[int]:
     """Return the grid: as many programs as the device runs at a time, but no more than there are blocks."""
-    return (min(blocks(samples, BLOCK), PROGRAMS_PER_PROCESSOR * processors(device)),)
+    return (min(blocks(samples, BLOCK), 4 * processors(device)),)
 
 
 @functools.cache

@@ -7,8 +7,6 @@ from torch import Tensor
 from nerfcli.kernels.interface import PixelTable
 from nerfcli.kernels.triton_cuda.launch import blocks, jit, launch
 
-BLOCK = 128
-
 
 @jit
 def _bearing(bearings, at, valid):
@@ -77,8 +75,8 @@ def pixel_rays(chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tens
     colours = torch.empty(count, channels, device=device)
     widths, corners = pixels.grids or (pixels.first_pixel, pixels.bearings)  # not read without grids
     launch(
-        _pixels, (blocks(count, BLOCK),), chosen.contiguous(), pixels.first_pixel, pixels.first_bearing,
+        _pixels, (blocks(count, 128),), chosen.contiguous(), pixels.first_pixel, pixels.first_bearing,
         pixels.bearings, pixels.poses.contiguous(), pixels.colours, widths, corners, origins, directions, colours,
-        photos, max(0, photos - 1).bit_length(), count, CHANNELS=channels, GRIDS=pixels.grids is not None, BLOCK=BLOCK,
+        photos, max(0, photos - 1).bit_length(), count, CHANNELS=channels, GRIDS=pixels.grids is not None, BLOCK=128,
     )  # fmt: skip
     return origins, directions, colours

@@ -6,10 +6,9 @@ The pass also zeroes the gradient. Same operation as `reference.adam_rows`, for 
 import triton.language as tl
 from torch import Tensor
 
-from nerfcli.kernels.interface import AdamStep
+from nerfcli.kernels.interface import FEATURES, AdamStep
 from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
 
-FEATURES = 4
 BLOCK = Size.of(256, interpreted=1024)
 
 
