@@ -200,3 +200,25 @@ def _at_most(seconds: int) -> Iterator[None]:
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
+
+
+def count_refused(
+    path: Path,
+    damage: Callable[[bytes, np.random.Generator], bytes],
+    read: Callable[[], Capture],
+    *,
+    times: int = 200,
+    seed: int = 0,
+    named: Path | None = None,
+) -> int:
+    """Damage a file again and again, and return how often `read` refused it; otherwise it must give a sound capture.
+
+    Args:
+        named: path that an error must name; None for that of the file.
+    """
+    data, rng = path.read_bytes(), np.random.default_rng(seed)
+    refused = 0
+    for _ in range(times):
+        path.write_bytes(damage(data, rng))
+        refused += assert_refused_or_sound(read, named or path)
+    return refused

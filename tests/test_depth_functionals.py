@@ -36,14 +36,6 @@ def test_moment_and_conditional_are_exact_for_piecewise_constant_density(seed):
     assert conditional.item() == pytest.approx(first / mass, rel=1e-8)
 
 
-def test_one_place_per_interval_is_not_the_moment():
-    # The opacity of one thick interval is exact, its midpoint is not where light ends.
-    density, start, end = (torch.tensor([v], dtype=torch.float64) for v in (10.0, 1.0, 2.0))
-    mean = depth.interval_means(density, start, end)
-    assert mean.item() == pytest.approx(1 + 1 / 10 - 1 / math.expm1(10.0), rel=1e-14)
-    assert abs(mean.item() - 1.5) > 0.4
-
-
 @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 4), at=st.floats(0.01, 0.99), exponent=st.floats(-12.0, 6.0))
 def test_splitting_an_interval_changes_nothing_but_max_weight(seed, cut, at, exponent):
     density, starts, ends, offsets = ray(seed, scale=10.0**exponent)
@@ -88,12 +80,6 @@ def test_fractions_across_magnitudes_against_sixty_digits(fraction, dtype, toler
             exact = [1 / (v * v) - v.exp() / (v.exp() - 1) ** 2 for v in values]
     wanted = torch.tensor([float(value) for value in exact], dtype=torch.float64)
     assert ((fraction(x).double() - wanted) / wanted).abs().max() < tolerance
-
-
-def test_mean_fraction_branches_meet():
-    below = torch.tensor([depth.SERIES_BELOW * (1 - 1e-15)], dtype=torch.float64)
-    above = torch.tensor([depth.SERIES_BELOW], dtype=torch.float64)
-    torch.testing.assert_close(depth.mean_fraction(below), depth.mean_fraction(above), rtol=1e-13, atol=0)
 
 
 @pytest.mark.parametrize(("x", "slope"), [(0.0, -1 / 12), (1e-9, -1 / 12), (500.0, -1 / 500**2), (1e4, -1e-8)])
@@ -194,16 +180,6 @@ def test_a_median_that_rounding_puts_into_thin_air_stays_inside_an_interval():
     assert ((starts <= median) & (median <= ends)).any()
 
 
-def test_gradient_of_the_mean_of_a_far_thin_surface():
-    """Closed form: minus the variance of a thin interval, length^2 / 12. It is 1e8 times smaller than the
-    distance, and was once lost in the rounding of the distance."""
-    density = torch.tensor([0.5], requires_grad=True)
-    start, length = torch.tensor([200.0]), 2.0**-12
-    mean = depth.light_ends(density, start, start + length, offsets=torch.tensor([0, 1]), fractions=()).mean
-    (gradient,) = torch.autograd.grad(mean.sum(), density)
-    assert gradient.item() == pytest.approx(-(length**2) / 12, rel=1e-3)
-
-
 def test_undefined_depths_are_nan_and_only_those():
     # Ray 0 is empty, ray 1 has opacity 0.1, ray 2 is opaque.
     offsets = torch.tensor([0, 0, 1, 2])
@@ -226,18 +202,6 @@ def test_undefined_depths_are_nan_and_only_those():
         assert undefined(convention, 1.0) == [False, False, False]
     assert spread(DepthRequest("moment", "ray", 0.05), light).isnan().tolist() == [True, False, False]
     assert disagreement(DepthRequest("moment", "ray", 0.05), light).isnan().tolist() == [True, True, False]
-
-
-def test_conditional_gradient_is_bounded_in_empty_space():
-    # Density is exactly 0: the value is NaN by definition, but its gradient must not make other gradients NaN.
-    density = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    starts = torch.arange(3, dtype=torch.float64)
-    weights, _ = reference.interval_weights(density, torch.ones(3, dtype=torch.float64), torch.tensor([0, 3]))
-    means = depth.interval_means(density, starts, starts + 1)
-    values = depth.conditional(weights, means, torch.tensor([0, 3]))
-    (gradient,) = torch.autograd.grad(torch.where(values.isnan(), 0.0, values).sum(), density)
-    assert torch.isfinite(gradient).all()
-    assert gradient.abs().max() == 0
 
 
 def test_max_weight_takes_the_nearest_of_equals():

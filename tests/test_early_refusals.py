@@ -21,12 +21,6 @@ def test_a_scan_where_photos_are_needed_is_named(command, tmp_path):
     assert listing(tmp_path) == {}
 
 
-def test_a_file_where_a_run_is_needed_is_named(tmp_path):
-    (tmp_path / "notes.txt").write_text("x")
-    error = error_of(nerfcli("report", tmp_path / "notes.txt"))
-    assert error[0] == f"Error: {tmp_path / 'notes.txt'} is a file, not a run folder"
-
-
 def test_json_nested_too_deeply_is_refused_and_not_a_traceback(tmp_path):
     """Before the format of IN is known, each reader looks into it."""
     (tmp_path / "reconstruction.json").write_text("[" * 100_000)

@@ -16,12 +16,11 @@ from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity, rotation_from_quaternion
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
-from nerfcli.field.contraction import training_points, uncontract
+from nerfcli.field.contraction import uncontract
 from nerfcli.field.cost import field_bytes
 from nerfcli.field.fourier_field import fourier_features
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.kernels import spherical_harmonics
-from nerfcli.kernels.activations import LOG_DENSITY_LIMIT, density_from_log
 from nerfcli.render import model as model_file
 from nerfcli.render.model import Marching, Model, load_model, save_model
 
@@ -75,26 +74,6 @@ def test_fourier_features_gradcheck():
     assert torch.autograd.gradcheck(lambda x: fourier_features(x, 3), x)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_density_is_the_exponential_and_so_is_its_gradient(dtype):
-    x = torch.linspace(-10, 10, 61, dtype=dtype, requires_grad=True)
-    density = density_from_log(x)
-    (gradient,) = torch.autograd.grad(density.sum(), x)
-    expected = x.detach().exp()
-    torch.testing.assert_close(density.detach(), expected, rtol=1e-6, atol=0)
-    torch.testing.assert_close(gradient, expected, rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("beyond", [25.0, 100.0, 1e30])
-def test_density_beyond_the_limits_stays_and_keeps_a_gradient(beyond):
-    x = torch.tensor([-beyond, beyond], requires_grad=True)
-    density = density_from_log(x)
-    (gradient,) = torch.autograd.grad(density.sum(), x)
-    limits = torch.tensor([-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT]).exp()
-    assert torch.equal(density.detach(), limits)
-    assert torch.equal(gradient, limits)
-
-
 def test_uncontract_is_the_inverse_of_contract_across_magnitudes():
     g = torch.Generator().manual_seed(0)
     unit = torch.nn.functional.normalize(torch.randn(500, 3, generator=g, dtype=torch.float64), dim=-1)
@@ -122,16 +101,6 @@ def test_coordinates_move_by_at_most_a_quarter():
 def test_an_unknown_contraction_is_refused():
     with pytest.raises(ValueError, match="contraction must be one of"):
         kernels.grid_coordinates(torch.zeros(1, 3), "l1")
-
-
-@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
-def test_grid_coordinates_and_back(contraction):
-    g = torch.Generator().manual_seed(0)
-    points = torch.rand(100, 3, generator=g, dtype=torch.float64) * 2 - 1
-    there = kernels.grid_coordinates(points, contraction)
-    assert (there >= 0).all()
-    assert (there <= 1).all()
-    torch.testing.assert_close(training_points(there, contraction), points, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)

@@ -165,19 +165,6 @@ def test_what_a_model_cannot_hold_is_listed(tmp_path):
     assert losses_colmap(more) == ("1 masks", "the split of 1 frames", "depth bounds", "the unit of length (metre)")
 
 
-def test_a_folder_with_other_files_is_left_alone(tmp_path):
-    capture = ring(CAMERAS["PINHOLE"])
-    (tmp_path / "a.jpg").write_bytes(b"photo")
-    with pytest.raises(UserError, match=r"contains files other than a COLMAP model, such as a\.jpg"):
-        write_colmap_binary(capture, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["a.jpg"]
-    (tmp_path / "model").mkdir()
-    (tmp_path / "model/rigs.bin").write_bytes(b"of the model that is replaced")
-    write_colmap_binary(capture, tmp_path / "model")
-    names = sorted(path.name for path in (tmp_path / "model").iterdir())
-    assert names == ["cameras.bin", "images.bin", "points3D.bin"]
-
-
 @pytest.mark.parametrize(
     ("suffix", "name"), [("bin", "a\0b"), ("bin", ""), ("txt", "a\nb"), ("txt", " a"), ("txt", "")]
 )

@@ -262,38 +262,6 @@ def synthetic() -> pycolmap.Reconstruction:
     return reconstruction
 
 
-@pytest.mark.parametrize("suffix", ["bin", "txt"])
-def test_a_colmap_model_is_read_as_pycolmap_wrote_it(tmp_path, synthetic, suffix):
-    (synthetic.write_binary if suffix == "bin" else synthetic.write_text)(str(tmp_path))
-    assert is_model(tmp_path)
-    model = read_model(tmp_path)
-    expected = {image.name: image for image in synthetic.images.values()}
-    assert [image.name for image in model.images] == sorted(expected)
-    for image in model.images:
-        camera = expected[image.name].camera
-        assert camera is not None
-        assert model.cameras[image.camera_id] == Camera(
-            camera.model.name, camera.width, camera.height, tuple(camera.params)
-        )
-        cam_from_world = np.vstack([expected[image.name].cam_from_world().matrix(), [0, 0, 0, 1]])
-        np.testing.assert_allclose(image.world_from_cam @ cam_from_world, np.eye(4), rtol=0, atol=1e-14)
-    points = np.array([point.xyz for point in synthetic.points3D.values()])
-    np.testing.assert_allclose(np.sort(model.points, axis=0), np.sort(points, axis=0), rtol=0, atol=1e-15)
-
-
-def test_points_of_a_colmap_model_project_onto_their_observations(tmp_path, synthetic):
-    """The whole chain against COLMAP's own: pose, lens and pixel positions, half a pixel included."""
-    synthetic.write_binary(str(tmp_path))
-    model = read_model(tmp_path)
-    by_name = {image.name: image for image in synthetic.images.values()}
-    for image in model.images:
-        observed = [p for p in by_name[image.name].points2D if p.has_point3D()]
-        points = np.array([synthetic.points3D[p.point3D_id].xyz for p in observed])
-        pixels, valid = model.cameras[image.camera_id].project(rigid.apply(rigid.inverse(image.world_from_cam), points))
-        assert valid.all()
-        np.testing.assert_allclose(pixels, np.array([p.xy for p in observed]), rtol=0, atol=1e-6)
-
-
 def test_colmap_images_that_are_not_on_disk_are_missing(tmp_path, synthetic):
     synthetic.write_binary(str(tmp_path))
     names = sorted(image.name for image in synthetic.images.values())

@@ -20,6 +20,14 @@ adam.step(0.1)
 assert (parameter < 1).all()
 """,
     "after training": "from nerfcli.workflows import evaluate, render, report",
+    "threads": """
+import torch
+torch.set_num_threads(1)
+from nerfcli.kernels import numba_cpu
+numba_cpu.warm_up()
+from nerfcli.kernels.numba_cpu.threads import use_threads
+assert (torch.get_num_threads(), use_threads()) == (1, 1)
+""",
     "peak memory": """
 import numpy as np
 from nerfcli.bench.machine import PeakMemory
@@ -70,6 +78,11 @@ def test_what_comes_after_training_loads_no_trainer(modules):
     loaded = modules["package"] | modules["conversion"] | modules["adam"] | modules["after training"]
     assert "nerfcli.runs.run" in loaded
     assert not [name for name in loaded if name.startswith("nerfcli.train")]
+
+
+def test_starting_numba_leaves_the_thread_count_alone(modules):
+    """Both libraries share one OpenMP: without care, the first compiled loop gave --threads 1 two threads."""
+    assert "threads" in modules, modules["stderr"]
 
 
 def test_peak_memory_is_that_of_the_work_since_it_began(modules):

@@ -3,9 +3,6 @@
 Gradients are compared as vectors (relative L2) and per element against the largest one.
 """
 
-import subprocess
-import sys
-
 import numba
 import numpy as np
 import pytest
@@ -212,17 +209,6 @@ def test_sample_coordinates(samples, contraction, reach, generator):
     fast, exact = run(numba_cpu.sample_coordinates, torch.float32), run(reference.sample_coordinates, torch.float64)
     for name, actual, expected in zip(("coordinates", "origins", "directions"), fast, exact, strict=True):
         assert_close(actual, expected, name)
-
-
-@once
-def test_sample_coordinates_that_are_known_are_taken(generator):
-    ray = torch.randn(1, 3, generator=generator)
-    computed, offsets = torch.rand(2, 3, generator=generator), torch.tensor([0, 2])
-    starts = torch.tensor([0.0, 1.0])
-    taken = numba_cpu.sample_coordinates(
-        ray, ray, starts, starts + 1, offsets=offsets, contraction="l2", computed=computed
-    )
-    assert torch.equal(taken, computed)
 
 
 @pytest.mark.parametrize("samples", SIZES)
@@ -479,33 +465,9 @@ def test_pixel_rays(count, channels, grids, generator):
 
 
 @once
-def test_starting_numba_leaves_the_thread_count_alone():
-    # Both libraries share one OpenMP: without care, the first compiled loop gave --threads 1 two threads.
-    program = (
-        "import torch; torch.set_num_threads(1); from nerfcli.kernels import numba_cpu; numba_cpu.warm_up(); "
-        "from nerfcli.kernels.numba_cpu.threads import use_threads; print(torch.get_num_threads(), use_threads()); "
-        "import gc; gc.freeze()  # ends half a second sooner"
-    )
-    reported = subprocess.run([sys.executable, "-c", program], check=True, stdout=subprocess.PIPE, text=True)
-    assert reported.stdout.split() == ["1", "1"]
-
-
-@once
 def test_numba_follows_when_the_thread_count_changes():
     limit = int(config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     # Numba's own count used to stay where the last loop had left it, and loops that asked for two threads got one.
     for wanted in (1, 2, 1, 2):
         torch.set_num_threads(wanted)
         assert use_threads() == numba.get_num_threads() == min(wanted, limit)
-
-
-def test_two_runs_are_bit_identical(generator):
-    points = torch.rand(3000, 3, generator=generator)
-    gradient = torch.randn(3000, 8, generator=generator)
-    results = []
-    for _ in range(2):
-        table = torch.ones(2, 64, 4, requires_grad=True)
-        numba_cpu.hash_encode(points, table, (5, 50), None, None).backward(gradient)
-        assert table.grad is not None
-        results.append(table.grad)
-    assert torch.equal(*results)

@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
-from nerfcli.media.images import write_png
 
 
 @pytest.fixture(scope="module")
@@ -82,40 +81,3 @@ def test_relative_errors_and_missing_photos(benchmark):
     for limit, auc in ((1, accuracy.auc_1), (3, accuracy.auc_3), (10, accuracy.auc_10)):
         expected = sum(max(0.0, 1 - error / limit) for error in errors) / 21  # 7 photos have 21 pairs
         assert auc == pytest.approx(expected, abs=1e-6)
-
-
-def test_too_few_photos_say_nothing(benchmark):
-    assert np.isnan(benchmark.compare_poses(random_poses(2), random_poses(2)).ate)
-
-
-def test_projection_matrices_are_taken_apart(benchmark, tmp_path):
-    """K [R | t], of either sign and any scale, in pixels of pictures twice as large."""
-    poses = random_poses(3)
-    k = np.array([[900.0, 0, 64], [0, 910, 48], [0, 0, 1]])
-    projections: dict[str, Any] = {}
-    for index, (pose, scale) in enumerate(zip(poses, (1.0, -3.0, 0.1), strict=True)):
-        write_png(tmp_path / "images" / f"{index}.png", np.zeros((48, 64, 3), np.uint8))
-        projections[f"world_mat_{index}"] = np.vstack([scale * (k @ rigid.inverse(pose)[:3]), [0, 0, 0, 1]])
-    np.savez(tmp_path / "cameras_sphere.npz", **projections)
-    truth = benchmark.read_truth(tmp_path, tmp_path / "images")
-    for name, pose in zip(["0.png", "1.png", "2.png"], poses, strict=True):
-        np.testing.assert_allclose(truth.world_from_cam[name], pose, atol=1e-9)
-        assert truth.focal_px[name] == pytest.approx(905 / 2)
-
-
-def test_frames_between_given_poses(benchmark, tmp_path):
-    """A camera on a circle, every tenth frame given: frames between are found, those after the last one are not."""
-
-    def pose(number: int) -> np.ndarray:
-        turn = Rotation.from_rotvec([0, 0, number / 50]).as_matrix()
-        return rigid.from_parts(turn, turn @ [2.0, 0, 0])
-
-    (tmp_path / "pose").mkdir()
-    for number in range(0, 101, 10):
-        np.savetxt(tmp_path / "pose" / f"frame-{number:06d}.txt", pose(number))
-    for number in (10, 33, 104):
-        write_png(tmp_path / "clip-frames" / f"frame_{number:06d}.png", np.zeros((4, 4, 3), np.uint8))
-    truth = benchmark.read_truth(tmp_path / "clip.mp4", tmp_path / "clip-frames")
-    assert sorted(truth.world_from_cam) == ["frame_000010.png", "frame_000033.png"]
-    np.testing.assert_allclose(truth.world_from_cam["frame_000010.png"], pose(10), atol=1e-12)
-    np.testing.assert_allclose(truth.world_from_cam["frame_000033.png"], pose(33), atol=1e-4)

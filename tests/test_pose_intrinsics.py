@@ -17,7 +17,7 @@ from commands import error_of, nerfcli
 from corner import CENTRES, FOCAL_PX, NAMES, write_capture
 from in_this_process import worker_in_this_process
 from PIL import Image
-from test_cli import USAGE, write_photos
+from test_cli import write_photos
 from test_pose_stages import model, rows
 from test_poses import similarity
 
@@ -220,15 +220,3 @@ def test_a_dry_run_says_which_cameras_are_used(tmp_path: Path):
     said = " ".join(result.stderr.split())
     assert "cameras.txt: 1 camera for 4 photos, 4 by size" in said
     assert "4 photos are 64x48, but the intrinsics are for 128x96: rescaled" in said
-
-
-@pytest.mark.parametrize(
-    ("line", "named"),
-    [
-        ("--intrinsics c.txt --camera-model OPENCV", "remove --camera-model"),
-    ],
-)
-def test_options_that_do_not_go_together_are_usage_errors(line: str, named: str):
-    result = nerfcli("poses", "x", *line.split())
-    assert result.exit_code == USAGE
-    assert named in " ".join(result.stderr.replace("│", " ").split())

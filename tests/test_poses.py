@@ -14,7 +14,7 @@ from in_this_process import worker_in_this_process
 from PIL import Image
 
 from nerfcli import scene
-from nerfcli.errors import BAD_INPUT, OUT_OF_MEMORY, TOO_FEW_PHOTOS, UserError
+from nerfcli.errors import OUT_OF_MEMORY, TOO_FEW_PHOTOS, UserError
 from nerfcli.media.images import read_image
 from nerfcli.poses.engine import supervise
 from nerfcli.poses.input.settings import PoseSettings
@@ -260,22 +260,6 @@ def test_a_folder_that_is_no_scene_is_not_replaced(tmp_path: Path):
     with pytest.raises(UserError, match="the folder contains other files"):
         estimate(tmp_path / "photos", tmp_path / "thesis")
     assert (tmp_path / "thesis" / "chapter.tex").is_file()
-
-
-def test_an_output_that_cannot_be_written_is_bad_input(tmp_path: Path):
-    write_noise(tmp_path / "photos")
-    with pytest.raises(UserError, match="cannot write") as caught:
-        estimate(tmp_path / "photos", tmp_path / "photos" / "0.png" / "scene")
-    assert caught.value.exit_code == BAD_INPUT
-
-
-def test_too_few_photos_write_nothing(tmp_path: Path):
-    write_noise(tmp_path / "photos")
-    for name in ("0.png", "1.png", "2.png"):
-        (tmp_path / "photos" / name).unlink()
-    with pytest.raises(UserError, match="only 2 photos"):
-        estimate(tmp_path / "photos", tmp_path / "scene")
-    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
 @pytest.mark.parametrize(

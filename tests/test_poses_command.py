@@ -31,20 +31,6 @@ def test_what_is_no_amount_of_memory(text: str):
 
 
 @pytest.mark.parametrize(
-    ("line", "named"),
-    [
-        ("--quality superb", "'superb'; choose fast, default or best"),
-        ("--pairing random", "'random'; choose auto, exhaustive, sequential, retrieval or spatial"),
-        ("--pairing spatial --pairs p.txt", "cannot be combined with --pairs"),
-    ],
-)
-def test_bad_values_are_usage_errors(line: str, named: str):
-    result = nerfcli("poses", "x", *line.split())
-    assert result.exit_code == USAGE
-    assert named in " ".join(result.stderr.replace("│", " ").split())
-
-
-@pytest.mark.parametrize(
     ("options", "size", "features"),
     [
         ((), 1600, 4096),

@@ -76,31 +76,6 @@ def test_every_eighth_name_is_held_out():
     assert default_split([]) == frozenset()
 
 
-def test_transforms_by_folder_and_by_file(tmp_path):
-    names = [f"images/{index}.png" for index in range(9)]
-    for name in names[:-1]:
-        write_image(tmp_path / name)
-    write_transforms(tmp_path, names)
-    for path in (tmp_path, tmp_path / "transforms.json"):
-        scene = scenes.load(path)
-        assert (scene.root, scene.kind, scene.unit) == (tmp_path, "transforms", "arbitrary")
-        assert [frame.name for frame in scene.frames] == names[:-1]
-        assert [frame.name for frame in scene.test_frames] == [names[0]]
-        assert len(scene.train_frames) == 7
-        assert scene.missing == (names[-1],)
-
-
-def test_blender_folder_keeps_its_own_split(tmp_path):
-    for name in ("train/a.png", "train/b.png", "test/a.png"):
-        write_image(tmp_path / name)
-    write_transforms(tmp_path, ["train/a", "train/b"], file="transforms_train.json")
-    write_transforms(tmp_path, ["test/a"], file="transforms_test.json")
-    scene = scenes.load(tmp_path)
-    assert scene.kind == "blender"
-    assert scene.test_names == {"test/a.png"}
-    assert [frame.name for frame in scene.train_frames] == ["train/a.png", "train/b.png"]
-
-
 def test_splits_that_nerfstudio_lists_are_kept(tmp_path):
     for name in "abcd":
         write_image(tmp_path / f"{name}.png")
@@ -115,16 +90,6 @@ def test_splits_that_nerfstudio_lists_are_kept(tmp_path):
     )
     assert [frame.name for frame in scenes.load(tmp_path).frames] == ["a.png", "d.png"]
     assert scenes.load(tmp_path).test_names == {"d.png"}
-
-
-def test_llff_folder(tmp_path):
-    write_image(tmp_path / "images_8/0.png")
-    pose = np.column_stack([np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]), np.zeros(3), [96, 128, 100]])
-    np.save(tmp_path / "poses_bounds.npy", np.concatenate([pose.ravel(), [1.0, 9.0]])[None])
-    scene = scenes.load(tmp_path)
-    assert scene.kind == "llff"
-    assert scene.frames[0].camera == Camera.pinhole(64, 48, 50.0)
-    np.testing.assert_array_equal(scene.depth_bounds, [[1, 9]])
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])

@@ -135,7 +135,7 @@ ALL, EACH, HOTTEST = "all", "each", "hottest"
 @pytest.mark.parametrize(
     ("capability", "which"),
     [
-        *((90, EACH), (80, HOTTEST), (120, HOTTEST)),
+        *((90, EACH), (80, HOTTEST)),
         *(pytest.param(capability, ALL, marks=pytest.mark.slow) for capability in (80, 90, 120)),
     ],
 )

@@ -9,10 +9,10 @@ from clips import encode, pan
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerfcli.errors import TOO_FEW_PHOTOS, UserError
+from nerfcli.errors import UserError
 from nerfcli.poses.input.frame_choice import MOVED_FRACTION, FrameMeasure, FrameMeter, MotionPicture, choose_frames
 from nerfcli.poses.input.pairs import capture_order
-from nerfcli.poses.input.video_frames import FRAMES_FILE, extract_frames, frames_folder
+from nerfcli.poses.input.video_frames import FRAMES_FILE, extract_frames
 
 # One frame in five is sharp; each moves by 2 pixels of 160.
 SHARP = [3, 5, 13, 19, 20, 26, 34, 36]
@@ -109,14 +109,6 @@ def test_a_video_that_moves_little_still_gets_enough_frames(
     assert np.diff(offsets[numbers]).min() > 0.9 * 160 * 0.005
 
 
-def test_a_camera_that_never_moves_is_reported(tmp_path):
-    path = encode(tmp_path / "still.mp4", pan([0.0] * 30))
-    with pytest.raises(UserError, match="has only 1 different frames; at least 4") as error:
-        extract(path, tmp_path / "frames", count=10)
-    assert error.value.exit_code == TOO_FEW_PHOTOS
-    assert not (tmp_path / "frames").exists()
-
-
 def test_frames_are_kept_and_not_replaced_without_overwrite(clip, tmp_path):
     folder = tmp_path / "frames"
     extract(clip, folder, count=8)
@@ -176,10 +168,3 @@ def test_a_meter_keeps_one_picture():
     assert moved[0] == np.inf
     # Motion is from an anchor, which is replaced by the first frame that has moved by 1 %, 1.6 of 160 pixels.
     np.testing.assert_allclose(moved[1:], np.array([1, 2, 1, 2]) / 160, atol=0.1 / 160)
-
-
-@pytest.mark.parametrize(
-    ("scene", "frames"), [("a/clip-scene", "a/clip-frames"), ("kitchen", "kitchen-frames"), ("out/scene", "out/frames")]
-)
-def test_frames_stand_beside_the_scene(scene, frames):
-    assert frames_folder(Path(scene)) == Path(frames)

@@ -2,12 +2,10 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from kernel_parts import parts_for
 
-from nerfcli.cameras.camera import Camera
 from nerfcli.field.fourier_field import fourier_features
 from nerfcli.kernels import LightEnds
 from nerfcli.kernels.reference import depth
@@ -38,15 +36,6 @@ def slabs(dtype):
     return density, torch.eye(3, dtype=dtype), torch.ones(3, dtype=dtype)
 
 
-def test_ray_of_a_pixel_has_unit_direction():
-    # K = diag(2, 2, 1), principal point 0, pixel (2, 0): (1, 0, 1) / sqrt 2; at distance sqrt 2 the point (1, 0, 1).
-    camera = Camera("PINHOLE", 4, 4, (2.0, 2.0, 0.0, 0.0))
-    directions, valid = camera.bearings(np.array([[2.0, 0.0]]))
-    assert valid.all()
-    np.testing.assert_allclose(directions[0], np.array([1, 0, 1]) / math.sqrt(2), atol=1e-15)
-    np.testing.assert_allclose(directions[0] * math.sqrt(2), [1, 0, 1], atol=1e-15)
-
-
 def test_slabs_weights_transmittance_and_colour(slabs, dtype):
     density, rgb, lengths = slabs
     colour, transmittance, weights = parts_for(dtype).composite(
@@ -59,13 +48,6 @@ def test_slabs_weights_transmittance_and_colour(slabs, dtype):
     entering = torch.exp(-parts_for(dtype).optical_depth_before(density, lengths, OFFSETS))
     close(entering, [1.0, 1 / 2, 1 / 4], dtype)
     close(-torch.expm1(-density * lengths), [1 / 2, 1 / 2, 3 / 4], dtype)
-
-
-def test_weights_are_differences_of_transmittance(slabs, dtype):
-    density, _, lengths = slabs
-    weights, behind = parts_for(dtype).interval_weights(density, lengths, OFFSETS)
-    at_edges = torch.cat([torch.exp(-parts_for(dtype).optical_depth_before(density, lengths, OFFSETS)), behind])
-    close(weights, at_edges[:-1] - at_edges[1:], dtype)
 
 
 def test_depths_of_slabs_at_points(slabs, dtype):
@@ -94,19 +76,6 @@ def test_median_of_slabs_is_inside_the_interval(slabs, dtype):
     close(depth.quantile(2 * density, starts, starts + lengths, offsets=OFFSETS, fraction=0.5), [0.5], dtype)
 
 
-@pytest.mark.parametrize(("optical_depth", "length"), [(1e-12, 2.0), (0.1, 1.0), (1.0, 3.0), (30.0, 0.5), (1e6, 1.0)])
-def test_mean_place_inside_an_interval(optical_depth, length, dtype):
-    # t0 + 1/s - d/(exp(s d) - 1), with the limits d/2 and 1/s; the closed form by mpmath-free series at small s d.
-    s = optical_depth / length
-    if optical_depth < 1e-6:
-        expected = length * (0.5 - optical_depth / 12)
-    else:
-        expected = 1 / s - (length / math.expm1(optical_depth) if optical_depth < 700 else 0.0)
-    t0 = torch.tensor([5.0], dtype=dtype)
-    mean = depth.interval_means(torch.tensor([s], dtype=dtype), t0, t0 + length)
-    close(mean, [5.0 + expected], dtype)
-
-
 def test_gradients_of_the_slabs(slabs, dtype):
     density, rgb, lengths = slabs
     density.requires_grad_()
@@ -119,19 +88,6 @@ def test_gradients_of_the_slabs(slabs, dtype):
     close(by_density[:, 1], [-1 / 16, 3 / 16, -1 / 4], dtype)
     by_red = torch.autograd.grad(colour[0, 0], rgb)[0]
     close(by_red[:, 0], weights.detach(), dtype)
-
-
-def test_one_observation_is_consistent_with_many_fields(dtype):
-    # y = alpha c on black: alpha 1/2 with c 1/2 and alpha 1/4 with c 1 both give 1/4.
-    for density, grey in ((math.log(2), 0.5), (-math.log(3 / 4), 1.0)):
-        colour, _, _ = parts_for(dtype).composite(
-            torch.tensor([density], dtype=dtype),
-            torch.full((1, 3), grey, dtype=dtype),
-            torch.ones(1, dtype=dtype),
-            offsets=torch.tensor([0, 1]),
-            background=torch.zeros(3, dtype=dtype),
-        )
-        close(colour, [[0.25] * 3], dtype)
 
 
 def test_fourier_features(dtype):

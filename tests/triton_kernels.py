@@ -391,14 +391,6 @@ def test_composite(samples, magnitude, generator):
         assert_close(a, b, name)
 
 
-def test_small_opacities_keep_their_digits():
-    density = torch.logspace(-10, 1, 60)
-    offsets = torch.arange(61)
-    weights, passing = compositing.interval_weights(*on_device(density, torch.ones(60), offsets))
-    torch.testing.assert_close(weights.cpu().double(), -torch.expm1(-density.double()), rtol=1e-6, atol=0)
-    torch.testing.assert_close(passing.cpu().double(), (-density.double()).exp(), rtol=4e-6, atol=0)
-
-
 @pytest.mark.parametrize("samples", SIZES)
 @pytest.mark.parametrize("far", [0.0, 1e4])
 def test_distortion(samples, far, generator):
@@ -455,22 +447,6 @@ def test_light_ends(samples, magnitude, fractions, generator):
             getattr(fast, name).cpu().double(), getattr(exact, name), rtol=2e-5, atol=1e-7, equal_nan=True,
             msg=lambda text, name=name: f"{name} {text}",
         )  # fmt: skip
-
-
-def test_a_far_thin_surface_has_its_spread():
-    """1e-4 wide at a distance of 1000, where the spacing of float32 is 6e-5."""
-    starts = torch.tensor([1000.0, 1000.25])
-    ends, density = starts + 0.25, torch.tensor([1e4, 1.0])
-    found = depth.light_ends(
-        *on_device(
-            density,
-            starts,
-            ends,
-        ),
-        offsets=torch.tensor([0, 2]).to(DEVICE),
-        fractions=(),
-    )
-    torch.testing.assert_close(found.spread.cpu(), torch.tensor([1e-4]), rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("rows", SIZES)
