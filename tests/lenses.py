@@ -6,7 +6,6 @@ from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.lens import DISTORTIONS
 
 MODELS = tuple(DISTORTIONS)
-WITHOUT_END = ("SIMPLE_FISHEYE", "FISHEYE", "EUCM", "SIMPLE_DIVISION", "DIVISION", "EQUIRECTANGULAR")
 WIDTH, HEIGHT = 1200, 900
 
 

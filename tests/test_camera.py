@@ -1,4 +1,4 @@
-"""Lens models against closed forms and OpenCV, the domain in which they can be inverted, and turning with the photo."""
+"""Cameras: bearings by hand and in closed form, sizes, records, and turning with the photo."""
 
 import json
 

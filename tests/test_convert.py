@@ -351,31 +351,23 @@ def test_stdout_is_the_path_and_stderr_the_report(tmp_path):
     assert (quiet.exit_code, quiet.stderr) == (0, "")
 
 
-def test_an_existing_result_is_kept(tmp_path):
+@pytest.mark.parametrize(
+    ("out", "form", "more", "message"),
+    [
+        ("out.json", "transforms", (), "out.json exists"),
+        ("out.json/model", "colmap", (), "cannot write"),
+        ("photos", "colmap", ("--overwrite",), "photos"),
+    ],
+)
+def test_what_is_in_the_way_is_kept(out, form, more, message, tmp_path):
     source = model_of(tmp_path, capture_of([PINHOLE]))
     (tmp_path / "out.json").write_text("mine")
-    result = nerfcli("convert", source, tmp_path / "out.json", "--to", "transforms", "--allow-loss")
-    assert result.exit_code == BAD_INPUT
-    assert "out.json exists" in error_of(result)[0]
-    assert (tmp_path / "out.json").read_text() == "mine"
-
-
-def test_an_output_that_cannot_exist_is_an_error_of_two_lines(tmp_path):
-    (tmp_path / "file").write_text("hello")
-    source = model_of(tmp_path, capture_of([PINHOLE]))
-    result = nerfcli("convert", source, tmp_path / "file" / "model", "--to", "colmap")
-    assert result.exit_code == BAD_INPUT
-    assert "cannot write" in error_of(result)[0]
-    assert (tmp_path / "file").read_text() == "hello"
-
-
-def test_a_folder_of_other_things_is_not_replaced_by_a_model(tmp_path):
-    source = model_of(tmp_path, capture_of([PINHOLE]))
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"photo")
     before = listing(tmp_path)
-    result = nerfcli("convert", source, tmp_path / "photos", "--to", "colmap", "--overwrite")
+    result = nerfcli("convert", source, tmp_path / out, "--to", form, "--allow-loss", *more)
     assert result.exit_code == BAD_INPUT
+    assert message in error_of(result)[0]
     assert listing(tmp_path) == before
 
 

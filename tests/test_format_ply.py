@@ -90,12 +90,6 @@ def test_points_that_colmap_exports(tmp_path):
     np.testing.assert_array_equal(colours[order], capture.colours[expected])
 
 
-def edges_of(data: bytes, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
-    start = data.index(b"end_header\n") + 11
-    vertices = np.frombuffer(data, "<f8", 3 * num_vertices, start).reshape(-1, 5, 3)
-    return vertices, np.frombuffer(data, "<i4", offset=start + 24 * num_vertices).reshape(-1, 8, 2)
-
-
 @pytest.mark.parametrize(
     ("data", "what"),
     [

@@ -1,4 +1,4 @@
-"""benchmarks/poses.py: its measures against closed forms, and its readers of truth against matrices made here."""
+"""benchmarks/poses.py: its measures against closed forms and a double loop."""
 
 import importlib.util
 import sys

@@ -1,4 +1,4 @@
-"""Step schedules, stratified places and draws from a histogram."""
+"""Step schedules."""
 
 import pytest
 import torch

@@ -19,7 +19,6 @@ from nerfcli.cameras.formats.transforms import parse_transforms
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.holdout import default_split
 
-POSE = np.eye(4).tolist()
 NAMES = [f"photo {index:02d}.jpg" for index in range(10)]
 
 
