@@ -4,7 +4,6 @@ The formulas rotate the object, as their sources do; nerfcli rotates the source.
 """
 
 import json
-import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,31 +81,6 @@ def _parallel(pixel: float) -> Projection:
     return seen
 
 
-def naf(folder: Path, *, protocol: int = 4, order: int = 1) -> Written:
-    values, path = -np.log(numbers()), folder / "a.pickle"
-    angles = np.radians(ANGLES_DEG)
-    content = {
-        "DSD": 1500.0,
-        "DSO": 1000.0,
-        "mode": "cone",
-        "accuracy": 0.5,
-        "filter": None,
-        "numTrain": 6,
-        "numVal": 3,
-        "nDetector": [COLUMNS, ROWS][::order],
-        "dDetector": [2.0, 3.0][::order],
-        "offDetector": [4.0, -6.0][::order],
-        "nVoxel": [4, 4, 4],
-        "dVoxel": [2.0, 2.0, 2.0],
-        "offOrigin": [0, 0, 0],
-        "train": {"angles": angles[:6], "projections": values[:6]},
-        "val": {"angles": angles[6:], "projections": values[6:]},
-        "image": np.arange(64, dtype=np.float32).reshape(4, 4, 4),
-    }
-    path.write_bytes(pickle.dumps(content, protocol=protocol))
-    return Written(path, _pinhole(1000, 1500, (2.0, 3.0), (4.0, -6.0)), values)
-
-
 def r2_gaussian(folder: Path) -> Written:
     values = -np.log(numbers())
     frames: dict[str, list[dict[str, object]]] = {"proj_train": [], "proj_test": []}
@@ -132,7 +106,7 @@ def r2_gaussian(folder: Path) -> Written:
 
 
 def _pinhole(origin: float, detector: float, pixel: tuple[float, float], offset: tuple[float, float]) -> Projection:
-    """Return NAF's projection: uu = (i + 0.5 - W / 2) d + off, for a camera with x right, y down, z forward."""
+    """Return R2-Gaussian's projection: uu = (i + 0.5 - W / 2) d + off, for a camera with x right, y down, z forward."""
 
     def seen(view: int, point: np.ndarray) -> tuple[float, float]:
         at = turned(-np.radians(ANGLES_DEG[view]), point)  # the source is on +x
@@ -288,7 +262,6 @@ def transforms(folder: Path) -> Written:
 WRITERS: dict[str, Callable[[Path], Written]] = {
     "data-exchange": data_exchange,
     "nxtomo": nxtomo,
-    "naf": naf,
     "r2-gaussian": r2_gaussian,
     "nikon": nikon,
     "skyscan": skyscan,

@@ -1,8 +1,6 @@
 """Damaged and mistaken scans: two lines that say what is wrong, or the right answer; never a traceback."""
 
 import json
-import os
-import pickle
 import re
 import shutil
 from collections.abc import Callable
@@ -21,7 +19,6 @@ from scan_files import (
     VIEWS,
     data_exchange,
     heltomo,
-    naf,
     nikon,
     nxtomo,
     r2_gaussian,
@@ -57,15 +54,6 @@ def edited(path: Path, old: str, new: str) -> Path:
     return path
 
 
-def pickled(folder: Path, change: Callable[[dict], object]) -> Path:
-    """NAF's pickle with another content."""
-    path = naf(folder).path
-    content = pickle.loads(path.read_bytes())
-    change(content)
-    path.write_bytes(pickle.dumps(content))
-    return path
-
-
 def without(folder: Path, name: str) -> Path:
     """A folder without one of its files."""
     (folder / name).unlink()
@@ -76,34 +64,6 @@ def cut(path: Path, fraction: float) -> Path:
     """A file of which only the first part was copied."""
     content = path.read_bytes()
     path.write_bytes(content[: int(fraction * len(content))])
-    return path
-
-
-class Bomb:
-    """An object whose pickle runs a program when it is loaded."""
-
-    def __init__(self, mark: Path):
-        self.mark = mark
-
-    def __reduce__(self) -> tuple[object, tuple[str]]:
-        return os.system, (f"touch {self.mark}",)
-
-
-def bomb(folder: Path) -> Path:
-    path = folder / "bomb.pickle"
-    path.write_bytes(pickle.dumps({"DSD": 1500.0, "train": Bomb(folder / "executed")}))
-    return path
-
-
-def pickle_of_a_list(folder: Path) -> Path:
-    (folder / "a.pkl").write_bytes(pickle.dumps([1]))
-    return folder / "a.pkl"
-
-
-def wrapped_bomb(folder: Path) -> Path:
-    """A reference to eval through builtins, written by hand."""
-    path = folder / "eval.pkl"
-    path.write_bytes(b"cbuiltins\neval\n(S'open(\"" + bytes(folder / "executed") + b'","w")\'\ntR.')
     return path
 
 
@@ -148,28 +108,6 @@ def other_mat(folder: Path) -> Path:
 
 # For each case: the function that makes the input in a folder, options, and the expected error.
 REFUSED: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
-    # Code in pickles.
-    "pickle with code": (bomb, (), "tries to call .*system and was not opened"),
-    "pickle with eval": (wrapped_bomb, (), "tries to call builtins.eval"),
-    "pickle cut off": (lambda f: cut(naf(f).path, 0.6), (), "cannot be read as a pickle"),
-    "pickle of a list": (pickle_of_a_list, (), "holds a list"),
-    "pickle without DSD": (lambda f: pickled(f, lambda c: c.pop("DSD")), (), "has no DSD"),
-    "pickle of another detector": (
-        lambda f: pickled(f, lambda c: c.update(nDetector=[7, 7])),
-        (),
-        "nDetector is 7 x 7",
-    ),
-    "pickle with missing angles": (
-        lambda f: pickled(f, lambda c: c["train"].update(angles=c["train"]["angles"][:4])),
-        (),
-        "4 angles for 6 projections",
-    ),
-    "pickle in degrees": (
-        lambda f: pickled(f, lambda c: c["train"].update(angles=np.linspace(0, 300, 6))),
-        (),
-        "look|angles span 300 radians",
-    ),
-    "pickle of another beam": (lambda f: pickled(f, lambda c: c.update(mode="helix")), (), "mode 'helix'"),
     # HDF5.
     "zero flats": (
         lambda f: rewritten(data_exchange(f).path, "exchange/data_white", np.zeros((3, ROWS, COLUMNS))),
@@ -344,13 +282,6 @@ def test_damage_is_reported_in_two_lines_and_nothing_is_written(name: str, tmp_p
     assert re.search(expected, error), error
     assert len(hint) > 10
     assert not (tmp_path / "out").exists()
-    assert not (place / "executed").exists()
-
-
-def test_the_bomb_would_have_gone_off(tmp_path: Path) -> None:
-    """The pickle of the test above does run a program if `pickle` loads it."""
-    pickle.loads(bomb(tmp_path).read_bytes())
-    assert (tmp_path / "executed").exists()
 
 
 def test_rows_of_nan_are_left_out(tmp_path: Path) -> None:

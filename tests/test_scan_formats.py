@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import error_of, nerfcli
-from scan_files import WRITERS, Written, naf, nikon, stack
+from scan_files import WRITERS, Written, nikon, stack
 
 from nerfcli.tomography.circle import Circle, circle_from_json, circle_of, differences
 from nerfcli.tomography.formats.assemble import axis_column
@@ -64,20 +64,9 @@ def test_the_axis_of_nikon_is_moved_and_tilted(top: float, bottom: float, record
     np.testing.assert_allclose(by_vectors, by_formula, atol=1e-9)
 
 
-@pytest.mark.parametrize("protocol", [0, 1, 2, 3, 4, 5])
-@pytest.mark.parametrize("order", [1, -1])
-def test_naf_is_read_in_every_protocol_and_order_of_the_detector(protocol: int, order: int, tmp_path: Path) -> None:
-    written = naf(tmp_path, protocol=protocol, order=order)
-    scan = read_scan(written.path)
-    np.testing.assert_allclose(*pixels_by_formula(written, scan.geometry), atol=1e-9)
-    assert scan.held_out == (6, 7, 8)
-
-
-@pytest.mark.parametrize(
-    ("form", "per_value"), [("naf", 1e-3), ("r2-gaussian", 1.0), ("transmission-transforms", None)]
-)
+@pytest.mark.parametrize(("form", "per_value"), [("r2-gaussian", 1.0), ("transmission-transforms", None)])
 def test_the_true_volume_is_found_in_its_unit(form: str, per_value: float | None, tmp_path: Path) -> None:
-    """Values of NAF are 1/m, indexed x, y, z; those of transforms are 8-bit, x fastest."""
+    """Values of R2-Gaussian are indexed x, y, z; those of transforms are 8-bit, x fastest."""
     found = load_truth(read_scan(WRITERS[form](tmp_path).path).history)
     assert found is not None
     grid, volume = found
@@ -103,24 +92,6 @@ def test_options_say_more_than_the_file(tmp_path: Path) -> None:
     assert scan.geometry.pixel_at_origin[1] == pytest.approx(plain.geometry.pixel_at_origin[1] / 10)
     assert not circle_of(scan.geometry)[0].mirrored
     assert circle_of(plain.geometry)[0].mirrored
-
-
-@pytest.mark.parametrize("suffix", [".npy", ".txt"])
-def test_vectors_of_astra_are_written(suffix: str, tmp_path: Path) -> None:
-    """The vectors by themselves project points as the format says."""
-    written = stack(tmp_path)
-    place = tmp_path / f"v{suffix}"
-    assert nerfcli("convert", written.path, place, "--to", "astra").exit_code == 0
-    vectors = np.load(place) if suffix == ".npy" else np.loadtxt(place)
-    facts = json.loads(place.with_suffix(".json").read_text())
-    assert facts["type"] == "cone_vec"
-    point = np.array([3.0, -2.0, 1.0])
-    for view, (source, centre, along, down) in enumerate(vectors.reshape(-1, 4, 3)):
-        # Where source + t (point - source) = centre + a along + b down.
-        a, b, _ = np.linalg.solve(np.stack([along, down, source - point], axis=1), source - centre)
-        expected = written.seen(view, point)
-        assert a + (facts["detector_columns"] - 1) / 2 == pytest.approx(expected[0], abs=1e-9)
-        assert b + (facts["detector_rows"] - 1) / 2 == pytest.approx(expected[1], abs=1e-9)
 
 
 def test_options_of_photos_are_refused_for_scans_and_the_other_way_round(tmp_path: Path, capture: Path) -> None:

@@ -150,16 +150,15 @@ def convert(
     If you are not sure, --detect compares the possible conventions with the photos.
 
     \b
-    Scans by X-rays become a scan folder, or ASTRA's vectors with --to astra (OUT ends in .npy or .txt):
+    Scans by X-rays become a scan folder, whose scene.json has ASTRA's vectors:
       DataExchange and NXtomo (.h5, .nxs), Nikon (.xtekct), SkyScan (.log), HelTomo (.mat), R2-Gaussian
-      (meta_data.json), NAF (.pickle, which is not executed), pictures with a scan.json that states what they are
+      (meta_data.json), pictures with a scan.json that states what they are
     --photons, --unit, --mirrored, --centre-of-rotation and --holdout are for them; --detect ranks the direction of
     rotation, the side that columns are numbered from, and the centre of rotation by how well they predict other views.
 
     \b
     Examples:
       nerfcli convert tooth.h5 tooth-scan --centre-of-rotation 295.8
-      nerfcli convert tooth-scan tooth.npy --to astra
       nerfcli convert photos-scene transforms.json --to transforms
       nerfcli convert fox/transforms.json fox/sparse/0 --to colmap
       nerfcli convert fern poses.txt --to kitti --allow-loss

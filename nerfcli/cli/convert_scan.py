@@ -49,7 +49,7 @@ def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console
             _refuse(path, [name for name in given if name in OF_SCANS], of="X-ray scans, and this is not one")
             return False
         from nerfcli.tomography.formats.scan_options import ScanOptions
-        from nerfcli.workflows.scans import ASTRA, OWN, convert_scan, detect_scan, judgement_record
+        from nerfcli.workflows.scans import OWN, convert_scan, detect_scan, judgement_record
 
         _refuse(
             path, [name for name in given if name not in (*OF_SCANS, *OF_BOTH)], of="photos, and this is an X-ray scan"
@@ -72,7 +72,7 @@ def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console
             raise typer.BadParameter("say where the result goes", param_hint="OUT")
         place = target
         if one_of_many:
-            place = target / (path.stem + ".npy" if to == ASTRA else path.stem if path.is_file() else path.name)
+            place = target / (path.stem if path.is_file() else path.name)
         record = convert_scan(
             path, place, to=to or OWN, given=options, overwrite=values["overwrite"], notify=console.note
         )

@@ -33,6 +33,7 @@ REMOVED: tuple[Removed, ...] = (
     Removed("bench", "--sweep", "2026-11-29", "give a run for rendering settings, a scene for trainings"),
     Removed("convert", "--georeference", "2026-11-29", "use --scale gps for metres; for surveys, see docs/formats.md"),
     Removed("convert", "--no-verify", "2026-11-29", "remove it: every file is read back and compared"),
+    Removed("convert", "--to astra", "2026-11-29", "scene.json in the folder of the scan has the vectors of ASTRA"),
     Removed("convert", "--to npz", "2026-11-29", "use --to nerfcli (a scene folder), or --to colmap without photos"),
     Removed("convert", "--tolerance", "2026-11-29", "remove it: a file is kept if no ray is off by more than 1e-6 px"),
     Removed("convert", "--verify", "2026-11-29", "remove it: every file is read back and compared"),

@@ -51,7 +51,7 @@ def reconstruction_settings(
         passes=given["steps"],
         field=field or "voxels",
         voxel_size=given["voxel_size"],
-        strength=values["tv"],
+        strength=1.0 if values["tv"] is None else values["tv"],
         centre=values["centre"],
         tilt=None if tilt is None else math.radians(tilt),
         air=None if values["air"] is None else bool(values["air"]),

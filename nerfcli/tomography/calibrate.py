@@ -1,17 +1,17 @@
-"""Corrections estimated from a scan's own measurements: the detector's tilt and the brightness of each view.
+"""Estimates from a scan's own measurements: the detector's tilt, the brightness of each view, and the model error.
 
 The tilt is judged by prediction: a volume fitted to every second view has to explain the others. See `centre` for the
 centre of rotation.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
 
 from nerfcli.tomography.geometry import ScanGeometry
-from nerfcli.tomography.grid import grid_of_scan
+from nerfcli.tomography.grid import VoxelGrid, grid_of_scan, layers_of_rays
 from nerfcli.tomography.likelihood import Poisson, likelihood_of
 from nerfcli.tomography.reconstruct import Problem, Projector, reconstruct, start
 from nerfcli.tomography.scan import Scan
@@ -28,6 +28,9 @@ SIGNIFICANT = 3.0
 PRIOR_PHOTONS = 1e4
 # The largest line integral of a ray beside the object.
 MOST_IN_AIR = 0.01
+# The trial for the model error predicts one in this many training views, after this many passes over the others, with
+# this many middle rows of the detector. Pixels and voxels keep their size: larger ones have larger errors.
+LEFT_OUT_EVERY, MODEL_ERROR_PASSES, MODEL_ERROR_ROWS = 5, 10, 12
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,32 @@ def air_factors(likelihood: Poisson, integrals: torch.Tensor) -> torch.Tensor:
     expected = torch.where(air, likelihood.open_beam * torch.exp(-integrals) + likelihood.background, 0).double().sum(1)
     counted = torch.where(air, likelihood.counts, 0).double().sum(1)
     return ((counted + PRIOR_PHOTONS) / (expected + PRIOR_PHOTONS)).float()
+
+
+def model_error(scan: Scan, geometry: ScanGeometry, grid: VoxelGrid, *, seconds: float | None) -> float:
+    """Estimate the model error of line integrals, see `Poisson`, from views that a trial does not fit.
+
+    Args:
+        scan: the scan; every fifth of its training views is predicted.
+        geometry: corrected geometry of all views.
+        seconds: time limit; None for no limit, so that the result does not depend on the machine.
+
+    Returns:
+        The error; 0 for measured line integrals, whose noise is estimated as a whole.
+    """
+    views = scan.training_views
+    left = views[2::LEFT_OUT_EVERY]
+    first = max((geometry.rows - MODEL_ERROR_ROWS) // 2, 0)
+    part = replace(scan, geometry=geometry).only_rows(first, min(first + MODEL_ERROR_ROWS, geometry.rows))
+    judge = likelihood_of(part, left)
+    if not isinstance(judge, Poisson):
+        return 0.0
+    fitted, layers = np.setdiff1d(views, left), layers_of_rays(grid, part.geometry)
+    problem = Problem(part.geometry.select(fitted), likelihood_of(part, fitted), layers)
+    fit = reconstruct(problem, start(problem), strength=1.0, passes=MODEL_ERROR_PASSES, seconds=seconds)
+    every = np.arange(len(left))
+    integrals = Projector(part.geometry.select(left), layers).forward(fit.volume, every)
+    return judge.found_model_error(integrals, torch.from_numpy(every))
 
 
 def _prediction(scan: Scan, geometry: ScanGeometry, *, binning: int) -> np.ndarray:

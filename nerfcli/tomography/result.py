@@ -35,7 +35,7 @@ class ReconstructionSettings:
         passes: number of passes over all views; None for no limit.
         field: one of `FIELDS`.
         voxel_size: in the scan's unit; None for the size of a pixel at the object.
-        strength: weight of total variation; None to choose it by predicting training views that are left out.
+        strength: weight of total variation, see `reconstruct`.
         centre: offset of the detector in columns; None to estimate it.
         tilt: rotation of the detector in its plane in radians; None to estimate it.
         air: whether the open beam of each view is measured in its pixels beside the object; None to decide by the data.
@@ -50,7 +50,7 @@ class ReconstructionSettings:
     passes: int | None = None
     field: str = "voxels"
     voxel_size: float | None = None
-    strength: float | None = None
+    strength: float = 1.0
     centre: float | None = None
     tilt: float | None = None
     air: bool | None = None
@@ -64,7 +64,7 @@ class ReconstructionSettings:
             )
         if self.voxel_size is not None and not self.voxel_size > 0:
             raise UserError(f"invalid voxel size {self.voxel_size:g}", "give --voxel-size a length above 0")
-        if self.strength is not None and not 0 <= self.strength < float("inf"):
+        if not 0 <= self.strength < float("inf"):
             raise UserError(
                 f"invalid weight of total variation: {self.strength:g}", "give a number of 0 or more, or leave it out"
             )
@@ -160,7 +160,9 @@ def load_reconstruction(run: Path) -> Reconstruction:
     try:
         content = read_sealed(run / DESCRIPTION)
         arrays = {name: read_array(run / name, digest) for name, digest in content["arrays"].items()}
-        grid = content["grid"]
+        grid, settings = content["grid"], content["settings"]
+        if settings["strength"] is None:  # earlier runs could choose it
+            settings["strength"] = content["used"]["strength"]
         return Reconstruction(
             arrays.pop(VOLUME),
             arrays.pop(MARKS),
@@ -168,7 +170,7 @@ def load_reconstruction(run: Path) -> Reconstruction:
             content["unit"],
             Path(content["scan"]),
             content["scan_digest"],
-            ReconstructionSettings(**content["settings"]),
+            ReconstructionSettings(**settings),
             content["used"],
             tuple(content["decisions"]),
             content["passes"],

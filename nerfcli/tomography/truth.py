@@ -23,7 +23,7 @@ def described_truth(
     """Return the entry of a scan's history from which `load_truth` loads the true volume.
 
     Args:
-        path: the file: a .npy, a pickle of NAF, or plain numbers of type `dtype`.
+        path: the file: a .npy, or plain numbers of type `dtype`.
         layout: order of the axes in the file, "zyx" or "xyz".
         shape: number of voxels (z, y, x).
         size: side of a voxel, in the scan's unit.
@@ -60,13 +60,9 @@ def load_truth(history: Mapping[str, Any]) -> tuple[VoxelGrid, np.ndarray] | Non
     try:
         if "dtype" in stated:
             volume = np.fromfile(path, dtype=stated["dtype"])
-        elif path.suffix == ".npy":
-            volume = np.load(path, allow_pickle=False)
         else:
-            from nerfcli.tomography.formats.naf import load_plain
-
-            volume = np.asarray(load_plain(path)["image"])
-    except (OSError, ValueError, KeyError) as error:
+            volume = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
         raise UserError(
             f"the true volume {path} cannot be read: {error}",
             "restore it, or convert the scan again without it",

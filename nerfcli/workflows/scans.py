@@ -7,7 +7,6 @@ import numpy as np
 
 from nerfcli.errors import GATE_NOT_MET, UserError
 from nerfcli.findings import as_json
-from nerfcli.tomography.astra import write_astra
 from nerfcli.tomography.checks.examine import ScanDiagnosis, examine_scan
 from nerfcli.tomography.checks.page import refuse_foreign, write_scan_page
 from nerfcli.tomography.circle import circle_from_json, circle_of, differences
@@ -18,8 +17,7 @@ from nerfcli.tomography.hypotheses import Judgement, judge
 from nerfcli.tomography.scan import Scan, is_scan, load_scan, save_scan
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 
-OWN, ASTRA = "nerfcli", "astra"
-WRITTEN = (OWN, ASTRA)
+OWN = "nerfcli"
 # Suffixes of scan files, which the name of a scan folder may not have.
 _FILE_SUFFIXES = (
     ".h5",
@@ -31,7 +29,6 @@ _FILE_SUFFIXES = (
     ".json",
     ".tif",
     ".tiff",
-    ".pickle",
     ".xtekct",
     ".log",
 )
@@ -48,33 +45,28 @@ def convert_scan(
     overwrite: bool = False,
     notify: Notify = silent,
 ) -> dict[str, Any]:
-    """Write a scan as a scan folder, or its geometry as ASTRA's vectors, and return its record as plain values.
+    """Write a scan as a scan folder, and return its record as plain values.
 
-    A written folder is read back, and the angles, distances and pixel sizes stated by the source are recovered from it.
+    The folder is read back, and the angles, distances and pixel sizes stated by the source are recovered from it.
 
     Args:
         source: a file or folder in a known format.
-        target: the folder, or the file of vectors.
-        to: nerfcli or astra.
+        target: the folder.
+        to: nerfcli; no other format holds a scan.
 
     Raises:
         UserError: the scan cannot be read or written, `target` exists, or the written scan differs from its source.
     """
-    if to not in WRITTEN:
-        raise UserError(f"a scan cannot be written as {to}", f"scans are written as {' or '.join(WRITTEN)}")
-    if to == OWN and target.suffix.lower() in _FILE_SUFFIXES:
-        astra = "add --to astra for a file of vectors, or " if target.suffix.lower() in (".npy", ".txt") else ""
-        raise UserError(f"{target}: a scan is written as a folder", f"{astra}give a folder, such as {target.stem}")
-    if target.exists() and not (overwrite and (target.is_file() or is_scan(target))):
-        what = "add --overwrite to replace it" if target.is_file() or is_scan(target) else "choose another output path"
+    if to != OWN:
+        raise UserError(f"a scan cannot be written as {to}", f"scans are written as {OWN}")
+    if target.suffix.lower() in _FILE_SUFFIXES:
+        raise UserError(f"{target}: a scan is written as a folder", f"give a folder, such as {target.stem}")
+    if target.exists() and not (overwrite and is_scan(target)):
+        what = "add --overwrite to replace it" if is_scan(target) else "choose another output path"
         raise UserError(f"{target} exists", what)
     if target.exists() and target.resolve() == source.resolve():
         raise UserError(f"{target} is the input itself", "choose another output path")
     scan = read_scan(source, given)
-    if to == ASTRA:
-        facts = write_astra(scan, target)
-        notify(f"{source}: {in_words(scan)}")
-        return {"to": to, "views": scan.geometry.views, "json": str(facts)}
     notify(f"{source}: {scan.history.get('format')}, {in_words(scan)}")
     for note in scan.history.get("notes", ()):
         notify(note)

@@ -18,7 +18,7 @@ from nerfcli.errors import UserError
 from nerfcli.exclusive import exclusive
 from nerfcli.memory import default_memory_limit
 from nerfcli.runs.files import LOCK, METRICS
-from nerfcli.tomography.calibrate import air_factors, beside_object, detector_tilt
+from nerfcli.tomography.calibrate import air_factors, beside_object, detector_tilt, model_error
 from nerfcli.tomography.centre import FEWEST_VIEWS, centre_of
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid, grid_of_scan
@@ -35,13 +35,11 @@ from nerfcli.tomography.result import (
     save_reconstruction,
 )
 from nerfcli.tomography.scan import Scan, load_scan
-from nerfcli.tomography.strength import choose_strength
 from nerfcli.workflows.machine import thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
-# Fraction of the time budget for choosing the weight of total variation, and of the time left for the coarse start.
-STRENGTH_FRACTION = 0.15
-COARSE_FRACTION = 0.1
+# Fraction of the time budget for the trial of the model error, and of the time left for the coarse start.
+TRIAL_FRACTION, COARSE_FRACTION = 0.0375, 0.1
 # Minimum fraction of the budget for the fit, even if the trials before it took longer than planned.
 LEAST_FRACTION = 0.25
 COARSE_PASSES = 6
@@ -147,18 +145,13 @@ def _fit(
     geometry = corrected_by(scan.geometry, centre, tilt)
     grid = earlier.grid if earlier is not None else grid_of_scan(geometry, settings.voxel_size)
     if earlier is not None:
-        strength, model_error = float(earlier.used["strength"]), float(earlier.used["model_error"])
+        strength, error = float(earlier.used["strength"]), float(earlier.used["model_error"])
     else:
-        most = None if settings.budget_seconds is None else STRENGTH_FRACTION * settings.budget_seconds
-        trial = choose_strength(scan, geometry, grid, max_seconds=most, progress=progress)
-        strength, model_error = trial.strength, trial.model_error
-        if settings.strength is None:
-            tried = ", ".join(f"{value:g}: {deviance:.3f}" for value, deviance in sorted(trial.tried))
-            decisions.append(f"total variation: weight {strength:g}; chi-square of left-out views by weight: {tried}")
-        else:
-            strength = settings.strength
-        if model_error > 0:
-            decisions.append(f"model error: line integrals are uncertain by {model_error:.2g} beyond photon noise")
+        progress(0.0, "model error")
+        most = None if settings.budget_seconds is None else TRIAL_FRACTION * settings.budget_seconds
+        strength, error = settings.strength, model_error(scan, geometry, grid, seconds=most)
+        if error > 0:
+            decisions.append(f"model error: line integrals are uncertain by {error:.2g} beyond photon noise")
     likelihood = likelihood_of(scan, views)
     factors = None
     if earlier is not None:
@@ -168,10 +161,10 @@ def _fit(
     if factors is not None and isinstance(likelihood, Poisson):
         likelihood = likelihood.scaled(torch.tensor(factors))
     if isinstance(likelihood, Poisson):
-        likelihood = likelihood.with_model_error(model_error)
+        likelihood = likelihood.with_model_error(error)
     problem = Problem(geometry.select(views), likelihood, grid)
 
-    used = {"strength": strength, "model_error": model_error, "centre": centre, "tilt": tilt, "air": factors}
+    used = {"strength": strength, "model_error": error, "centre": centre, "tilt": tilt, "air": factors}
     limit = Limit(settings.passes, settings.budget_seconds, begun, 0 if earlier is None else earlier.passes)
     if settings.field == "hash":
         used["start"] = mean_attenuation(problem) if earlier is None else earlier.used["start"]
@@ -182,7 +175,7 @@ def _fit(
         if earlier is not None:
             fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
         else:
-            fit = _coarse_start(scan, geometry, grid, factors, (strength, model_error), limit.seconds)
+            fit = _coarse_start(scan, geometry, grid, factors, (strength, error), limit.seconds)
         fit, interrupt = _fit_voxels(problem, fit, strength, limit, progress=progress)
         learned = {}
     found = marks(problem.geometry, grid)
@@ -361,9 +354,9 @@ def _coarse_start(
     views = scan.training_views
     small = grid.coarser(2)
     likelihood = likelihood_of(scan, views, binning=2)
-    strength, model_error = weights
+    strength, error = weights
     if isinstance(likelihood, Poisson):
-        likelihood = likelihood.with_model_error(model_error)
+        likelihood = likelihood.with_model_error(error)
         likelihood = likelihood if factors is None else likelihood.scaled(torch.tensor(factors))
     problem = Problem(geometry.binned(2).select(views), likelihood, small)
     limit = None if seconds is None else COARSE_FRACTION * seconds

@@ -8,7 +8,6 @@ from nerfcli.errors import UserError
 from nerfcli.tomography.formats import (
     hdf5,
     heltomo,
-    naf,
     nikon,
     r2_gaussian,
     skyscan,
@@ -23,7 +22,6 @@ READERS: dict[str, Reader] = {
     "data-exchange": hdf5.read_data_exchange,
     "nxtomo": hdf5.read_nxtomo,
     "r2-gaussian": r2_gaussian.read_r2_gaussian,
-    "naf": naf.read_naf,
     "nikon": nikon.read_nikon,
     "skyscan": skyscan.read_skyscan,
     "heltomo": heltomo.read_heltomo,
@@ -47,8 +45,6 @@ def recognise(path: Path) -> str | None:
         return None
     if suffix in hdf5.SUFFIXES:
         return hdf5.hdf5_form(path)
-    if suffix in naf.SUFFIXES:
-        return "naf"
     if suffix in nikon.SUFFIXES:
         return "nikon"
     if suffix in skyscan.SUFFIXES:
