@@ -41,11 +41,3 @@ def test_no_time_is_estimated_from_hardly_any_work_or_beside_a_better_estimate(c
         clock(20.0)
         update(0.5, "(5 of 10 photos, about 34 s left)")
     assert capsys.readouterr().err == "poses desk: 1 %\nposes desk: 50 % (5 of 10 photos, about 34 s left)\n"
-
-
-def test_a_quiet_console_shows_no_progress(clock, capsys):
-    with Console(quiet=True, json_lines=False).progress("train desk") as update:
-        update(0.0, "")
-        clock(60.0)
-        update(0.5, "")
-    assert capsys.readouterr().err == ""
