@@ -37,7 +37,6 @@ def test_facts_fit_the_lines_of_a_terminal():
         "kind": "run",
         "held_out": 1,
         "loss": 0.015097633935511112,
-        "samples_per_second": 281_659,
         "settings": {"seed": 0, "steps": None, "log2_rows": 18, "fixed": ["points", "view"]}
         | {f"setting_{i}": i for i in range(9)},
         "components": {"view": 3, "stereo": True, "points": 0.1},
@@ -50,7 +49,6 @@ def test_facts_fit_the_lines_of_a_terminal():
         "kind: run",
         "held out: 1",
         "loss: 0.0150976",
-        "samples per second: 281659",
         'settings: seed=0, log2_rows=18, fixed=["points", "view"], setting_0=0, setting_1=1, setting_2=2, setting_3=3,',
         "  setting_4=4, setting_5=5, setting_6=6, setting_7=7, setting_8=8",
         "components: view=3, stereo=true, points=0.1",
