@@ -334,14 +334,15 @@ def _wait_for_worker(scene: Path) -> None:
 
 @pytest.mark.slow
 def test_ten_kills_at_random_moments_change_nothing(photos: Path, whole: Path, tmp_path: Path):
-    """The whole command is killed (SIGKILL); its worker then ends by itself, and the next call waits for neither."""
+    """The whole process is killed (SIGKILL); its worker then ends by itself, and the next call waits for neither."""
     rng = random.Random(0)
     scene = tmp_path / "scene"
-    command = [sys.executable, "-m", "nerfcli", "poses", str(photos), "-o", str(scene), "--quality", "fast"]
-    command += ["--max-size", "192", "--camera-model", "SIMPLE_RADIAL"]
+    settings = f"from nerfcli.poses.input.settings import PoseSettings; settings = {ONE_THREAD!r}"
+    script = f"import sys, nerfcli; {settings}; nerfcli.estimate_poses(*sys.argv[1:], settings)"
+    command = [sys.executable, "-c", script, str(photos), str(scene)]
     environment = {**os.environ, "PYTHONPATH": str(Path(nerfcli.__file__).parent.parent)}
     for _ in range(10):
-        process = subprocess.Popen([*command, "--threads", "1", "--quiet"], env=environment, stderr=subprocess.PIPE)
+        process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
         time.sleep(rng.uniform(0.5, 6.0))
         process.send_signal(signal.SIGKILL)
         process.communicate()
