@@ -8,7 +8,6 @@ from typing import Annotated, TypeVar
 import typer
 
 from nerfcli.holdout import check_holdout
-from nerfcli.memory import default_memory_limit
 
 Word = TypeVar("Word", str, str | None)
 
@@ -185,12 +184,3 @@ def holdout_rule(holdout: str | None) -> str | None:
         return None if holdout is None else check_holdout(holdout)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--holdout") from error
-
-
-def memory_limit(memory: str | None, device: str = "cpu") -> int | None:
-    """Parse --memory to bytes, with `default_memory_limit` of the device if it is not given.
-
-    Raises:
-        typer.BadParameter: not an amount of memory.
-    """
-    return default_memory_limit(device) if memory is None else bytes_from_text(memory)

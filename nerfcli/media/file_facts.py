@@ -149,9 +149,9 @@ _READERS: dict[str, Callable[[Path], str | None]] = {
 def file_facts(path: Path) -> dict[str, Any]:
     """Return the facts about one file as plain values.
 
-    Keys: kind ("depth", "levels", "preview", "picture", "video", "array"), format, width and height, depth (in words),
-    meaning (`DepthMeta` as plain values), not_stated, maps (for each map its dtype, shape, valid_share, min, median and
-    max in the unit of the meaning), texts (other texts in a PNG).
+    The facts are kind ("depth", "levels", "preview", "picture", "video" or "array"), format, width, height, depth (one
+    sentence), meaning (`DepthMeta` as plain values), not_stated, maps (dtype, shape, valid_share, min, median, max of
+    each map, in the unit of the meaning) and texts (other text chunks of a PNG).
 
     Raises:
         UserError: the file is missing, damaged, or of another kind.
