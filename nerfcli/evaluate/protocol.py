@@ -21,8 +21,8 @@ from nerfcli.evaluate.perceptual import NAME as LPIPS_NAME
 from nerfcli.evaluate.perceptual import SMALLEST, Perceptual
 from nerfcli.field.background import Background
 from nerfcli.field.exposure import exposed
-from nerfcli.render.model import Model
-from nerfcli.render.pictures import RenderedPicture, render_picture
+from nerfcli.render.pictures import RenderedPicture
+from nerfcli.render.renderable import Renderable
 
 PROTOCOL = "nerfcli-2"
 
@@ -80,7 +80,7 @@ class Extras:
 
 
 def evaluate_model(
-    model: Model,
+    model: Renderable,
     held_out: Sequence[HeldOutPhoto],
     *,
     on_image: Callable[[int, int], None],
@@ -120,7 +120,7 @@ def evaluate_model(
     for index, photo in enumerate(held_out):
         background = background_of(model, photo)
         began = time.perf_counter()
-        picture = render_picture(model, photo.frame, background=background, on_tile=on_tile)
+        picture = model.render(photo.frame, background=background, on_tile=on_tile)
         seconds.append(time.perf_counter() - began)
         compared = compare(photo, picture)
         extras.keep(compared)
@@ -166,7 +166,7 @@ def mean_of(images: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
     return means
 
 
-def background_of(model: Model, photo: HeldOutPhoto) -> Background:
+def background_of(model: Renderable, photo: HeldOutPhoto) -> Background:
     """Return the background of pictures that are compared with a photo: white if the photo has alpha."""
     return (1.0, 1.0, 1.0) if photo.pixels.shape[-1] == 4 else model.background
 

@@ -19,11 +19,11 @@ from nerfcli.export.settings import depth_meta
 from nerfcli.export.unfinished import UnfinishedFrames, take_over, unfinished_of
 from nerfcli.media.levels import scale_in_words
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
-from nerfcli.render.model import Model
+from nerfcli.render.renderable import Renderable
 
 
 def export_frames(
-    model: Model,
+    model: Renderable,
     order: Order,
     folder: Path,
     *,
@@ -89,7 +89,7 @@ def export_frames(
 
 
 def export_part(
-    model: Model,
+    model: Renderable,
     order: Order,
     folder: Path,
     part: range,
@@ -115,7 +115,7 @@ def export_part(
 
 
 def _render_missing(
-    model: Model,
+    model: Renderable,
     order: Order,
     part: range,
     *,

@@ -17,12 +17,12 @@ from nerfcli.field.background import Background, SphereBackground
 from nerfcli.media.depth_pictures import DepthMeta, limits_in_words
 from nerfcli.media.images import write_png
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
-from nerfcli.render.accuracy import measure_error, truncation_bounds
+from nerfcli.render.accuracy import truncation_bounds
 from nerfcli.render.coverage import DepthMap, coverage_and_parallax
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.depth_errors import DepthErrors
-from nerfcli.render.model import Model
-from nerfcli.render.pictures import RenderedPicture, render_picture, straight_rgba
+from nerfcli.render.pictures import RenderedPicture, straight_rgba
+from nerfcli.render.renderable import Renderable
 from nerfcli.render.tracing import TOLERANCE
 
 
@@ -117,7 +117,7 @@ def _to_bytes(values: np.ndarray) -> np.ndarray:
 
 
 def render_frame(
-    model: Model, order: Order, index: int, *, unfinished: UnfinishedFrames, on_rays: Callable[[int], None]
+    model: Renderable, order: Order, index: int, *, unfinished: UnfinishedFrames, on_rays: Callable[[int], None]
 ) -> None:
     """Render a frame and write its files to the unfinished folder.
 
@@ -129,7 +129,7 @@ def render_frame(
     frame, name, settings = order.frames[index], order.names[index], order.settings
     wanted = settings.depth if settings.measured else None
     background = BLACK if settings.rgba else model.background
-    picture = render_picture(model, frame, background=background, depth=wanted, on_tile=on_rays)
+    picture = model.render(frame, background=background, depth=wanted, on_tile=on_rays)
     if settings.rgba:
         picture = replace(picture, rgb=straight_rgba(picture))
     removed = {}
@@ -138,8 +138,7 @@ def render_frame(
         if order.depth_errors is not None:
             picture = with_measured_errors(picture, order.depth_errors)
         picture, removed = without_unseen_depth(picture, settings.depth)
-    measured = measure_error(model, frame, depth=wanted, tolerance=TOLERANCE)
-    facts = truncation_bounds(picture, TOLERANCE) | measured.to_json()
+    facts = truncation_bounds(picture, TOLERANCE) | model.measured_error(frame, depth=wanted)
     bounds = {**facts, "meaning": ERROR_IN_WORDS}
     meta = frame_meta(depth_meta(model, settings.depth), frame, provenance=order.provenance, error_bounds=bounds)
     files = _write_outputs(picture, unfinished.folder, name, settings=settings, meta=meta, background=model.background)

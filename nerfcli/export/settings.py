@@ -6,7 +6,7 @@ from typing import Any
 from nerfcli.media.depth_pictures import CONVENTION_OF, QUANTITIES, DepthMeta
 from nerfcli.render import depth_errors
 from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
-from nerfcli.render.model import Model
+from nerfcli.render.renderable import Renderable
 
 OUTPUTS = ("rgb", "depth", "opacity", *CONVENTION_OF)
 # Measured outputs, which are stored as floats, with previews in false colours.
@@ -98,7 +98,7 @@ class ExportSettings:
         return {"levels": self.in_levels or None, "video": video}
 
 
-def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
+def depth_meta(model: Renderable, request: DepthRequest) -> DepthMeta:
     """Return the definition of the depth that `request` asks for."""
     return DepthMeta(
         convention=request.convention,

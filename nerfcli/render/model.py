@@ -3,21 +3,26 @@
 import dataclasses
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from nerfcli import kernels
+from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.field.background import Background, SphereBackground
 from nerfcli.field.checkpoint import read_checkpoint, refuse_non_finite, save_tensors, tensors_of
 from nerfcli.field.interface import Field
 from nerfcli.field.kinds import fresh_field, settings_from_json
+from nerfcli.render.depth import DepthRequest
+
+if TYPE_CHECKING:
+    from nerfcli.render.pictures import RenderedPicture
 
 FORMAT = "nerfcli field 2"
 # Format without a choice of contractions; still read.
@@ -114,6 +119,26 @@ class Model:
     def thread_safe(self) -> bool:
         """Whether several threads may render it at the same time; only on a CPU."""
         return self.device.type == "cpu" and kernels.thread_safe()
+
+    def render(
+        self,
+        frame: Frame,
+        *,
+        background: Background,
+        depth: DepthRequest | None = None,
+        on_tile: Callable[[int], None] | None = None,
+    ) -> "RenderedPicture":
+        """Render a frame, see `render_picture`."""
+        from nerfcli.render.pictures import render_picture
+
+        return render_picture(self, frame, background=background, depth=depth, on_tile=on_tile)
+
+    def measured_error(self, frame: Frame, *, depth: DepthRequest | None) -> dict[str, float]:
+        """Return the measured error of the rendering, see `measure_error`."""
+        from nerfcli.render.accuracy import measure_error
+        from nerfcli.render.tracing import TOLERANCE
+
+        return measure_error(self, frame, depth=depth, tolerance=TOLERANCE).to_json()
 
     def stretched(self, factor: float) -> "Model":
         """Return the same model with steps along rays `factor` times as long."""

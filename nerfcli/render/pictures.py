@@ -10,6 +10,7 @@ from torch import Tensor
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.background import Background, colours_behind
+from nerfcli.kernels import LightEnds
 from nerfcli.render.depth import DepthRequest, disagreement, fractions, median, requested, spread
 from nerfcli.render.model import Model
 from nerfcli.render.rays import PictureRays, successive_rays
@@ -159,19 +160,40 @@ def _render_tile(
     if depth is None:
         return colours
     scale = model.training_from_scene.scale
-    # From distances along the ray in the training frame to distances along the axis in the scene's unit. There is no z
-    # behind the camera.
-    factor, ahead = torch.full_like(rays.cosines[part], 1.0 / scale), torch.ones_like(valid)
-    if depth.axis == "z":
-        ahead = rays.cosines[part] > 0
-        factor = torch.where(ahead, rays.cosines[part], 1.0) / scale
-    ends = seen.ends._replace(
-        opacity=opacity,
-        mean=seen.ends.mean * factor,
-        spread=seen.ends.spread * factor,
-        heaviest=seen.ends.heaviest * factor,
-        quantiles=seen.ends.quantiles * factor[:, None],
+    maps = depth_maps_of(
+        depth,
+        seen.ends._replace(opacity=opacity),
+        cosines=rays.cosines[part],
+        unit=scale,
+        valid=valid,
+        background_distance=(depth.background_distance or 0.0) * scale,
     )
-    distances = requested(depth, ends, background_distance=(depth.background_distance or 0.0) * scale * factor)
+    return *colours, *maps
+
+
+def depth_maps_of(
+    depth: DepthRequest, ends: LightEnds, *, cosines: Tensor, unit: float, valid: Tensor, background_distance: float
+) -> tuple[Tensor, ...]:
+    """Return the requested depth, spread, disagreement and median (R,), NaN where undefined.
+
+    Args:
+        ends: where the light of the rays ends, as distances along them.
+        cosines: (R,) of the angles to the optical axis.
+        unit: length of a unit of the maps, in that of the distances.
+        valid: (R,) bool, whether there is a ray.
+        background_distance: that of the request, in the unit of the distances.
+    """
+    # There is no z behind the camera.
+    factor, ahead = torch.full_like(cosines, 1.0 / unit), torch.ones_like(valid)
+    if depth.axis == "z":
+        ahead = cosines > 0
+        factor = torch.where(ahead, cosines, 1.0) / unit
+    ends = ends._replace(
+        mean=ends.mean * factor,
+        spread=ends.spread * factor,
+        heaviest=ends.heaviest * factor,
+        quantiles=ends.quantiles * factor[:, None],
+    )
+    distances = requested(depth, ends, background_distance=background_distance * factor)
     maps = (distances, spread(depth, ends), disagreement(depth, ends), median(depth, ends))
-    return *colours, *(torch.where(valid & ahead, values, torch.nan) for values in maps)
+    return tuple(torch.where(valid & ahead, values, torch.nan) for values in maps)
