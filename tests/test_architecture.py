@@ -83,18 +83,20 @@ MAY_IMPORT = {
     "report": {"runs", "evaluate", "export", "render", "field", "scene", "cameras", "media", "pages"},
     "workflows": {
         *("ablate", "report", "export", "evaluate", "train", "runs", "photos", "doctor", "poses"),
-        *("surface", "viewer", "tomography", "findings"),
+        *("surface", "splats", "viewer", "tomography", "findings"),
         *("poses.model", "poses.input", "convert", "render", "field", "scene", "cameras", "media"),
         "pages",
     },
     "viewer": {"photos", "render", "field", "kernels", "cameras", "media", "pages"},
     "surface": {"photos", "render", "kernels", "cameras", "media"},
+    "splats": {"photos", "render", "field", "kernels", "cameras", "media", "pages"},
 }
 # Libraries that are heavy, or whose use must stay confined, and the parts that may use them.
 CONFINED = {
     "torch": {
         *("kernels", "field", "render", "runs", "train", "search", "fit", "evaluate", "export"),
         *("selftest", "bench", "workflows", "cli", "photos", "surface", "viewer", "tomography", "distributed"),
+        "splats",
     },
     "safetensors": {"field"},
     "numba": {"kernels"},

@@ -45,3 +45,13 @@ def spherical_harmonics(directions: Tensor, degree: int = 3) -> Tensor:
     if degree == 3:
         return harmonics
     return harmonics * (torch.arange(16, device=x.device) < (degree + 1) ** 2)
+
+
+def splat_harmonics(directions: Tensor) -> Tensor:
+    """Return the 16 harmonics with the signs of splat files: those of odd order m are negated.
+
+    In the order of `spherical_harmonics` these are all with an odd number. Differentiable.
+    Source: Kerbl et al. 2023, 3D Gaussian Splatting for Real-Time Radiance Field Rendering, released code.
+    """
+    signs = torch.tensor([1.0, -1.0] * 8, dtype=directions.dtype, device=directions.device)
+    return spherical_harmonics(directions) * signs

@@ -8,11 +8,16 @@ grid; L levels of a table, T rows per level, F features per row.
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
+import numpy as np
 from torch import Tensor
 
 # Widths that compiled kernels are written for: of rows of a table, of codes and hidden layers, of the density network's
 # outputs and of spherical harmonics.
 FEATURES, WIDTH, OUT = 4, 32, 16
+# Of splats: added to the diagonal of covariances, px^2, as every program that shows splats does; limits of opacities.
+LOW_PASS, SMALLEST_ALPHA, LARGEST_ALPHA = 0.3, 1 / 255, 0.99
+# Fraction of a picture's size beyond its edge at which splats end: there the lens is no longer its tangent.
+BEYOND = 0.15
 # Assumed colour of samples whose colour is not evaluated; the error is at most half of their weight.
 UNSEEN = 0.5
 
@@ -228,6 +233,56 @@ class PixelTable(NamedTuple):
     poses: Tensor
     colours: Tensor
     grids: BearingGrids | None = None
+
+
+class Splats(NamedTuple):
+    """N Gaussians: means (N, 3), log_scales (N, 3), quaternions (N, 4), logits (N,) of opacity, harmonics (N, K, 3)."""
+
+    means: Tensor
+    log_scales: Tensor
+    quaternions: Tensor
+    logits: Tensor
+    harmonics: Tensor
+
+
+class Footprints(NamedTuple):
+    """N Gaussians in a picture.
+
+    Args:
+        centres: (N, 2) pixels.
+        covariances: (N, 2, 2) square pixels, with `LOW_PASS` on the diagonal.
+        opacities: (N,) at the centres.
+        colours: (N, 3) sRGB.
+        distances: (N,) of the means from the camera.
+    """
+
+    centres: Tensor
+    covariances: Tensor
+    opacities: Tensor
+    colours: Tensor
+    distances: Tensor
+
+
+class SplatView(NamedTuple):
+    """A camera of splats: NumPy arrays, float64.
+
+    Args:
+        rotation, translation: (3, 3) and (3,), camera axes from the frame of the splats.
+        width, height: of the picture.
+        near: distance below which Gaussians are left out.
+        table: (2, G, G) coefficients of bicubic B-splines of the pixel's x and y, indexed [axis, y, x], over the
+            stereographic coordinates s = (x, y) / (|p| + z) of points p in camera axes.
+        first, step: (2,) s at the first coefficient, and between two.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    width: int
+    height: int
+    near: float
+    table: np.ndarray
+    first: np.ndarray
+    step: np.ndarray
 
 
 # Called with a name, a tensor whose rows belong to samples, and the ray (N,) of each row.

@@ -54,3 +54,21 @@ def sigmoid_slope(x: Any) -> Any:
     """Return the derivative of `sigmoid`: value * (1 - value) would lose every digit near 1."""
     tail = exponential(-abs(x))
     return tail / ((np.float32(1) + tail) * (np.float32(1) + tail))
+
+
+@numba.njit(inline="always")
+def power_of_two(x: Any) -> Any:
+    """Return 2^x to a relative error of 3e-7, with x clipped to [-126, 127]; NaN for NaN.
+
+    2^x = 2^n 2^f with an integer n and |f| <= 1/2; 2^f by a polynomial, the best of its degree.
+    """
+    x = min(max(x, np.float32(-126)), np.float32(127))
+    n = np.floor(x + np.float32(0.5))
+    f = x - n
+    y = np.float32(1.322539872e-3)
+    y = y * f + np.float32(9.675668553e-3)
+    y = y * f + np.float32(5.550863966e-2)
+    y = y * f + np.float32(2.402213067e-1)
+    y = y * f + np.float32(6.931469440e-1)
+    y = y * f + np.float32(1)
+    return y * float_of_bits(np.int32((np.int32(n) + np.int32(127)) << np.int32(23)))

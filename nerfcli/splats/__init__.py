@@ -1,0 +1,1 @@
+"""Gaussian splats: made from a trained field, refined on its training photos, rendered, read and written."""
