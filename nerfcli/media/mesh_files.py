@@ -6,7 +6,7 @@ The description consists of plain values, the same for all formats: a comment `n
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,17 @@ def comments_of(description: Mapping[str, Any]) -> list[str]:
     return [line.replace("±", "+-").encode("ascii", "backslashreplace").decode() for line in lines]
 
 
+def description_in(comments: Iterable[str]) -> dict[str, Any]:
+    """Return the description that `comments_of` wrote; empty if there is none."""
+    for comment in comments:
+        if comment.startswith(f"{KEY} {{"):
+            try:
+                return json.loads(comment.partition(" ")[2])
+            except ValueError:
+                break
+    return {}
+
+
 def write_ply(
     path: Path,
     columns: Mapping[str, np.ndarray],
@@ -68,6 +79,17 @@ def write_ply(
     Raises:
         UserError: the file cannot be written.
     """
+    with atomic_path(path) as partial:
+        partial.write_bytes(ply_bytes(columns, faces=faces, description=description))
+
+
+def ply_bytes(
+    columns: Mapping[str, np.ndarray],
+    *,
+    faces: np.ndarray | None = None,
+    description: Mapping[str, Any] | None = None,
+) -> bytes:
+    """Return what `write_ply` writes."""
     table = np.zeros(len(next(iter(columns.values()))), [(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         table[name] = values
@@ -77,11 +99,8 @@ def write_ply(
     lines += [f"property {_WORDS[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
     if faces is not None:
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-    with atomic_path(path) as partial, partial.open("wb") as file:
-        file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
-        file.write(table.tobytes())
-        if faces is not None:
-            file.write(_triangles(faces).tobytes())
+    head = "\n".join([*lines, "end_header", ""]).encode("ascii")
+    return b"".join([head, table.view(np.uint8).data, b"" if faces is None else _triangles(faces).tobytes()])
 
 
 def read_ply_header(path: Path) -> tuple[dict[str, int], dict[str, str], list[str], int]:
@@ -92,7 +111,7 @@ def read_ply_header(path: Path) -> tuple[dict[str, int], dict[str, str], list[st
         body, 0 if it is not binary little-endian.
 
     Raises:
-        UserError: it is not a PLY file.
+        UserError: it is not a PLY file, or its vertices hold lists, unknown types or a property twice.
     """
     with path.open("rb") as file:
         head = file.read(2**20)
@@ -109,10 +128,12 @@ def read_ply_header(path: Path) -> tuple[dict[str, int], dict[str, str], list[st
                 comments.append(line.partition(" ")[2])
             case ["format", form, _]:
                 binary = form == "binary_little_endian"
-            case ["element", name, count] if count.isdigit():
+            case ["element", name, count] if count.isdecimal() and len(count) < 20:
                 elements[name] = int(count)
-            case ["property", kind, name] if list(elements) == ["vertex"] and kind in _CODES:
+            case ["property", kind, name] if list(elements) == ["vertex"] and kind in _CODES and name not in properties:
                 properties[name] = f"<{_CODES[kind]}"
+            case ["property", *_] if list(elements) == ["vertex"]:
+                raise UserError(f"{path} has vertices that cannot be read: {line.strip()[:80]}", "export it once more")
     return elements, properties, comments, stop + 1 if binary else 0
 
 

@@ -1,11 +1,10 @@
 """Describe files of meshes and points as plain values."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from nerfcli.errors import UserError
-from nerfcli.media.mesh_files import KEY, read_glb_json, read_ply_header
+from nerfcli.media.mesh_files import description_in, read_glb_json, read_ply_header
 
 # Note for files without a description.
 NOT_STATED = "unit and frame"
@@ -67,10 +66,4 @@ def _counts(form: str, vertices: int, faces: int | None) -> dict[str, Any]:
 
 
 def _described(comments: list[str]) -> dict[str, Any]:
-    for comment in comments:
-        if comment.startswith(f"{KEY} {{"):
-            try:
-                return json.loads(comment.partition(" ")[2])
-            except ValueError:
-                break
-    return {"not_stated": NOT_STATED}
+    return description_in(comments) or {"not_stated": NOT_STATED}

@@ -1,0 +1,62 @@
+"""Files of splats by their suffix."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from nerfcli.errors import UserError
+from nerfcli.media.mesh_files import description_in, read_ply_header
+from nerfcli.splats.gaussians import Gaussians
+from nerfcli.splats.ply import read_splat_ply, write_splat_ply
+from nerfcli.splats.spz import read_spz, write_spz
+
+SUFFIXES = (".ply", ".spz")
+
+
+def read_splats(path: Path, notify: Callable[[str], None]) -> tuple[Gaussians, dict[str, Any]]:
+    """Read Gaussians from a .ply or .spz of any program, in the frame of the file, and nerfcli's description of them.
+
+    Args:
+        notify: is told in a line what was left out.
+
+    Returns:
+        The Gaussians; the description that `write_splats` was given, empty in files of other programs.
+
+    Raises:
+        UserError: the file is missing, damaged or of another kind.
+    """
+    if not path.is_file():
+        raise UserError(f"there is no {path}", "give a .ply or .spz of splats")
+    if _suffix(path) == ".spz":
+        return read_spz(path, notify)
+    return read_splat_ply(path, notify), description_in(read_ply_header(path)[2])
+
+
+def write_splats(
+    path: Path, gaussians: Gaussians, *, description: Mapping[str, Any] | None, notify: Callable[[str], None]
+) -> None:
+    """Write Gaussians, atomically, as .ply or .spz by the suffix.
+
+    Viewers expect y to point down; see `Gaussians.moved`.
+
+    Args:
+        description: unit, frame and others, as in `media.mesh_files`; in a .spz it is the comment of the gzip stream.
+        notify: is told in a line what the format does not hold.
+
+    Raises:
+        UserError: the suffix is another, or the file cannot be written.
+    """
+    if _suffix(path) == ".spz":
+        write_spz(path, gaussians, description, notify=notify)
+    else:
+        write_splat_ply(path, gaussians, description)
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise UserError(
+            f"{path} is no file of splats that nerfcli knows: its suffix is neither .ply nor .spz",
+            "convert others: npx @playcanvas/splat-transform in.sog out.ply",
+        )
+    return suffix
