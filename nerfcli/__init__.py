@@ -1,7 +1,8 @@
 """nerfcli: from a folder of photos to a radiance field, its renders, depth maps and videos.
 
 Python programs can call the commands as functions: `estimate_poses`, `train_scene`, `evaluate_run`, `render_run` and
-`export_run`; `load_scene` and `load_run` read their results. All are imported on first use: `import nerfcli` is fast.
+`export_run`; `load_scene`, `load_run` and `load_splats` read their results. All are imported on first use: `import
+nerfcli` is fast.
 """
 
 # Must come before any import of pycolmap: its wheel exports zlib's functions, and if Python's zlib is loaded after it,
@@ -9,7 +10,16 @@ Python programs can call the commands as functions: `estimate_poses`, `train_sce
 import zlib  # noqa: F401
 
 __version__ = "0.1.0"
-__all__ = ["estimate_poses", "evaluate_run", "export_run", "load_run", "load_scene", "render_run", "train_scene"]
+__all__ = [
+    "estimate_poses",
+    "evaluate_run",
+    "export_run",
+    "load_run",
+    "load_scene",
+    "load_splats",
+    "render_run",
+    "train_scene",
+]
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -19,6 +29,7 @@ if TYPE_CHECKING:
     from nerfcli.workflows.export import export_run
     from nerfcli.workflows.poses import estimate_poses
     from nerfcli.workflows.render import render_run
+    from nerfcli.workflows.splats import load_splats
     from nerfcli.workflows.train import train_scene
 
 _MODULES = {
@@ -27,6 +38,7 @@ _MODULES = {
     "export_run": "nerfcli.workflows.export",
     "load_run": "nerfcli.runs.run",
     "load_scene": "nerfcli.scene",
+    "load_splats": "nerfcli.workflows.splats",
     "render_run": "nerfcli.workflows.render",
     "train_scene": "nerfcli.workflows.train",
 }

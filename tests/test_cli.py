@@ -169,7 +169,7 @@ def test_all_threads_are_the_processors_of_this_process():
         ("train", "scene"),
         ("trian x", "trian"),
         ("train x --stepz 3", "--stepz (Possible options: --help, --seed, --steps)"),
-        ("poses x --budget 3m", "--budget, which belongs to train, run, bench, ablate"),
+        ("poses x --budget 3m", "--budget, which belongs to train, export, run, bench, ablate"),
         ("poses x y", "(y); give one, or several on standard input: ls -d captures/*/ | nerfcli poses -"),
         ("view x y", "unexpected extra argument(s) (y)"),
         ("export x", "'--to'. What to export: page, mesh"),
@@ -782,8 +782,9 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
     run = tmp_path / "all" / "run"
     expected = [
         *(tmp_path / "all" / "scene", run, run / "metrics.json"),
+        *(run / "metrics-run-splats.ply.json", tmp_path / "all" / "run-splats.ply"),
         *(run / "renders" / "test-conditional-z" / name for name in ("rgb", "depth", "opacity")),
-        *(run / "renders" / "orbit-conditional-z" / f"{name}.mp4" for name in ("rgb", "depth")),
+        *(run / "renders" / "orbit-conditional-z-splats" / f"{name}.mp4" for name in ("rgb", "depth")),
         run / "report.html",
     ]
     assert first.exit_code == 0, first.stderr

@@ -33,6 +33,9 @@ def evaluate(
     save_predictions: Annotated[
         str | None, typer.Option(help="png: save the compared pictures in RUN/predictions; float: also unrounded.")
     ] = None,
+    splats: Annotated[
+        Path | None, typer.Option(help="A .ply or .spz of splats, measured on the held-out photos beside the field.")
+    ] = None,
     reference: Annotated[
         Path | None,
         typer.Option(
@@ -62,15 +65,18 @@ def evaluate(
       nerfcli evaluate photos-scene-run --require "psnr>=25,registered>=0.9"
       nerfcli evaluate photos-scene-run --save-predictions png --overwrite
       nerfcli evaluate first-run second-run third-run
+      nerfcli evaluate photos-scene-run --splats photos-scene-run-splats.ply
       nerfcli evaluate tooth-15-views-run --reference tooth-run
     """
     values = dict(locals())
     from nerfcli.evaluate.predictions import KINDS
     from nerfcli.runs.run import Run
     from nerfcli.tomography.result import is_reconstruction
-    from nerfcli.workflows.evaluate import check_requirements, evaluate_run
+    from nerfcli.workflows.evaluate import check_requirements, evaluate_run, evaluate_splats
 
     one_of(save_predictions, KINDS, "--save-predictions")
+    if splats is not None and (len(runs) > 1 or STDIN in runs):
+        raise typer.BadParameter("splats belong to one run; give only that", param_hint="--splats")
     if STDIN in runs and len(runs) > 1:
         raise typer.BadParameter("- cannot be combined with other runs", param_hint="RUNS")
     console = Console(quiet=quiet, json_lines=json)
@@ -108,6 +114,11 @@ def evaluate(
         if reference is not None:
             raise typer.BadParameter(f"{folder} is no reconstruction of a scan", param_hint="--reference")
         found = measure(folder)
+        if splats is not None:
+            with console.callbacks("evaluate splats") as callbacks:
+                of_splats = evaluate_splats(folder, splats, threads=cores, overwrite=overwrite, **callbacks)
+            print_beside_field(found, of_splats, console)
+            console.result(of_splats.path, of_splats.metrics)
         check_requirements(Run(folder), found, requirements)
 
     if len(runs) == 1:
@@ -165,6 +176,19 @@ def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None
     console.note(summary_line([Entry(**entry) for entry in metrics["ledger"]]))
     for text in metrics["warnings"]:
         console.warn(text)
+
+
+def print_beside_field(field: dict[str, Any], splats: "Evaluation", console: Console) -> None:
+    """Print the metrics of splats below those of the field, as rendered in 8 bit."""
+    rows = [
+        (
+            name,
+            *(_number(metrics["mean"][measure], digits) for measure, digits in _MEASURES),
+            f"{1000 * metrics['render']['seconds_per_image']:.0f}",
+        )
+        for name, metrics in (("field", field), ("splats", splats.metrics))
+    ]
+    console.table(("", "PSNR", "SSIM", "LPIPS", "ms per picture"), rows, styles={})
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -1,4 +1,4 @@
-"""nerfcli export: export a run as a page, a mesh or points; of a scan, its volume."""
+"""nerfcli export: export a run as a page, a mesh, points or splats; of a scan, its volume."""
 
 import math
 from pathlib import Path
@@ -8,7 +8,7 @@ import typer
 
 from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, one_of
+from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, one_of, seconds_from_text
 from nerfcli.cli.render_options import finite
 from nerfcli.errors import UserError
 from nerfcli.workflows.machine import device_name, thread_count
@@ -20,13 +20,15 @@ _OF_SCANS = "run to output form water device threads overwrite json quiet"
 @command
 def export(
     run: Annotated[str, typer.Argument(help="Run folder written by train, or - to read paths from standard input.")],
-    to: Annotated[str, typer.Option("--to", help="What to export: page, mesh or points; of an X-ray scan: volume.")],
+    to: Annotated[
+        str, typer.Option("--to", help="What to export: page, mesh, points, splats; of an X-ray scan: volume.")
+    ],
     output: Output = None,
     form: Annotated[
         str | None,
         typer.Option(
             "--format",
-            help="File format if -o does not determine it: ply, glb or obj; of scans nrrd, mha, nii or tif.",
+            help="File format if -o does not determine it: ply, glb, obj, spz, html; of scans nrrd, mha, nii, tif.",
         ),
     ] = None,
     box: Annotated[
@@ -41,6 +43,23 @@ def export(
         int | None,
         typer.Option(help="Maximum number of triangles of a mesh.  [default: 300000]", min=4, show_default=False),
     ] = None,
+    count: Annotated[
+        int | None,
+        typer.Option(help="Largest number of splats.  [default: by photos and budget]", min=100, max=10_000_000),
+    ] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="Time to refine splats on the training photos.  [default: 60s]")
+    ] = None,
+    sh: Annotated[
+        int | None,
+        typer.Option(help="Degree of the harmonics by which colours of splats vary.  [default: 2]", min=0, max=3),
+    ] = None,
+    frame: Annotated[
+        str | None, typer.Option(help="Of splats: viewer (y down, as viewers expect) or scene.  [default: viewer]")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on refining the splats of the run, to a larger --budget.")
+    ] = False,
     water: Annotated[
         float | None, typer.Option(help="Scans: attenuation of water, so that values are Hounsfield units.")
     ] = None,
@@ -50,15 +69,18 @@ def export(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Export a run: page, mesh or points; volume of an X-ray scan.
+    """Export a run: page, mesh, points, splats; of a scan, its volume.
 
-    All results are in the frame and unit of the scene. Files state both; nerfcli info shows them.
+    All results are in the frame and unit of the scene, splats turned so that y points down. Files state both; nerfcli
+    info shows them.
 
     \b
     page    one .html that renders the field in a browser (WebGL2), from the disk, without a server
     mesh    .ply, .glb or .obj: zero level of truncated signed distances from median depths, with colours
     points  .ply: where median and mean depth agree and two photos see the same point, with normals,
             photos, parallax and spread
+    splats  Gaussians for SuperSplat, Spark, Blender and game engines: .ply, .spz (a seventh of the size), or one
+            .html that shows them without a network; refined on the training photos
 
     Writes RUN.html, RUN-mesh.ply, ... next to the run. Regions that no photo sees stay open. In a .glb, the rotation to
     +Y up is in the root node; positions stay in the scene's frame.
@@ -72,6 +94,8 @@ def export(
       nerfcli export photos-scene-run --to mesh --voxel-size 0.005 --faces 100000 -o kitchen.glb
       nerfcli export photos-scene-run --to mesh --box=-1,-1,0,1,1,2
       nerfcli export photos-scene-run --to points -o kitchen.ply
+      nerfcli export photos-scene-run --to splats -o kitchen.spz --budget 2m
+      nerfcli export photos-scene-run --to splats -o kitchen.html --budget 5m --resume
       nerfcli export tooth-scene-run --to volume -o tooth.nrrd
     """
     values = dict(locals())
@@ -79,6 +103,7 @@ def export(
     from nerfcli.surface.settings import FACES, SurfaceSettings
     from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.export import TARGETS, default_target, export_run
+    from nerfcli.workflows.splats import SplatSettings
 
     console = Console(quiet=quiet, json_lines=json)
     finite(water, "--water")
@@ -113,14 +138,33 @@ def export(
         raise typer.BadParameter(f"{voxel_size:g} is not a positive size", param_hint="--voxel-size")
     unused = {
         "--faces": (faces is not None and to != "mesh", "meshes"),
-        "--voxel-size": (voxel_size is not None and to in ("page", "volume"), "meshes and points"),
+        "--voxel-size": (voxel_size is not None and to not in ("mesh", "points"), "meshes and points"),
         "--water": (water is not None, "X-ray scans"),
+        **{
+            option: (to != "splats" and value not in (None, False), "splats")
+            for option, value in {
+                "--count": count,
+                "--budget": budget,
+                "--sh": sh,
+                "--frame": frame,
+                "--resume": resume,
+            }.items()
+        },
     }
     for option, (is_unused, suited) in unused.items():
         if is_unused:
             raise typer.BadParameter(f"it is for {suited}; remove it", param_hint=option)
     if suffix is not None and output is not None and run != STDIN and output.suffix.lower() not in ("", suffix):
         raise typer.BadParameter(f"{form!r} contradicts -o {output}; remove one of them", param_hint="--format")
+    if frame is not None:
+        one_of(frame, ("viewer", "scene"), "--frame")
+    splats = SplatSettings(
+        count=count,
+        budget_seconds=60.0 if budget is None else seconds_from_text(budget),
+        degree=2 if sh is None else sh,
+        frame=frame or "viewer",
+        resume=resume,
+    )
     settings = SurfaceSettings(box=None if box is None else box_of(box), voxel_size=voxel_size, faces=faces or FACES)
 
     def work(folder: Path, one_of_many: bool) -> None:
@@ -140,6 +184,7 @@ def export(
                 target,
                 to=to,
                 settings=settings,
+                splats=splats,
                 device=device_name(device),
                 threads=thread_count(threads),
                 overwrite=overwrite,

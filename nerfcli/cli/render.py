@@ -23,7 +23,10 @@ _OF_SCANS = "run output outputs slices cameras device threads overwrite json qui
 
 @command
 def render(
-    run: Annotated[str, typer.Argument(help="Run folder written by train, or - to read paths from standard input.")],
+    run: Annotated[
+        str,
+        typer.Argument(help="Run folder written by train, a .ply or .spz of splats, or - to read paths from stdin."),
+    ],
     cameras: Annotated[
         str,
         typer.Option(help="test, train, orbit, ellipse, spiral, interpolate, or any capture that convert reads."),
@@ -116,6 +119,9 @@ def render(
     crop: Annotated[
         str | None, typer.Option(help="Render only the window X,Y,WIDTH,HEIGHT of the pictures, in pixels.")
     ] = None,
+    splats: Annotated[
+        Path | None, typer.Option(help="A .ply or .spz of splats to render instead of the run's field.")
+    ] = None,
     output: options.Output = None,
     device: options.Device = "auto",
     threads: options.Threads = 0,
@@ -157,6 +163,8 @@ def render(
       nerfcli render photos-scene-run --cameras ellipse --count 240 --cameras-only -o ellipse/
       nerfcli render photos-scene-run --cameras orbit --lens equirectangular --width 2048 --video
       nerfcli render photos-scene-run --cameras test --width 1920 --height 1080 --crop 480,270,960,540
+      nerfcli render photos-scene-run --splats kitchen.ply --cameras orbit --video
+      nerfcli render kitchen.ply --cameras camera_path.json --video
       nerfcli render tooth-scene-run --outputs projection,residual
       nerfcli render tooth-scene-run --slices z=0 --slices x=12.5
     """
@@ -164,8 +172,9 @@ def render(
     from nerfcli.cameras.formats.camera_path import DEFAULT_FPS
     from nerfcli.export.settings import OUTPUTS, ExportSettings
     from nerfcli.runs.run import load_run
+    from nerfcli.splats.files import SUFFIXES
     from nerfcli.tomography.result import is_reconstruction
-    from nerfcli.workflows.render import RENDERS, folder_name, render_run
+    from nerfcli.workflows.render import RENDERS, folder_name, render_run, render_splats
     from nerfcli.workflows.views import Views, file_fps, usual_axis
 
     console = Console(quiet=quiet, json_lines=json)
@@ -205,9 +214,20 @@ def render(
         if is_reconstruction(folder):
             _render_scan(folder, one_of_many, given=values, console=console)
             return
+        if folder.suffix.lower() in SUFFIXES:
+            settings = replace(usual, depth=replace(request, axis=depth_axis or "z"))
+            target = output if output is None or not one_of_many else output / folder.stem
+            with console.callbacks(f"render {views.name}") as callbacks:
+                written = render_splats(
+                    folder, target, views=views, settings=settings, threads=thread_count(threads), part=part,
+                    overwrite=overwrite, **callbacks,
+                )  # fmt: skip
+            for path in written:
+                console.result(path)
+            return
         settings = replace(usual, depth=replace(request, axis=depth_axis or usual_axis(load_run(folder), views)))
         name = f"{views.name}-cameras" if cameras_only else folder_name(views, settings)
-        target = folder / RENDERS / name
+        target = folder / RENDERS / (name if splats is None else f"{name}-splats")
         if output is not None:
             target = output / folder.name if one_of_many else output
         if cameras_only:
@@ -219,6 +239,7 @@ def render(
                 target,
                 views=views,
                 settings=settings,
+                splats=splats,
                 device=device_name(device),
                 threads=thread_count(threads),
                 part=part,

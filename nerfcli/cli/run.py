@@ -1,4 +1,4 @@
-"""nerfcli run: all stages, from photos to a report."""
+"""nerfcli run: all stages, from photos to splats, a video and a report."""
 
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +20,7 @@ def run(
     subfolders: Subfolders = False,
     quality: Quality = "default",
     intrinsics: Intrinsics = None,
-    budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h.")] = "2m",
+    budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h. Splats are refined for half of it.")] = "2m",
     downscale: options.Downscale = "auto",
     holdout: options.Holdout = None,
     require: options.Require = None,
@@ -31,10 +31,11 @@ def run(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run all stages: poses, train, evaluate, render, video, report.
+    """Run all stages: poses, train, evaluate, splats, video, report.
 
-    Writes PHOTOS-scene/ and PHOTOS-scene-run/ next to the photos, or scene/ and run/ inside --output. Completed stages
-    are kept: run the same command again to resume an interrupted run. For other settings, run the stages one by one.
+    Writes PHOTOS-scene/, PHOTOS-scene-run/ and PHOTOS-scene-run-splats.ply next to the photos, or scene/, run/ and
+    run-splats.ply inside --output. The video is made from the splats. Completed stages are kept: run the same command
+    again to resume an interrupted run. For other settings, run the stages one by one.
 
     \b
     Examples:
@@ -44,17 +45,19 @@ def run(
       nerfcli run kitchen.mp4
       nerfcli run photos/kitchen --require "psnr>=25,registered>=0.9"
     """
-    from nerfcli.cli.evaluate import print_numbers, requirements_of
+    from nerfcli.cli.evaluate import print_beside_field, print_numbers, requirements_of
     from nerfcli.export.settings import OUTPUTS, ExportSettings, VideoSettings
     from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.memory import default_memory_limit
     from nerfcli.poses.input.settings import PoseSettings
     from nerfcli.runs.run import load_run
     from nerfcli.runs.settings import TrainSettings, sizes_for
-    from nerfcli.workflows.evaluate import check_requirements, evaluate_run
+    from nerfcli.workflows.evaluate import check_requirements, evaluate_run, evaluate_splats
+    from nerfcli.workflows.export import default_target, export_run
     from nerfcli.workflows.poses import estimate_poses, folder_of_photos, given_intrinsics, without_suffix
     from nerfcli.workflows.render import render_run
     from nerfcli.workflows.report import report_runs
+    from nerfcli.workflows.splats import SplatSettings
     from nerfcli.workflows.train import train_scene, was_interrupted
     from nerfcli.workflows.views import Views, usual_depth
 
@@ -116,6 +119,16 @@ def run(
         console.result(scene)
         console.result(field)
         console.result(evaluation.path, evaluation.metrics)
+        splats = default_target(field, "splats")
+        if overwrite or not splats.exists():
+            with console.callbacks("export splats") as callbacks:
+                half = SplatSettings(budget_seconds=options.seconds_from_text(budget) / 2)
+                export_run(field, splats, to="splats", splats=half, **where, **callbacks)
+        with console.callbacks("evaluate splats") as callbacks:
+            of_splats = evaluate_splats(field, splats, threads=cores, overwrite=overwrite, **callbacks)
+        print_beside_field(evaluation.metrics, of_splats, console)
+        console.result(of_splats.path, of_splats.metrics)
+        console.result(splats)
         for cameras, video in (("test", False), ("orbit", True)):
             views = Views(cameras)
             settings = ExportSettings(
@@ -124,7 +137,8 @@ def run(
                 video=VideoSettings() if video else None,
             )
             with console.callbacks(f"render {views.name}") as callbacks:
-                written = render_run(field, views=views, settings=settings, **where, **callbacks)
+                shown = splats if video else None
+                written = render_run(field, views=views, settings=settings, splats=shown, **where, **callbacks)
             for path in written:
                 console.result(path)
         with console.callbacks("report") as callbacks:

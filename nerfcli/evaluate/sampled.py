@@ -12,6 +12,7 @@ from nerfcli.evaluate.protocol import PROTOCOL, HeldOutPhoto, as_exposed, backgr
 from nerfcli.field.background import colours_behind
 from nerfcli.render.model import Model
 from nerfcli.render.rays import pixel_rays
+from nerfcli.render.renderable import Renderable
 from nerfcli.render.tracing import TOLERANCE, render_rays, uniform_cuts
 
 SAMPLED_PIXELS = 2**14
@@ -56,6 +57,17 @@ class SampledPixels:
         values = []
         for photo, pixels in zip(self.photos, self.pixels, strict=True):
             rgb, valid = render_sampled(model, photo, pixels, cuts=cuts, tolerance=TOLERANCE)
+            truth = over_white(photo.pixels).reshape(-1, 3)[pixels]
+            if valid.any():
+                values.append(psnr(to_8_bit(as_exposed(rgb, photo.log_gains)), truth, used=valid))
+        return float(np.mean(values))
+
+    def psnr_of_pictures(self, model: Renderable) -> float:
+        """Return the same of a model whose whole pictures take less time than these pixels of a field."""
+        values = []
+        for photo, pixels in zip(self.photos, self.pixels, strict=True):
+            picture = model.render(photo.frame, background=background_of(model, photo))
+            rgb, valid = picture.rgb.reshape(-1, 3)[pixels], picture.valid.ravel()[pixels]
             truth = over_white(photo.pixels).reshape(-1, 3)[pixels]
             if valid.any():
                 values.append(psnr(to_8_bit(as_exposed(rgb, photo.log_gains)), truth, used=valid))

@@ -3,6 +3,7 @@
 CONFIG = "config.json"
 FIELD = "field.safetensors"
 STATE = "state.safetensors"
+SPLATS = "splats.safetensors"
 LOG = "log.jsonl"
 METRICS = "metrics.json"
 DEPTH_ERRORS = "depth_errors.json"

@@ -23,6 +23,7 @@ from nerfcli.runs.files import LOG
 from nerfcli.runs.run import Run
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.splats import file_digest, load_splats
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,49 @@ def evaluate_run(
     return Evaluation(trained.metrics_path, metrics, is_kept=False)
 
 
+def evaluate_splats(
+    run: str | Path,
+    splats: str | Path,
+    *,
+    threads: int = 0,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> Evaluation:
+    """Measure splats on the held-out photos of a run by the protocol of `evaluate_run`: RUN/metrics-FILE.json.
+
+    Args:
+        run: the folder that `train_scene` wrote.
+        splats: a .ply or .spz.
+        threads, overwrite, notify, progress: see `evaluate_run`.
+
+    Raises:
+        UserError: as for `evaluate_run`, or the splats cannot be read.
+    """
+    trained, file, cores = Run(Path(run)), Path(splats), thread_count(threads)
+    torch.set_num_threads(cores)
+    trained.check_split()
+    scene, digest = load_splats(file, notify=notify), file_digest(file)
+    path = trained.path / f"metrics-{file.name}.json"
+    if path.exists() and not overwrite:
+        metrics = _kept(path, digest, predictions=None)
+        notify(f"{path} is kept: it is up to date; add --overwrite to evaluate again")
+        return Evaluation(path, metrics, is_kept=True)
+    refuse_read_only(path)
+    held_out = held_out_photos_of(trained.config, trained.cameras.test, trained.model(), threads=cores)
+    metrics = evaluate_model(
+        scene,
+        held_out,
+        on_image=lambda done, total: progress(done / total, f"of {total} pixels"),
+        extras=Extras(trained.cameras.train, find_perceptual(notify)),
+    )
+    metrics["splats"] = {"file": file.name, "count": len(scene.gaussians), "degree": scene.gaussians.degree}
+    metrics["device"] = f"cpu, {cores} threads, {platform.machine()}"
+    metrics["checkpoint_sha256"] = digest
+    write_json(path, metrics)
+    return Evaluation(path, metrics, is_kept=False)
+
+
 def check_requirements(run: Run, metrics: dict[str, Any], requirements: Sequence[Requirement]) -> None:
     """Raise if a requirement is not met.
 
@@ -156,7 +200,7 @@ def _kept(path: Path, checkpoint: str, *, predictions: str | None) -> dict[str, 
     """Return existing metrics; raise if they are of another checkpoint or lack the predictions."""
     metrics = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to evaluate again")
     if metrics.get("checkpoint_sha256") != checkpoint:
-        raise UserError(f"{path} belongs to an earlier checkpoint of this run", "add --overwrite to replace it")
+        raise UserError(f"{path} belongs to an earlier checkpoint or file", "add --overwrite to replace it")
     if predictions is not None and not predictions_are_there(
         path.with_name(PREDICTIONS), predictions, checkpoint=checkpoint
     ):

@@ -1,4 +1,4 @@
-"""Export a run to files that other programs open: a page, a mesh, points."""
+"""Export a run to files that other programs open: a page, a mesh, points, splats."""
 
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from nerfcli.workflows.export_geometry import export_mesh, export_points
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.workflows.photo_depths import photo_depths
+from nerfcli.workflows.splats import SplatSettings, export_splats
 
 # Maximum size of a page; the field comes first, and photos get the rest.
 PAGE_BYTES = 9_700_000
@@ -29,8 +30,9 @@ TARGETS = {
     "page": (".html",),
     "mesh": (".ply", ".glb", ".obj"),
     "points": (".ply",),
+    "splats": (".ply", ".spz", ".html"),
 }
-SURFACE = SurfaceSettings()
+SURFACE, SPLATS = SurfaceSettings(), SplatSettings()
 
 
 def export_run(
@@ -39,6 +41,7 @@ def export_run(
     *,
     to: str,
     settings: SurfaceSettings = SURFACE,
+    splats: SplatSettings = SPLATS,
     device: str = "auto",
     threads: int = 0,
     overwrite: bool = False,
@@ -56,6 +59,7 @@ def export_run(
         target: the file to write, whose suffix chooses among the formats of `to`; beside the run by default.
         to: one of `TARGETS`.
         settings: region and resolution of a geometry.
+        splats: number, refinement and frame of splats.
         device: "auto", "cpu", "cuda" or "cuda:1".
         threads: number of CPU threads; 0 for all.
         overwrite: replace an existing export at `target`.
@@ -80,7 +84,10 @@ def export_run(
     torch.set_num_threads(thread_count(threads))
     model = trained.model(torch_device)
     progress(0.0, "")
-    _EXPORTS[to](trained, model, path, settings=settings, notify=notify, progress=progress)
+    if to == "splats":
+        export_splats(trained, model, path, settings=splats, notify=notify, progress=progress)
+    else:
+        _EXPORTS[to](trained, model, path, settings=settings, notify=notify, progress=progress)
     return path
 
 

@@ -53,7 +53,7 @@ def export_mesh(
         photos, parallax = coverage_and_parallax([view.distances() for view in views], mesh.vertices)
         seen = {"photos": photos.astype(np.uint16), "parallax_deg": parallax}
         description |= {"parallax_deg": PARALLAX}
-    _write_mesh(path, mesh, colours, description, seen=seen, y_up=_y_up_from_scene(run))
+    _write_mesh(path, mesh, colours, description, seen=seen, y_up=y_up_from_scene(run))
     of_found = f" of {found}" if found != len(mesh.faces) else ""
     notify(f"{len(mesh.faces)} triangles{of_found}, {_grid_in_words(grid, model)}")
 
@@ -149,7 +149,7 @@ def _write_mesh(
             write_ply(path, {**columns, **seen}, faces=mesh.faces, description=description)
 
 
-def _y_up_from_scene(run: Run) -> np.ndarray:
+def y_up_from_scene(run: Run) -> np.ndarray:
     """Return the rotation that turns the up direction of the cameras to +y."""
     up = up_direction(run.cameras.train)
     aside = np.eye(3)[np.argmin(np.abs(up))]

@@ -10,11 +10,20 @@ from nerfcli.errors import UserError
 from nerfcli.export.frames import export_frames, export_part
 from nerfcli.export.order import Order, refuse_foreign
 from nerfcli.export.settings import OUTPUTS, ExportSettings
+from nerfcli.render.renderable import Renderable
 from nerfcli.runs.run import Run, load_run
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.workflows.photo_depths import depth_errors, photo_depths
-from nerfcli.workflows.views import Views, chosen_frames, refuse_z_depth_for_equirectangular, usual_depth
+from nerfcli.workflows.splats import file_digest, load_splats
+from nerfcli.workflows.views import (
+    PATHS,
+    Views,
+    chosen_frames,
+    frames_of_file,
+    refuse_z_depth_for_equirectangular,
+    usual_depth,
+)
 
 RENDERS = "renders"
 HELD_OUT = Views("test")
@@ -38,6 +47,7 @@ def render_run(
     *,
     views: Views = HELD_OUT,
     settings: ExportSettings | None = None,
+    splats: str | Path | None = None,
     device: str = "auto",
     threads: int = 0,
     part: slice | None = None,
@@ -57,6 +67,7 @@ def render_run(
         target: the folder to write; in RUN/renders by default, named after views and depth.
         views: which cameras; the held-out ones by default.
         settings: outputs, depth, file formats, videos, and steps along rays; `usual_settings` by default.
+        splats: a .ply or .spz to render instead of the field.
         device: "auto", "cpu", "cuda" or "cuda:1".
         threads: number of CPU threads; 0 for all.
         part: render only these views, for a later call to complete; None for all.
@@ -72,11 +83,16 @@ def render_run(
     """
     trained, cores, torch_device = Run(Path(run)), thread_count(threads), device_name(device)
     settings = usual_settings(load_run(run), views) if settings is None else settings
-    folder = trained.path / RENDERS / folder_name(views, settings) if target is None else Path(target)
+    name = folder_name(views, settings) + ("-splats" if splats is not None else "")
+    folder = trained.path / RENDERS / name if target is None else Path(target)
     torch.set_num_threads(cores)
     model = trained.model(torch_device)
+    shown: Renderable = model.stretched(settings.step)
     seen = ()
     provenance: dict[str, Any] = {"cameras": views.cameras, "run": trained.path.name, "field_sha256": model.sha256}
+    if splats is not None:
+        shown, of_file = load_splats(splats, notify=notify), file_digest(Path(splats))
+        provenance |= {"splats": Path(splats).name, "splats_sha256": of_file}
     if settings.needs_visibility:
         depths = part_of(progress, 0.0, 1.0, "depths of the training photos")
         seen = photo_depths(trained, model, on_progress=depths, notify=notify)
@@ -93,8 +109,72 @@ def render_run(
     frames = chosen_frames(trained, views, depth_hint=1.0 / model.training_from_scene.scale)
     if "depth" in settings.outputs and settings.depth.axis == "z":
         refuse_z_depth_for_equirectangular(frames, notify=notify)
-    model = model.stretched(settings.step)
     order = Order(tuple(frames), settings, provenance, seen, errors)
+    return _export(
+        shown, order, folder, part=part, threads=cores, overwrite=overwrite, notify=notify, progress=progress
+    )
+
+
+def render_splats(
+    file: str | Path,
+    target: str | Path | None = None,
+    *,
+    views: Views,
+    settings: ExportSettings,
+    threads: int = 0,
+    part: slice | None = None,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> list[Path]:
+    """Render splats of any program with the cameras of a file or folder; the other arguments are as for `render_run`.
+
+    Args:
+        file: a .ply or .spz.
+        target: the folder to write; FILE-renders/CAMERAS beside the file by default.
+
+    Raises:
+        UserError: the file cannot be read, the cameras are those of a run, or an output needs training photos.
+    """
+    path, cores = Path(file), thread_count(threads)
+    if views.cameras in ("test", "train", *PATHS):
+        raise UserError(
+            f"{path} has no cameras, so --cameras {views.cameras} is not known",
+            "give a file or folder of cameras, or render the run: nerfcli render RUN --splats FILE",
+            exit_code=2,
+        )
+    if settings.needs_visibility:
+        raise UserError(
+            "coverage, parallax and errors of depth need training photos",
+            "leave them out, or render the run: nerfcli render RUN --splats FILE",
+            exit_code=2,
+        )
+    torch.set_num_threads(cores)
+    splats = load_splats(path, notify=notify)
+    frames = frames_of_file(views)
+    if "depth" in settings.outputs and settings.depth.axis == "z":
+        refuse_z_depth_for_equirectangular(frames, notify=notify)
+    provenance = {"cameras": views.cameras, "splats": path.name, "splats_sha256": file_digest(path)}
+    folder = path.with_name(f"{path.stem}-{RENDERS}") / folder_name(views, settings) if target is None else Path(target)
+    order = Order(tuple(frames), settings, provenance)
+    return _export(
+        splats, order, folder, part=part, threads=cores, overwrite=overwrite, notify=notify, progress=progress
+    )
+
+
+def _export(
+    shown: Renderable,
+    order: Order,
+    folder: Path,
+    *,
+    part: slice | None,
+    threads: int,
+    overwrite: bool,
+    notify: Notify,
+    progress: Progress,
+) -> list[Path]:
+    """Render an order, or keep a complete folder."""
+    frames = order.frames
     chosen = range(len(frames))[part] if part is not None else range(len(frames))
     if not chosen:
         raise UserError(f"--frames: there are only {len(frames)} views", "views are counted from 0", exit_code=2)
@@ -113,5 +193,5 @@ def render_run(
 
     progress(0.0, "")
     if part is not None:
-        return [export_part(model, order, folder, chosen, on_rays=on_rays, notify=notify, threads=cores)]
-    return export_frames(model, order, folder, on_rays=on_rays, notify=notify, threads=cores)
+        return [export_part(shown, order, folder, chosen, on_rays=on_rays, notify=notify, threads=threads)]
+    return export_frames(shown, order, folder, on_rays=on_rays, notify=notify, threads=threads)

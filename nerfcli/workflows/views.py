@@ -124,9 +124,21 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
         path = {"orbit": paths.orbit, "spiral": paths.spiral}[cameras]
         chosen = path(keyframes, count=views.count, depth_hint=depth_hint)
     else:
-        chosen = _frames_of(Path(cameras))
-        factor = 1
-    chosen = [replace(frame, camera=downscaled_camera(frame.camera, factor)) for frame in chosen]
+        return frames_of_file(views)
+    return _presented([replace(frame, camera=downscaled_camera(frame.camera, factor)) for frame in chosen], views)
+
+
+def frames_of_file(views: Views) -> list[Frame]:
+    """Return the frames of a file or folder of cameras.
+
+    Raises:
+        UserError: there are no cameras, or an option cannot be used with them.
+    """
+    return _presented(_frames_of(Path(views.cameras)), views)
+
+
+def _presented(chosen: Sequence[Frame], views: Views) -> list[Frame]:
+    """Return frames with the size, lens and crop of the views."""
     if views.max_size is not None:
         chosen = [replace(frame, camera=_within(frame.camera, views.max_size)) for frame in chosen]
     # Frames that share a camera share the new one too, and with it its rays.

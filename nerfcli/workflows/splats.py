@@ -1,0 +1,258 @@
+"""Export a run as Gaussian splats, and measure splats on the held-out photos of a run."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nerfcli import __version__
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.errors import UserError
+from nerfcli.evaluate.protocol import HeldOutPhoto
+from nerfcli.evaluate.sampled import SampledPixels
+from nerfcli.interrupts import deferred_interrupts
+from nerfcli.photos.loading import LoadedPhoto, load_photos
+from nerfcli.photos.undistorted import pinhole_of
+from nerfcli.render.model import Model
+from nerfcli.runs.files import SPLATS
+from nerfcli.runs.run import Run
+from nerfcli.splats.beside import pictures_beside, share_of_pictures
+from nerfcli.splats.files import read_splats, write_splats
+from nerfcli.splats.page import write_splat_page
+from nerfcli.splats.refine import Refinement, refine, splat_photos
+from nerfcli.splats.render import SplatScene, near_of
+from nerfcli.splats.rows import rows_of
+from nerfcli.splats.start import count_for, gaussians_of_field
+from nerfcli.splats.state import RunSplats, load_splat_state, save_splats
+from nerfcli.workflows.export_geometry import y_up_from_scene
+from nerfcli.workflows.notices import Notify, Progress, part_of, silent
+
+FORMAT = "nerfcli splat file 1"
+# Photos of the training that the field and the splats are compared on.
+COMPARED = 8
+# Splats that are this much below the field on training photos should be refined for longer.
+BELOW_DB = 1.0
+# Fractions of the progress bar at which the depths of the training photos are known, and the refinement begins.
+_MAPS, _START = 0.08, 0.1
+
+
+@dataclass(frozen=True)
+class SplatSettings:
+    """Settings of splats.
+
+    Args:
+        count: largest number of Gaussians; None to choose it from the photos and the budget.
+        budget_seconds: of refinement, wall time.
+        degree: of the harmonics of colours, 0 to 3.
+        frame: "viewer", whose y points down, or "scene".
+        resume: refine the splats that the run already has for another `budget_seconds`.
+    """
+
+    count: int | None = None
+    budget_seconds: float = 60.0
+    degree: int = 2
+    frame: str = "viewer"
+    resume: bool = False
+
+
+def export_splats(
+    run: Run,
+    model: Model,
+    path: Path,
+    *,
+    settings: SplatSettings,
+    notify: Notify,
+    progress: Progress,
+) -> None:
+    """Write the splats of a run as .ply, .spz or .html; make and refine them first if the run does not have them.
+
+    Raises:
+        UserError: a photo cannot be read, numbers are not finite, or the file cannot be written.
+        KeyboardInterrupt: passed on after the state of the refinement has been saved.
+    """
+    splats = run_splats(run, model, settings=settings, notify=notify, progress=progress)
+    file_from_scene = Similarity.identity() if settings.frame == "scene" else viewer_from_scene(run)
+    gaussians = splats.gaussians().moved(file_from_scene)
+    if path.suffix.lower() == ".html":
+        camera = pinhole_of(run.cameras.train[0].camera)
+        write_splat_page(
+            path,
+            gaussians,
+            title=run.path.resolve().name,
+            world_from_cam=file_from_scene.apply_pose(run.cameras.train[0].world_from_cam),
+            fov_deg=camera.fov_deg[1],
+            background=splats.background,
+            notify=notify,
+        )
+        return
+    turned = "that of the scene" if settings.frame == "scene" else "that of the scene, turned so that y points down"
+    description = {
+        "format": FORMAT,
+        "frame": turned,
+        "file_from_scene": file_from_scene.to_json(),
+        "background": list(splats.background),
+        "unit": model.unit,
+        "unit_source": model.unit_source,
+        "nerfcli": __version__,
+        "run": run.path.resolve().name,
+        "field_sha256": model.sha256,
+    }
+    write_splats(path, gaussians, description=description, notify=notify)
+    notify(f"{len(gaussians)} splats of degree {splats.degree}, {path.stat().st_size / 1e6:.1f} MB, frame: {turned}")
+
+
+def viewer_from_scene(run: Run) -> Similarity:
+    """Return the rotation of the scene that viewers of splats expect: y points down."""
+    return Similarity(1.0, np.diag([1.0, -1.0, -1.0]) @ y_up_from_scene(run), np.zeros(3))
+
+
+def run_splats(run: Run, model: Model, *, settings: SplatSettings, notify: Notify, progress: Progress) -> RunSplats:
+    """Return the splats of a run, made from its field and refined on its training photos, or those that it has.
+
+    Splats that the run has are returned as they are if they belong to its field and were made with these settings.
+
+    Raises:
+        UserError: see `export_splats`; or there is nothing to resume.
+    """
+    kept = _kept(run, model, settings)
+    if kept is not None and kept.refinement.seconds >= settings.budget_seconds:
+        notify(f"the splats of {run.path} are used: refined for {kept.refinement.seconds:.0f} s")
+        return kept
+    if model.device.type != "cpu":
+        notify("splats are refined on the CPU; the GPU renders the field that they start from")
+    loaded = load_photos(
+        run.cameras.train, factor=run.config.downscale, threads=torch.get_num_threads(), masks=run.components.masks
+    )
+    splats = kept or _started(run, model, loaded, settings=settings, progress=progress)
+    pictures = pictures_beside(model, loaded, on_progress=part_of(progress, _MAPS, _START, "pictures of the field"))
+    frame = {"splats_from_scene": model.training_from_scene, "near": near_of(splats.refinement.rows[:, :3])}
+    began = splats.refinement.seconds / settings.budget_seconds
+    on_step = part_of(progress, _START, 1.0, f"refines {len(splats.refinement.rows)} splats")
+    with deferred_interrupts() as interrupts:
+        refine(
+            splats.refinement,
+            splat_photos(loaded, splats.log_gains, **frame),
+            background=splats.background,
+            beside=splat_photos(pictures, np.zeros((len(pictures), 3)), **frame),
+            share=share_of_pictures(len(loaded)),
+            seconds=settings.budget_seconds,
+            on_step=lambda fraction: on_step((fraction - began) / (1.0 - began)),
+            is_ended=lambda: interrupts.came is not None,
+            notify=notify,
+        )
+        save_splats(run.path / SPLATS, splats)
+        if interrupts.came is not None:
+            notify("the splats are saved; the same command with --resume goes on")
+        interrupts.raise_if_pending()
+    notify(compared_in_words(model, loaded, splats))
+    return splats
+
+
+def _kept(run: Run, model: Model, settings: SplatSettings) -> RunSplats | None:
+    """Return the splats that the run has, if they are to be used or refined further.
+
+    Raises:
+        UserError: there is nothing to resume.
+    """
+    path = run.path / SPLATS
+    splats = load_splat_state(path) if path.exists() else None
+    same = (
+        splats is not None
+        and splats.field_sha256 == model.sha256
+        and settings.degree == splats.degree
+        and settings.count in (None, splats.count)
+    )
+    if settings.resume and not same:
+        raise UserError(
+            f"{run.path} has no splats of this field, --count and --sh to refine further", "leave out --resume"
+        )
+    if not same or splats is None:
+        return None
+    return splats if settings.resume or splats.refinement.seconds >= settings.budget_seconds else None
+
+
+def _started(
+    run: Run, model: Model, loaded: Sequence[LoadedPhoto], *, settings: SplatSettings, progress: Progress
+) -> RunSplats:
+    """Return the first splats of a field."""
+    core_seconds = settings.budget_seconds * torch.get_num_threads()
+    count = settings.count or count_for(loaded, core_seconds=core_seconds)
+    start = gaussians_of_field(
+        model,
+        loaded,
+        count=count,
+        degree=settings.degree,
+        with_gains=run.components.exposure != "none",
+        on_progress=part_of(progress, 0.0, _MAPS, "depths of the training photos"),
+    )
+    rows = rows_of(start.gaussians.moved(model.training_from_scene))
+    assert model.sha256 is not None
+    return RunSplats(
+        Refinement.of(rows), start.log_gains, start.background, model.training_from_scene, model.sha256, count
+    )
+
+
+def compared_in_words(model: Model, loaded: Sequence[LoadedPhoto], splats: RunSplats) -> str:
+    """Compare field and splats on random pixels of training photos, and say how much longer to refine if needed."""
+    chosen = np.unique(np.linspace(0, len(loaded) - 1, COMPARED).astype(int))
+    photos = [
+        HeldOutPhoto(
+            loaded[index].frame, loaded[index].pixels, loaded[index].used, tuple(splats.log_gains[index].tolist())
+        )
+        for index in chosen
+    ]
+    pixels = SampledPixels.drawn(photos, seed=0)
+    of_field, of_splats = pixels.psnr(model), pixels.psnr_of_pictures(scene_of(splats, model))
+    seconds = splats.refinement.seconds
+    words = (
+        f"training photos: field {of_field:.1f} dB, splats {of_splats:.1f} dB after {splats.refinement.steps} steps in "
+        f"{seconds:.0f} s"
+    )
+    if of_splats < of_field - BELOW_DB:
+        # On large captures the splats gain about 1 dB each time the seconds are doubled.
+        longer = seconds * 2.0 ** (of_field - of_splats)
+        words += f"; the splats are below the field: go on with --resume --budget {longer:.0f}s"
+    return words
+
+
+def scene_of(splats: RunSplats, model: Model) -> SplatScene:
+    """Return the splats of a run as a scene that can be rendered."""
+    return SplatScene(splats.gaussians(), splats.background, model.unit, model.unit_source)
+
+
+def load_splats(path: str | Path, *, notify: Notify = silent) -> SplatScene:
+    """Read a .ply or .spz of splats, of any program.
+
+    Example:
+        >>> import nerfcli
+        >>> splats = nerfcli.load_splats("kitchen.ply")
+        >>> picture = splats.render(nerfcli.load_run("photos-scene-run").cameras.test[0])
+        >>> picture.rgb.shape
+
+    Args:
+        path: the file. Files that nerfcli wrote state how their frame is turned from the scene's, their background and
+            unit; others are taken to be in the scene's frame, before black.
+        notify: called with lines for the user.
+
+    Returns:
+        The splats in the scene's frame.
+
+    Raises:
+        UserError: the file is missing, damaged or of another kind.
+    """
+    gaussians, description = read_splats(Path(path), notify)
+    if description.get("format") != FORMAT:
+        return SplatScene(gaussians)
+    scene_from_file = Similarity.from_json(description["file_from_scene"]).inverse()
+    red, green, blue = (float(value) for value in description["background"])
+    unit, source = str(description["unit"]), description["unit_source"]
+    return SplatScene(gaussians.moved(scene_from_file), (red, green, blue), unit, source)
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

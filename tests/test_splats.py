@@ -1,0 +1,239 @@
+"""Splats of a run: refined, saved, resumed, interrupted, written, read, rendered and evaluated."""
+
+import os
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import nerfcli
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, look_at
+from nerfcli.errors import UserError
+from nerfcli.export.settings import ExportSettings
+from nerfcli.field.exposure import exposed
+from nerfcli.kernels.numba_cpu.splats import render_splats
+from nerfcli.media.images import read_image
+from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.render.depth import DepthRequest
+from nerfcli.runs.files import SPLATS
+from nerfcli.splats import refine as refinement
+from nerfcli.splats.gaussians import Gaussians
+from nerfcli.splats.refine import Refinement, refine, splat_photos
+from nerfcli.splats.render import SplatScene
+from nerfcli.splats.rows import gaussians_of, rows_of
+from nerfcli.splats.state import load_splat_state
+from nerfcli.workflows.evaluate import evaluate_splats
+from nerfcli.workflows.render import render_splats as render_file
+from nerfcli.workflows.splats import SplatSettings
+from nerfcli.workflows.views import Views
+
+CAMERA = Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
+IDENTITY = Similarity.identity()
+SMALL = SplatSettings(count=800, budget_seconds=1.0, degree=1)
+
+
+def frames(count: int = 6) -> list[Frame]:
+    """Return cameras on an arc around the origin."""
+    angles = np.linspace(-0.6, 0.6, count)
+    centres = 3.0 * np.stack([np.sin(angles), 0 * angles, -np.cos(angles)], axis=-1)
+    up = np.array([0.0, -1.0, 0.0])
+    return [Frame(f"{k}.png", CAMERA, look_at(centre, np.zeros(3), up)) for k, centre in enumerate(centres)]
+
+
+def wall() -> Gaussians:
+    """Return Gaussians of many colours on a wall."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.linspace(-1.5, 1.5, 24), np.linspace(-1.1, 1.1, 18))
+    count = x.size
+    means = np.stack([x.ravel(), y.ravel(), 0.2 * np.sin(3 * x.ravel())], axis=-1)
+    scales = np.full((count, 3), np.log(0.06))
+    quaternions = np.tile([1.0, 0, 0, 0], (count, 1))
+    return Gaussians(means, scales, quaternions, np.full(count, 2.0), rng.uniform(-1.5, 1.5, (count, 1, 3)))
+
+
+def photographed(gaussians: Gaussians) -> list[LoadedPhoto]:
+    scene = SplatScene(gaussians)
+    pictures = [(frame, scene.render(frame).rgb) for frame in frames()]
+    return [LoadedPhoto(frame, np.rint(255 * rgb).astype(np.uint8), None) for frame, rgb in pictures]
+
+
+def error_of(state: Refinement, photos: list[refinement.SplatPhoto]) -> float:
+    black = np.zeros(3, np.float32)
+    return float(np.mean([np.abs(render_splats(state.rows, p.view, black).image - p.target(black)) for p in photos]))
+
+
+def perturbed() -> Refinement:
+    rng, true = np.random.default_rng(1), wall()
+    means = true.means + rng.normal(size=true.means.shape) * 0.02
+    return Refinement.of(rows_of(replace(true, means=means, harmonics=0.5 * true.harmonics)))
+
+
+def test_refinement_recovers_what_was_photographed() -> None:
+    """Gaussians that were moved by a third of their size and faded give the photos again, to 2 of 255 levels."""
+    photos = splat_photos(photographed(wall()), np.zeros((6, 3)), splats_from_scene=IDENTITY, near=0.0)
+    state = perturbed()
+    assert error_of(state, photos) > 0.05
+    refine(state, photos, background=(0, 0, 0), steps=300)
+    assert error_of(state, photos) < 0.008
+
+
+def test_refinement_by_steps_has_the_same_bits_with_any_threads() -> None:
+    photos = splat_photos(photographed(wall()), np.zeros((6, 3)), splats_from_scene=IDENTITY, near=0.0)
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            state = perturbed()
+            refine(state, photos, background=(0, 0, 0), steps=12)
+            found.append(state.rows)
+    finally:
+        torch.set_num_threads(before)
+    np.testing.assert_array_equal(*found)
+
+
+def test_gains_of_photos_are_divided_out() -> None:
+    """Photos taken with half and twice the exposure ask for the same splats; levels that saturate excepted."""
+    photos = photographed(wall())
+    gains = np.log(np.array([[0.5] * 3, [1.2, 1.0, 0.9]] * 3))
+    taken = [
+        replace(
+            photo, pixels=np.rint(255 * exposed(torch.tensor(photo.pixels / 255.0), torch.tensor(g)).numpy().clip(0, 1))
+        )
+        for photo, g in zip(photos, gains, strict=True)
+    ]
+    taken = [replace(photo, pixels=photo.pixels.astype(np.uint8)) for photo in taken]
+    black = np.zeros(3, np.float32)
+    same = splat_photos(photos, np.zeros((6, 3)), splats_from_scene=IDENTITY, near=0.0)
+    found = splat_photos(taken, gains, splats_from_scene=IDENTITY, near=0.0)
+    for photo, wanted, raw in zip(found, same, taken, strict=True):
+        clear = (raw.pixels > 20) & (raw.pixels < 255)
+        np.testing.assert_allclose(photo.target(black)[clear], wanted.target(black)[clear], atol=0.012)
+
+
+def test_masked_pixels_have_no_say() -> None:
+    """Under a mask the photos are white, and the splats stay as they are there."""
+    photos, used = photographed(wall()), np.ones((48, 64), bool)
+    used[:, 32:] = False
+    hidden = [replace(p, pixels=np.where(used[..., None], p.pixels, 255).astype(np.uint8), used=used) for p in photos]
+    state = Refinement.of(rows_of(wall()))
+    refine(
+        state,
+        splat_photos(hidden, np.zeros((6, 3)), splats_from_scene=IDENTITY, near=0.0),
+        background=(0,) * 3,
+        steps=30,
+    )
+    shown = SplatScene(gaussians_of(state.rows)).render(frames()[2]).rgb
+    assert np.abs(shown - photos[2].pixels / 255).mean() < 0.01
+
+
+def test_frames_and_depth_of_a_scene() -> None:
+    """Depth along the optical axis is that along the ray times the cosine; the wall is where it was put."""
+    scene, frame = SplatScene(wall(), unit="metre"), frames()[2]
+    along = scene.render(frame, depth=DepthRequest("conditional", "ray"))
+    z = scene.render(frame, depth=DepthRequest("conditional", "z"))
+    cosines = frame.camera.pixel_bearings()[0][:, 2].reshape(48, 64)
+    assert along.depth is not None
+    assert z.depth is not None
+    np.testing.assert_allclose(z.depth, along.depth * cosines, rtol=1e-5)
+    median = scene.render(frame, depth=DepthRequest("median", "z")).depth
+    assert median is not None
+    assert 2.7 < np.nanmin(median) < np.nanmax(median) < 3.4
+    moved = Similarity(2.0, np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([1.0, 2, 3]))
+    there = SplatScene(wall().moved(moved)).render(
+        replace(frame, world_from_cam=moved.apply_pose(frame.world_from_cam))
+    )
+    np.testing.assert_allclose(there.rgb, along.rgb, atol=2e-3)
+
+
+@pytest.fixture(scope="module")
+def run(spheres_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of a trained run, in which splats may be kept."""
+    return shutil.copytree(spheres_run, tmp_path_factory.mktemp("splats") / "spheres-run")
+
+
+def test_export_refines_once_and_writes_every_format(run: Path) -> None:
+    """The .ply and .spz hold the same scene, whichever frame they are in; the second export uses the first's splats."""
+    told: list[str] = []
+    ply = nerfcli.export_run(run, to="splats", splats=SMALL, notify=told.append)
+    assert ply == run.with_name("spheres-run-splats.ply")
+    assert any("training photos: field" in line for line in told)
+    state = (run / SPLATS).read_bytes()
+    for name, frame in (("a.spz", "viewer"), ("b.ply", "scene")):
+        nerfcli.export_run(run, run.with_name(name), to="splats", splats=replace(SMALL, frame=frame))
+    nerfcli.export_run(run, run.with_name("c.html"), to="splats", splats=SMALL)
+    assert (run / SPLATS).read_bytes() == state
+    held_out = nerfcli.load_run(run).cameras.test[0]
+    pictures = [nerfcli.load_splats(run.with_name(n)).render(held_out).rgb for n in (ply.name, "b.ply", "a.spz")]
+    np.testing.assert_allclose(pictures[0], pictures[1], atol=2e-3)
+    assert np.abs(pictures[0] - pictures[2]).mean() < 0.01
+    assert len(nerfcli.load_splats(ply).gaussians) <= 800
+
+
+def test_resume_goes_on_and_other_settings_begin_again(run: Path) -> None:
+    before = load_splat_state(run / SPLATS)
+    longer = replace(SMALL, budget_seconds=2.0, resume=True)
+    nerfcli.export_run(run, to="splats", splats=longer, overwrite=True)
+    after = load_splat_state(run / SPLATS)
+    assert after.refinement.steps > before.refinement.steps
+    assert len(after.refinement.rows) == len(before.refinement.rows)
+    with pytest.raises(UserError, match="no splats of this field"):
+        nerfcli.export_run(run, to="splats", splats=replace(longer, degree=2), overwrite=True)
+    nerfcli.export_run(run, to="splats", splats=replace(SMALL, degree=0), overwrite=True)
+    assert load_splat_state(run / SPLATS).degree == 0
+
+
+def test_an_interrupt_saves_the_splats_and_writes_no_file(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[int] = []
+    step = refinement.step_splats
+
+    def interrupted(*given: object, **named: object) -> None:
+        step(*given, **named)  # type: ignore[arg-type]
+        steps.append(1)
+        if len(steps) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(refinement, "step_splats", interrupted)
+    target, told = run.with_name("interrupted.ply"), []
+    with pytest.raises(KeyboardInterrupt):
+        nerfcli.export_run(run, target, to="splats", splats=replace(SMALL, budget_seconds=60), notify=told.append)
+    assert not target.exists()
+    assert load_splat_state(run / SPLATS).refinement.steps == 3
+    assert told[-1] == "the splats are saved; the same command with --resume goes on"
+
+
+def test_splats_are_measured_by_the_protocol_of_fields(run: Path) -> None:
+    """The number in the file is that of the picture that `render` writes."""
+    ply = run.with_name("spheres-run-splats.ply")
+    found = evaluate_splats(run, ply)
+    name = found.metrics["images"][0]["name"]
+    folder = nerfcli.render_run(
+        run, splats=ply, settings=ExportSettings(("rgb",), DepthRequest("median", "z"), rgba=False)
+    )
+    assert folder[0].parent.name == "test-splats"
+    shown = read_image(next(folder[0].rglob(f"{Path(name).stem}.png")))
+    assert shown.shape[:2] == (72, 96)
+    assert found.metrics["protocol"].startswith("nerfcli-2")
+    assert found.metrics["splats"]["count"] == len(nerfcli.load_splats(ply).gaussians)
+    assert evaluate_splats(run, ply).is_kept
+
+
+def test_foreign_splats_are_rendered_with_the_cameras_of_a_file(run: Path, tmp_path: Path) -> None:
+    """The pictures are those of `SplatScene`; cameras of a run and photos are refused in two lines."""
+    ply = shutil.copy(run.with_name("b.ply"), tmp_path / "b.ply")
+    settings = ExportSettings(("rgb", "depth"), DepthRequest("median", "z"))
+    rgb, _ = render_file(ply, views=Views(str(run / "cameras.json")), settings=settings)
+    assert rgb == tmp_path / "b-renders" / "cameras-median-z" / "rgb"
+    frame = nerfcli.load_run(run).cameras.test[0]
+    picture = nerfcli.load_splats(ply).render(frame).rgb
+    shown = read_image(next(rgb.rglob(f"{Path(frame.name).stem}.png")))
+    assert np.abs(shown / 255 - picture).max() < 0.003
+    with pytest.raises(UserError, match="has no cameras"):
+        render_file(ply, views=Views("orbit"), settings=settings)
+    with pytest.raises(UserError, match="need training photos"):
+        render_file(ply, views=Views(str(run / "cameras.json")), settings=replace(settings, outputs=("coverage",)))
