@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
 
 from nerfcli import kernels
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.field.background import Background, SphereBackground
@@ -81,7 +82,7 @@ class SplatScene:
         behind = self.background if background is None or isinstance(background, SphereBackground) else background
         view = splat_view(frame, splats_from_scene=Similarity.identity(), near=self.near)
         seen = render_splats(self.rows, view, np.asarray(behind))
-        bearings, valid = frame.camera.pixel_bearings()
+        valid, cosines = _rays_of(frame.camera)
         shape = seen.transmittance.shape
         error = np.where(seen.transmittance <= OPAQUE, seen.transmittance, 0.0).astype(np.float32)
         picture = RenderedPicture(
@@ -91,11 +92,10 @@ class SplatScene:
             on_tile(valid.size)
         if depth is not None:
             ends = splat_depths(seen, fractions(depth))
-            cosines = torch.from_numpy(bearings[:, 2].astype(np.float32))
             found = depth_maps_of(
                 depth,
                 ends,
-                cosines=cosines,
+                cosines=torch.from_numpy(cosines),
                 unit=1.0,
                 valid=torch.from_numpy(valid),
                 background_distance=depth.background_distance or 0.0,
@@ -104,6 +104,13 @@ class SplatScene:
             maps = {name: values.numpy().reshape(shape) for name, values in zip(names, found, strict=True)}
             picture = replace(picture, **maps)
         return picture
+
+
+@lru_cache(maxsize=8)  # inverting a lens takes longer than rendering a picture
+def _rays_of(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return whether each pixel has a ray, and the cosine of its angle to the optical axis, (H * W,) float32."""
+    bearings, valid = camera.pixel_bearings()
+    return valid, bearings[:, 2].astype(np.float32)
 
 
 def near_of(means: np.ndarray) -> float:
