@@ -208,6 +208,6 @@ def test_a_learned_background_is_shown_in_all_directions(monkeypatch):
 
 def test_the_count_grows_with_the_seconds_up_to_one_per_20_pixels():
     photos = photos_of_box() * 100  # of 49,152 pixels
-    assert count_for(photos, core_seconds=60) == 2 * count_for(photos, core_seconds=30) == 24_000
+    assert count_for(photos, core_seconds=60) == 2 * count_for(photos, core_seconds=30) == 36_000
     assert count_for(photos, core_seconds=1e9) == 800 * 49_152 // 20
     assert count_for(photos[:1], core_seconds=1e9) == count_for(photos, core_seconds=0.0) == 10_000

@@ -84,7 +84,7 @@ class _Squares:
 def count_for(photos: Sequence[LoadedPhoto], *, core_seconds: float) -> int:
     """Return how many Gaussians can be refined on these photos: at most one per 20 pixels of theirs."""
     pixels = sum(photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos)
-    return int(np.clip(400 * core_seconds, 10_000, max(10_000, pixels / 20)))
+    return int(np.clip(600 * core_seconds, 10_000, max(10_000, pixels / 20)))
 
 
 def gaussians_of_field(

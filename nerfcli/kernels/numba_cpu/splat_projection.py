@@ -38,8 +38,8 @@ def to_camera(row: Any, rotation: Any, translation: Any, point: Any) -> None:
 
 
 @numba.njit(cache=True, fastmath=FUSED, error_model="numpy")
-def _axes(row: Any, r: Any, sizes: Any) -> float:
-    """Write the rotation of a Gaussian by rows (9,), and its sizes (3,); return 1 / |quaternion|."""
+def _axes(row: Any, r: Any, sizes: Any) -> None:
+    """Write the rotation of a Gaussian by rows (9,), and its sizes (3,)."""
     w, x = np.float64(row[QUATERNION]), np.float64(row[QUATERNION + 1])
     y, z = np.float64(row[QUATERNION + 2]), np.float64(row[QUATERNION + 3])
     inverse = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
@@ -49,7 +49,6 @@ def _axes(row: Any, r: Any, sizes: Any) -> float:
     r[6], r[7], r[8] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
     for k in range(3):
         sizes[k] = np.exp(np.float64(row[SCALE + k]))
-    return inverse
 
 
 @numba.njit(cache=True, fastmath=FUSED)
