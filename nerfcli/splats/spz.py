@@ -2,7 +2,7 @@
 
 One gzip stream: a header of 16 bytes, then one array per parameter for all Gaussians: positions (24-bit fixed point),
 opacities, colours and logarithmic scales (8 bits), quaternions (the smallest three, 10 bits each; in version 2 x y z
-in 8 bits), harmonics (8 bits, written with 6 significant bits: the 5 and 4 of the reference lose 0.5 dB).
+in 8 bits), harmonics (8 bits, written with 7 significant bits: the 5 and 4 of the reference lose 0.5 dB).
 The axes are right, up, back: y and z have the opposite signs of a .ply.
 
 Source: https://github.com/nianticlabs/spz, src/cc/load-spz.cc.
@@ -43,7 +43,7 @@ _MOST_RATIO = 1032
 _COLOUR = 0.15
 _HALF = np.sqrt(0.5)
 # Harmonics above degree 0 are rounded to a multiple of this, in units of 1 / 128.
-_STEP = 4
+_STEP = 2
 # At most 2^-24 units: readers compute 1 << bits in 32 bits, and log scales end at -10 anyway.
 _MOST_BITS = 24
 # Steps of positions in the middle one of the three standard deviations. All 24 bits make files 12 to 20 % larger.
@@ -121,9 +121,9 @@ def packed(gaussians: Gaussians) -> tuple[bytes, str]:
     """Return what a .spz of version 3 holds before compression, and a line about what was clipped, or "".
 
     Errors: half of 2^-b in positions, where 2^-b is at most 1/16 of the size of 99 % of the splats, or the least with
-    which the farthest fits in 24 bits; 1/32 in log scales; 1/510 in opacities; 0.0131 in the harmonic of degree 0, 1/64
-    in the others; 0.002 in parts of unit quaternions. Clipped are harmonics of degree 0 beyond
-    +-3.35 and others beyond -1 and 1, log scales beyond -10 and 5.9, and positions beyond 2^23.
+    which the farthest fits in 24 bits; 1/32 in log scales; 1/510 in opacities; 0.0131 in the harmonic of degree 0,
+    1/128 in the others; 0.002 in parts of unit quaternions. Clipped are harmonics of degree 0 beyond +-3.35 and others
+    beyond -1 and 1, log scales beyond -10 and 5.9, and positions beyond 2^23.
     """
     bits, useful = _fractional_bits(gaussians)
     clipped: Counter[str] = Counter()
