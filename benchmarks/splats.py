@@ -20,6 +20,8 @@ import torch
 import typer
 
 from nerfcli import evaluate_run, export_run, load_run, load_splats
+from nerfcli.runs.files import SPLATS
+from nerfcli.splats.state import load_splat_state
 from nerfcli.workflows.evaluate import evaluate_splats
 from nerfcli.workflows.splats import SplatSettings
 
@@ -62,20 +64,18 @@ def picture_ms(path: Path, run: Path, threads: int) -> float:
 def measure(run: Path, budget: float, field: dict[str, float], *, resume: bool, count: int | None) -> Row:
     """Refine to a budget, write both files, and evaluate them."""
     settings = SplatSettings(count=count, budget_seconds=budget, resume=resume)
-    told: list[str] = []
     began = time.perf_counter()
-    ply = export_run(run, run.with_name("a.ply"), to="splats", splats=settings, overwrite=True, notify=told.append)
+    ply = export_run(run, run.with_name("a.ply"), to="splats", splats=settings, overwrite=True, notify=print)
     seconds = time.perf_counter() - began
     spz = export_run(run, run.with_name("a.spz"), to="splats", splats=SplatSettings(count, budget), overwrite=True)
     found, of_spz = (evaluate_splats(run, path, overwrite=True).metrics for path in (ply, spz))
-    print(*(line for line in told if "training photos" in line), sep="\n")
     return Row(
         **field,
         run=run.name,
         budget_s=budget,
         start_s=seconds - budget,
         count=found["splats"]["count"],
-        steps=int(next(line for line in told if "steps" in line).split(" steps")[0].split()[-1]),
+        steps=load_splat_state(run / SPLATS).refinement.steps,
         psnr=found["mean"]["psnr"],
         ssim=found["mean"]["ssim"],
         ply_mb=ply.stat().st_size / 1e6,

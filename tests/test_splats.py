@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from commands import nerfcli as command
 
 import nerfcli
 from nerfcli.cameras.camera import Camera
@@ -173,6 +174,21 @@ def test_export_refines_once_and_writes_every_format(run: Path) -> None:
     np.testing.assert_allclose(pictures[0], pictures[1], atol=2e-3)
     assert np.abs(pictures[0] - pictures[2]).mean() < 0.01
     assert len(nerfcli.load_splats(ply).gaussians) <= 800
+
+
+def test_what_splats_cannot_do_is_refused(run: Path) -> None:
+    """A page in the scene's frame; cameras of a file of splats; splats that are not there."""
+    with pytest.raises(UserError, match="the page needs y to point down"):
+        nerfcli.export_run(run, run.with_name("d.html"), to="splats", splats=replace(SMALL, frame="scene"))
+    ply = run.with_name("spheres-run-splats.ply")
+    for arguments, words in (
+        (["render", ply, "--cameras", run / "cameras.json", "--cameras-only"], "it works with a run"),
+        (["render", ply, "--cameras", run / "cameras.json", "--splats", ply], "it works with a run"),
+        (["evaluate", run, "--splats", run / "none.ply"], "there is no"),
+    ):
+        refused = command(*arguments)
+        assert refused.exit_code == 2
+        assert words in " ".join(refused.stderr.split())
 
 
 def test_resume_goes_on_and_other_settings_begin_again(run: Path) -> None:

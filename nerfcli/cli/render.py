@@ -215,6 +215,9 @@ def render(
             _render_scan(folder, one_of_many, given=values, console=console)
             return
         if folder.suffix.lower() in SUFFIXES:
+            for option, given in {"--cameras-only": cameras_only, "--splats": splats is not None}.items():
+                if given:
+                    raise typer.BadParameter(f"it works with a run, not with {folder}; remove it", param_hint=option)
             settings = replace(usual, depth=replace(request, axis=depth_axis or "z"))
             target = output if output is None or not one_of_many else output / folder.stem
             with console.callbacks(f"render {views.name}") as callbacks:

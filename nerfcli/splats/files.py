@@ -17,7 +17,7 @@ def read_splats(path: Path, notify: Callable[[str], None]) -> tuple[Gaussians, d
     """Read Gaussians from a .ply or .spz of any program, in the frame of the file, and nerfcli's description of them.
 
     Args:
-        notify: is told in a line what was left out.
+        notify: called with a line about Gaussians that were left out.
 
     Returns:
         The Gaussians; the description that `write_splats` was given, empty in files of other programs.
@@ -41,7 +41,7 @@ def write_splats(
 
     Args:
         description: unit, frame and others, as in `media.mesh_files`; in a .spz it is the comment of the gzip stream.
-        notify: is told in a line what the format does not hold.
+        notify: called with a line about values that the format cannot hold.
 
     Raises:
         UserError: the suffix is another, or the file cannot be written.

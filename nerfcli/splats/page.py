@@ -39,7 +39,7 @@ def write_splat_page(
         world_from_cam: (4, 4) camera of the first view, in that frame; its roll is not kept.
         fov_deg: vertical field of view of the first view, in degrees.
         background: sRGB in [0, 1].
-        notify: is told in a line what is clipped.
+        notify: called with a line about values that were clipped.
 
     Raises:
         UserError: the file cannot be written.

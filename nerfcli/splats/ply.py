@@ -50,7 +50,7 @@ def read_splat_ply(path: Path, notify: Callable[[str], None]) -> Gaussians:
     """Read Gaussians that any program wrote: properties in any order, further ones and further elements ignored.
 
     The file is mapped, not loaded. Infinite logits become +-20; Gaussians with other numbers that are not finite, or
-    with a quaternion of norm 0, are left out, and `notify` is told how many.
+    with a quaternion of norm 0, are left out, and `notify` is called with their number.
 
     Raises:
         UserError: it is no such file, or truncated, or none of its Gaussians is finite.

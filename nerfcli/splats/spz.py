@@ -55,7 +55,7 @@ _ROWS = 2**16
 def write_spz(
     path: Path, gaussians: Gaussians, description: Mapping[str, Any] | None, *, notify: Callable[[str], None]
 ) -> None:
-    """Write Gaussians as .spz version 3, atomically; `notify` is told what is clipped, see `packed`.
+    """Write Gaussians as .spz version 3, atomically; `notify` is called with what is clipped, see `packed`.
 
     Raises:
         UserError: the file cannot be written.
@@ -182,6 +182,8 @@ def unpacked(data: bytes) -> Gaussians:
 
 def _counted(head: bytes) -> tuple[int, int]:
     """Return the number of Gaussians that a header states, and the number of bytes that they take after it."""
+    if len(head) < _HEADER.size:
+        raise ValueError(f"it ends after {len(head)} bytes, within its header")
     magic, version, count, degree, *_ = _HEADER.unpack_from(head)
     if magic != _MAGIC or version not in (2, 3) or degree > 3 or not count:
         raise ValueError(f"version {version}, {count} splats of degree {degree}")

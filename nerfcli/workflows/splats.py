@@ -73,6 +73,12 @@ def export_splats(
         UserError: a photo cannot be read, numbers are not finite, or the file cannot be written.
         KeyboardInterrupt: passed on after the state of the refinement has been saved.
     """
+    if path.suffix.lower() == ".html" and settings.frame == "scene":
+        raise UserError(
+            "--frame scene is for .ply and .spz: the page needs y to point down",
+            "remove it, or write a .ply",
+            exit_code=2,
+        )
     splats = run_splats(run, model, settings=settings, notify=notify, progress=progress)
     file_from_scene = Similarity.identity() if settings.frame == "scene" else viewer_from_scene(run)
     gaussians = splats.gaussians().moved(file_from_scene)
