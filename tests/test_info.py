@@ -23,6 +23,8 @@ from nerfcli.media.exr import write_exr
 from nerfcli.media.file_facts import NOT_STATED, RENDERS, description_of
 from nerfcli.media.images import write_png
 from nerfcli.media.levels import write_png16
+from nerfcli.splats.files import write_splats
+from nerfcli.splats.gaussians import Gaussians
 
 
 def info(*arguments: str | Path) -> Result:
@@ -90,6 +92,25 @@ def test_info_shows_everything_a_depth_file_records(suffix, tmp_path):
         "run=kitchen",
     ):
         assert expected in text, expected
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz"])
+def test_splats_state_their_count_degree_extent_and_frame(suffix, tmp_path):
+    means = np.linspace(0.0, 1.0, 101)[:, None] * [1.0, 2.0, -4.0]
+    rows, path = np.ones((101, 1)), tmp_path / f"a{suffix}"
+    gaussians = Gaussians(means, -3.0 * rows * np.ones(3), rows * [1.0, 0, 0, 0], 0 * rows[:, 0], np.zeros((101, 4, 3)))
+    write_splats(path, gaussians, description={"frame": "that of the scene", "unit": "metre"}, notify=pytest.fail)
+    printed = json.loads(info(path, "--json").stdout)
+    expected = {"kind": "splats", "format": suffix[1:].upper(), "splats": 101, "degree": 1, "unit": "metre"}
+    assert expected.items() <= printed.items()
+    assert printed["median_opacity"] == pytest.approx(0.5, abs=1 / 255)
+    assert printed["most_between"] == [
+        pytest.approx([0.01, 0.02, -3.96], abs=1e-3),
+        pytest.approx([0.99, 1.98, -0.04], abs=1e-3),
+    ]
+    assert "frame: that of the scene" in info(path).stdout
+    write_splats(path, gaussians, description=None, notify=pytest.fail)
+    assert "not stated: unit and frame" in info(path).stdout
 
 
 def test_levels_state_their_scale_and_rounding(tmp_path):

@@ -11,6 +11,16 @@ NOT_STATED = "unit and frame"
 SUFFIXES = (".ply", ".glb", ".obj")
 
 
+def is_splat_file(path: Path) -> bool:
+    """Return whether a file is a .spz, or a .ply whose points have colours by direction.
+
+    Raises:
+        UserError: the header of a .ply is damaged.
+    """
+    suffix = path.suffix.lower()
+    return path.is_file() and (suffix == ".spz" or (suffix == ".ply" and "f_dc_0" in read_ply_header(path)[1]))
+
+
 def model_facts(path: Path) -> dict[str, Any]:
     """Return the facts about a file: kind, format, counts, and what nerfcli wrote into it: unit, frame, run, ...
 

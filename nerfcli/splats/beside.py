@@ -16,9 +16,9 @@ from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture, straight_rgba
 
 # With more photos than this, nearly everything that one looks at was photographed.
-FEW = 60
-# Share of the pictures among the steps: this many for each photo's inverse, at most a fifth.
-SHARE_OF_ONE, LARGEST_SHARE = 3.0, 0.2
+FEW = 150
+# Share of the pictures among the steps: this over the number of photos, at most the second.
+SHARE_OF_ONE, LARGEST_SHARE = 3.0, 0.4
 # Distance of the cameras from those of photos, in units of the spread of these.
 NEAREST, FARTHEST = 0.2, 1.0
 # The pictures have half the size of the photos, and at most this many pixels together.

@@ -4,8 +4,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nerfcli.errors import UserError
 from nerfcli.media.mesh_files import description_in, read_ply_header
+from nerfcli.media.model_facts import NOT_STATED
 from nerfcli.splats.gaussians import Gaussians
 from nerfcli.splats.ply import read_splat_ply, write_splat_ply
 from nerfcli.splats.spz import read_spz, write_spz
@@ -50,6 +53,26 @@ def write_splats(
         write_spz(path, gaussians, description, notify=notify)
     else:
         write_splat_ply(path, gaussians, description)
+
+
+def splat_facts(path: Path) -> dict[str, Any]:
+    """Return the facts about a file of splats as plain values, for `nerfcli info`.
+
+    Raises:
+        UserError: see `read_splats`.
+    """
+    gaussians, described = read_splats(path, lambda text: None)
+    low, high = (np.round(np.quantile(gaussians.means, share, axis=0), 4).tolist() for share in (0.01, 0.99))
+    opacities = 1.0 / (1.0 + np.exp(-gaussians.logits.astype(np.float64)))
+    return {
+        "kind": "splats",
+        "splats": len(gaussians),
+        "degree": gaussians.degree,
+        "median_opacity": round(float(np.median(opacities)), 3),
+        "most_between": [low, high],
+        **(described or {"not_stated": NOT_STATED}),
+        "format": path.suffix[1:].upper(),
+    }
 
 
 def _suffix(path: Path) -> str:

@@ -16,7 +16,7 @@ from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.errors import UserError
 from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
 from nerfcli.media.model_facts import SUFFIXES as MODEL_SUFFIXES
-from nerfcli.media.model_facts import model_facts
+from nerfcli.media.model_facts import is_splat_file, model_facts
 from nerfcli.runs.files import CONFIG, DEPTH_ERRORS, LOG, METRICS, REPORT
 from nerfcli.tomography.result import is_reconstruction, load_reconstruction
 from nerfcli.tomography.volume_files import is_volume_file, volume_facts
@@ -50,6 +50,10 @@ def describe(path: str | Path) -> dict[str, Any]:
     may_be_capture = folder.suffix.lower() in _CAPTURE_SUFFIXES if folder.is_file() else not (folder / CONFIG).exists()
     if may_be_capture and recognised(folder) is not None:
         return _describe_capture(folder)
+    if is_splat_file(folder):
+        from nerfcli.splats.files import splat_facts
+
+        return splat_facts(folder)
     if folder.suffix.lower() in MODEL_SUFFIXES:
         return model_facts(folder)
     if folder.is_file() and is_volume_file(folder):
