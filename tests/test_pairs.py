@@ -11,7 +11,7 @@ from test_photos import NO_EXIF
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses.engine.retrieval import alike, likeness, promising
 from nerfcli.poses.input.pairs import (
-    EXHAUSTIVE_UP_TO,
+    ALL_ALIKE_UP_TO,
     Pairing,
     capture_order,
     choose_pairs,
@@ -42,10 +42,12 @@ def test_names_that_differ_in_more_than_a_number_have_no_order(names: list[str])
     assert capture_order(names) is None
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, EXHAUSTIVE_UP_TO])
-def test_small_captures_are_compared_exhaustively(count: int):
-    pairing = choose_pairs(named(*(f"{number:03}.jpg" for number in range(count))))
-    assert (pairing.rule, pairing.neighbours) == ("exhaustive", 0)
+@pytest.mark.parametrize("count", [0, 1, 2, ALL_ALIKE_UP_TO])
+@pytest.mark.parametrize("rule", ["auto", "exhaustive"])
+def test_all_pairs_of_small_captures_are_compared(count: int, rule: str):
+    """By default, those whose photos have no features in common are left out later."""
+    pairing = choose_pairs(named(*(f"{number:03}.jpg" for number in range(count))), rule=rule)
+    assert (pairing.rule, pairing.neighbours) == (("retrieval", 25) if rule == "auto" else ("exhaustive", 0))
     assert sorted(pairing.pairs) == list(combinations(range(count), 2))
 
 
@@ -196,8 +198,9 @@ def test_look_alikes_are_the_neighbours_that_are_not_known():
     assert {(i, i + 2) for i in range(28)} <= set(found)
 
 
-def test_pairs_without_common_features_are_left_out_except_the_best_of_each_photo():
+def test_pairs_without_common_features_are_left_out_except_the_best_of_each_photo(monkeypatch: pytest.MonkeyPatch):
     """Photos up to three apart share features; those at the ends have fewer than four such partners."""
+    monkeypatch.setattr("nerfcli.poses.engine.retrieval._FEW", 4)
     _, truth = shared_descriptors(30)
     pairs = sequential_pairs(range(30))
     kept = promising(truth, pairs)

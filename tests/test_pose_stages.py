@@ -317,7 +317,7 @@ def test_memory_of_this_process_and_machine_is_measured():
 def test_planning_writes_nothing(photos: Path):
     before = sorted(path.name for path in photos.parent.iterdir())
     _, _, pairing, plan = plan_poses(photos, settings=ONE_THREAD, progress=lambda *reported: None)
-    assert (plan.photos, plan.rule, plan.pairs) == (8, "exhaustive", 28)
+    assert (plan.photos, plan.rule, plan.pairs) == (8, "retrieval", 28)
     assert len(pairing.pairs) == 28
     assert sorted(path.name for path in photos.parent.iterdir()) == before
 

@@ -5,6 +5,8 @@ everything is real.
 """
 
 import shutil
+import threading
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -346,8 +348,8 @@ def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(
     climbed = climb(job, lambda *progress: None, notes.append)
     assert [attempt["what"] for attempt in climbed.attempts][:2] == ["default thresholds", "lower angles"]
     assert not any("start from" in attempt["what"] for attempt in climbed.attempts)
-    # By the plan, 10 photos take 0.38 + 10 * 0.0005 s each.
-    assert "not trying other starts, which take about 4 s each: most photos are registered" in notes
+    # By the plan, 10 photos take 0.09 + 10 * 0.0005 s each.
+    assert "not trying other starts, which take about 1 s each: most photos are registered" in notes
 
 
 def test_the_mapper_counts_the_photos_that_it_goes_on_from(solved: Solved, tmp_path: Path):
@@ -368,27 +370,65 @@ def test_the_mapper_counts_the_photos_that_it_goes_on_from(solved: Solved, tmp_p
     assert reports == [("map", 8, 10), ("map", 9, 10), ("map", 10, 10)]
 
 
-def test_a_run_of_the_mapper_ends_at_its_limit(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Ten times the plan's 0.38 + 0.0005 n seconds a photo, two minutes at least; photos placed by then are kept."""
-    assert [mapping.mapper_limit_seconds(photos) for photos in (10, 300)] == [120, 1590]
-    shutil.copytree(solved.job.database.parent, tmp_path / "again")
-    job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
-    (tmp_path / "again" / "work" / "models_0.json").unlink(missing_ok=True)
-    limits: list[int] = []
-    real = pycolmap.incremental_mapping
+def _again(solved: Solved, folder: Path) -> Job:
+    """Return the job in a copy of its folder, without the models of its mapper."""
+    shutil.copytree(solved.job.database.parent, folder)
+    (folder / "work" / "models_0.json").unlink(missing_ok=True)
+    return replace(solved.job, folder=str(folder / "work"))
 
-    def watched(*arguments, options: pycolmap.IncrementalPipelineOptions, **more) -> dict[int, pycolmap.Reconstruction]:
-        limits.append(options.max_runtime_seconds)
-        return real(*arguments, options=options, **more)
 
-    monkeypatch.setattr(mapping.pycolmap, "incremental_mapping", watched)
-    monkeypatch.setattr(ladder, "mapper_limit_seconds", lambda photos: 0)
+def test_a_run_of_the_mapper_ends_if_no_photo_follows(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The plan's time for all photos, two minutes at least; photos placed by then are kept, up to a tenth of them."""
+    assert [mapping.stall_seconds(photos) for photos in (10, 1000)] == [120, pytest.approx(590)]
+    monkeypatch.setattr(mapping, "stall_seconds", lambda photos: 0.0)
+    monkeypatch.setattr(ladder, "_other_starts", lambda *arguments: None)
+    hangs = threading.Event()
+
+    def report(stage: str, done: int, total: int) -> None:
+        if stage == "map" and done == 8 and not hangs.is_set():
+            hangs.set()
+            time.sleep(1.5)
+
     notes: list[str] = []
-    climbed = climb(job, lambda *progress: None, notes.append)
-    assert climbed.models[0].num_reg_images() == 10
-    assert limits[0] == 120
-    stopped = "default thresholds: stopped after 0 s, longer than most captures take"
-    assert (climbed.cut_short, notes[0]) == ((stopped,), f"cut short: {stopped}")
+    climbed = climb(_again(solved, tmp_path / "again"), report, notes.append)
+    stopped = "default thresholds: stopped after 0 s without another photo"
+    assert (climbed.attempts[0]["models"], climbed.cut_short[0], notes[0]) == ([8], stopped, f"cut short: {stopped}")
+
+
+def test_a_slow_run_of_the_mapper_is_not_ended_while_photos_follow(
+    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def slow(*arguments, cancellation_token, next_image_callback, **options) -> dict[int, pycolmap.Reconstruction]:
+        for _ in range(5):
+            time.sleep(0.5)
+            next_image_callback()
+        assert not cancellation_token.is_cancelled
+        return {}
+
+    monkeypatch.setattr(mapping.pycolmap, "incremental_mapping", slow)
+    monkeypatch.setattr(mapping, "stall_seconds", lambda photos: 1.4)
+    map_photos(_again(solved, tmp_path / "again"), lambda *progress: None, attempt=0, start=MapperOptions())
+
+
+def test_the_mapper_goes_on_from_its_last_snapshot(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Interrupted at the eighth of ten photos; the last snapshot was not written to its end."""
+    monkeypatch.setattr(mapping, "_MANY_PHOTOS", 10)
+    job, counts = _again(solved, tmp_path / "again"), list[int]()
+
+    def report(stage: str, done: int, total: int) -> None:
+        counts.append(done)
+        if done == 8 and 7 in counts:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        map_photos(job, report, attempt=0, start=MapperOptions())
+    assert counts == [2, 3, 4, 5, 6, 7, 8]
+    snapshots = sorted(Path(job.folder).glob("models_0_snapshots/*/*"))
+    (snapshots[-1].with_name("9" * 20)).mkdir()
+    counts.clear()
+    [model] = map_photos(job, report, attempt=0, start=MapperOptions())
+    assert (counts, model.num_reg_images()) == ([8, 9, 10], 10)
+    assert not list(Path(job.folder).glob("models_0_snapshots"))
 
 
 def test_groups_hold_together_against_what_speaks_against_them():

@@ -138,7 +138,7 @@ def test_the_report_file_has_the_promised_keys(solved: Solved):
     assert report["models"][0] == report["registered"] == 7
     assert report["settings"]["max_features"] == 500
     assert report["versions"]["pycolmap"] == pycolmap.__version__
-    assert report["matching"] == {"rule": "exhaustive", "pairs": 28}
+    assert report["matching"] == {"rule": "retrieval", "pairs": 28}
 
 
 def test_a_blank_photo_costs_no_second_attempt(solved: Solved):
@@ -149,7 +149,7 @@ def test_a_blank_photo_costs_no_second_attempt(solved: Solved):
 def test_progress_goes_through_all_stages(solved: Solved):
     stages = list(dict.fromkeys(stage for stage, _, _ in solved.stages))
     searches = ["extract", "enlarge", "faint", "faint-enlarged"]
-    assert stages == ["read", *searches, "features", "match", "map", "check", "stabilise"]
+    assert stages == ["read", *searches, "features", "pair", "match", "map", "check", "stabilise"]
     last = {stage: (done, total) for stage, done, total in solved.stages}
     assert last["extract"] == (8, 8)
     assert last["enlarge"][0] == last["enlarge"][1] > 0

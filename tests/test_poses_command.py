@@ -45,16 +45,16 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(
     result = nerfcli("poses", photos, "--dry-run", "--json", *options)
     plan = json.loads(result.stdout)
     assert plan["path"] == str(photos)
-    assert (plan["photos"], plan["rule"], plan["pairs"]) == (5, "exhaustive", 10)
+    assert (plan["photos"], plan["rule"], plan["pairs"]) == (5, "retrieval", 10)
     assert (plan["max_image_size"], plan["max_features"]) == (size, features)
-    assert set(plan["seconds"]) == {"extract", "match", "map", "check", "stabilise"}
+    assert set(plan["seconds"]) == {"extract", "pair", "match", "map", "check", "stabilise"}
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
 def test_the_plan_can_be_read(tmp_path: Path):
     photos = write_photos(tmp_path / "photos", 5)
     result = nerfcli("poses", photos, "--dry-run")
-    assert result.stdout.startswith(f"{photos}: 5 photos, 10 pairs to match (exhaustive), about ")
+    assert result.stdout.startswith(f"{photos}: 5 photos, 10 pairs to match (retrieval), about ")
     assert result.stdout.endswith("; 0.5 GB of memory\n")
 
 

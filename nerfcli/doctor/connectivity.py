@@ -11,7 +11,7 @@ from nerfcli.errors import several
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, worst
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.retrieval import alike, likeness
-from nerfcli.poses.input.pairs import EXHAUSTIVE_UP_TO
+from nerfcli.poses.input.pairs import ALL_ALIKE_UP_TO
 from nerfcli.poses.model.reasons import FEW_MATCHES
 
 # In captures that are not compared exhaustively, each photo is compared with some later ones by name and with its most
@@ -25,7 +25,7 @@ _COARSEST = 96
 def choose_pairs(photos: Sequence[PhotoFacts]) -> list[tuple[int, int]]:
     """Return the pairs (i, j), i < j, to compare: all of a small capture, about 11 per photo of a large one."""
     count = len(photos)
-    if count <= EXHAUSTIVE_UP_TO:
+    if count <= ALL_ALIKE_UP_TO:
         return list(combinations(range(count), 2))
     near = {(i, i + step) for step in STEPS_BY_NAME for i in range(count - step)}
     coarsest = [
@@ -37,7 +37,7 @@ def choose_pairs(photos: Sequence[PhotoFacts]) -> list[tuple[int, int]]:
 
 def pair_count(count: int) -> int:
     """Estimate how many pairs `choose_pairs` chooses."""
-    if count <= EXHAUSTIVE_UP_TO:
+    if count <= ALL_ALIKE_UP_TO:
         return count * (count - 1) // 2
     return count * (len(STEPS_BY_NAME) + LOOK_ALIKES)
 

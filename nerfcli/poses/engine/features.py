@@ -1,7 +1,6 @@
 """Extract features and match pairs with pycolmap, continuing from the existing content of its database."""
 
 import math
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,10 +12,13 @@ import pycolmap
 
 from nerfcli.errors import duration
 from nerfcli.poses.engine.database import clear_matches, forget_features, keep_geometries, register_photos
+from nerfcli.poses.engine.polling import every_second
 from nerfcli.poses.input.job import Job, Report, WorkMask
 from nerfcli.poses.input.plan import limit_seconds, matching_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
+# Of RANSAC in the verification of a pair, instead of 10,000: pairs that need more have wrong matches only, or few more.
+_MOST_TRIALS = 2000
 # The time limit is checked after this many pairs.
 _PAIRS_PER_CALL = 1024
 # Change these whenever this module would find other features in the same photo, or other matches of the same features.
@@ -95,7 +97,7 @@ def start_matching(job: Job, pairs: Sequence[tuple[int, int]]) -> None:
     """Remove the matches of other settings, and the verified matches of other pairs, which the mapper would use."""
     matched, verified = job.stage_file("matches"), job.stage_file("geometries")
     matches_key = stage_key(_MATCHES_VERSION, pycolmap.__version__)
-    verified_key = stage_key(matches_key, job.seed)
+    verified_key = stage_key(matches_key, job.seed, _MOST_TRIALS)
     if read_stage(matched, matches_key) is None:
         clear_matches(job, "matches", "two_view_geometries")
         write_stage(matched, matches_key, {})
@@ -116,6 +118,7 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
     options = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.seed
+    verification.ransac.max_num_trials = _MOST_TRIALS
     pair_list = Path(job.folder) / "pairs.txt"
     # Matches are written after each block, so that progress is visible and kept.
     pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list, block_size=_PAIRS_PER_CALL // 8)
@@ -201,18 +204,7 @@ def _watched(stage: str, done: Callable[[], int], total: int, report: Report) ->
 
     pycolmap has no callbacks for these stages, so the database is polled, through pycolmap: see `database`.
     """
-    finished = threading.Event()
-
-    def watch() -> None:
-        while not finished.wait(1.0):
-            report(stage, done(), total)
-
     report(stage, done(), total)
-    watcher = threading.Thread(target=watch)
-    watcher.start()
-    try:
+    with every_second(lambda: report(stage, done(), total)):
         yield
-    finally:
-        finished.set()
-        watcher.join()
     report(stage, total, total)

@@ -19,7 +19,7 @@ from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.initial_focal import with_focal_lengths
 from nerfcli.poses.engine.mapped import MappedModels
-from nerfcli.poses.engine.mapping import MapperOptions, map_photos, mapper_limit_seconds
+from nerfcli.poses.engine.mapping import MapperOptions, map_photos, mapper_limit_seconds, photo_numbers
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
 from nerfcli.poses.input.plan import extraction_seconds, mapping_seconds, matching_seconds
@@ -37,7 +37,7 @@ from nerfcli.poses.model.two_views import count_matches, read_verified_pairs
 _GOOD_FRACTION = 0.9
 # Below this registered fraction, several times the work done so far is worthwhile.
 _FEW_FRACTION = 0.75
-# From this many photos, mapping from scratch takes two minutes and more, which is not worth it for a few photos.
+# From this many photos, mapping from scratch takes a minute and more, which is not worth it for a few photos.
 _MANY_PHOTOS = 250
 # With more photos, comparing every pair, or searching full-size photos, takes longer than taking better photos.
 _MOST_FOR_ALL = 150
@@ -180,11 +180,10 @@ class _Ladder:
     def _map(
         self, what: str, job: Job, start: MapperOptions, *, base: pycolmap.Reconstruction | None = None
     ) -> list[pycolmap.Reconstruction]:
-        most, began = mapper_limit_seconds(self._photos), time.perf_counter()
-        models = map_photos(job, self.report, attempt=len(self.rungs), start=start, base=base)
-        if time.perf_counter() - began > most:
-            self._cut(f"{what}: stopped after {duration(most)}, longer than most captures take")
-        return models
+        def cut(seconds: float) -> None:
+            self._cut(f"{what}: stopped after {duration(seconds)} without another photo")
+
+        return map_photos(job, self.report, attempt=len(self.rungs), start=start, base=base, stalled=cut)
 
     def _cut(self, what: str) -> None:
         self.tell(f"cut short: {what}")
@@ -227,7 +226,8 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> MappedMod
     compared = set(job.pairs)
     few_more = len(compared) < math.comb(len(job.files), 2) and len(job.files) <= _MOST_FOR_ALL
     if few_more and ladder.fraction(featured) < _GOOD_FRACTION and ladder.has_time():
-        rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
+        placed = set(photo_numbers(ladder.best.models[0], job)) if ladder.best.models else set[int]()
+        rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared and not placed.issuperset(pair)]
         job = replace(job, pairs=(*job.pairs, *rest))
         ladder.match(job, rest)
         ladder.attempt("match all pairs", job, SMALLER_BASELINE)

@@ -1,7 +1,8 @@
 """Compute models from matches: single runs of the incremental or global mapper, and COLMAP files."""
 
 import shutil
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,11 +12,21 @@ import numpy as np
 import pycolmap
 
 from nerfcli.poses.engine.mapped import file_keys, mapping_key, read_models, write_models
+from nerfcli.poses.engine.polling import every_second
 from nerfcli.poses.input.job import Job, Report
-from nerfcli.poses.input.plan import limit_seconds, mapping_seconds
+from nerfcli.poses.input.plan import LEAST_LIMIT_SECONDS, limit_seconds, mapping_seconds
 from nerfcli.poses.input.stages import stage_key
 from nerfcli.poses.model.principal_points import camera_of_lens
 from nerfcli.poses.model.reasons import FEW_MATCHES
+
+# Change this whenever the mapper would make other models of the same matches.
+_VERSION = "rough adjustments to few points, then all of them"
+# Everything is adjusted each time the photos or the points have grown by this factor: where photos have few matches it
+# is quickly done, and needed. They have many if there are more than this many verified ones for each photo.
+_GROWTH, _DENSE = (1.1, 1.3), 3000
+# Snapshots of the model during a run of the mapper. With at least this many photos, a call goes on from those of one
+# that was killed; with fewer it begins again, which takes seconds and gives the same bits as without interruption.
+_SNAPSHOTS, _MANY_PHOTOS = 10, 100
 
 
 @dataclass(frozen=True)
@@ -99,32 +110,65 @@ def _model_folder(job: Job) -> Path:
 
 
 def map_photos(
-    job: Job, report: Report, *, attempt: int, start: MapperOptions, base: pycolmap.Reconstruction | None = None
+    job: Job,
+    report: Report,
+    *,
+    attempt: int,
+    start: MapperOptions,
+    base: pycolmap.Reconstruction | None = None,
+    stalled: Callable[[float], None] = lambda seconds: None,
 ) -> list[pycolmap.Reconstruction]:
     """Run the incremental mapper once, from scratch or from a model, unless an earlier call has done so.
 
-    Its models are read back from disk, largest first, with point errors.
+    Its models are read back from disk, largest first, with point errors. A call that was killed leaves snapshots; with
+    many photos, the next one goes on from the largest of them.
+
+    Args:
+        stalled: called with a number of seconds if the mapper was ended because it placed no photo for so long.
     """
     output = Path(job.folder) / f"{job.rung}models_{attempt}"
     base_folder = output.with_name(f"{output.name}_base")
     if base is not None:
         base_folder.mkdir(exist_ok=True)
         base.write(base_folder)
-    key = stage_key(mapping_key(job), attempt, asdict(start), base is not None and file_keys(base_folder))
+    key = stage_key(mapping_key(job), _VERSION, attempt, asdict(start), base is not None and file_keys(base_folder))
     if (found := read_models(output, key)) is None:
-        placed = 0 if base is None else base.num_reg_images()
+        snapshots = output.with_name(f"{output.name}_snapshots") / key
+        if len(job.files) < _MANY_PHOTOS:
+            shutil.rmtree(snapshots, ignore_errors=True)
+        snapshots.mkdir(parents=True, exist_ok=True)
+        placed, begin = _largest_snapshot(snapshots) or (0 if base is None else base.num_reg_images(), base_folder)
         options = _options(job, attempt=attempt, start=start)
-        models = _run_mapper(job, report, options, None if base is None else base_folder, placed=placed)
+        options.snapshot_path = snapshots
+        options.snapshot_frames_freq = max(1, len(job.files) // _SNAPSHOTS)
+        models = _run_mapper(job, report, options, begin if placed else None, placed=placed, stalled=stalled)
         write_models(output, models, key)
+        shutil.rmtree(snapshots.parent)
         found = read_models(output, key)
     if found is None:
         raise OSError(f"cannot read back the models in {output}")
     return found[0]
 
 
+def _largest_snapshot(snapshots: Path) -> tuple[int, Path] | None:
+    """Return the largest number of photos of an intact snapshot, and its folder; None if there is none."""
+    found = []
+    for folder in snapshots.iterdir():
+        try:
+            found.append((pycolmap.Reconstruction(folder).num_reg_images(), folder))
+        except (RuntimeError, ValueError):  # killed while it was written
+            continue
+    return max(found, default=None)
+
+
 def mapper_limit_seconds(photos: int) -> int:
-    """Return the time limit of one run of the mapper, which then ends with the photos placed so far."""
+    """Return the time after which no further attempt to map begins."""
     return round(limit_seconds(mapping_seconds(photos)))
+
+
+def stall_seconds(photos: int) -> float:
+    """Return the time without another photo after which a run of the mapper ends with those placed so far."""
+    return max(mapping_seconds(photos), LEAST_LIMIT_SECONDS)
 
 
 def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
@@ -144,13 +188,22 @@ def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
 
 def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.IncrementalPipelineOptions:
     seed, fixed = job.seed + attempt, set(job.fixed_cameras)
+    with pycolmap.Database.open(job.database) as database:
+        growth = _GROWTH[database.num_inlier_matches() > _DENSE * len(job.files)]
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=job.threads,
         random_seed=seed,
         min_model_size=3,  # models of small captures count too; the largest is chosen below
         constant_cameras=fixed,
-        max_runtime_seconds=mapper_limit_seconds(len(job.files)),
+        extract_colors=False,  # see `with_colours`
+        # Until all photos are placed, rough local adjustments suffice, and global ones to few points, see
+        # `_adjust_fully`. Shorter global ones find the way back from a wrong turn less often, and so do fewer of them.
+        ba_global_frames_ratio=growth,
+        ba_global_points_ratio=growth,
+        ba_local_max_refinements=1,
+        ba_local_max_num_iterations=10,
     )
+    options.mapper.ba_global_ignore_redundant_points3D = True
     options.mapper.random_seed = options.triangulation.random_seed = seed
     options.mapper.constant_cameras = fixed
     options.mapper.init_min_tri_angle = start.init_min_tri_angle
@@ -165,28 +218,66 @@ def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.Increm
 
 
 def _run_mapper(
-    job: Job, report: Report, options: pycolmap.IncrementalPipelineOptions, base_folder: Path | None, *, placed: int
+    job: Job,
+    report: Report,
+    options: pycolmap.IncrementalPipelineOptions,
+    base_folder: Path | None,
+    *,
+    placed: int,
+    stalled: Callable[[float], None],
 ) -> list[pycolmap.Reconstruction]:
     beginnings = iter([placed] if placed else [])  # a given model; every other one begins with two photos
-    most = 0
+    most, latest = 0, time.monotonic()
+    token, longest = pycolmap.CancellationToken(), stall_seconds(len(job.files))
 
     def tell(count: int) -> None:
-        nonlocal placed, most
+        nonlocal placed, most, latest
+        latest = time.monotonic()
         # Report the largest model so far: each further one begins again with two of the few photos left.
         placed, most = count, max(most, min(count, len(job.files)))
         report("map", most, len(job.files))
 
-    with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
-        models = pycolmap.incremental_mapping(
-            job.database,
-            job.photos,
-            output,
-            options=options,
-            input_path="" if base_folder is None else base_folder,
-            initial_image_pair_callback=lambda: tell(next(beginnings, 2)),
-            next_image_callback=lambda: tell(placed + 1),
-        )
+    with (
+        TemporaryDirectory(dir=job.folder, prefix="mapper-") as output,
+        every_second(lambda: token.cancel() if time.monotonic() - latest > longest else None),
+    ):
+        try:
+            models = pycolmap.incremental_mapping(
+                job.database,
+                job.photos,
+                output,
+                options=options,
+                input_path="" if base_folder is None else base_folder,
+                initial_image_pair_callback=lambda: tell(next(beginnings, 2)),
+                next_image_callback=lambda: tell(placed + 1),
+                cancellation_token=token,
+            )
+        except InterruptedError:  # by the token
+            stalled(longest)
+            last = _largest_snapshot(Path(options.snapshot_path))
+            models = {} if last is None else {0: pycolmap.Reconstruction(last[1])}
+    for model in models.values():
+        _adjust_fully(model, job, options)
     return _largest_first(models)
+
+
+def _adjust_fully(model: pycolmap.Reconstruction, job: Job, options: pycolmap.IncrementalPipelineOptions) -> None:
+    """Triangulate a mapped model again and adjust it with all of its points until it converges, in place."""
+    thorough = pycolmap.IncrementalPipelineOptions(num_threads=job.threads, constant_cameras=set(job.fixed_cameras))
+    with pycolmap.Database.open(job.database) as database:
+        cache = pycolmap.DatabaseCache.create(
+            database, pycolmap.DatabaseCacheOptions(min_num_matches=options.min_num_matches)
+        )
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    mapper.iterative_global_refinement(
+        thorough.ba_global_max_refinements,
+        thorough.ba_global_max_refinement_change,
+        options.mapper,
+        thorough.get_global_bundle_adjustment(),
+        options.triangulation,
+    )
+    mapper.end_reconstruction(discard=False)
 
 
 def _largest_first(models: Mapping[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:

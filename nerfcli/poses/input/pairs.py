@@ -18,8 +18,8 @@ from nerfcli.poses.input.photos import Photo, Photos
 # Choices. "auto" selects one of the others, by the number of photos and their metadata.
 PAIRINGS = ("auto", "exhaustive", "sequential", "retrieval", "spatial")
 
-# Up to this many photos, every photo is compared with every other one, whatever their names.
-EXHAUSTIVE_UP_TO = 60
+# Up to this many photos, every pair that looks alike is matched, whatever the photos' names.
+ALL_ALIKE_UP_TO = 60
 # In an ordered capture, each photo is compared with this many that follow it; with GPS, with this many nearest ones...
 FOLLOWERS = 10
 _NEAREST = 20
@@ -38,7 +38,8 @@ class Pairing:
     """Pairs of photos to match.
 
     rule: one of `PAIRINGS` except "auto", or "file". pairs: (i, j), i < j, of photo numbers. neighbours: how many
-    look-alikes of each photo to add, once features are known.
+    look-alikes of each photo to add, once features are known, when pairs of photos that are not alike are left out too;
+    0 to match `pairs` as they are.
     """
 
     rule: str
@@ -49,8 +50,8 @@ class Pairing:
 def choose_pairs(photos: Sequence[Photo], *, rule: str = "auto") -> Pairing:
     """Choose the pairs of photos to match by one of the rules below.
 
-    "auto" compares a small capture exhaustively, and a larger one as its photos allow: by position, if their GPS can
-    tell neighbours apart; in the order in which they were taken, if there is one; else by similarity.
+    "auto" compares up to 60 photos by similarity, and more as they allow: by position, if their GPS can tell neighbours
+    apart; in the order in which they were taken, if there is one; else by similarity.
 
     Raises:
         ValueError: no such rule.
@@ -63,15 +64,15 @@ def choose_pairs(photos: Sequence[Photo], *, rule: str = "auto") -> Pairing:
     if rule == "sequential":
         return Pairing("sequential", sequential_pairs(order_of_capture(photos) or range(len(photos))), _LOOP_NEIGHBOURS)
     if rule == "retrieval":
-        return Pairing("retrieval", (), _NEIGHBOURS)
+        return Pairing("retrieval", all_pairs(len(photos)) if len(photos) <= ALL_ALIKE_UP_TO else (), _NEIGHBOURS)
     if rule == "spatial":
         return Pairing("spatial", nearest_pairs(_positions(photos), _NEAREST), _LOOP_NEIGHBOURS)
     raise ValueError(f"pairing must be one of {', '.join(PAIRINGS)}, got {rule}")
 
 
 def _best_rule(photos: Sequence[Photo]) -> str:
-    if len(photos) <= EXHAUSTIVE_UP_TO:
-        return "exhaustive"
+    if len(photos) <= ALL_ALIKE_UP_TO:
+        return "retrieval"
     if all(photo.exif.gps for photo in photos):
         places = _positions(photos)
         radii = np.sort(np.linalg.norm(places[:, None] - places[None], axis=-1), axis=1)[:, _NEAREST]

@@ -76,7 +76,7 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
         "match": matching_seconds(pairs, max_features=features) / threads,
         "map": mapping_seconds(count),
         "check": checking_seconds(count),
-        "stabilise": 2.5 + count * 0.075,
+        "stabilise": 1.2 + count * 0.02,
     }
     # The libraries, each photo in the mapper, and the picture that each thread searches enlarged.
     memory_bytes = 500e6 + count * 1.5e6 + threads * max(searched, default=0.0) * 70
@@ -113,12 +113,12 @@ def matching_seconds(pairs: int, *, max_features: int) -> float:
 
 def mapping_seconds(photos: int) -> float:
     """Estimate the CPU seconds to place this many photos one after the other."""
-    return photos * (0.38 + photos * 0.0005)  # all photos are adjusted again and again
+    return photos * (0.09 + photos * 0.0005)  # all photos are adjusted again and again
 
 
 def at_once_seconds(photos: int) -> float:
     """Estimate the CPU seconds to place this many photos with the global mapper."""
-    return photos * 0.5
+    return photos * (0.1 + photos * 0.0015)
 
 
 def limit_seconds(planned: float) -> float:
@@ -128,7 +128,7 @@ def limit_seconds(planned: float) -> float:
 
 def checking_seconds(photos: int) -> float:
     """Estimate the CPU seconds to check the poses of this many photos."""
-    return 5 + photos * 0.13
+    return 2 + photos * 0.08
 
 
 class TimeEstimate:

@@ -44,6 +44,9 @@ _GAIN_FRACTION = 0.001
 # The report has the uncertainty of as many.
 MOST_CAMERAS = 8
 LEAST_PHOTOS = 3
+# Relative changes of the cost at which adjustments end: smaller ones take two to four times as long and move cameras by
+# less than 1e-4 of the radius of the capture.
+_TOLERANCE, _ROBUST_TOLERANCE = 1e-6, 1e-4
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ def choose_lenses(
     freed: list[int] = []
     held: dict[int, DeterminedLens] = {}
     result = pycolmap.Reconstruction(model)
-    held_out.adjust(result, threads=threads, fixed=fixed)
+    held_out.adjust(result, threads=threads, fixed=fixed, tolerance=_TOLERANCE)
     for camera_id in cameras[:MOST_CAMERAS]:
         camera = result.cameras[camera_id]
         exif = (exif_focal_px or {}).get(camera_id)
@@ -194,10 +197,10 @@ def settle(
     in the same way in many photos; with squared errors, they would bias the lens.
     """
     adjust = partial(held_out.adjust, model, threads=threads, principal_points=principal_points, fixed=fixed)
-    adjust(tolerance=1e-6)
+    adjust(tolerance=_TOLERANCE)
     held_out.drop_misfits(model)
     scale_px = held_out.loss_scale_px(held_out.observation_errors_px(model))
-    adjust(robust_px=scale_px, tolerance=1e-5)  # a smaller one takes many times as long and moves no camera
+    adjust(robust_px=scale_px, tolerance=_ROBUST_TOLERANCE)
     held_out.drop_misfits(model)
 
 

@@ -20,6 +20,8 @@ from nerfcli.poses.model.projection import Array, panorama_camera, px_per_radian
 
 # Below this median angle between the rays of a match, the relative pose of a pair is too weak to contradict anything.
 LEAST_ANGLE_DEG = 2.0
+# A relative rotation is estimated from this many matches of a pair: more make it no better than 10 degrees need.
+_MOST_FOR_ROTATION = 400
 
 
 @dataclass(frozen=True)
@@ -152,20 +154,20 @@ def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair
     for pair in strongest(placed_pairs(model, pairs), per_photo=4):
         first, second = model.image(pair.one), model.image(pair.other)
         camera, other_camera = model.camera(first.camera_id), model.camera(second.camera_id)
-        found = pycolmap.estimate_relative_pose(
-            camera, pair.pixels_one, other_camera, pair.pixels_other, options=options
-        )
+        step = max(1, pair.matches // _MOST_FOR_ROTATION)
+        pixels, other_pixels = pair.pixels_one[::step], pair.pixels_other[::step]
+        found = pycolmap.estimate_relative_pose(camera, pixels, other_camera, other_pixels, options=options)
         if found is None:
             continue
         own = found["cam2_from_cam1"]
         inliers = np.asarray(found["inlier_mask"])
-        p = rays(camera, pair.pixels_one[inliers]) @ own.rotation.matrix().T
-        q = rays(other_camera, pair.pixels_other[inliers])
+        p = rays(camera, pixels[inliers]) @ own.rotation.matrix().T
+        q = rays(other_camera, other_pixels[inliers])
         if not len(p) or np.degrees(np.nanmedian(_angles(p, q))) < LEAST_ANGLE_DEG:
             continue
         pose = second.cam_from_world() * first.cam_from_world().inverse()
         degrees = float(np.degrees((own.rotation * pose.rotation.inverse()).angle()))
-        errors.append(RotationError(degrees, int(inliers.sum())))
+        errors.append(RotationError(degrees, step * int(inliers.sum())))
     return errors
 
 
