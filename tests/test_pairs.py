@@ -198,9 +198,8 @@ def test_look_alikes_are_the_neighbours_that_are_not_known():
     assert {(i, i + 2) for i in range(28)} <= set(found)
 
 
-def test_pairs_without_common_features_are_left_out_except_the_best_of_each_photo(monkeypatch: pytest.MonkeyPatch):
+def test_pairs_without_common_features_are_left_out_except_the_best_of_each_photo():
     """Photos up to three apart share features; those at the ends have fewer than four such partners."""
-    monkeypatch.setattr("nerfcli.poses.engine.retrieval._FEW", 4)
     _, truth = shared_descriptors(30)
     pairs = sequential_pairs(range(30))
     kept = promising(truth, pairs)
@@ -208,6 +207,15 @@ def test_pairs_without_common_features_are_left_out_except_the_best_of_each_phot
     assert {(i, j) for i, j in pairs if j - i <= 3} <= set(kept)
     assert all(sum(photo in pair for pair in kept) >= 4 for photo in range(30))
     assert all({0, 29} & set(pair) for pair in kept if pair[1] - pair[0] > 3)
+
+
+def test_pairs_with_few_common_features_are_left_out_where_both_photos_have_better_ones():
+    """By hand: two groups of 15 that look alike, 8 features in common between them; two photos have no group."""
+    common = np.full((32, 32), 8)
+    common[:15, :15] = common[15:30, 15:30] = 20
+    kept = set(promising(common, combinations(range(32), 2)))
+    within = {(i, j) for start in (0, 15) for i, j in combinations(range(start, start + 15), 2)}
+    assert kept == within | {(i, j) for j in (30, 31) for i in range(j)}
 
 
 # The plan

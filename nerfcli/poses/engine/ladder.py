@@ -19,7 +19,7 @@ from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.initial_focal import with_focal_lengths
 from nerfcli.poses.engine.mapped import MappedModels
-from nerfcli.poses.engine.mapping import MapperOptions, map_photos, mapper_limit_seconds, photo_numbers
+from nerfcli.poses.engine.mapping import MapperOptions, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
 from nerfcli.poses.input.plan import extraction_seconds, mapping_seconds, matching_seconds
@@ -226,8 +226,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> MappedMod
     compared = set(job.pairs)
     few_more = len(compared) < math.comb(len(job.files), 2) and len(job.files) <= _MOST_FOR_ALL
     if few_more and ladder.fraction(featured) < _GOOD_FRACTION and ladder.has_time():
-        placed = set(photo_numbers(ladder.best.models[0], job)) if ladder.best.models else set[int]()
-        rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared and not placed.issuperset(pair)]
+        rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
         job = replace(job, pairs=(*job.pairs, *rest))
         ladder.match(job, rest)
         ladder.attempt("match all pairs", job, SMALLER_BASELINE)

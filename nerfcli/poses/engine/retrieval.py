@@ -21,11 +21,13 @@ from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
 # Ratio of the squared distances to the nearest and the second nearest: 0.8 of the distance, as in pycolmap.
 _RATIO = 0.64
-# Pairs with fewer common features than this are left out, except this many, the best, of each photo: a quarter of the
-# pairs of an orbit, half of those of a plain object, with 3 to 7 % of all verified matches.
-_FEW = 12
+# Pairs with fewer common features than this are left out, except this many, the best, of each photo.
+_FEW = 4
+# Two photos that both have this many pairs with so many common features are not matched with each other for fewer: a
+# third of the pairs of an orbit is left out, half of those of a plain object, with 3 to 7 % of the verified matches.
+_MANY = 12
 # Change this whenever this module would find other pairs.
-_VERSION = "256 coarsest, ties kept, pairs with fewer than 12 common features left out"
+_VERSION = "256 coarsest, ties kept, pairs without common features left out, or with few where there are many"
 
 
 def with_neighbours(job: Job, report: Report) -> Job:
@@ -89,10 +91,16 @@ def alike(likeness: np.ndarray, count: int, *, paired: Collection[tuple[int, int
 
 def promising(likeness: np.ndarray, pairs: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return the pairs with enough common features, and for each photo its few most similar pairs in any case."""
+    ordered = sorted(pairs, key=lambda pair: (-likeness[pair], pair))
+    strong = np.bincount(
+        [photo for pair in ordered if likeness[pair] >= _MANY for photo in pair], minlength=len(likeness)
+    )
     kept: list[tuple[int, int]] = []
     taken = np.zeros(len(likeness), dtype=int)
-    for i, j in sorted(pairs, key=lambda pair: (-likeness[pair], pair)):
-        if likeness[i, j] >= _FEW or min(taken[i], taken[j]) < _FEW:
+    for i, j in ordered:
+        common = likeness[i, j]
+        enough = min(strong[i], strong[j]) >= _MANY
+        if common >= (_MANY if enough else _FEW) or min(taken[i], taken[j]) < _FEW:
             kept.append((i, j))
             taken[[i, j]] += 1
     return kept

@@ -31,8 +31,9 @@ _CLIP = 4.0
 # Photos with fewer observations keep the shared principal point, as do those whose own would be farther from it than
 # this fraction of the picture's size, many times what stabilisers shift: it fits something else, or is undetermined.
 LEAST_OBSERVATIONS = 60
-# Robust adjustments. The first ones reduce the errors by so much that what counts as an outlier changes.
-_ROUNDS = 3
+# Robust adjustments of the whole model, each to this relative change of the cost. The first ones reduce the errors by
+# so much that what counts as an outlier changes.
+_ROUNDS, _TOLERANCE = 3, 1e-5
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,8 @@ def _settled(
     report("settle", 0, 1 + _ROUNDS)
     own, lens_of = with_own_cameras(model), lenses_of(model)
     free, held = _free_photos(model, fixed), set[int]()
-    _adjust(own, free, threads=threads, robust_px=held_out.loss_scale_px(held_out.observation_errors_px(own)))
+    scale_px = held_out.loss_scale_px(held_out.observation_errors_px(own))
+    _adjust(own, free, threads=threads, robust_px=scale_px, tolerance=_TOLERANCE)
     for number in range(_ROUNDS):
         report("settle", 1 + number, 1 + _ROUNDS)
         # Before cameras move: poses and points have not followed yet.
@@ -170,7 +172,7 @@ def _settled(
         held = _anchored(own, model, free)
         if number > 0:
             _move_lenses(own, lens_of, shifting=free - held, seed=seed, fixed=fixed)
-        _adjust(own, free - held, threads=threads, robust_px=scale_px)
+        _adjust(own, free - held, threads=threads, robust_px=scale_px, tolerance=_TOLERANCE)
     report("settle", 1 + _ROUNDS, 1 + _ROUNDS)
     held_out.drop_misfits(own)
     certain = {
@@ -225,7 +227,9 @@ def _move_lenses(
             own.cameras[photo].params = params.tolist()
 
 
-def _adjust(model: pycolmap.Reconstruction, free: set[int], *, threads: int, robust_px: float) -> None:
+def _adjust(
+    model: pycolmap.Reconstruction, free: set[int], *, threads: int, robust_px: float, tolerance: float = 1e-9
+) -> None:
     """Adjust poses, points and the principal points of the photos in `free`, which have cameras of their own."""
     held_out.adjust(
         model,
@@ -235,6 +239,7 @@ def _adjust(model: pycolmap.Reconstruction, free: set[int], *, threads: int, rob
         distortion=False,
         fixed=sorted(set(model.cameras) - free),
         robust_px=robust_px,
+        tolerance=tolerance,
     )
 
 
