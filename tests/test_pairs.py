@@ -419,6 +419,16 @@ def test_matching_is_planned_by_the_features_that_were_found():
     assert outlook.update("features", 1000, 4096) == (pytest.approx(10.0 / 55.0), pytest.approx(45.0))
 
 
+def test_mapping_is_planned_by_the_matches_that_were_found():
+    """By hand: ten photos with four times the usual 2,000 matches take twice the usual 0.09 + 10 * 0.0005 s each."""
+    now = 0.0
+    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, {"match": 10.0, "map": 20.0}), clock=lambda: now)
+    outlook.update("match", 0, 45)
+    now = 10.0
+    assert outlook.update("match", 45, 45)[1] == pytest.approx(20.0)
+    assert outlook.update("matches", 8000, 0)[1] == pytest.approx(1.9)
+
+
 def test_another_attempt_is_measured_from_its_own_start():
     """The mapper took 100 s to get stuck at 60 of 100 photos, and starts anew from two photos, as it did then."""
     now = 0.0

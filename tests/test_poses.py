@@ -149,7 +149,7 @@ def test_a_blank_photo_costs_no_second_attempt(solved: Solved):
 def test_progress_goes_through_all_stages(solved: Solved):
     stages = list(dict.fromkeys(stage for stage, _, _ in solved.stages))
     searches = ["extract", "enlarge", "faint", "faint-enlarged"]
-    assert stages == ["read", *searches, "features", "pair", "match", "map", "check", "stabilise"]
+    assert stages == ["read", *searches, "features", "pair", "match", "matches", "map", "check", "stabilise"]
     last = {stage: (done, total) for stage, done, total in solved.stages}
     assert last["extract"] == (8, 8)
     assert last["enlarge"][0] == last["enlarge"][1] > 0

@@ -57,9 +57,9 @@ def estimate_poses(
         notify: receives messages for the user, one sentence at a time.
         progress: receives (stage, done, total); the stages are "read", "extract", "enlarge" where photos have few
             features, "faint" and "faint-enlarged" where these still have very few, "features" (per photo, of those
-            requested), "pair" where look-alikes are searched for, "match", "map", "merge" where the mapper leaves
-            several models, "locate" where single photos are left, "check", "stabilise" where the poses are accepted,
-            and "settle" where each photo gets a principal point of its own, in this order.
+            requested), "pair" where look-alikes are searched for, "match", "matches" (verified ones per photo), "map",
+            "merge" where the mapper leaves several models, "locate" where single photos are left, "check", "stabilise"
+            where the poses are accepted, "settle" where each photo gets a principal point of its own, in this order.
         planned: receives the plan before the long work starts.
         given: known intrinsics, if any.
 

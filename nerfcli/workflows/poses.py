@@ -22,6 +22,7 @@ _STAGES = {
     "features": "features per photo",
     "pair": "photos, finding similar ones",
     "match": "pairs compared",
+    "matches": "verified matches per photo",
     "map": "photos registered",
     "merge": "sub-models, merging them",
     "locate": "trials to locate single photos",

@@ -25,6 +25,7 @@ _STAGES = {
     "features": "counting features",
     "pair": "choosing pairs",
     "match": "matching photos",
+    "matches": "counting matches",
     "map": "placing photos",
     "merge": "merging sub-models",
     "locate": "locating single photos",

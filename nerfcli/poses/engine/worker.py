@@ -38,6 +38,7 @@ from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.principal_points import StabilisedModel, choose_principal_points
+from nerfcli.poses.model.two_views import count_matches
 
 # The last stage's file, with the data for the report. The model is beside it, in sparse/0.
 RESULT = "result.json"
@@ -193,6 +194,8 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
         unmatched = match(matched, matched.pairs, report)
         if unmatched is not None:
             tell(f"cut short: {unmatched}")
+    matches = sum(count for _, _, count in count_matches(matched.database)) // len(job.files)
+    report("matches", matches, matches)
     with _timed(seconds, "map"):
         start = time.perf_counter()
         climbed = climb(matched, report, tell)
