@@ -21,7 +21,7 @@ from nerfcli.poses.engine.initial_focal import with_focal_lengths
 from nerfcli.poses.engine.mapped import MappedModels
 from nerfcli.poses.engine.mapping import MapperOptions, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
-from nerfcli.poses.input.pairs import all_pairs
+from nerfcli.poses.input.pairs import ALL_ALIKE_UP_TO, all_pairs
 from nerfcli.poses.input.plan import extraction_seconds, mapping_seconds, matching_seconds
 from nerfcli.poses.input.settings import FULL_SIZE, QUALITIES
 from nerfcli.poses.judge.parallax import best_rotation_fit
@@ -203,12 +203,13 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> MappedMod
     """Map a job's photos, with as many attempts as it takes.
 
     The first attempt has pycolmap's own thresholds, and starts from focal lengths estimated from pairs of photos where
-    EXIF has no reliable one. If it places less than half of the photos with a focal length from EXIF, the next one
-    starts without it. If its lens came out wide or it leaves out many photos, the next one starts from a fisheye,
-    provided that pairs of photos confirm one. If photos that match some other one well are still left out, the next
-    ones start from a pair with a smaller baseline, from the strongest pair that was left out, and with low angles; with
-    many photos, only if a quarter is left out. Then the remaining pairs are matched, and more features are extracted
-    from the full-size photos. Last, single photos are located from the points that they show (see `localise`). If the
+    EXIF has no reliable one. If it leaves out photos of a small capture, the pairs that do not look alike are matched
+    too. If it places less than half of the photos with a focal length from EXIF, the next one starts without it. If its
+    lens came out wide or it leaves out many photos, the next one starts from a fisheye, provided that pairs of photos
+    confirm one. If photos that match some other one well are still left out, the next ones start from a pair with a
+    smaller baseline, from the strongest pair that was left out, and with low angles; with many photos, only if a
+    quarter is left out. Then the remaining pairs are matched, and more features are extracted from the full-size
+    photos. Last, single photos are located from the points that they show (see `localise`). If the
     camera only turned, nothing more is tried; nor is it after twice the time limit of one run of the mapper. If the
     first attempt is not the last, `tell` receives each attempt and its result.
     """
@@ -220,15 +221,14 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> MappedMod
         ladder.tell_results()
         tell("not trying anything else: the camera turned on the spot")
         return ladder.result()
+    if len(job.files) <= ALL_ALIKE_UP_TO and ladder.fraction(featured) < _GOOD_FRACTION:
+        job = _with_all_pairs(ladder, job)
     job = _without_exif(ladder, job, fraction=ladder.fraction(featured))
     job = _with_fisheye(ladder, job, fraction=ladder.fraction(featured))
     _other_starts(ladder, job)
-    compared = set(job.pairs)
-    few_more = len(compared) < math.comb(len(job.files), 2) and len(job.files) <= _MOST_FOR_ALL
+    few_more = len(job.pairs) < math.comb(len(job.files), 2) and len(job.files) <= _MOST_FOR_ALL
     if few_more and ladder.fraction(featured) < _GOOD_FRACTION and ladder.has_time():
-        rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
-        job = replace(job, pairs=(*job.pairs, *rest))
-        ladder.match(job, rest)
+        job = _with_all_pairs(ladder, job)
         ladder.attempt("match all pairs", job, SMALLER_BASELINE)
     if _can_have_more_features(job) and ladder.fraction(featured) < _FEW_FRACTION and ladder.has_time():
         _with_more_features(ladder, job, missing=1 - ladder.fraction(featured))
@@ -261,6 +261,15 @@ def _only_turns(job: Job) -> bool:
     """Return whether rotations of the camera explain all matches, so that no attempt can give an accepted model."""
     turn = best_rotation_fit(read_verified_pairs(job.database, min_matches=FEW_MATCHES), job.sizes)
     return turn is not None and turn.explains_all
+
+
+def _with_all_pairs(ladder: _Ladder, job: Job) -> Job:
+    """Match the pairs of photos that have not been matched, and return the job with all of them."""
+    compared = set(job.pairs)
+    rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
+    job = replace(job, pairs=(*job.pairs, *rest))
+    ladder.match(job, rest)
+    return job
 
 
 def _with_more_features(ladder: _Ladder, job: Job, *, missing: float) -> None:
