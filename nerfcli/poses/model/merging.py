@@ -18,12 +18,16 @@ from numpy.typing import NDArray
 from nerfcli.cameras.alignment import align as similarity
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import duration
+from nerfcli.poses.model import held_out
 from nerfcli.poses.model.held_out import MAPPER
 from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.localise import pixels_of, place
 from nerfcli.poses.model.projection import Array, is_ahead, offsets_px
 from nerfcli.poses.model.reasons import MIN_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, count_matches, read_verified_pairs
+
+# Until all models are merged: rounds of triangulation, and the relative change of the cost at which adjustments end.
+_REFINEMENTS, _TOLERANCE = 2, 1e-4
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,7 @@ def merge_models(
     pairs = read_verified_pairs(database, min_matches=1)
     tracks = _matched_keypoints(database)
     merged: list[pycolmap.Reconstruction] = []
+    joined_once: set[int] = set()
     start = time.perf_counter()
     for number, model in enumerate(models):
         report("merge", number, len(models))
@@ -79,9 +84,12 @@ def merge_models(
             joined = _joined(base, model, similarity, database, output=output, threads=threads, fixed=fixed)
             if _holds(joined, base, pairs):
                 merged[index] = joined
+                joined_once.add(index)
                 break
         else:
             merged.append(model)
+    for index in joined_once:
+        settle(merged[index], threads=threads, fixed=fixed)
     report("merge", len(models), len(models))
     return sorted(merged, key=lambda model: -model.num_reg_images())
 
@@ -164,7 +172,7 @@ def _joined(
     threads: int,
     fixed: Sequence[int],
 ) -> pycolmap.Reconstruction:
-    """Merge the photos of both in the frame of the first, triangulate points again from all matches, and adjust."""
+    """Merge the photos of both in the frame of the first, triangulate again from all matches, and adjust roughly."""
     moved = pycolmap.Reconstruction(second)
     moved.transform(first_from_second)
     joined = pycolmap.Reconstruction(first)
@@ -173,7 +181,9 @@ def _joined(
         camera = second.camera(image.camera_id)
         place(joined, camera, image.cam_from_world(), image_id=photo, name=image.name, pixels=pixels_of(image))
     output.mkdir(parents=True, exist_ok=True)
-    options = pycolmap.IncrementalPipelineOptions(num_threads=threads, extract_colors=False)
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=threads, extract_colors=False, ba_global_max_refinements=_REFINEMENTS
+    )
     joined = pycolmap.triangulate_points(
         joined,
         database,
@@ -183,7 +193,8 @@ def _joined(
         options=options,
         refine_intrinsics=not fixed,
     )
-    settle(joined, threads=threads, fixed=fixed)
+    held_out.adjust(joined, threads=threads, fixed=fixed, tolerance=_TOLERANCE)
+    held_out.drop_misfits(joined)
     return joined
 
 
