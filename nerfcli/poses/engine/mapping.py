@@ -263,7 +263,9 @@ def _run_mapper(
 
 def _adjust_fully(model: pycolmap.Reconstruction, job: Job, options: pycolmap.IncrementalPipelineOptions) -> None:
     """Triangulate a mapped model again and adjust it with all of its points until it converges, in place."""
-    thorough = pycolmap.IncrementalPipelineOptions(num_threads=job.threads, constant_cameras=set(job.fixed_cameras))
+    thorough = pycolmap.IncrementalPipelineOptions(
+        num_threads=job.threads, constant_cameras=set(job.fixed_cameras), ba_global_function_tolerance=1e-6
+    )
     with pycolmap.Database.open(job.database) as database:
         cache = pycolmap.DatabaseCache.create(
             database, pycolmap.DatabaseCacheOptions(min_num_matches=options.min_num_matches)
