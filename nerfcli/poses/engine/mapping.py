@@ -196,14 +196,15 @@ def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.Increm
         min_model_size=3,  # models of small captures count too; the largest is chosen below
         constant_cameras=fixed,
         extract_colors=False,  # see `with_colours`
-        # Until all photos are placed, rough local adjustments suffice, and global ones to few points, see
-        # `_adjust_fully`. Shorter global ones find the way back from a wrong turn less often, and so do fewer of them.
         ba_global_frames_ratio=growth,
         ba_global_points_ratio=growth,
-        ba_local_max_refinements=1,
-        ba_local_max_num_iterations=10,
     )
-    options.mapper.ba_global_ignore_redundant_points3D = True
+    # Until all photos are placed, rough local adjustments suffice, and global ones to few points, see `_adjust_fully`.
+    # Shorter global ones find the way back from a wrong turn less often, and so do fewer of them. Where that left out
+    # photos of a small capture, thorough ones take little time, and may place more.
+    if attempt == 0 or len(job.files) >= _MANY_PHOTOS:
+        options.ba_local_max_refinements, options.ba_local_max_num_iterations = 1, 10
+        options.mapper.ba_global_ignore_redundant_points3D = True
     options.mapper.random_seed = options.triangulation.random_seed = seed
     options.mapper.constant_cameras = fixed
     options.mapper.init_min_tri_angle = start.init_min_tri_angle
