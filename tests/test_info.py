@@ -104,7 +104,7 @@ def test_splats_state_their_count_degree_extent_and_frame(suffix, tmp_path):
     expected = {"kind": "splats", "format": suffix[1:].upper(), "splats": 101, "degree": 1, "unit": "metre"}
     assert expected.items() <= printed.items()
     assert printed["median_opacity"] == pytest.approx(0.5, abs=1 / 255)
-    assert printed["most_between"] == [
+    assert printed["98_percent_between"] == [
         pytest.approx([0.01, 0.02, -3.96], abs=1e-3),
         pytest.approx([0.99, 1.98, -0.04], abs=1e-3),
     ]

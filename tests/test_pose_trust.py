@@ -378,7 +378,7 @@ def _again(solved: Solved, folder: Path) -> Job:
 
 
 def test_a_run_of_the_mapper_ends_if_no_photo_follows(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The plan's time for all photos, two minutes at least; photos placed by then are kept, up to a tenth of them."""
+    """The plan's time for all photos, two minutes at least; those in the last snapshot are kept."""
     assert [mapping.stall_seconds(photos) for photos in (10, 1000)] == [120, pytest.approx(590)]
     monkeypatch.setattr(mapping, "stall_seconds", lambda photos: 0.0)
     monkeypatch.setattr(ladder, "_other_starts", lambda *arguments: None)
@@ -691,6 +691,30 @@ def test_a_given_initial_pair_is_tried_once(solved: Solved, tmp_path: Path, monk
     for number, start in enumerate((MapperOptions(init_pair=(1, 2)), MapperOptions())):
         map_photos(job, lambda *progress: None, attempt=50 + number, start=start)
     assert trials == [1, 200]
+
+
+@pytest.mark.parametrize(
+    ("attempt", "many", "dense", "rough", "growth"),
+    [(0, 100, 3000, True, 1.1), (1, 100, 3000, False, 1.1), (1, 10, 3000, True, 1.1), (0, 100, 0, True, 1.3)],
+)
+def test_first_attempts_and_those_of_many_photos_are_rough(
+    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, attempt: int, many: int, dense: int, rough: bool,
+    growth: float,
+):  # fmt: skip
+    """Ten photos; global adjustments are fewer where photos have more matches than `dense`."""
+    used: list[pycolmap.IncrementalPipelineOptions] = []
+
+    def mapping_of(*arguments, options: pycolmap.IncrementalPipelineOptions, **others) -> dict[int, object]:
+        used.append(options)
+        return {}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping_of)
+    monkeypatch.setattr(mapping, "_MANY_PHOTOS", many)
+    monkeypatch.setattr(mapping, "_DENSE", dense)
+    map_photos(_again(solved, tmp_path / "again"), lambda *progress: None, attempt=attempt, start=MapperOptions())
+    assert used[0].mapper.ba_global_ignore_redundant_points3D == rough
+    assert used[0].ba_local_max_num_iterations == (10 if rough else -1)
+    assert used[0].ba_global_frames_ratio == used[0].ba_global_points_ratio == growth
 
 
 @pytest.mark.parametrize(

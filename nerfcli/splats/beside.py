@@ -17,7 +17,7 @@ from nerfcli.render.pictures import render_picture, straight_rgba
 
 # With more photos than this, nearly everything that one looks at was photographed.
 FEW = 150
-# Share of the pictures among the steps: this over the number of photos, at most the second.
+# Share of the pictures among the steps: the first over the number of photos, but at most the second.
 SHARE_OF_ONE, LARGEST_SHARE = 3.0, 0.4
 # Distance of the cameras from those of photos, in units of the spread of these.
 NEAREST, FARTHEST = 0.2, 1.0

@@ -69,7 +69,7 @@ def splat_facts(path: Path) -> dict[str, Any]:
         "splats": len(gaussians),
         "degree": gaussians.degree,
         "median_opacity": round(float(np.median(opacities)), 3),
-        "most_between": [low, high],
+        "98_percent_between": [low, high],
         **(described or {"not_stated": NOT_STATED}),
         "format": path.suffix[1:].upper(),
     }

@@ -209,9 +209,9 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> MappedMod
     confirm one. If photos that match some other one well are still left out, the next ones start from a pair with a
     smaller baseline, from the strongest pair that was left out, and with low angles; with many photos, only if a
     quarter is left out. Then the remaining pairs are matched, and more features are extracted from the full-size
-    photos. Last, single photos are located from the points that they show (see `localise`). If the
-    camera only turned, nothing more is tried; nor is it after twice the time limit of one run of the mapper. If the
-    first attempt is not the last, `tell` receives each attempt and its result.
+    photos. Last, single photos are located from the points that they show (see `localise`). If the camera only turned,
+    nothing more is tried; nor is it after twenty times the planned time, four minutes at least. If the first attempt is
+    not the last, `tell` receives each attempt and its result.
     """
     job = given = with_focal_lengths(job, tell)
     ladder = _Ladder(job, report, tell)

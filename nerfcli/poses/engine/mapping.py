@@ -24,8 +24,9 @@ _VERSION = "rough adjustments to few points, then all of them"
 # Everything is adjusted each time the photos or the points have grown by this factor: where photos have few matches it
 # is quickly done, and needed. They have many if there are more than this many verified ones for each photo.
 _GROWTH, _DENSE = (1.1, 1.3), 3000
-# Snapshots of the model during a run of the mapper. With at least this many photos, a call goes on from those of one
-# that was killed; with fewer it begins again, which takes seconds and gives the same bits as without interruption.
+# Snapshots of the model during a run of the mapper, and the number of photos from which mapping takes so long that a
+# call goes on from those of one that was killed, and that every attempt is rough. With fewer photos it begins again,
+# which takes seconds and gives the same bits as without interruption.
 _SNAPSHOTS, _MANY_PHOTOS = 10, 100
 
 
