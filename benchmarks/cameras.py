@@ -28,18 +28,19 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from nerfcli import kernels, scene
-from nerfcli.cameras.formats.run_cameras import read_cameras
+from nerfcli import kernels
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, apply, inverse, rotation_from_vector, vector_from_rotation
+from nerfcli.captures import scene
+from nerfcli.captures.formats.run_cameras import read_cameras
+from nerfcli.captures.scene import Scene
 from nerfcli.evaluate.protocol import Extras, HeldOutPhoto, evaluate_model
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
-from nerfcli.runs.components import Components
-from nerfcli.runs.files import FIELD
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
-from nerfcli.train.loop import Progress, train
+from nerfcli.training.loop import Progress, train
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.files import FIELD
+from nerfcli.training.runs.settings import TrainSettings
 
 # Scene, downscale, and what is refined. The last four need no refinement: their loss in PSNR is its cost.
 CASES = (

@@ -23,12 +23,12 @@ from PIL import ExifTags, Image
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
-from nerfcli.cameras.formats import scene_folder
-from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import rotation_from_vector
-from nerfcli.holdout import default_split
-from nerfcli.media.images import downscale, read_image
+from nerfcli.captures.formats import scene_folder
+from nerfcli.captures.formats.colmap import write_colmap_binary
+from nerfcli.captures.holdout import default_split
+from nerfcli.photos.images import downscale, read_image
 
 SAMPLES = Path(__file__).parent.parent / "sample_scenes"
 DESK_DOWNSCALE = 2

@@ -23,16 +23,17 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from nerfcli import kernels, scene
+from nerfcli import kernels
+from nerfcli.captures import scene
 from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
-from nerfcli.photos.held_out_exposure import log_gains_of
 from nerfcli.photos.loading import load_photos
+from nerfcli.render.held_out_exposure import log_gains_of
 from nerfcli.render.model import load_model
-from nerfcli.runs.components import Components, choose, differences
-from nerfcli.runs.config import read_config
-from nerfcli.runs.files import FIELD
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.train.loop import Progress, train
+from nerfcli.training.loop import Progress, train
+from nerfcli.training.runs.components import Components, choose, differences
+from nerfcli.training.runs.config import read_config
+from nerfcli.training.runs.files import FIELD
+from nerfcli.training.runs.settings import TrainSettings
 
 # Scene, downscale, and the choices to compare, the baseline first. "-name" is --without, "auto" is --model auto.
 CASES: tuple[tuple[str, int, tuple[str, ...]], ...] = (

@@ -31,13 +31,13 @@ from rich.table import Table
 from nerfcli import kernels
 from nerfcli.cameras.alignment import align
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.run_cameras import read_cameras
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures.formats.run_cameras import read_cameras
 from nerfcli.render.depth import CONVENTIONS, DepthRequest, requested
 from nerfcli.render.model import Model, load_model
 from nerfcli.render.rays import pixel_rays
 from nerfcli.render.tracing import render_rays
-from nerfcli.runs.files import FIELD
+from nerfcli.training.runs.files import FIELD
 
 DEPTHS = (*CONVENTIONS, "quantile:0.05", "quantile:0.95")
 FRACTIONS = (0.5, 0.05, 0.95)

@@ -154,7 +154,7 @@ def commands_for(file: str, draw: random.Random) -> tuple[str, ...]:
 def outcome(folder: Path, command: tuple[str, ...], text: str) -> str:
     """Return a hash of the results of a successful command, without times and paths."""
     from nerfcli.field.checkpoint import load_tensors
-    from nerfcli.media.images import read_image
+    from nerfcli.photos.images import read_image
 
     name, content = command[0], hashlib.blake2b()
     if name == "info":

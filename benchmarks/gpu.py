@@ -168,13 +168,13 @@ def stages(samples: int, log2_rows: int, device: Any, repeats: int) -> dict[str,
 
 def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[Any, Any]:
     """Return a fresh training with the GPU kernels, and the similarity to its training frame."""
-    from nerfcli import scene
-    from nerfcli.fit.extent import choose_extent
-    from nerfcli.fit.fitting import Fitting
+    from nerfcli.captures import scene
     from nerfcli.kernels.triton_cuda.backend import TritonBackend
     from nerfcli.photos.loading import load_photos
-    from nerfcli.photos.pool import PixelPool
-    from nerfcli.runs.settings import TrainSettings, automatic_downscale
+    from nerfcli.training.extent import choose_extent
+    from nerfcli.training.fitting import Fitting
+    from nerfcli.training.pool import PixelPool
+    from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 
     captured = scene.load(capture)
     first = captured.train_frames[0].camera
@@ -242,7 +242,7 @@ def whole_step(capture: Path, device: Any, batch: int, sizes: Sizes) -> dict[str
 def quality(capture: Path, device: str, seconds: int, folder: Path, *, dry: bool) -> dict[str, float]:
     """Return held-out PSNR after a training of `seconds`."""
     import nerfcli
-    from nerfcli.runs.settings import TrainSettings, sizes_for
+    from nerfcli.training.runs.settings import TrainSettings, sizes_for
 
     settings = TrainSettings(budget_seconds=float(seconds), device=device, threads=os.cpu_count() or 1)
     settings = replace(settings, **sizes_for(device))
@@ -257,8 +257,8 @@ def quality(capture: Path, device: str, seconds: int, folder: Path, *, dry: bool
 
 def pictures(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
     """Return square pictures per second (800x800 at full size) after a short training."""
-    from nerfcli import scene
     from nerfcli.cameras.camera import Camera
+    from nerfcli.captures import scene
     from nerfcli.render.model import Model
     from nerfcli.render.pictures import render_picture
 

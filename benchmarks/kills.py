@@ -29,8 +29,8 @@ from PIL import Image
 DESK = SPHERES.with_name("desk") / "images"
 CHECKPOINT_SECONDS = 0.3
 PROGRAM = f"""
-import nerfcli.train.loop
-nerfcli.train.loop.CHECKPOINT_SECONDS = {CHECKPOINT_SECONDS}
+import nerfcli.training.loop
+nerfcli.training.loop.CHECKPOINT_SECONDS = {CHECKPOINT_SECONDS}
 from nerfcli.cli import main
 main()
 """

@@ -33,11 +33,11 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import rq
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from nerfcli import scene as scenes
 from nerfcli.cameras import rigid
 from nerfcli.cameras.alignment import align
+from nerfcli.captures import scene as scenes
 from nerfcli.errors import TOO_FEW_PHOTOS
-from nerfcli.media.images import image_size, list_images
+from nerfcli.photos.images import image_size, list_images
 
 NAN = float("nan")
 # Frames of a video between two known poses at most this far apart get an interpolated pose.

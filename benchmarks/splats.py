@@ -20,8 +20,8 @@ import torch
 import typer
 
 from nerfcli import evaluate_run, export_run, load_run, load_splats
-from nerfcli.runs.files import SPLATS
 from nerfcli.splats.state import load_splat_state
+from nerfcli.training.runs.files import SPLATS
 from nerfcli.workflows.evaluate import evaluate_splats
 from nerfcli.workflows.splats import SplatSettings
 

@@ -24,15 +24,15 @@ from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 
 from nerfcli.cameras.camera import Camera
+from nerfcli.export.depth_views import depth_views
+from nerfcli.export.extent import Grid, scene_box
+from nerfcli.export.fusion import fuse
+from nerfcli.export.marching import Mesh, mesh_of, simplified, surface_of, without_small_pieces
 from nerfcli.kernels import grid_coordinates
-from nerfcli.media.float_tiff import read_any_tiff
 from nerfcli.render.depth import DepthRequest
+from nerfcli.render.files.float_tiff import read_any_tiff
 from nerfcli.render.model import Model
-from nerfcli.runs.run import load_run
-from nerfcli.surface.depth_views import depth_views
-from nerfcli.surface.extent import Grid, scene_box
-from nerfcli.surface.fusion import fuse
-from nerfcli.surface.marching import Mesh, mesh_of, simplified, surface_of, without_small_pieces
+from nerfcli.training.runs.run import load_run
 
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk" / "truth"
 THRESHOLDS = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)

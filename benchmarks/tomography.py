@@ -21,11 +21,11 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels
-from nerfcli.tomography.formats.read import read_scan
-from nerfcli.tomography.result import ReconstructionSettings
-from nerfcli.tomography.scan import Scan, save_scan
-from nerfcli.workflows.tomography import train_scan
-from nerfcli.workflows.tomography_scores import evaluate_scan
+from nerfcli.ct.formats.read import read_scan
+from nerfcli.ct.result import ReconstructionSettings
+from nerfcli.ct.scan import Scan, save_scan
+from nerfcli.ct.training import train_scan
+from nerfcli.ct.training_scores import evaluate_scan
 
 
 @dataclass(frozen=True)

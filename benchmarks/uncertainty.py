@@ -21,13 +21,13 @@ from rich.console import Console
 from rich.table import Table
 from scipy import stats
 
-from nerfcli import scene as scenes
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures import scene as scenes
 from nerfcli.render.coverage import coverage_and_parallax, depth_maps, small_frame
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
-from nerfcli.runs.settings import TrainSettings
+from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.workflows.train import train_scene, was_interrupted
 
 # Fraction of the photos that is withheld on one side; every how many photos is, too.

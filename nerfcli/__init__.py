@@ -23,8 +23,8 @@ __all__ = [
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from nerfcli.runs.run import load_run
-    from nerfcli.scene import load as load_scene
+    from nerfcli.captures.scene import load as load_scene
+    from nerfcli.training.runs.run import load_run
     from nerfcli.workflows.evaluate import evaluate_run
     from nerfcli.workflows.export import export_run
     from nerfcli.workflows.poses import estimate_poses
@@ -36,8 +36,8 @@ _MODULES = {
     "estimate_poses": "nerfcli.workflows.poses",
     "evaluate_run": "nerfcli.workflows.evaluate",
     "export_run": "nerfcli.workflows.export",
-    "load_run": "nerfcli.runs.run",
-    "load_scene": "nerfcli.scene",
+    "load_run": "nerfcli.training.runs.run",
+    "load_scene": "nerfcli.captures.scene",
     "load_splats": "nerfcli.workflows.splats",
     "render_run": "nerfcli.workflows.render",
     "train_scene": "nerfcli.workflows.train",

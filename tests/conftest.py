@@ -20,18 +20,18 @@ from examples import MANY
 from fog import fog, foggy_cells
 from hypothesis import settings
 
-from nerfcli import scene
 from nerfcli.atomic import write_json
-from nerfcli.cameras.formats.run_cameras import write_cameras
-from nerfcli.fit.extent import Extent, choose_extent
-from nerfcli.fit.normalisation import object_frame
+from nerfcli.captures import scene
+from nerfcli.captures.formats.run_cameras import write_cameras
 from nerfcli.render.model import Model, save_model
-from nerfcli.runs.config import RunConfig
-from nerfcli.runs.files import CONFIG, FIELD
-from nerfcli.runs.log import LogEntry, append_log
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.train import preparation, waypoints
-from nerfcli.train.loop import train
+from nerfcli.training import preparation, waypoints
+from nerfcli.training.extent import Extent, choose_extent
+from nerfcli.training.loop import train
+from nerfcli.training.normalisation import object_frame
+from nerfcli.training.runs.config import RunConfig
+from nerfcli.training.runs.files import CONFIG, FIELD
+from nerfcli.training.runs.log import LogEntry, append_log
+from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.workflows import photo_depths
 
 # Relative tolerance of a chain of about a dozen operations, per dtype. A test with a looser one states its reason.

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfcli.media.depth_pictures import DepthMeta
-from nerfcli.media.exr import write_exr
-from nerfcli.media.float_tiff import write_tiff
-from nerfcli.media.levels import write_png16
-from nerfcli.media.npy import write_npy
+from nerfcli.render.files.depth_pictures import DepthMeta
+from nerfcli.render.files.exr import write_exr
+from nerfcli.render.files.float_tiff import write_tiff
+from nerfcli.render.files.levels import write_png16
+from nerfcli.render.files.npy import write_npy
 
 META = DepthMeta("conditional", "ray", "arbitrary", 0.5)
 FULL_META = DepthMeta(

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.registry import format_named
-from nerfcli.cameras.formats.run_cameras import write_cameras
 from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats.registry import format_named
+from nerfcli.captures.formats.run_cameras import write_cameras
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
 

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from ellipsoids import Ellipsoid, bean, line_integrals
 
-from nerfcli.tomography.circle import Circle
-from nerfcli.tomography.geometry import Beam
-from nerfcli.tomography.scan import Scan, held_out_views
+from nerfcli.ct.circle import Circle
+from nerfcli.ct.geometry import Beam
+from nerfcli.ct.scan import Scan, held_out_views
 
 
 def phantom_circle(

@@ -8,10 +8,10 @@ import pytest
 from conftest import SPHERES
 from typer.testing import CliRunner
 
-from nerfcli.ablate.results import MeasuredTraining, half_interval, rows_of
-from nerfcli.ablate.variants import AUTO, CHOSEN, CaptureTraits, Variant, variants
+from nerfcli.bench.ablation_results import MeasuredTraining, half_interval, rows_of
+from nerfcli.bench.ablation_variants import AUTO, CHOSEN, CaptureTraits, Variant, variants
 from nerfcli.cli import app
-from nerfcli.runs.components import CHOICES, Components
+from nerfcli.training.runs.components import CHOICES, Components
 
 ALL = CaptureTraits(has_alpha=False, has_points=True, has_exif=True)
 
@@ -69,9 +69,9 @@ def test_differences_are_taken_seed_by_seed_and_get_a_verdict():
 
 def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
     """After a kill before its third training, the same command trains only the models that are left."""
-    from nerfcli.train import loop
+    from nerfcli.training import loop
 
-    monkeypatch.setattr("nerfcli.runs.settings.FEWEST_LOG2_ROWS", 10)  # 34 MB for each run otherwise
+    monkeypatch.setattr("nerfcli.training.runs.settings.FEWEST_LOG2_ROWS", 10)  # 34 MB for each run otherwise
     trained, real = [], loop.train
 
     def train(scene, run, settings, **rest):

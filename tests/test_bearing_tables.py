@@ -10,10 +10,10 @@ from frame_rays import frame_rays
 from test_training_rays import BARREL, CPU, FISHEYE, SIMILARITY, numbered_photo, ring
 
 from nerfcli.cameras.camera import Camera, by_lens
-from nerfcli.photos.bearings import BearingTables
-from nerfcli.photos.pool import PixelPool
-from nerfcli.photos.storage import IN_MEMORY, needs_of
-from nerfcli.runs.settings import TrainSettings
+from nerfcli.training.bearings import BearingTables
+from nerfcli.training.pool import PixelPool
+from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.storage import IN_MEMORY, needs_of
 
 LENS = Camera("SIMPLE_RADIAL", 160, 120, (140.0, 80.0, 60.0, 0.05))
 SHIFTS = np.array([(0.0, 0.0), (2.5, -1.25), (-3.7, 0.1), (1.0, 2.0), (0.3, -4.9), (-0.001, 3.3), (0.0, 0.0)])

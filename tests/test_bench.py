@@ -31,13 +31,13 @@ from nerfcli.bench.settings import (
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
+from nerfcli.captures.scene import Scene
 from nerfcli.errors import BAD_INPUT, INTERRUPTED
 from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
-from nerfcli.fit.normalisation import object_frame
 from nerfcli.render.model import Model
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
+from nerfcli.training.normalisation import object_frame
+from nerfcli.training.runs.settings import TrainSettings
 
 FEW = [RenderSetting(2), RenderSetting(2, step=2.0), RenderSetting(2, step=0.5), RenderSetting(1)]
 
@@ -209,7 +209,7 @@ def test_an_interrupted_bench_keeps_what_it_has(foggy, tmp_path, monkeypatch):
 
 def test_a_bench_of_a_scene_trains_it(spheres, tmp_path, monkeypatch):
     """Two trainings of a few steps; of the runs nothing is left."""
-    monkeypatch.setattr("nerfcli.runs.settings.FEWEST_LOG2_ROWS", 10)
+    monkeypatch.setattr("nerfcli.training.runs.settings.FEWEST_LOG2_ROWS", 10)
     monkeypatch.setattr(measurement, "affordable", lambda settings, seconds, overhead: (settings[:2], 600.0))
     monkeypatch.setattr(TrainSetting, "settings", lambda self, base, seconds: replace(base, steps=2, downscale=8))
     saved: list[list[Point]] = []

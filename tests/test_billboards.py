@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from conftest import SPHERES
 
-from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import from_parts, rotation_from_vector
+from nerfcli.captures import scene as scenes
 from nerfcli.evaluate.billboards import (
     COMPARED_PIXELS,
     Billboards,
@@ -24,8 +24,8 @@ from nerfcli.evaluate.billboards import (
 )
 from nerfcli.evaluate.metrics import to_8_bit
 from nerfcli.evaluate.protocol import Extras, HeldOutPhoto, evaluate_model, over_white
+from nerfcli.photos.colours import psnr_of
 from nerfcli.photos.loading import load_photos
-from nerfcli.photos.psnr import psnr_of
 from nerfcli.render.model import load_model
 
 CAMERA = Camera.pinhole(80, 60, 70.0)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.orientation import fit_to_picture, turned
+from nerfcli.captures.orientation import fit_to_picture, turned
 from nerfcli.errors import UserError
 
 WIDTH, HEIGHT = 100, 80

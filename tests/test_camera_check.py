@@ -10,9 +10,9 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.lens_change import FOCAL, changed
 from nerfcli.cameras.rigid import rotation_from_vector
-from nerfcli.multiview.camera_check import FARTHEST, FEWEST_MATCHES, CameraCheck, check_cameras
-from nerfcli.multiview.correspondences import LONGER_SIDE_PX, chosen_pairs
-from nerfcli.multiview.features import Matches
+from nerfcli.matching.camera_check import FARTHEST, FEWEST_MATCHES, CameraCheck, check_cameras
+from nerfcli.matching.correspondences import LONGER_SIDE_PX, chosen_pairs
+from nerfcli.matching.features import Matches
 from nerfcli.photos.loading import LoadedPhoto
 
 PINHOLE = Camera.pinhole(600, 450, 550.0)

@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.camera_path import (
+from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.captures.formats.camera_path import (
     is_camera_path,
     losses_camera_path,
     parse_camera_path,
     read_path,
     write_camera_path,
 )
-from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.errors import BAD_INPUT, UserError
 
 # A camera at (1, 2, 3) that looks along -x with +z up; OpenGL axes: right +y, up +z, backward +x.

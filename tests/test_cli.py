@@ -22,20 +22,21 @@ from commands import error_of, listing, nerfcli, started
 from PIL import Image
 from typer.exceptions import TyperException
 
-from nerfcli import cli, scene
+from nerfcli import cli
 from nerfcli.atomic import write_json
+from nerfcli.captures import scene
 from nerfcli.cli.options import seconds_from_text
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TERMINATED, TOO_FEW_PHOTOS, in_shell
 from nerfcli.interrupts import install_handlers
-from nerfcli.media.float_tiff import read_tiff
-from nerfcli.media.images import read_image
-from nerfcli.photos.mask_files import write_masks
-from nerfcli.runs import settings
-from nerfcli.runs.log import append_log, read_log
-from nerfcli.train import loop
-from nerfcli.train.loop import Progress
+from nerfcli.machine import thread_count
+from nerfcli.photos.images import read_image
+from nerfcli.photos.masks import write_masks
+from nerfcli.render.files.float_tiff import read_tiff
+from nerfcli.training import loop
+from nerfcli.training.loop import Progress
+from nerfcli.training.runs import settings
+from nerfcli.training.runs.log import append_log, read_log
 from nerfcli.workflows import poses as poses_workflow
-from nerfcli.workflows.machine import thread_count
 
 BATCH_COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench", "export")
 COMMANDS = (*BATCH_COMMANDS, "view")
@@ -346,7 +347,7 @@ def test_memory_that_runs_out_is_exit_code_6(monkeypatch, capture, finished):
     def exhausted(*args: object, **kwargs: object) -> None:
         raise RuntimeError("[enforce fail at alloc_cpu.cpp:114] DefaultCPUAllocator: not enough memory: you tried")
 
-    monkeypatch.setattr("nerfcli.runs.run.load_model", exhausted)
+    monkeypatch.setattr("nerfcli.training.runs.run.load_model", exhausted)
     result = nerfcli("evaluate", finished)
     assert result.exit_code == OUT_OF_MEMORY
     assert error_of(result)[0] == "Error: out of memory"
@@ -359,7 +360,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch, finished):
     def broken(*args: object, **kwargs: object) -> None:
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("nerfcli.runs.run.load_model", broken)
+    monkeypatch.setattr("nerfcli.training.runs.run.load_model", broken)
     with pytest.raises(RuntimeError, match="a bug"):
         nerfcli("evaluate", finished)
 

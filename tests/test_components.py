@@ -12,8 +12,8 @@ from nerfcli.cli import app
 from nerfcli.errors import UserError
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.kernels import reference, spherical_harmonics
-from nerfcli.runs.components import CHOICES, Components, choose, differences
-from nerfcli.runs.settings import TrainSettings
+from nerfcli.training.runs.components import CHOICES, Components, choose, differences
+from nerfcli.training.runs.settings import TrainSettings
 
 
 def test_with_and_without_set_what_they_name_and_nothing_else():

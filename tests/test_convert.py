@@ -16,14 +16,14 @@ from views import BROWN, FISHEYE, PANORAMA, PINHOLE, PRISM, RADIAL, RATIONAL, SQ
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import OPENCV_FROM_LLFF, OPENCV_FROM_OPENGL
-from nerfcli.cameras.formats import blender, transforms, transforms_cameras
-from nerfcli.cameras.formats.colmap import write_colmap_binary
-from nerfcli.cameras.formats.ply import write_ply
-from nerfcli.cameras.formats.registry import FORMATS, UserInputs, format_named, recognise
 from nerfcli.cameras.frame import Capture, Observations
+from nerfcli.captures.axes import Convention, all_axes, expressed, opencv_from_axes, reinterpreted
+from nerfcli.captures.conversion import ConventionOverrides, TargetOptions, convert, load
+from nerfcli.captures.formats import blender, transforms, transforms_cameras
+from nerfcli.captures.formats.colmap import write_colmap_binary
+from nerfcli.captures.formats.ply import write_ply
+from nerfcli.captures.formats.registry import FORMATS, UserInputs, format_named, recognise
 from nerfcli.cli.convert import FORMATS_WRITTEN
-from nerfcli.convert.axes import Convention, all_axes, expressed, opencv_from_axes, reinterpreted
-from nerfcli.convert.conversion import ConventionOverrides, TargetOptions, convert, load
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
 
 USAGE = 2

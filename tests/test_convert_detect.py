@@ -14,15 +14,15 @@ from views import BROWN, PINHOLE, capture_of
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.colmap import write_colmap_text
-from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture, Frame, Observations
-from nerfcli.convert import evidence
-from nerfcli.convert.axes import Convention, expressed, for_picture, opencv_from_axes, poses_of, reinterpreted
-from nerfcli.convert.detect import Detection, detect
-from nerfcli.convert.evidence import LEAST_MOVE, MatchEvidence, match_neighbours
+from nerfcli.captures import evidence
+from nerfcli.captures.axes import Convention, expressed, for_picture, opencv_from_axes, poses_of, reinterpreted
+from nerfcli.captures.detect import Detection, detect
+from nerfcli.captures.evidence import LEAST_MOVE, MatchEvidence, match_neighbours
+from nerfcli.captures.formats.colmap import write_colmap_text
+from nerfcli.captures.formats.transforms import write_transforms
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.multiview.features import Features, Matches, find_features
+from nerfcli.matching.features import Features, Matches, find_features
 
 
 def silent(fraction: float, detail: str) -> None:

@@ -13,19 +13,19 @@ from test_convert import LIMIT_PX, farthest_px, model_of
 from test_scale import photos_of, sheet_of_markers
 from views import BROWN, PINHOLE, PRISM, capture_of
 
-from nerfcli import scene as scenes
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats import colmap_binary
-from nerfcli.cameras.formats.colmap import write_colmap_binary
-from nerfcli.cameras.formats.registry import UserInputs, format_named
-from nerfcli.cameras.formats.scene_folder import write_scene
-from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture
-from nerfcli.cameras.stored_pixels import in_pixels
-from nerfcli.convert.conversion import ConventionOverrides, TargetOptions, convert, load
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.conversion import ConventionOverrides, TargetOptions, convert, load
+from nerfcli.captures.formats import colmap_binary
+from nerfcli.captures.formats.colmap import write_colmap_binary
+from nerfcli.captures.formats.registry import UserInputs, format_named
+from nerfcli.captures.formats.scene_folder import write_scene
+from nerfcli.captures.formats.transforms import write_transforms
+from nerfcli.captures.stored_pixels import in_pixels
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
-from nerfcli.media.images import read_image
+from nerfcli.photos.images import read_image
 
 USAGE = 2
 # OpenCV's rotation from stored to upright for each value of tag 0x0112, by EXIF 2.32.

@@ -14,11 +14,10 @@ from fog import fog, foggy_cells
 from PIL import Image
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.run_cameras import RunCameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.media.file_facts import depth_meta_of
-from nerfcli.media.mesh_files import read_ply_header
+from nerfcli.captures.formats.run_cameras import RunCameras
+from nerfcli.export.mesh_files import read_ply_header
 from nerfcli.render.coverage import (
     DepthMap,
     coverage_and_parallax,
@@ -27,8 +26,9 @@ from nerfcli.render.coverage import (
     sees,
     without_steep,
 )
-from nerfcli.runs.files import PHOTO_DEPTHS
-from nerfcli.runs.run import Run
+from nerfcli.render.files.file_facts import depth_meta_of
+from nerfcli.training.runs.files import PHOTO_DEPTHS
+from nerfcli.training.runs.run import Run
 from nerfcli.workflows.photo_depths import photo_depths
 
 # Two balls beside each other: each hides a part of the other from most sides.

@@ -10,22 +10,22 @@ import pytest
 import tifffile
 from commands import nerfcli
 
-from nerfcli.cameras.formats.run_cameras import RunCameras
+from nerfcli.captures.formats.run_cameras import RunCameras
 from nerfcli.errors import UserError
 from nerfcli.evaluate import depth_errors
 from nerfcli.evaluate.depth_errors import measure_depth_errors, surface_tracks
-from nerfcli.media.exr import read_exr
-from nerfcli.media.file_facts import depth_meta_of
-from nerfcli.multiview.stereo import DenseDepth
-from nerfcli.multiview.tracks import Tracks
-from nerfcli.multiview.triangulation import triangulate
+from nerfcli.matching.stereo import DenseDepth
+from nerfcli.matching.tracks import Tracks
+from nerfcli.matching.triangulation import triangulate
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.depth_errors import LEAST_PIXELS, DepthErrors
+from nerfcli.render.files.exr import read_exr
+from nerfcli.render.files.file_facts import depth_meta_of
 from nerfcli.render.pictures import render_picture
-from nerfcli.runs.files import DEPTH_ERRORS
-from nerfcli.runs.run import Run
+from nerfcli.training.runs.files import DEPTH_ERRORS
+from nerfcli.training.runs.run import Run
 
 TRUTH = Path(__file__).parent.parent / "sample_scenes" / "spheres" / "truth"
 

@@ -19,12 +19,12 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from nerfcli.errors import UserError
-from nerfcli.media.colours import linear_light
-from nerfcli.media.depth_pictures import DepthMeta, difference_of
-from nerfcli.media.exr import write_exr
-from nerfcli.media.file_facts import depth_meta_of
-from nerfcli.media.float_tiff import read_tiff, write_tiff
-from nerfcli.media.levels import LARGEST_LEVEL, chosen_scale, depth_of_levels, write_png16
+from nerfcli.photos.colours import linear_light
+from nerfcli.render.files.depth_pictures import DepthMeta, difference_of
+from nerfcli.render.files.exr import write_exr
+from nerfcli.render.files.file_facts import depth_meta_of
+from nerfcli.render.files.float_tiff import read_tiff, write_tiff
+from nerfcli.render.files.levels import LARGEST_LEVEL, chosen_scale, depth_of_levels, write_png16
 
 
 def odd_depth() -> np.ndarray:

@@ -16,9 +16,10 @@ from PIL import Image
 from walks import BOARDS, FOCAL_PX, HEIGHT, WIDTH, view, walk, write
 
 from nerfcli.cameras import rigid
-from nerfcli.cameras.calibration import Calibration
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures.calibration import Calibration
+from nerfcli.captures.scene import Scene
 from nerfcli.doctor import camera_layout, camera_motion, connectivity, inventory, quality
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.examination import Diagnosis, compare_all, content, estimated_seconds, examine, judged
@@ -27,11 +28,10 @@ from nerfcli.doctor.photo_facts import PhotoFacts, Source, read_photo
 from nerfcli.doctor.photo_list import ExaminedCapture, find_subject
 from nerfcli.doctor.sharpness import measure
 from nerfcli.errors import UserError
-from nerfcli.findings import BAD, GOOD, LOOK, Finding
-from nerfcli.media.exif import Exif
-from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
-from nerfcli.multiview.graph import connected_groups
-from nerfcli.scene import Scene
+from nerfcli.matching.features import LOOSE_RATIO, mutual_matches
+from nerfcli.matching.graph import connected_groups
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding
+from nerfcli.photos.exif import Exif
 
 ONE = 3  # the number of the photo that is spoilt
 FEATURES = 500

@@ -16,6 +16,7 @@ from walks import FOCAL_PX, HEIGHT, WIDTH, walk, write
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures.scene import Scene
 from nerfcli.doctor import connectivity, examination
 from nerfcli.doctor.brightness import Brightness
 from nerfcli.doctor.compared_pairs import Pair
@@ -25,10 +26,9 @@ from nerfcli.doctor.photo_facts import PhotoFacts, PhotoFeatures, Source
 from nerfcli.doctor.photo_list import ExaminedCapture
 from nerfcli.doctor.pose_agreement import PairError, agreement, contradicting, pair_errors
 from nerfcli.doctor.sharpness import Sharpness
-from nerfcli.findings import BAD, GOOD, LOOK, Finding
-from nerfcli.media.exif import Exif
-from nerfcli.multiview.epipolar import sampson_angles
-from nerfcli.scene import Scene
+from nerfcli.matching.epipolar import sampson_angles
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding
+from nerfcli.photos.exif import Exif
 
 CAMERA = Camera.pinhole(1600, 1200, 1400.0)
 SIZE = (800, 600)  # features are at half the size of the photos

@@ -16,9 +16,9 @@ from nerfcli.evaluate.colour_alignment import colour_aligned
 from nerfcli.evaluate.ledger import leak_ledger, summary_line
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.evaluate.requirements import known_numbers, parse_requirements, unmet
-from nerfcli.runs.components import Components
-from nerfcli.runs.config import RunConfig
-from nerfcli.runs.decisions import Selection
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.config import RunConfig
+from nerfcli.training.runs.decisions import Selection
 
 UP = np.array([0.0, -1.0, 0.0])
 

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.registry import FORMATS, recognise
+from nerfcli.captures.formats.registry import FORMATS, recognise
+from nerfcli.captures.scene import describe_source, load
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.scene import describe_source, load
 
 CAMERA = Camera.pinhole(64, 48, 70.0)  # the only kind of lens that all formats hold
 ROTATIONS = Rotation.from_rotvec([[0.1, -0.4, 0.2], [1.3, 0.2, -0.7], [-0.5, 2.1, 0.3]])

@@ -14,16 +14,16 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
-from nerfcli.export.frames import export_frames
-from nerfcli.export.order import Order, file_names
-from nerfcli.export.presentation import value_range
-from nerfcli.export.settings import ExportSettings, VideoSettings
-from nerfcli.media.float_tiff import read_tiff
-from nerfcli.media.images import read_image
-from nerfcli.media.preview import preview
+from nerfcli.photos.images import read_image
 from nerfcli.render.depth import effective_floor
+from nerfcli.render.files.float_tiff import read_tiff
+from nerfcli.render.files.preview import preview
+from nerfcli.render.frames import export_frames
+from nerfcli.render.job import Order, file_names
 from nerfcli.render.model import Model
+from nerfcli.render.outputs import ExportSettings, VideoSettings
 from nerfcli.render.pictures import DepthRequest, render_picture
+from nerfcli.render.presentation import value_range
 
 CAMERA = Camera.pinhole(10, 8, 8.0)
 DEPTH = DepthRequest("conditional", "z", min_opacity=0.1)

@@ -16,15 +16,15 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
-from nerfcli.export.depth_files import Levels, map_path, read_map, write_levels, write_maps
-from nerfcli.export.frames import export_frames
-from nerfcli.export.order import Order
-from nerfcli.export.settings import MEASURED, ExportSettings, depth_meta, floor_of
-from nerfcli.media.colours import linear_light
-from nerfcli.media.depth_pictures import DepthMeta
-from nerfcli.media.file_facts import depth_meta_of
-from nerfcli.media.float_tiff import write_tiff
+from nerfcli.photos.colours import linear_light
+from nerfcli.render.files.depth_files import Levels, map_path, read_map, write_levels, write_maps
+from nerfcli.render.files.depth_pictures import DepthMeta
+from nerfcli.render.files.file_facts import depth_meta_of
+from nerfcli.render.files.float_tiff import write_tiff
+from nerfcli.render.frames import export_frames
+from nerfcli.render.job import Order
 from nerfcli.render.model import Model
+from nerfcli.render.outputs import MEASURED, ExportSettings, depth_meta, floor_of
 from nerfcli.render.pictures import DepthRequest, RenderedPicture, render_picture
 
 CAMERA = Camera.pinhole(10, 8, 8.0)

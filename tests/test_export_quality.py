@@ -10,12 +10,12 @@ from PIL import Image
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.export.frames import export_frames
-from nerfcli.export.order import Order
-from nerfcli.export.settings import ExportSettings
-from nerfcli.media.float_tiff import read_tiff
-from nerfcli.media.images import read_image
+from nerfcli.photos.images import read_image
 from nerfcli.render.depth import DepthRequest
+from nerfcli.render.files.float_tiff import read_tiff
+from nerfcli.render.frames import export_frames
+from nerfcli.render.job import Order
+from nerfcli.render.outputs import ExportSettings
 from nerfcli.render.tracing import TOLERANCE
 
 VIEW = Frame(

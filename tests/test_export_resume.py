@@ -20,14 +20,14 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
-from nerfcli.export.frames import export_frames, export_part
-from nerfcli.export.one_frame import render_frame
-from nerfcli.export.order import Order
-from nerfcli.export.settings import ExportSettings, VideoSettings
-from nerfcli.media.file_facts import description_of
-from nerfcli.media.images import read_image
+from nerfcli.photos.images import read_image
 from nerfcli.render.depth import DepthRequest
+from nerfcli.render.files.file_facts import description_of
+from nerfcli.render.frames import export_frames, export_part
+from nerfcli.render.job import Order
 from nerfcli.render.model import Model
+from nerfcli.render.one_frame import render_frame
+from nerfcli.render.outputs import ExportSettings, VideoSettings
 
 PIXELS = 10 * 8
 # A gif, since the other encoders do not promise the same bytes for the same frames.
@@ -190,7 +190,7 @@ def test_frames_in_progress_render_in_threads_of_their_own(model, tmp_path):
         render_frame(*given, **options)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nerfcli.export.frames.render_frame", render)
+        patch.setattr("nerfcli.render.frames.render_frame", render)
         export_frames(*(model, order(2), tmp_path / "views"), on_rays=on_rays, notify=lambda text: None, threads=2)
     assert len(set(met)) == 2
     assert threading.get_ident() not in met
@@ -219,7 +219,7 @@ def test_threads_stop_before_the_main_thread_hears_of_an_error(model, tmp_path, 
             time.sleep(1.0)
             yield future
 
-    monkeypatch.setattr("nerfcli.export.frames.as_completed", late)
+    monkeypatch.setattr("nerfcli.render.frames.as_completed", late)
     with pytest.raises(KeyboardInterrupt):
         export_frames(
             *(model, order(8), tmp_path / "views"),
@@ -305,7 +305,7 @@ def test_a_video_gets_the_pictures_of_its_output_in_order(model, tmp_path, monke
         seen[path.name] = list(frames())
         path.write_bytes(b"")
 
-    monkeypatch.setattr("nerfcli.export.presentation.write_video", collect)
+    monkeypatch.setattr("nerfcli.render.presentation.write_video", collect)
     export(model, order(), tmp_path / "views")
     assert list(seen) == ["rgb.gif", "depth.gif"]
     for name, frames in seen.items():

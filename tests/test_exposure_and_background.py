@@ -11,25 +11,25 @@ from PIL import ExifTags, Image
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures.scene import Scene
 from nerfcli.errors import UserError
 from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
 from nerfcli.field.background import SphereBackground, colours_behind
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.exposure import Exposure, exposed, linear_from_srgb, srgb_from_linear
 from nerfcli.field.hash_field import DETAILED_LOG2_ROWS
-from nerfcli.fit import fitting
-from nerfcli.fit.appearance import Appearance
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.photos.pool import PixelBatch, PixelPool
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import render_picture
-from nerfcli.runs.components import Components
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
-from nerfcli.train.checkpoints import Checkpoints, Totals
-from nerfcli.train.loop import Progress, train
-from nerfcli.train.preparation import EarlierDecisions, prepare
+from nerfcli.training import fitting
+from nerfcli.training.appearance import Appearance
+from nerfcli.training.checkpoints import Checkpoints, Totals
+from nerfcli.training.loop import Progress, train
+from nerfcli.training.pool import PixelBatch, PixelPool
+from nerfcli.training.preparation import EarlierDecisions, prepare
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.settings import TrainSettings
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
 LEARNED = Components(background="sphere", exposure="learned")
@@ -147,8 +147,8 @@ def test_known_exposures_keep_their_differences_while_the_others_are_learned(cap
 def test_a_resumed_training_keeps_the_exposures_that_auto_has_fixed(capture, tmp_path, monkeypatch):
     """EXIF of three photos is too little to confirm them again, as with other stereo depths it might be."""
     found = np.array([[0.4] * 3, [-0.4] * 3, [np.nan] * 3])
-    monkeypatch.setattr("nerfcli.train.evidence.dense_depths", lambda *photos, **options: [])
-    monkeypatch.setattr("nerfcli.train.evidence.matched_log_gains", lambda photos, dense: found)
+    monkeypatch.setattr("nerfcli.training.evidence.dense_depths", lambda *photos, **options: [])
+    monkeypatch.setattr("nerfcli.training.evidence.matched_log_gains", lambda photos, dense: found)
     settings, notes = replace(SHORT, model="auto", components=Components()), []
     first = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
     begun = EarlierDecisions(first.extent, Components(exposure="matched"), None)

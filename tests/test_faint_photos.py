@@ -13,7 +13,7 @@ from PIL import Image
 from test_masks import job_for
 from test_poses import similarity
 
-from nerfcli.media.exif import read_exif
+from nerfcli.photos.exif import read_exif
 from nerfcli.poses.engine import features as searching
 from nerfcli.poses.engine.features import extract, feature_counts
 from nerfcli.poses.input.job import Job

@@ -13,6 +13,7 @@ from scipy.special import sph_harm_y
 
 from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.captures.scene import Scene
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings, fourier_features
@@ -20,16 +21,15 @@ from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import KINDS, fresh_field, settings_from_json
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
-from nerfcli.fit import fitting
-from nerfcli.fit.fitting import Fitting
-from nerfcli.fit.optimiser import FieldOptimiser
 from nerfcli.kernels import HashGrid, March, Rays, RaySums, Targets, numba_cpu, reference, spherical_harmonics
 from nerfcli.photos.loading import load_photos
-from nerfcli.photos.pool import PixelPool
 from nerfcli.render.model import Marching, Model, load_model, save_model
-from nerfcli.runs.components import Components
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
+from nerfcli.training import fitting
+from nerfcli.training.fitting import Fitting
+from nerfcli.training.optimiser import FieldOptimiser
+from nerfcli.training.pool import PixelPool
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.settings import TrainSettings
 
 DEFAULTS = Components()
 SMALL: dict[str, FieldSettings] = {

@@ -7,8 +7,8 @@ import pytest
 from PIL import ExifTags, Image
 from test_photos import NO_EXIF, photo
 
-from nerfcli.media.exif import Exif, read_exif
-from nerfcli.media.focal_evidence import focal_evidence, with_digital_zoom
+from nerfcli.photos.exif import Exif, read_exif
+from nerfcli.photos.focal_evidence import focal_evidence, with_digital_zoom
 from nerfcli.poses.engine.database import camera_of_group
 from nerfcli.poses.input.photos import Photos, camera_groups, find_photos
 from nerfcli.poses.model.cameras import group_photos

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.alicevision import parse_alicevision
-from nerfcli.cameras.formats.registry import recognise
+from nerfcli.captures.formats.alicevision import parse_alicevision
+from nerfcli.captures.formats.registry import recognise
 from nerfcli.errors import BAD_INPUT, UserError
 
 # Written by Meshroom 2023: focal length and sensor in millimetres, 6.3 mm / 9 mm * 640 px = 448 px.

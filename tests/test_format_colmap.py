@@ -10,14 +10,14 @@ from captures import CAMERAS, assert_same, reprojection_px, ring
 from corruption import assert_refused_or_sound, corrupted_binary, corrupted_text
 
 from nerfcli.cameras import rigid
-from nerfcli.cameras.formats.colmap import (
+from nerfcli.cameras.frame import Capture, Observations
+from nerfcli.captures.formats.colmap import (
     losses_colmap,
     losses_colmap_text,
     parse_colmap,
     write_colmap_binary,
     write_colmap_text,
 )
-from nerfcli.cameras.frame import Capture, Observations
 from nerfcli.errors import UserError
 
 WRITERS = {"bin": write_colmap_binary, "txt": write_colmap_text}

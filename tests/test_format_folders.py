@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.registry import UserInputs, recognise
 from nerfcli.cameras.frame import Capture
+from nerfcli.captures.formats.registry import UserInputs, recognise
 from nerfcli.errors import BAD_INPUT, UserError
 
 SIZE = (64, 48)

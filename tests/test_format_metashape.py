@@ -9,7 +9,7 @@ from corruption import corrupted_text, count_refused
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.metashape import parse_metashape
+from nerfcli.captures.formats.metashape import parse_metashape
 from nerfcli.errors import BAD_INPUT, UserError
 
 # At (1, 2, 3) in the chunk, turned a quarter about y: the camera's z axis along chunk x.

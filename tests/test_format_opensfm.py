@@ -10,8 +10,8 @@ from corruption import corrupted_json, count_refused
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.opensfm import losses_opensfm, parse_opensfm, write_opensfm
 from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.captures.formats.opensfm import losses_opensfm, parse_opensfm, write_opensfm
 from nerfcli.errors import BAD_INPUT, UserError
 
 AFFINE = {"focal_x": 0.9, "focal_y": 0.93, "c_x": 0.021, "c_y": -0.013}

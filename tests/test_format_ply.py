@@ -9,9 +9,9 @@ import pytest
 from captures import CAMERAS, ring
 from corruption import corrupted_binary, corrupted_text, count_refused
 
-from nerfcli.cameras.formats.colmap import write_colmap_binary
-from nerfcli.cameras.formats.ply import losses_ply, read_ply_points, write_ply
 from nerfcli.cameras.frame import Capture
+from nerfcli.captures.formats.colmap import write_colmap_binary
+from nerfcli.captures.formats.ply import losses_ply, read_ply_points, write_ply
 from nerfcli.errors import UserError
 
 POINTS = np.array([[1.5, -2.0, 3.0], [4.0, 5.0, -6.25]])

@@ -8,7 +8,7 @@ from corruption import corrupted_text, count_refused
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.reality_capture import parse_reality_capture
+from nerfcli.captures.formats.reality_capture import parse_reality_capture
 from nerfcli.errors import BAD_INPUT, UserError
 
 OLD = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"

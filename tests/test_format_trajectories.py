@@ -8,7 +8,8 @@ from corruption import corrupted_text, count_refused
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.trajectories import (
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats.trajectories import (
     losses_kitti,
     losses_tum,
     parse_kitti,
@@ -16,7 +17,6 @@ from nerfcli.cameras.formats.trajectories import (
     write_kitti,
     write_tum,
 )
-from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import BAD_INPUT, UserError
 
 CAMERA = Camera("OPENCV", 640, 480, (500, 510, 331, 236, 0.1, -0.05, 0.001, 0.002))

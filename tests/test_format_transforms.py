@@ -11,16 +11,16 @@ from captures import CAMERAS, assert_same, photograph, reprojection_px, ring, wi
 from corruption import assert_refused_or_sound, corrupted_binary, corrupted_json
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.blender import losses_blender, parse_blender, write_blender
-from nerfcli.cameras.formats.transforms import (
+from nerfcli.cameras.frame import Capture
+from nerfcli.captures.formats.blender import losses_blender, parse_blender, write_blender
+from nerfcli.captures.formats.transforms import (
     losses_transforms,
     parse_transforms,
     write_transforms,
 )
-from nerfcli.cameras.formats.transforms_cameras import lost_to_transforms
-from nerfcli.cameras.frame import Capture
+from nerfcli.captures.formats.transforms_cameras import lost_to_transforms
+from nerfcli.captures.scene import load
 from nerfcli.errors import UserError
-from nerfcli.scene import load
 
 LOST = {
     "FULL_OPENCV": ("k4", "k5", "k6"),

@@ -16,10 +16,10 @@ from nerfcli.cameras.conventions import (
     opencv_from_opengl_pose,
     opengl_from_opencv_pose,
 )
-from nerfcli.cameras.formats.colmap import is_model, read_model
-from nerfcli.cameras.formats.transforms import parse_transforms
+from nerfcli.captures.formats.colmap import is_model, read_model
+from nerfcli.captures.formats.transforms import parse_transforms
+from nerfcli.captures.scene import load
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.scene import load
 
 # A camera at (1, 2, 3) that looks along -x with +z up. OpenGL axes: right +y, up +z, backward +x, as columns.
 OPENGL_POSE = [[0.0, 0.0, 1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from test_stereo import LENS, NORMALS, PINHOLE, found, photo, truth
 
 from nerfcli.cameras.rigid import rotation_from_vector
-from nerfcli.multiview import forward_stereo
-from nerfcli.multiview.forward_stereo import forward_depths
-from nerfcli.multiview.stereo_view import view_of
+from nerfcli.matching import forward_stereo
+from nerfcli.matching.forward_stereo import forward_depths
+from nerfcli.matching.stereo_view import view_of
 from nerfcli.photos.loading import LoadedPhoto
 
 AHEAD = (0.0, 0.3, 0.6, -0.3)

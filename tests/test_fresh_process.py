@@ -12,7 +12,7 @@ CODES = {
     "conversion": "from nerfcli.workflows import convert",
     "adam": """
 import torch
-from nerfcli.fit.adam import Adam
+from nerfcli.training.adam import Adam
 parameter = torch.ones(3, requires_grad=True)
 adam = Adam([parameter])
 parameter.grad = torch.ones(3)
@@ -70,13 +70,13 @@ def test_a_conversion_imports_no_torch(modules):
 
 
 def test_a_step_of_adam_loads_no_compiler(modules):
-    assert "nerfcli.fit.adam" in modules["adam"]
+    assert "nerfcli.training.adam" in modules["adam"]
     assert "torch._dynamo" not in modules["adam"]
 
 
 def test_what_comes_after_training_loads_no_trainer(modules):
     loaded = modules["package"] | modules["conversion"] | modules["adam"] | modules["after training"]
-    assert "nerfcli.runs.run" in loaded
+    assert "nerfcli.training.runs.run" in loaded
     assert not [name for name in loaded if name.startswith("nerfcli.train")]
 
 

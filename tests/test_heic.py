@@ -15,13 +15,13 @@ from commands import nerfcli
 from PIL import ExifTags, Image, ImageOps
 from test_images import exif_with, icc_profile, noise
 
+from nerfcli.captures.scene import load
 from nerfcli.errors import UserError
-from nerfcli.media.exif import read_exif
-from nerfcli.media.images import image_size, list_images, read_image
-from nerfcli.media.masks import read_mask
+from nerfcli.photos.exif import read_exif
+from nerfcli.photos.images import image_size, list_images, read_image
+from nerfcli.photos.masks import read_mask
 from nerfcli.poses.input.photos import find_photos
 from nerfcli.poses.input.work_photos import lay_out
-from nerfcli.scene import load
 
 WIDTH, HEIGHT = 96, 64
 # Display P3's primaries, adapted to D50, as phones embed them (columns of the matrix to XYZ).

@@ -10,7 +10,8 @@ from PIL import ExifTags, Image
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.photos.held_out_exposure import (
+from nerfcli.captures.scene import Scene
+from nerfcli.render.held_out_exposure import (
     exif_slope,
     gain_sources,
     gains_between,
@@ -18,10 +19,9 @@ from nerfcli.photos.held_out_exposure import (
     log_gains_of,
 )
 from nerfcli.render.model import load_model
-from nerfcli.runs.components import Components
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
-from nerfcli.train.loop import train
+from nerfcli.training.loop import train
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.settings import TrainSettings
 
 
 def drifting(places: np.ndarray) -> np.ndarray:
@@ -209,7 +209,7 @@ def test_exif_of_a_held_out_photo_takes_precedence_over_its_neighbours(monkeypat
     """EXIF has the exposure of one photo only; a model without a mean exposure does not use it."""
     frames = [Frame(name, Camera.pinhole(4, 4, 4.0), np.eye(4)) for name in ("a", "b", "c")]
     monkeypatch.setattr(
-        "nerfcli.photos.held_out_exposure.log_exposures", lambda frames: np.array([1.5, np.nan, np.nan])[: len(frames)]
+        "nerfcli.render.held_out_exposure.log_exposures", lambda frames: np.array([1.5, np.nan, np.nan])[: len(frames)]
     )
     around = {"a": (9.0, 9.0, 9.0), "b": (0.1, 0.2, 0.3)}
     model = SimpleNamespace(log_exposure=1.0, exif_slope=1.0, exposures=around, beyond_exif={})

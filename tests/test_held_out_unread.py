@@ -16,18 +16,18 @@ import numpy as np
 import pytest
 from conftest import SPHERES
 
-from nerfcli import scene as scenes
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.scene import Scene
 from nerfcli.field.checkpoint import load_tensors
-from nerfcli.media.images import read_image, write_png
-from nerfcli.multiview.sky import sky_masks
-from nerfcli.runs.components import Components
-from nerfcli.runs.files import FIELD
-from nerfcli.runs.log import read_log
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
-from nerfcli.search import selection
-from nerfcli.train import evidence, loop, preparation, waypoints
-from nerfcli.train.loop import train
+from nerfcli.matching.sky import sky_masks
+from nerfcli.photos.images import read_image, write_png
+from nerfcli.training import evidence, loop, preparation, waypoints
+from nerfcli.training.loop import train
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.files import FIELD
+from nerfcli.training.runs.log import read_log
+from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.selection import selection
 
 HELD_OUT = "test"  # the folder of these photos in the capture
 _listeners: list[list[str]] = []

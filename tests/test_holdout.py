@@ -4,9 +4,9 @@ from pathlib import PurePosixPath
 
 import pytest
 
-from nerfcli import scene as scenes
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.holdout import DEFAULT_HOLDOUT, check_holdout, default_split, names_held_out
 from nerfcli.errors import UserError
-from nerfcli.holdout import DEFAULT_HOLDOUT, check_holdout, default_split, names_held_out
 
 NAMES = [f"frame_{index}.png" for index in range(1, 21)]
 

@@ -1,4 +1,4 @@
-"""nerfcli.media.images: orientation, colour, damage, exact downscaling, EXIF, PNG."""
+"""nerfcli.photos.images: orientation, colour, damage, exact downscaling, EXIF, PNG."""
 
 import io
 import math
@@ -18,8 +18,8 @@ from PIL import ExifTags, Image, ImageCms, ImageOps
 from PIL.TiffImagePlugin import IFDRational
 
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.media.exif import read_exif
-from nerfcli.media.images import downscale, image_size, list_images, read_image, write_png
+from nerfcli.photos.exif import read_exif
+from nerfcli.photos.images import downscale, image_size, list_images, read_image, write_png
 
 # Linear red, green, blue to XYZ (D50), Bradford-adapted, a column each: IEC 61966-2-1 and SMPTE EG 432-1.
 SRGB = ((0.43607, 0.22250, 0.01393), (0.38506, 0.71688, 0.09710), (0.14308, 0.06062, 0.71417))

@@ -11,8 +11,8 @@ from nerfcli import kernels
 from nerfcli.bench import machine
 from nerfcli.errors import UserError
 from nerfcli.kernels.devices import describe_machine
-from nerfcli.runs.settings import TrainSettings, sizes_for
-from nerfcli.workflows.machine import device_name
+from nerfcli.machine import device_name
+from nerfcli.training.runs.settings import TrainSettings, sizes_for
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""nerfcli.media.masks and poses.input.masks: found by name, turned like the photo, obeyed by feature extraction."""
+"""nerfcli.photos.masks and poses.input.masks: found by name, turned like the photo, obeyed by feature extraction."""
 
 import json
 from dataclasses import replace
@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from nerfcli.errors import UserError
-from nerfcli.media.images import read_image, write_png
-from nerfcli.media.masks import find_mask, read_mask
+from nerfcli.photos.images import read_image, write_png
+from nerfcli.photos.masks import find_mask, read_mask
 from nerfcli.poses.engine.features import extract, feature_keys
 from nerfcli.poses.input.job import CameraGroup, Job, WorkMask, read_job, write_job
 from nerfcli.poses.input.masks import lay_out_masks

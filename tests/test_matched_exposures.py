@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from test_stereo import OFFSETS, PINHOLE, photo, tracks, truth
 
-from nerfcli.multiview.exposures import matched_log_gains
-from nerfcli.multiview.stereo import DenseDepth
+from nerfcli.matching.exposures import matched_log_gains
+from nerfcli.matching.stereo import DenseDepth
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.runs.components import Components
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.train.evidence import Evidence
+from nerfcli.training.evidence import Evidence
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.settings import TrainSettings
 
 GAINS = np.array([[0.0, 0.1, -0.1], [0.4, 0.4, 0.4], [-0.5, -0.4, -0.3], [0.1, -0.1, 0.0]])
 NOTHING = DenseDepth(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
@@ -72,7 +72,7 @@ def test_exposures_count_where_exif_confirms_them(exif, is_kept, monkeypatch):
     """EXIF has to confirm them because shiny surfaces differ from photo to photo, too."""
     gains = [-0.6, 0.6, -0.3, 0.3, 0.0, 0.1]
     photos = [exposed(photo(0.12 * k, contrast=1.5), np.full(3, gain)) for k, gain in enumerate(gains)]
-    monkeypatch.setattr("nerfcli.train.evidence.log_exposures", lambda frames: np.array(exif))
+    monkeypatch.setattr("nerfcli.training.evidence.log_exposures", lambda frames: np.array(exif))
     shared: Any = SimpleNamespace(tracks=tracks(photos))
     album, extent, pool = SimpleNamespace(photos=photos), SimpleNamespace(training_from_scene=None), None
     evidence = Evidence(shared, album, pool, extent, TrainSettings(), lambda text: None)  # type: ignore[arg-type]

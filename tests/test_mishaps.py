@@ -16,11 +16,12 @@ import pytest
 from commands import error_of, listing, nerfcli, started
 from full_disk import files_of_at_most
 
-from nerfcli import atomic, kernels, scene
+from nerfcli import atomic, kernels
+from nerfcli.captures import scene
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, TERMINATED
 from nerfcli.exclusive import exclusive
 from nerfcli.interrupts import Terminated, install_handlers
-from nerfcli.runs.files import LOCK, PHOTO_DEPTHS
+from nerfcli.training.runs.files import LOCK, PHOTO_DEPTHS
 from nerfcli.workflows import describe
 
 ONE_STEP = ("--steps", "1", "--downscale", "8", "--log2-rows", "10", "--threads", "2")

@@ -13,21 +13,21 @@ from test_stereo import LENS, NORMALS, OFFSETS, PINHOLE, TEXTURE, found, photo, 
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.captures.scene import Scene, load
 from nerfcli.errors import UserError
-from nerfcli.media.images import read_image, write_png
-from nerfcli.multiview import occluders
-from nerfcli.multiview.occluders import occluder_masks
-from nerfcli.multiview.stereo import DenseDepth
+from nerfcli.matching import occluders
+from nerfcli.matching.occluders import occluder_masks
+from nerfcli.matching.stereo import DenseDepth
+from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.photos.pool import PixelPool
-from nerfcli.runs.components import Components
-from nerfcli.runs.run import Run
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene, load
-from nerfcli.search import selection
-from nerfcli.search.trials import Trials
-from nerfcli.train import preparation
-from nerfcli.train.loop import train
+from nerfcli.training import preparation
+from nerfcli.training.loop import train
+from nerfcli.training.pool import PixelPool
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.selection import selection
+from nerfcli.training.selection.trials import Trials
 
 SAME = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
 UNKNOWN = np.full((4, 3), np.nan)

@@ -1,4 +1,4 @@
-"""nerfcli.fit.open_cells: which cells training rays look into, against fields and samples that are known."""
+"""nerfcli.training.open_cells: which cells training rays look into, against fields and samples that are known."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,9 +10,9 @@ from torch import Tensor
 
 from nerfcli import distributed, kernels
 from nerfcli.field.hash_field import HashField, HashFieldSettings
-from nerfcli.fit.open_cells import FINE_SIDE, OCCUPANCY_SIDE, REFRESH_EVERY, REFRESH_TURNS, OpenCells
 from nerfcli.kernels import March, Rays, numba_cpu, reference
 from nerfcli.render.model import Marching
+from nerfcli.training.open_cells import FINE_SIDE, OCCUPANCY_SIDE, REFRESH_EVERY, REFRESH_TURNS, OpenCells
 
 CPU = torch.device("cpu")
 MARCHING = Marching(0.1, 10.0, 0.05, 0.0)

@@ -18,11 +18,10 @@ from fog import SIDE
 from page_arithmetic import PageField, array, element
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.camera_path import read_path
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
+from nerfcli.captures.formats.camera_path import read_path
 from nerfcli.errors import UserError
-from nerfcli.export.one_frame import with_coverage
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.field.hash_field import HashField, HashFieldSettings
@@ -33,8 +32,9 @@ from nerfcli.kernels.reference.encoding import hash_encode
 from nerfcli.render.coverage import DepthMap, depth_maps
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Marching, Model
+from nerfcli.render.one_frame import with_coverage
 from nerfcli.render.pictures import render_picture
-from nerfcli.runs.run import Run
+from nerfcli.training.runs.run import Run
 from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_rows
 from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import PagePhotos

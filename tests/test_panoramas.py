@@ -14,19 +14,20 @@ from panorama_room import CENTRES, WIDTH, panorama, render, world_from_cam, writ
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nerfcli import scene as scenes
 from nerfcli.cameras.alignment import align
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.model_tracks import tracks_of_model
 from nerfcli.doctor.compared_pairs import compare
 from nerfcli.doctor.photo_facts import Source, read_all
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
-from nerfcli.media.images import read_image
-from nerfcli.media.panoramas import PANORAMA, is_panorama
-from nerfcli.multiview.panorama_faces import FACES, Faces
-from nerfcli.multiview.stereo import dense_depths
-from nerfcli.multiview.tracks import Tracks, tracks_of_model
+from nerfcli.matching.panorama_faces import FACES, Faces
+from nerfcli.matching.stereo import dense_depths
+from nerfcli.matching.tracks import Tracks
+from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto, load_photos
+from nerfcli.photos.panoramas import PANORAMA, is_panorama
 from nerfcli.poses.input.photos import find_photos
 from nerfcli.poses.input.settings import PoseSettings, for_panoramas
 from nerfcli.poses.judge.acceptance import nothing_placed
@@ -35,7 +36,7 @@ from nerfcli.poses.model import held_out
 from nerfcli.poses.model.cameras import group_by_given, group_photos
 from nerfcli.poses.model.projection import is_ahead, offsets_px, panorama_camera, projected, px_per_radian
 from nerfcli.poses.model.two_views import VerifiedPair, panorama_inliers, rays
-from nerfcli.runs.run import load_run
+from nerfcli.training.runs.run import load_run
 from nerfcli.workflows.poses import given_intrinsics
 from nerfcli.workflows.render import render_run
 from nerfcli.workflows.report import report_runs

@@ -12,9 +12,9 @@ from ellipsoids import Ellipsoid, attenuation_at, attenuation_of_voxels, bean, l
 from typer.testing import CliRunner
 
 from nerfcli.cli import app
-from nerfcli.tomography.formats.read import read_scan
-from nerfcli.tomography.likelihood import likelihood_of
-from nerfcli.tomography.truth import load_truth
+from nerfcli.ct.formats.read import read_scan
+from nerfcli.ct.likelihood import likelihood_of
+from nerfcli.ct.truth import load_truth
 
 PHANTOM = Path(__file__).parent.parent / "sample_scenes" / "phantom"
 

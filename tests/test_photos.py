@@ -9,7 +9,7 @@ from PIL import Image
 
 from nerfcli.doctor.photo_list import find_subject
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
-from nerfcli.media.exif import Exif
+from nerfcli.photos.exif import Exif
 from nerfcli.poses.input.photos import Photo, camera_groups, find_photos
 from nerfcli.poses.model.reasons import NO_TRAINING_PHOTO, dominant, reason
 

@@ -9,16 +9,16 @@ import torch
 from fog import SIDE, fog, foggy_cells
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.run_cameras import read_cameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
+from nerfcli.captures.formats.run_cameras import read_cameras
 from nerfcli.field.hash_field import HashField
 from nerfcli.render import pictures
 from nerfcli.render.accuracy import IN_WORDS, measure_error, refined, truncation_bounds
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model, load_model
 from nerfcli.render.pictures import RenderedPicture, render_picture, straight_rgba
-from nerfcli.runs.files import FIELD
+from nerfcli.training.runs.files import FIELD
 
 BLACK = (0.0, 0.0, 0.0)
 MAPS = ("rgb", "opacity", "depth", "spread", "disagreement", "median", "truncation_error", "valid")

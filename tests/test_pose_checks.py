@@ -24,14 +24,14 @@ from hypothesis import strategies as st
 from in_this_process import worker_in_this_process
 from synthetic_captures import LONG, WIDE, Noise
 
-from nerfcli import scene as scenes
+from nerfcli.captures import scene as scenes
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
-from nerfcli.finite import finite
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.engine import worker
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.largest_component import describe_components
 from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.worker import finite
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.judge import acceptance, examine

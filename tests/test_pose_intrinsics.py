@@ -21,11 +21,11 @@ from test_cli import write_photos
 from test_pose_stages import model, rows
 from test_poses import similarity
 
-from nerfcli.cameras.calibration import Calibration, Picture, calibrated
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.registry import format_named
 from nerfcli.cameras.frame import Capture
-from nerfcli.convert.camera_files import read_calibration
+from nerfcli.captures.calibration import Calibration, Picture, calibrated
+from nerfcli.captures.camera_files import read_calibration
+from nerfcli.captures.formats.registry import format_named
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport

@@ -10,14 +10,14 @@ from corner import CENTRES, NAMES, cam_from_world, write_capture
 from in_this_process import poses_in_this_process
 from test_poses import FAST, similarity
 
-from nerfcli import scene
+from nerfcli.captures import scene
 from nerfcli.evaluate.ledger import leak_ledger
 from nerfcli.poses.engine.strict import fingerprint, held_out_last, training_part
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import is_same_scene
-from nerfcli.runs.config import RunConfig
+from nerfcli.training.runs.config import RunConfig
 
 HELD_OUT = 2  # in the middle, and stored upright
 

@@ -13,12 +13,12 @@ from corner import CENTRES, FOCAL_PX, HEIGHT, WIDTH, render
 from in_this_process import poses_in_this_process
 from PIL import Image
 
-from nerfcli import scene as scenes
-from nerfcli.cameras.calibration import Calibration, Picture, calibrated
 from nerfcli.cameras.camera import Camera
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.calibration import Calibration, Picture, calibrated
 from nerfcli.errors import BAD_INPUT
-from nerfcli.media.images import list_photos
-from nerfcli.media.masks import find_mask
+from nerfcli.photos.images import list_photos
+from nerfcli.photos.masks import find_mask
 from nerfcli.poses.input.photos import camera_groups, find_photos
 from nerfcli.poses.input.settings import QUALITIES, PoseSettings
 from nerfcli.poses.structure_from_motion import is_same_scene

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Lens, Noise, Scene, View
 
 from nerfcli.cameras.alignment import align
-from nerfcli.multiview.graph import Bottlenecks, connected_groups, consistent_groups
+from nerfcli.matching.graph import Bottlenecks, connected_groups, consistent_groups
 from nerfcli.poses.engine import ladder, mapping
 from nerfcli.poses.engine import second_chance as chances
 from nerfcli.poses.engine.database import register_photos

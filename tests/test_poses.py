@@ -13,9 +13,9 @@ from corner import CENTRES, FOCAL_PX, NAMES, cam_from_world, wall, write_capture
 from in_this_process import worker_in_this_process
 from PIL import Image
 
-from nerfcli import scene
+from nerfcli.captures import scene
 from nerfcli.errors import OUT_OF_MEMORY, TOO_FEW_PHOTOS, UserError
-from nerfcli.media.images import read_image
+from nerfcli.photos.images import read_image
 from nerfcli.poses.engine import supervise
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport

@@ -1,4 +1,4 @@
-"""nerfcli.media.preview: previews show what they say."""
+"""nerfcli.render.files.preview: previews show what they say."""
 
 import math
 
@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from matplotlib import colormaps
 from skimage.color import rgb2lab
 
-from nerfcli.media.colours import COLOUR_MAPS, levels_of
-from nerfcli.media.depth_pictures import DepthMeta
-from nerfcli.media.preview import coloured, preview
+from nerfcli.photos.colours import COLOUR_MAPS, levels_of
+from nerfcli.render.files.depth_pictures import DepthMeta
+from nerfcli.render.files.preview import coloured, preview
 
 META = DepthMeta("conditional", "ray", "arbitrary", 0.5)
 

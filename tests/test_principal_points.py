@@ -11,7 +11,7 @@ from corner import NAMES, write_capture
 from in_this_process import poses_in_this_process
 from synthetic_captures import Lens
 
-from nerfcli import scene
+from nerfcli.captures import scene
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.lens_observability import uncertainty

@@ -10,28 +10,29 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.colmap import write_colmap_binary
-from nerfcli.cameras.formats.scene_folder import MODEL_FOLDER, save
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.formats.colmap import write_colmap_binary
+from nerfcli.captures.formats.scene_folder import MODEL_FOLDER, save
+from nerfcli.captures.model_tracks import tracks_of_model
+from nerfcli.captures.scene import Scene
 from nerfcli.errors import UserError
-from nerfcli.fit.losses import distance_losses
-from nerfcli.fit.point_depth import PointRays, fading, point_depths
 from nerfcli.kernels import reference
-from nerfcli.multiview.camera_check import CameraCheck
-from nerfcli.multiview.correspondences import SharedFeatures, chosen_pairs
-from nerfcli.multiview.tracks import Tracks, tracks_of_model
-from nerfcli.multiview.triangulation import triangulate
+from nerfcli.matching.camera_check import CameraCheck
+from nerfcli.matching.correspondences import SharedFeatures, chosen_pairs
+from nerfcli.matching.tracks import Tracks
+from nerfcli.matching.triangulation import triangulate
 from nerfcli.photos.loading import load_photos
-from nerfcli.photos.pool import PixelPool
-from nerfcli.runs.components import Components
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
-from nerfcli.search.selection import Facts
-from nerfcli.train.loop import train
-from nerfcli.train.preparation import prepare
+from nerfcli.training.loop import train
+from nerfcli.training.losses import distance_losses
+from nerfcli.training.point_depth import PointRays, fading, point_depths
+from nerfcli.training.pool import PixelPool
+from nerfcli.training.preparation import prepare
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.selection.selection import Facts
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
 # Both cameras see them; the first point is off by half a pixel in the second camera.
@@ -219,7 +220,7 @@ def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(c
         fractions.append(fraction)
         return distance_losses(off_target, fraction=fraction)
 
-    monkeypatch.setattr("nerfcli.fit.fitting.distance_losses", recorded)
+    monkeypatch.setattr("nerfcli.training.fitting.distance_losses", recorded)
     for fraction in (0.0, 0.29, 0.31, 0.9):
         fitting.advance(fraction)
     assert fractions == [0.0, 0.29, 0.31, 0.9]
@@ -242,7 +243,7 @@ def test_points_of_a_narrow_baseline_fade_with_the_steps_of_a_training(
     losses = []
     for value in (0.0, 4.0):
         monkeypatch.setattr(
-            "nerfcli.fit.fitting.distance_losses", lambda off, *, fraction, value=value: 0 * off + value
+            "nerfcli.training.fitting.distance_losses", lambda off, *, fraction, value=value: 0 * off + value
         )
         fitting = prepared.fitting()
         assert fitting.points is not None
@@ -294,7 +295,7 @@ def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
 @pytest.mark.parametrize("limit", [{"budget_seconds": None, "steps": 10}, {"budget_seconds": 1.0}])
 def test_a_short_training_does_not_wait_for_photos_to_be_compared(capture, tmp_path, monkeypatch, limit):
     monkeypatch.setattr(
-        "nerfcli.multiview.correspondences.match", lambda *photos, **threads: pytest.fail("photos were compared")
+        "nerfcli.matching.correspondences.match", lambda *photos, **threads: pytest.fail("photos were compared")
     )
     without_model = replace(capture, root=tmp_path / "elsewhere")
     settings = TrainSettings(**limit, model="auto")
@@ -307,7 +308,7 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
     """With requested components and no search; refining poses alone leaves lenses as they are."""
     check = CameraCheck(-0.019, 0.0006, (0.26, 0.14), 900)
     facts = Facts("hash", has_alpha=False, has_exif=False, cameras=check, fixed=("cameras",))
-    monkeypatch.setattr("nerfcli.train.preparation._facts", lambda *positional, **of_points: facts)
+    monkeypatch.setattr("nerfcli.training.preparation._facts", lambda *positional, **of_points: facts)
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(cameras=cameras), model="default")
     reported: list[str] = []
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=reported.append)
@@ -324,7 +325,7 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
 def test_comparing_photos_has_a_price_once(spheres):
     """0.7 us for each pixel of the compared photos, divided by two threads; 0 once it is done."""
     photos = load_photos(spheres.train_frames, factor=4, threads=1)
-    shared = SharedFeatures(spheres, photos, threads=2)
+    shared = SharedFeatures(photos, lambda: tracks_of_model(spheres, photos), threads=2)
     wanted = {index for pair in chosen_pairs(photos) for index in pair}
     pixels = sum(photos[index].pixels.shape[0] * photos[index].pixels.shape[1] for index in wanted)
     assert shared.matching_seconds == pytest.approx(0.7e-6 * pixels / 2)

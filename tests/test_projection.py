@@ -9,9 +9,9 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nerfcli.ct.geometry import circular_cone, circular_parallel
+from nerfcli.ct.grid import VoxelGrid, centred_grid, grid_of_scan
 from nerfcli.kernels import numba_cpu, reference
-from nerfcli.tomography.geometry import circular_cone, circular_parallel
-from nerfcli.tomography.grid import VoxelGrid, centred_grid, grid_of_scan
 
 GRID = {"first": (-2.5, -1.5, -2.0), "size": 0.5}
 SHAPE = (9, 7, 11)

@@ -19,16 +19,15 @@ import pytest
 import torch
 from commands import error_of, nerfcli
 
-from nerfcli import distributed
+from nerfcli import distributed, machine
 from nerfcli.errors import INTERRUPTED, LOST_RANK, TERMINATED
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.photos.pool import PixelBatch
-from nerfcli.runs.components import Components, choose
-from nerfcli.runs.run import Run
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.train import evidence, loop
-from nerfcli.workflows import machine
+from nerfcli.training import evidence, loop
+from nerfcli.training.pool import PixelBatch
+from nerfcli.training.runs.components import Components, choose
+from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.workflows.train import train_scene
 
 SPHERES = Path(__file__).parents[1] / "sample_scenes" / "spheres"
@@ -51,8 +50,8 @@ atexit.register(gc.freeze)  # as in `nerfcli.__main__`
 sys.path.insert(0, {tests!r})
 from test_ranks import SPHERES, SMALL, VARIANTS, settings_with, torch, train_until
 from nerfcli import distributed
-from nerfcli.fit.fitting import Fitting
-from nerfcli.train import sentinel
+from nerfcli.training.fitting import Fitting
+from nerfcli.training import sentinel
 
 # After all that the program does at its end: threads that still listen would abort some processes, one in four.
 atexit.register(lambda: print("joined" if torch.distributed.is_initialized() else "parted"))

@@ -7,10 +7,10 @@ import torch
 
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.voxel_field import VoxelFieldSettings
-from nerfcli.fit.strides import DETAILED_STEPS, RaySteps, halvings
 from nerfcli.render.model import Marching
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.train.preparation import prepare
+from nerfcli.training.preparation import prepare
+from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.strides import DETAILED_STEPS, RaySteps, halvings
 
 BALL = Marching(near=0.5, far=300.0, shortest_step=1 / 256, growth=1 / 128)
 CUBE = Marching(near=0.5, far=4.0, shortest_step=1 / 128, growth=0.0)

@@ -10,22 +10,22 @@ import torch
 from ellipsoids import attenuation_of_voxels, bean, line_integrals
 from scipy.ndimage import binary_erosion
 
+from nerfcli.ct import reconstruct as reconstruction
+from nerfcli.ct.baselines import filtered_back_projection, sart_total_variation
+from nerfcli.ct.calibrate import air_factors, detector_tilt, model_error
+from nerfcli.ct.centre import centre_of
+from nerfcli.ct.geometry import ScanGeometry, circular_cone, circular_parallel
+from nerfcli.ct.grid import VoxelGrid, centred_grid, grid_of_scan
+from nerfcli.ct.hash_fit import ARRAYS, fit_hash, hash_volume, new_arrays, total_variation
+from nerfcli.ct.hash_fit import line_integrals as hash_line_integrals
+from nerfcli.ct.likelihood import Gaussian, Poisson, likelihood_of, noise, photons_per_value
+from nerfcli.ct.marks import OUTSIDE, TRUNCATED, UNSEEN, WEDGE, marks, missing_wedge_deg
+from nerfcli.ct.quick import highest_contrast_row
+from nerfcli.ct.reconstruct import Problem, Projector, mean_attenuation, reconstruct, start
+from nerfcli.ct.scan import Scan, held_out_views, load_scan, save_scan
+from nerfcli.ct.scores import resampled, score_volume
+from nerfcli.ct.training import Limit
 from nerfcli.errors import UserError
-from nerfcli.tomography import reconstruct as reconstruction
-from nerfcli.tomography.baselines import filtered_back_projection, sart_total_variation
-from nerfcli.tomography.calibrate import air_factors, detector_tilt, model_error
-from nerfcli.tomography.centre import centre_of
-from nerfcli.tomography.geometry import ScanGeometry, circular_cone, circular_parallel
-from nerfcli.tomography.grid import VoxelGrid, centred_grid, grid_of_scan
-from nerfcli.tomography.hash_fit import ARRAYS, fit_hash, hash_volume, new_arrays, total_variation
-from nerfcli.tomography.hash_fit import line_integrals as hash_line_integrals
-from nerfcli.tomography.likelihood import Gaussian, Poisson, likelihood_of, noise, photons_per_value
-from nerfcli.tomography.marks import OUTSIDE, TRUNCATED, UNSEEN, WEDGE, marks, missing_wedge_deg
-from nerfcli.tomography.quick import highest_contrast_row
-from nerfcli.tomography.reconstruct import Problem, Projector, mean_attenuation, reconstruct, start
-from nerfcli.tomography.scan import Scan, held_out_views, load_scan, save_scan
-from nerfcli.tomography.scores import resampled, score_volume
-from nerfcli.workflows.tomography import Limit
 
 PHOTONS = 2e4
 

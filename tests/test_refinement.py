@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from lenses import HEIGHT, MODELS, WIDTH, random_camera
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.run_cameras import find_run, parse_run, read_cameras, read_given_cameras
 from nerfcli.cameras.lens_change import bearings_by_change, changeable, changed
 from nerfcli.cameras.rigid import (
     Similarity,
@@ -24,21 +23,22 @@ from nerfcli.cameras.rigid import (
     transform_from_twist,
     vector_from_rotation,
 )
+from nerfcli.captures.formats.run_cameras import find_run, parse_run, read_cameras, read_given_cameras
+from nerfcli.captures.scene import Scene
 from nerfcli.field.checkpoint import load_tensors
-from nerfcli.fit.extent import Extent
-from nerfcli.fit.fitting import Fitting
-from nerfcli.fit.gauge import mean_similarity, without_mean
-from nerfcli.fit.newton import NewtonSteps
-from nerfcli.fit.refinement import LAST_FRACTION, LENS_RATE, PoseRefinement, Refinement, rate_at
-from nerfcli.fit.whitening import BETAS, EPS, WhitenedAdam, whitening
 from nerfcli.photos.loading import load_photos
-from nerfcli.photos.pool import PixelPool
-from nerfcli.runs.camera_moves import camera_moves
-from nerfcli.runs.components import Components
-from nerfcli.runs.files import STATE
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
-from nerfcli.train.loop import train
+from nerfcli.training.extent import Extent
+from nerfcli.training.fitting import Fitting
+from nerfcli.training.gauge import mean_similarity, without_mean
+from nerfcli.training.loop import train
+from nerfcli.training.newton import NewtonSteps
+from nerfcli.training.pool import PixelPool
+from nerfcli.training.refinement import LAST_FRACTION, LENS_RATE, PoseRefinement, Refinement, rate_at
+from nerfcli.training.runs.camera_moves import camera_moves
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.files import STATE
+from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.whitening import BETAS, EPS, WhitenedAdam, whitening
 
 seeds = st.integers(0, 2**32 - 1)
 FEW = TrainSettings(

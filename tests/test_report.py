@@ -13,24 +13,31 @@ from browser import Browser, find_browser
 from fog import fog, foggy_cells
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.run_cameras import RunCameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
+from nerfcli.captures.formats.run_cameras import RunCameras
 from nerfcli.evaluate.protocol import HeldOutPhoto
-from nerfcli.export.settings import depth_meta
-from nerfcli.media.colours import levels_of
+from nerfcli.evaluate.report.drawings import Curve, curves, from_above
+from nerfcli.evaluate.report.page import page_html
+from nerfcli.evaluate.report.run_facts import RunFacts, captures_of, labels_of, mismatches_of, warnings_of
+from nerfcli.evaluate.report.views import (
+    ERROR_RANGE,
+    HeldOutRenderings,
+    common_names,
+    depth_range,
+    error_map,
+    spread_evenly,
+)
+from nerfcli.evaluate.report.views import look_at as look_through
+from nerfcli.photos.colours import levels_of
 from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest
-from nerfcli.report.drawings import Curve, curves, from_above
-from nerfcli.report.page import page_html
-from nerfcli.report.run_facts import RunFacts, captures_of, labels_of, mismatches_of, warnings_of
-from nerfcli.report.views import ERROR_RANGE, HeldOutRenderings, common_names, depth_range, error_map, spread_evenly
-from nerfcli.report.views import look_at as look_through
-from nerfcli.runs.components import Components
-from nerfcli.runs.config import RunConfig
-from nerfcli.runs.decisions import Decision, Selection
-from nerfcli.runs.log import LogEntry
-from nerfcli.runs.settings import TrainSettings
+from nerfcli.render.outputs import depth_meta
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.config import RunConfig
+from nerfcli.training.runs.decisions import Decision, Selection
+from nerfcli.training.runs.log import LogEntry
+from nerfcli.training.runs.settings import TrainSettings
 
 EVIL = "</script><script>alert(1)</script><b>\"'"
 DEPTH = DepthRequest("conditional", "z", min_opacity=0.1)

@@ -19,19 +19,19 @@ from scipy.stats import norm
 from nerfcli.cameras import rigid
 from nerfcli.cameras.alignment import align, align_robustly
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.colmap import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.cameras.world import transformed
+from nerfcli.captures.formats.colmap import write_colmap_binary
+from nerfcli.captures.scale.boards import CharucoBoard, refined_corners, scale_from_charuco, scale_from_markers
+from nerfcli.captures.scale.corners import Side, nearest_in_pixels, scale_from_corners
+from nerfcli.captures.scale.distances import KnownDistance, known_distance, scale_from_distances
+from nerfcli.captures.scale.estimate import ScaleEstimate
+from nerfcli.captures.scale.gps import gps_positions, scale_from_gps
+from nerfcli.captures.scene import load
+from nerfcli.captures.world import transformed
 from nerfcli.errors import UserError
-from nerfcli.media.geodesy import Position, east_north_up, ecef
-from nerfcli.media.images import write_png
-from nerfcli.scale.boards import CharucoBoard, refined_corners, scale_from_charuco, scale_from_markers
-from nerfcli.scale.corners import Side, nearest_in_pixels, scale_from_corners
-from nerfcli.scale.distances import KnownDistance, known_distance, scale_from_distances
-from nerfcli.scale.estimate import ScaleEstimate
-from nerfcli.scale.gps import gps_positions, scale_from_gps
-from nerfcli.scene import load
+from nerfcli.photos.geodesy import Position, east_north_up, ecef
+from nerfcli.photos.images import write_png
 
 few = examples(20)
 seeds = st.integers(0, 2**32 - 1)

@@ -11,11 +11,11 @@ from commands import error_of, nerfcli
 from ellipsoids import Ellipsoid
 from scan_of_phantom import phantom_circle, scan_of_phantom
 
+from nerfcli.ct.checks.examine import CHECKS, examine_scan
+from nerfcli.ct.checks.sample import sample_of
+from nerfcli.ct.scan import Scan, save_scan
 from nerfcli.errors import GATE_NOT_MET
-from nerfcli.findings import Finding
-from nerfcli.tomography.checks.examine import CHECKS, examine_scan
-from nerfcli.tomography.checks.sample import sample_of
-from nerfcli.tomography.scan import Scan, save_scan
+from nerfcli.pages.findings import Finding
 
 VIEWS, COLUMNS = 96, 48
 SOLID = (Ellipsoid((0.5, -0.3, 0), (8, 6, 7), 0.3, turn=0.4),)
@@ -177,7 +177,7 @@ def test_the_command_writes_a_page_and_holds_a_gate(tmp_path: Path) -> None:
 
 def test_flats_determine_the_number_of_photons() -> None:
     """Known truth, within 5 %: 8000 photons a pixel at a gain of 0.25 values a photon, with read noise and drift."""
-    from nerfcli.tomography.open_beam import open_beam_of
+    from nerfcli.ct.open_beam import open_beam_of
 
     rng = np.random.default_rng(0)
     lamp = 1 + 0.02 * rng.normal(size=(12, 1, 1))

@@ -14,17 +14,17 @@ from test_reconstruct import cone, scan_of
 from typer.testing import CliRunner
 
 from nerfcli.cli import app
+from nerfcli.ct.grid import VoxelGrid, centred_grid
+from nerfcli.ct.marks import UNSEEN
+from nerfcli.ct.result import DESCRIPTION, ReconstructionSettings, load_reconstruction
+from nerfcli.ct.scan import save_scan
+from nerfcli.ct.training import train_scan
+from nerfcli.ct.training_files import export_scan, slice_of
+from nerfcli.ct.volume_files import VolumeFile, read_volume, write_volume
 from nerfcli.errors import UserError
 from nerfcli.interrupts import Terminated
-from nerfcli.media.images import read_image
+from nerfcli.photos.images import read_image
 from nerfcli.sealed import read_sealed, write_sealed
-from nerfcli.tomography.grid import VoxelGrid, centred_grid
-from nerfcli.tomography.marks import UNSEEN
-from nerfcli.tomography.result import DESCRIPTION, ReconstructionSettings, load_reconstruction
-from nerfcli.tomography.scan import save_scan
-from nerfcli.tomography.volume_files import VolumeFile, read_volume, write_volume
-from nerfcli.workflows.tomography import train_scan
-from nerfcli.workflows.tomography_files import export_scan, slice_of
 
 
 def call(*arguments: str | Path) -> tuple[int, str, str]:
@@ -152,8 +152,8 @@ def test_info_reads_reconstructions_and_their_volumes(bean_run: Path, tmp_path: 
 
 
 def test_commands_for_runs_of_photos_name_what_works(bean_run: Path) -> None:
-    from nerfcli.runs.files import RECONSTRUCTION
-    from nerfcli.tomography.result import DESCRIPTION
+    from nerfcli.ct.result import DESCRIPTION
+    from nerfcli.training.runs.files import RECONSTRUCTION
 
     assert RECONSTRUCTION == DESCRIPTION
     for command in (("report",), ("bench",), ("doctor",), ("export", "--to", "mesh")):
@@ -184,8 +184,8 @@ def test_sign_of_residuals(bean_run: Path) -> None:
     """More photons than predicted: the measured line integral is smaller, the residual negative; closed form."""
     import torch
 
-    from nerfcli.tomography.likelihood import Gaussian, Poisson
-    from nerfcli.workflows.tomography_files import residual_of
+    from nerfcli.ct.likelihood import Gaussian, Poisson
+    from nerfcli.ct.training_files import residual_of
 
     zero = torch.zeros(1, 1)
     view = torch.tensor([0])
@@ -415,7 +415,7 @@ def test_a_changed_scan_is_not_evaluated_as_the_old_one(bean_run: Path, tmp_path
 
     shutil.copytree(bean_run.parent, tmp_path / "copy")
     run = tmp_path / "copy" / "bean-run"
-    from nerfcli.workflows.tomography_scores import scan_of as scan_behind
+    from nerfcli.ct.training_scores import scan_of as scan_behind
 
     result = load_reconstruction(run)
     from dataclasses import replace

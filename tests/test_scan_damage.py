@@ -27,9 +27,9 @@ from scan_files import (
     transforms,
 )
 
+from nerfcli.ct.formats.read import read_scan
+from nerfcli.ct.scan import load_scan
 from nerfcli.errors import BAD_INPUT
-from nerfcli.tomography.formats.read import read_scan
-from nerfcli.tomography.scan import load_scan
 
 
 def rewritten(path: Path, name: str, value: object, *, units: str | None = None) -> Path:

@@ -9,8 +9,8 @@ import pytest
 from commands import nerfcli
 from scan_of_phantom import phantom_circle, scan_of_phantom
 
-from nerfcli.tomography.hypotheses import judge
-from nerfcli.tomography.scan import save_scan
+from nerfcli.ct.hypotheses import judge
+from nerfcli.ct.scan import save_scan
 
 
 @pytest.mark.parametrize("truth", ["as stated", "mirrored", "reversed", "both"])

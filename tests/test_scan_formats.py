@@ -8,13 +8,13 @@ import pytest
 from commands import error_of, nerfcli
 from scan_files import WRITERS, Written, nikon, stack
 
-from nerfcli.tomography.circle import Circle, circle_from_json, circle_of, differences
-from nerfcli.tomography.formats.assemble import axis_column
-from nerfcli.tomography.formats.read import read_scan, recognise
-from nerfcli.tomography.formats.scan_options import ScanOptions
-from nerfcli.tomography.geometry import ScanGeometry
-from nerfcli.tomography.scan import load_scan
-from nerfcli.tomography.truth import load_truth
+from nerfcli.ct.circle import Circle, circle_from_json, circle_of, differences
+from nerfcli.ct.formats.assemble import axis_column
+from nerfcli.ct.formats.read import read_scan, recognise
+from nerfcli.ct.formats.scan_options import ScanOptions
+from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.scan import load_scan
+from nerfcli.ct.truth import load_truth
 
 
 def pixels_by_formula(written: Written, geometry: ScanGeometry) -> tuple[np.ndarray, np.ndarray]:

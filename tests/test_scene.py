@@ -10,14 +10,14 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from nerfcli import scene as scenes
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.colmap import write_colmap_binary
-from nerfcli.cameras.formats.scene_folder import save
-from nerfcli.cameras.formats.transforms import parse_transforms
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.formats.colmap import write_colmap_binary
+from nerfcli.captures.formats.scene_folder import save
+from nerfcli.captures.formats.transforms import parse_transforms
+from nerfcli.captures.holdout import default_split
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.holdout import default_split
 
 NAMES = [f"photo {index:02d}.jpg" for index in range(10)]
 

@@ -10,11 +10,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerfcli.multiview.camera_check import CameraCheck
-from nerfcli.runs.components import Components
-from nerfcli.runs.decisions import Decision, Selection
-from nerfcli.search.diagnostics import Diagnostics
-from nerfcli.search.judgement import (
+from nerfcli.matching.camera_check import CameraCheck
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.decisions import Decision, Selection
+from nerfcli.training.selection.diagnostics import Diagnostics
+from nerfcli.training.selection.judgement import (
     CLEAR_ERRORS,
     FLOOR,
     LEAST_GAIN_DB,
@@ -25,8 +25,8 @@ from nerfcli.search.judgement import (
     judge_removal,
     judge_supported,
 )
-from nerfcli.search.race import COSTS_MORE, NO_TIME, ONCE, REMOVAL_FRACTION, SearchBudget
-from nerfcli.search.selection import (
+from nerfcli.training.selection.race import COSTS_MORE, NO_TIME, ONCE, REMOVAL_FRACTION, SearchBudget
+from nerfcli.training.selection.selection import (
     MOST_START_STEPS,
     Facts,
     is_worth_a_search,
@@ -39,7 +39,7 @@ from nerfcli.search.selection import (
     with_evidence,
     with_known_cameras,
 )
-from nerfcli.search.trials import Trial, TrialStart
+from nerfcli.training.selection.trials import Trial, TrialStart
 
 PHOTOS = 20
 FITTED = Facts("hash", has_alpha=False, has_exif=False, cameras_known="they are exact")

@@ -15,10 +15,10 @@ from nerfcli import cli, kernels
 from nerfcli.errors import GATE_NOT_MET
 from nerfcli.kernels import numba_cpu, reference
 from nerfcli.kernels.reference import compositing, depth
-from nerfcli.selftest import table, textbook
-from nerfcli.selftest.cases import Ray, Segments
-from nerfcli.selftest.measure import MET, NOT_MET, Errors, Precision, Row, by_formula, largest_error
-from nerfcli.selftest.table import checks, row_of
+from nerfcli.kernels.selftest import table, textbook
+from nerfcli.kernels.selftest.cases import Ray, Segments
+from nerfcli.kernels.selftest.measure import MET, NOT_MET, Errors, Precision, Row, by_formula, largest_error
+from nerfcli.kernels.selftest.table import checks, row_of
 
 SINGLE = Precision("float32", torch.float32, "cpu")
 COMPILED = Precision("compiled", torch.float32, "cpu", compiled=True)

@@ -9,21 +9,21 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from nerfcli.captures.scene import Scene
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
-from nerfcli.fit.delayed import Delayed
-from nerfcli.fit.fitting import Fitting
-from nerfcli.fit.watch import FirstBad, is_finite
 from nerfcli.kernels import numba_cpu
 from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 from nerfcli.render.model import load_model, save_model
 from nerfcli.render.pictures import render_picture
-from nerfcli.runs.log import read_log
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
-from nerfcli.train import sentinel
-from nerfcli.train.loop import train
-from nerfcli.train.sentinel import replay
+from nerfcli.training import sentinel
+from nerfcli.training.delayed import Delayed
+from nerfcli.training.fitting import Fitting
+from nerfcli.training.loop import train
+from nerfcli.training.runs.log import read_log
+from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.sentinel import replay
+from nerfcli.training.watch import FirstBad, is_finite
 
 FEW = TrainSettings(
     budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, threads=2

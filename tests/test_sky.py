@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from nerfcli.field.background import SphereBackground
-from nerfcli.fit.adam import Adam
-from nerfcli.fit.fitting import ROUGHNESS_WEIGHT
-from nerfcli.fit.losses import colour_losses
-from nerfcli.search.sky import explained_by_direction, paint
+from nerfcli.training.adam import Adam
+from nerfcli.training.fitting import ROUGHNESS_WEIGHT
+from nerfcli.training.losses import colour_losses
+from nerfcli.training.selection.sky import explained_by_direction, paint
 
 PHOTOS = 12
 PIXELS = 150

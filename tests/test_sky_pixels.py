@@ -6,9 +6,9 @@ import pytest
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
-from nerfcli.multiview import sky
-from nerfcli.multiview.sky import PointsBefore, points_before, sky_masks
-from nerfcli.multiview.tracks import Tracks
+from nerfcli.matching import sky
+from nerfcli.matching.sky import PointsBefore, points_before, sky_masks
+from nerfcli.matching.tracks import Tracks
 from nerfcli.photos.loading import LoadedPhoto
 
 CAMERA = Camera.pinhole(160, 120, 140.0)

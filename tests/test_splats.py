@@ -16,19 +16,19 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
-from nerfcli.export.settings import ExportSettings
 from nerfcli.field.exposure import exposed
 from nerfcli.kernels.numba_cpu.splats import render_splats
-from nerfcli.media.images import read_image
+from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.depth import DepthRequest
-from nerfcli.runs.files import SPLATS
+from nerfcli.render.outputs import ExportSettings
 from nerfcli.splats import refine as refinement
 from nerfcli.splats.gaussians import Gaussians
 from nerfcli.splats.refine import Refinement, refine, splat_photos
 from nerfcli.splats.render import SplatScene
 from nerfcli.splats.rows import gaussians_of, rows_of
 from nerfcli.splats.state import load_splat_state
+from nerfcli.training.runs.files import SPLATS
 from nerfcli.workflows.evaluate import evaluate_splats
 from nerfcli.workflows.render import render_splats as render_file
 from nerfcli.workflows.splats import SplatSettings

@@ -19,17 +19,17 @@ from torch.utils._python_dispatch import TorchDispatchMode
 pytest.importorskip("triton", reason="Triton is for Linux")
 
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.fit.fitting import Fitting
-from nerfcli.fit.point_depth import PointDepths, PointRays
+from nerfcli.captures.scene import Scene
 from nerfcli.kernels.triton_cuda import launch
 from nerfcli.kernels.triton_cuda.backend import TritonBackend
-from nerfcli.photos import pool as pools
 from nerfcli.photos.loading import load_photos
-from nerfcli.photos.pool import PixelPool
 from nerfcli.render.model import Marching
-from nerfcli.runs.components import Components
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
+from nerfcli.training import pool as pools
+from nerfcli.training.fitting import Fitting
+from nerfcli.training.point_depth import PointDepths, PointRays
+from nerfcli.training.pool import PixelPool
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.settings import TrainSettings
 
 GPU = torch.device("meta")
 # The number that any copy from the device returns.

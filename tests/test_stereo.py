@@ -10,11 +10,11 @@ import torch
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, rotation_from_vector
-from nerfcli.fit.point_depth import stereo_depths
-from nerfcli.multiview.stereo import LONGER_SIDE_PX, SECONDS_PER_PIXEL, DenseDepth, affordable_side_px, dense_depths
-from nerfcli.multiview.tracks import Tracks
+from nerfcli.matching.stereo import LONGER_SIDE_PX, SECONDS_PER_PIXEL, DenseDepth, affordable_side_px, dense_depths
+from nerfcli.matching.tracks import Tracks
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.photos.pool import PixelPool
+from nerfcli.training.point_depth import stereo_depths
+from nerfcli.training.pool import PixelPool
 
 PINHOLE = Camera.pinhole(200, 150, 180.0)
 LENS = Camera("RADIAL", 200, 150, (180.0, 103.0, 72.0, -0.12, 0.03))

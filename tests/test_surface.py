@@ -16,19 +16,19 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
 from nerfcli.errors import UserError
-from nerfcli.media.mesh_files import read_glb_json, read_ply_header, read_ply_mesh, write_glb, write_ply
+from nerfcli.export import extent
+from nerfcli.export.colours import point_colours, surface_colours
+from nerfcli.export.depth_views import DepthView, normals_of, plane_rays
+from nerfcli.export.extent import Grid, scene_box
+from nerfcli.export.fusion import FusedVolume, fuse
+from nerfcli.export.marching import mesh_of, simplified, surface_of, without_small_pieces
+from nerfcli.export.mesh_files import read_glb_json, read_ply_header, read_ply_mesh, write_glb, write_ply
+from nerfcli.export.points import agreed_points
+from nerfcli.export.settings import SurfaceSettings
 from nerfcli.photos.undistorted import pinhole_of, undistorted
 from nerfcli.render.model import Model, save_model
-from nerfcli.runs.files import FIELD
-from nerfcli.runs.run import Run
-from nerfcli.surface import extent
-from nerfcli.surface.colours import point_colours, surface_colours
-from nerfcli.surface.depth_views import DepthView, normals_of, plane_rays
-from nerfcli.surface.extent import Grid, scene_box
-from nerfcli.surface.fusion import FusedVolume, fuse
-from nerfcli.surface.marching import mesh_of, simplified, surface_of, without_small_pieces
-from nerfcli.surface.points import agreed_points
-from nerfcli.surface.settings import SurfaceSettings
+from nerfcli.training.runs.files import FIELD
+from nerfcli.training.runs.run import Run
 from nerfcli.workflows.describe import describe
 from nerfcli.workflows.export import export_run
 

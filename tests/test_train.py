@@ -18,31 +18,31 @@ import torch
 from conftest import SPHERES
 
 from nerfcli import kernels
-from nerfcli import scene as scenes
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.registry import UserInputs, recognise
-from nerfcli.cameras.formats.run_cameras import read_cameras, write_cameras
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity, apply, rotation_from_quaternion
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.formats.registry import UserInputs, recognise
+from nerfcli.captures.formats.run_cameras import read_cameras, write_cameras
+from nerfcli.captures.holdout import default_split
+from nerfcli.captures.scene import Scene
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model, over_white
 from nerfcli.field import hash_field
 from nerfcli.field.checkpoint import load_tensors
-from nerfcli.holdout import default_split
-from nerfcli.media.float_tiff import read_tiff
-from nerfcli.media.images import read_image, write_png
+from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.loading import load_photos
-from nerfcli.photos.pool import PixelBatch, PixelPool
+from nerfcli.render.files.float_tiff import read_tiff
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import DepthRequest, render_picture
-from nerfcli.runs.config import read_config
-from nerfcli.runs.log import LogEntry, append_log, read_log
-from nerfcli.runs.run import Run
-from nerfcli.runs.settings import TrainSettings, automatic_downscale
-from nerfcli.scene import Scene
-from nerfcli.train import loop, sentinel
-from nerfcli.train.loop import Progress, train
+from nerfcli.training import loop, sentinel
+from nerfcli.training.loop import Progress, train
+from nerfcli.training.pool import PixelBatch, PixelPool
+from nerfcli.training.runs.config import read_config
+from nerfcli.training.runs.log import LogEntry, append_log, read_log
+from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 
 # A step of a few rays is enough where bits are compared, not pictures.
 # Tables of 2^12 rows: a run folder takes 3 MB, with the default of 2^16 it takes 34.
@@ -260,7 +260,7 @@ def test_longer_trainings_have_more_rows_and_given_ones_stay():
 def test_a_training_that_goes_on_to_a_larger_total_keeps_its_rows(views, tmp_path, monkeypatch):
     """The larger total would by default choose more rows; a different number given explicitly is refused."""
     fit(views, tmp_path / "run", replace(CHOSEN_ROWS, steps=2))
-    monkeypatch.setattr("nerfcli.runs.settings.FEWEST_LOG2_ROWS", 17)
+    monkeypatch.setattr("nerfcli.training.runs.settings.FEWEST_LOG2_ROWS", 17)
     assert replace(CHOSEN_ROWS, steps=3).chosen_log2_rows == 17
     fit(views, tmp_path / "run", replace(CHOSEN_ROWS, steps=3), resume=True)
     assert load_model(tmp_path / "run" / "field.safetensors", "cpu").field.settings.to_json()["log2_rows"] == 16

@@ -8,11 +8,11 @@ import pytest
 from conftest import SPHERES
 from typer.testing import CliRunner
 
+from nerfcli.captures.scene import Scene
 from nerfcli.cli import app
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
-from nerfcli.train.loop import train
+from nerfcli.training.loop import train
+from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.workflows.train_plan import plan_training
 
 STEPS = TrainSettings(budget_seconds=None, steps=250)

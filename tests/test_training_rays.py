@@ -13,25 +13,25 @@ from frame_rays import frame_rays
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_quaternion
+from nerfcli.captures.scene import Scene
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.fit.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
-from nerfcli.fit.losses import colour_losses, over_background
-from nerfcli.fit.normalisation import (
+from nerfcli.memory import default_memory_limit, resident_bytes
+from nerfcli.photos.images import downscale, write_png
+from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
+from nerfcli.training import preparation
+from nerfcli.training.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
+from nerfcli.training.losses import colour_losses, over_background
+from nerfcli.training.normalisation import (
     box_frame,
     contracted_frame,
     has_narrow_baseline,
     narrow_frame,
     object_frame,
 )
-from nerfcli.media.images import downscale, write_png
-from nerfcli.memory import default_memory_limit, resident_bytes
-from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
-from nerfcli.photos.pool import Album, PixelPool, load_album
-from nerfcli.photos.storage import IN_MEMORY, InFiles, MemoryNeeds, PhotoStorage, check_device_memory, storage_for
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
-from nerfcli.train import preparation
-from nerfcli.train.preparation import prepare
+from nerfcli.training.pool import Album, PixelPool, load_album
+from nerfcli.training.preparation import prepare
+from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.storage import IN_MEMORY, InFiles, MemoryNeeds, PhotoStorage, check_device_memory, storage_for
 
 CPU = torch.device("cpu")
 CAMERA = Camera.pinhole(40, 30, 50.0)

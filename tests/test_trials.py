@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from nerfcli.field.exposure import exposed
-from nerfcli.fit.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
-from nerfcli.fit.fitting import Fitting
-from nerfcli.photos.pool import load_album
-from nerfcli.photos.storage import IN_MEMORY
-from nerfcli.runs.components import Components
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.search.diagnostics import diagnose
-from nerfcli.search.trials import Trials, TrialStart
+from nerfcli.training.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
+from nerfcli.training.fitting import Fitting
+from nerfcli.training.pool import load_album
+from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.selection.diagnostics import diagnose
+from nerfcli.training.selection.trials import Trials, TrialStart
+from nerfcli.training.storage import IN_MEMORY
 
 SETTINGS = TrainSettings(budget_seconds=None, steps=100, first_samples_per_step=2**11, threads=1)
 
@@ -34,8 +34,8 @@ def trials(spheres) -> Trials:
 def start(trials) -> Iterator[TrialStart]:
     """A start early in a schedule, without closing cells: within a few dozen steps they would leave nothing to see."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nerfcli.search.trials.FORK_FRACTION", 0.02)
-        patch.setattr("nerfcli.fit.open_cells.CLOSING_FRACTION", 1e9)
+        patch.setattr("nerfcli.training.selection.trials.FORK_FRACTION", 0.02)
+        patch.setattr("nerfcli.training.open_cells.CLOSING_FRACTION", 1e9)
         yield trials.begin(Components(view=0), steps=20)
 
 
@@ -127,7 +127,7 @@ def test_large_tables_have_their_levels_by_steps(trials, monkeypatch, rows_of_la
     """In tables that count as large, half of 4 steps open all 8 levels, even at fraction 0 of a budget, and their rows
     move; but learned cameras keep the field coarse at first."""
     monkeypatch.setattr("nerfcli.field.hash_field.DETAILED_LOG2_ROWS", rows_of_large)
-    monkeypatch.setattr("nerfcli.fit.fitting.LARGE_TABLE_STEPS", 4)
+    monkeypatch.setattr("nerfcli.training.fitting.LARGE_TABLE_STEPS", 4)
     fitting = trials._fitting(Components(view=0, cameras=cameras), seed=0, log_gains=None, cameras_from=0.0)
     fresh = fitting.field.rows().detach().clone()
     moved = []

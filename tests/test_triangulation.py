@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
-from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
-from nerfcli.multiview.correspondences import chosen_pairs, match
-from nerfcli.multiview.features import Matches
-from nerfcli.multiview.tracks import Tracks, indices_by_value, tracks_of_matches
-from nerfcli.multiview.triangulation import triangulate
+from nerfcli.captures.scene import Scene
+from nerfcli.matching.correspondences import chosen_pairs, match
+from nerfcli.matching.features import Matches
+from nerfcli.matching.tracks import Tracks, indices_by_value, tracks_of_matches
+from nerfcli.matching.triangulation import triangulate
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
+from nerfcli.training.extent import Extent, choose_extent, lacks_depth
+from nerfcli.training.runs.settings import TrainSettings
 
 CAMERA = Camera.pinhole(320, 240, 300.0)
 WALL_Z = 3.0

@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 from synthetic_captures import WIDE, Scene, View
 from turntable_capture import Turntable, turntable, write
 
-from nerfcli import scene as scenes
 from nerfcli.cameras.alignment import align
+from nerfcli.captures import scene as scenes
 from nerfcli.doctor.examination import Diagnosis, examine
 from nerfcli.doctor.photo_list import find_subject
 from nerfcli.errors import UserError
-from nerfcli.findings import LOOK
-from nerfcli.multiview.stationary import Motions, Stationary, motions, still_px, together
+from nerfcli.matching.stationary import Motions, Stationary, motions, still_px, together
+from nerfcli.pages.findings import LOOK
 from nerfcli.poses.engine.turntable import advised, sentence
 from nerfcli.poses.input import still_background as still
 from nerfcli.poses.input.settings import PoseSettings

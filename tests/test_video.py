@@ -1,4 +1,4 @@
-"""nerfcli.media.video: what ffmpeg and Pillow read back, and nothing left after an exception."""
+"""nerfcli.render.files.film: what ffmpeg and Pillow read back, and nothing left after an exception."""
 
 import json
 import re
@@ -14,7 +14,7 @@ from commands import error_of, nerfcli
 from PIL import Image
 
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.media.video import ENCODERS, check_encoders, write_video
+from nerfcli.render.files.film import ENCODERS, check_encoders, write_video
 
 
 def smooth_frames(count: int, *, height: int, width: int) -> list[np.ndarray]:

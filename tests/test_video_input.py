@@ -1,4 +1,4 @@
-"""nerfcli.media.video_input: frames come back upright, whole in number, at their times; other files are refused."""
+"""nerfcli.photos.video: frames come back upright, whole in number, at their times; other files are refused."""
 
 import io
 from pathlib import Path
@@ -11,7 +11,7 @@ from clips import LOSSLESS, encode, ffmpeg
 from PIL import Image
 
 from nerfcli.errors import UserError
-from nerfcli.media.video_input import Video, _Decoder, measure_frames, open_video, read_frames
+from nerfcli.photos.video import Video, _Decoder, measure_frames, open_video, read_frames
 
 COUNT, HEIGHT, WIDTH = 40, 48, 64
 

@@ -23,18 +23,18 @@ from browser import Browser, find_browser
 from commands import error_of, nerfcli, started
 from fog import foggy_cells
 
-from nerfcli import scene
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures import scene
 from nerfcli.errors import INTERRUPTED
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Marching, Model, save_model
 from nerfcli.render.pictures import RenderedPicture, render_picture
-from nerfcli.runs.files import FIELD
-from nerfcli.runs.run import Run
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.train import loop
+from nerfcli.training import loop
+from nerfcli.training.runs.files import FIELD
+from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.viewer import painter
 from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.painter import Painter, Tile, View, render_tile, strides_of, tiles_of, view_from_json

@@ -12,7 +12,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.cameras.world import WORLD_AXES, moved_to_origin, smallest_rotation, transformed, up_aligned
+from nerfcli.captures.world import WORLD_AXES, moved_to_origin, smallest_rotation, transformed, up_aligned
 from nerfcli.errors import UserError
 
 few = examples(30)

@@ -38,12 +38,12 @@ from nerfcli.kernels import (
     spherical_harmonics,
 )
 from nerfcli.kernels.contraction import contract
+from nerfcli.kernels.selftest.measure import MET, Precision
+from nerfcli.kernels.selftest.table import OF_GPU, checks, row_of
 from nerfcli.kernels.triton_cuda import compositing, coordinates, depth, hash_grid, marching, networks, pixels, row_adam
 from nerfcli.kernels.triton_cuda import rays as along
 from nerfcli.kernels.triton_cuda.backend import TritonBackend
 from nerfcli.kernels.triton_cuda.launch import INTERPRETED, seen
-from nerfcli.selftest.measure import MET, Precision
-from nerfcli.selftest.table import OF_GPU, checks, row_of
 
 DEVICE = torch.device("cpu" if INTERPRETED else "cuda")
 SIZES = [0, 1, 5, 123]

@@ -15,23 +15,23 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nerfcli import scene as scenes
 from nerfcli.bench.machine import PeakMemory
 from nerfcli.bench.results import Point, spread
 from nerfcli.bench.settings import RenderSetting, affordable, render_settings, train_settings
+from nerfcli.captures import scene as scenes
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import psnr, to_8_bit
 from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
 from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.evaluate.sampled import SampledPixels
-from nerfcli.media.images import downscale
+from nerfcli.photos.images import downscale
 from nerfcli.photos.loading import downscaled_camera
 from nerfcli.render.accuracy import TIGHT
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import RenderedPicture, render_picture
-from nerfcli.runs.run import Run
-from nerfcli.runs.settings import TrainSettings, sizes_for
-from nerfcli.train.loop import Progress, train
+from nerfcli.training.loop import Progress, train
+from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.settings import TrainSettings, sizes_for
 
 MOST_PHOTOS = 3
 LEAST_ROUNDS, MOST_ROUNDS = 3, 9
@@ -116,7 +116,7 @@ def measure_trainings(
         work: folder for the runs; they are deleted again.
 
     Raises:
-        UserError: see `nerfcli.train.loop.train`; or nothing was held out.
+        UserError: see `nerfcli.training.loop.train`; or nothing was held out.
     """
     scene = scenes.load(scene_folder)
     if not scene.test_frames:

@@ -6,7 +6,7 @@ from fractions import Fraction
 from itertools import accumulate
 
 from nerfcli.render.tracing import TOLERANCE
-from nerfcli.runs.settings import TrainSettings
+from nerfcli.training.runs.settings import TrainSettings
 
 # A training shorter than this learns too little to tell settings apart.
 SHORTEST_TRAINING_SECONDS = 8.0

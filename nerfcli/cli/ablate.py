@@ -8,7 +8,7 @@ import typer
 from nerfcli.cli import options
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.machine import device_name, thread_count
 
 DEFAULT_BUDGET = "1m"
 _STYLES = {"would help": "green", "needed: worse without it": "green", "not needed: better without it": "yellow"}
@@ -62,11 +62,11 @@ def ablate(
       nerfcli ablate photos-scene --only view,exposure --budget 30s
       nerfcli ablate photos-scene --seeds 5 -o paper/ablation
     """
-    from nerfcli.ablate.results import COLUMNS, ResultRow, table_of
+    from nerfcli.bench.ablation_results import COLUMNS, ResultRow, table_of
     from nerfcli.cli.scans import refuse_scan
     from nerfcli.memory import default_memory_limit
-    from nerfcli.runs.components import CHOICES
-    from nerfcli.runs.settings import TrainSettings, sizes_for
+    from nerfcli.training.runs.components import CHOICES
+    from nerfcli.training.runs.settings import TrainSettings, sizes_for
     from nerfcli.workflows.ablate import ablate_scene
 
     if unknown := [name for name in only or () if name not in CHOICES]:

@@ -11,7 +11,7 @@ from nerfcli.cli import options
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
 from nerfcli.errors import UserError
-from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.machine import device_name, thread_count
 
 if TYPE_CHECKING:
     from nerfcli.bench.results import Point
@@ -75,7 +75,7 @@ def bench_one(path: Path, folder: Path, how: dict[str, Any], *, overwrite: bool,
     from nerfcli.bench.machine import describe_machine, is_busy, load_average
     from nerfcli.bench.measurement import measure_renderings, measure_trainings
     from nerfcli.bench.results import BENCH, COLUMNS, Point, table_of, write_results
-    from nerfcli.runs.run import Run
+    from nerfcli.training.runs.run import Run
 
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a run folder, or a scene folder")

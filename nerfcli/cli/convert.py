@@ -13,7 +13,7 @@ from nerfcli.cli.options import Holdout, Json, Overwrite, Quiet, one_of
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
-    from nerfcli.convert.detect import Detection, HypothesisScore, Question
+    from nerfcli.captures.detect import Detection, HypothesisScore, Question
 
 FORMATS_WRITTEN = (
     "nerfcli",
@@ -173,11 +173,11 @@ def convert(
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
     """
     values = dict(locals())
-    from nerfcli.cameras.formats.registry import UserInputs, format_named
-    from nerfcli.convert.camera_files import read_intrinsics
-    from nerfcli.convert.conversion import ConventionOverrides, TargetOptions
-    from nerfcli.convert.world_frame import WorldFrame
-    from nerfcli.tomography.result import is_reconstruction
+    from nerfcli.captures.camera_files import read_intrinsics
+    from nerfcli.captures.conversion import ConventionOverrides, TargetOptions
+    from nerfcli.captures.formats.registry import UserInputs, format_named
+    from nerfcli.captures.world_frame import WorldFrame
+    from nerfcli.ct.result import is_reconstruction
     from nerfcli.workflows.convert import convert_capture, detect_convention, detection_record
 
     console = Console(quiet=quiet, json_lines=json)

@@ -11,7 +11,7 @@ from nerfcli.cli.options import holdout_rule
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
-    from nerfcli.tomography.hypotheses import Hypothesis, Judgement
+    from nerfcli.ct.hypotheses import Hypothesis, Judgement
 
 Photons = Annotated[
     float | None, typer.Option(help="Scans: photons that an open pixel counts per view.", show_default=False)
@@ -43,13 +43,13 @@ def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console
     target, to = values["target"], values["to"]
 
     def work(path: Path, one_of_many: bool) -> bool:
-        from nerfcli.tomography.formats.read import recognise
+        from nerfcli.ct.formats.read import recognise
 
         if recognise(path) is None:
             _refuse(path, [name for name in given if name in OF_SCANS], of="X-ray scans, and this is not one")
             return False
-        from nerfcli.tomography.formats.scan_options import ScanOptions
-        from nerfcli.workflows.scans import OWN, convert_scan, detect_scan, judgement_record
+        from nerfcli.ct.formats.scan_options import ScanOptions
+        from nerfcli.ct.scans import OWN, convert_scan, detect_scan, judgement_record
 
         _refuse(
             path, [name for name in given if name not in (*OF_SCANS, *OF_BOTH)], of="photos, and this is an X-ray scan"

@@ -10,12 +10,12 @@ from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads, one_of
 from nerfcli.cli.poses import Intrinsics, Subfolders
 from nerfcli.errors import GATE_NOT_MET, UserError, listed
-from nerfcli.findings import VERDICTS
-from nerfcli.workflows.machine import thread_count
+from nerfcli.machine import thread_count
+from nerfcli.pages.findings import VERDICTS
 
 if TYPE_CHECKING:
+    from nerfcli.ct.checks.examine import ScanDiagnosis
     from nerfcli.doctor.examination import Diagnosis
-    from nerfcli.tomography.checks.examine import ScanDiagnosis
 
 _GATES = ("good", "look")
 _STYLES = {"good": "green", "look": "yellow", "bad": "bold red"}
@@ -56,10 +56,10 @@ def doctor(
       ls -d captures/*/ | nerfcli doctor - -o pages/
     """
     one_of(require, _GATES, "--require")
-    from nerfcli.cameras.formats.run_cameras import find_run
+    from nerfcli.captures.formats.run_cameras import find_run
+    from nerfcli.ct.formats.read import recognise
+    from nerfcli.ct.result import is_reconstruction
     from nerfcli.doctor.examination import content
-    from nerfcli.tomography.formats.read import recognise
-    from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.doctor import examine_capture
 
     console = Console(quiet=quiet, json_lines=json)
@@ -80,7 +80,7 @@ def doctor(
                 raise UserError(
                     f"{path}: --intrinsics and --subfolders are for photos, and this is a scan", "leave them out"
                 )
-            from nerfcli.workflows.scans import examine_scan_input, scan_diagnosis_record
+            from nerfcli.ct.scans import examine_scan_input, scan_diagnosis_record
 
             with console.callbacks(f"doctor {path.name}") as callbacks:
                 of_scan = examine_scan_input(path, page, overwrite=overwrite, **callbacks)

@@ -8,7 +8,7 @@ import typer
 from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Overwrite, Quiet, Require, Threads, one_of
-from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.machine import device_name, thread_count
 
 if TYPE_CHECKING:
     from nerfcli.evaluate.requirements import Requirement
@@ -69,9 +69,9 @@ def evaluate(
       nerfcli evaluate tooth-15-views-run --reference tooth-run
     """
     values = dict(locals())
+    from nerfcli.ct.result import is_reconstruction
     from nerfcli.evaluate.predictions import KINDS
-    from nerfcli.runs.run import Run
-    from nerfcli.tomography.result import is_reconstruction
+    from nerfcli.training.runs.run import Run
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run, evaluate_splats
 
     one_of(save_predictions, KINDS, "--save-predictions")
@@ -87,7 +87,7 @@ def evaluate(
 
     def measure_scan(folder: Path) -> None:
         from nerfcli.cli.scans import print_scan_numbers, refuse_photo_options
-        from nerfcli.workflows.tomography_scores import evaluate_scan
+        from nerfcli.ct.training_scores import evaluate_scan
 
         refuse_photo_options(folder, evaluate, values, of_scans=_OF_SCANS)
         with console.callbacks("evaluate") as callbacks:

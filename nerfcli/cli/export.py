@@ -11,7 +11,7 @@ from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, one_of, seconds_from_text
 from nerfcli.cli.render_options import finite
 from nerfcli.errors import UserError
-from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.machine import device_name, thread_count
 
 # Parameters for reconstructions of X-ray scans.
 _OF_SCANS = "run to output form water device threads overwrite json quiet"
@@ -99,9 +99,9 @@ def export(
       nerfcli export tooth-scene-run --to volume -o tooth.nrrd
     """
     values = dict(locals())
-    from nerfcli.runs.run import load_run
-    from nerfcli.surface.settings import FACES, SurfaceSettings
-    from nerfcli.tomography.result import is_reconstruction
+    from nerfcli.ct.result import is_reconstruction
+    from nerfcli.export.settings import FACES, SurfaceSettings
+    from nerfcli.training.runs.run import load_run
     from nerfcli.workflows.export import TARGETS, default_target, export_run
     from nerfcli.workflows.splats import SplatSettings
 
@@ -112,8 +112,8 @@ def export(
 
     def export_one_scan(folder: Path, one_of_many: bool) -> None:
         from nerfcli.cli.scans import refuse_photo_options
-        from nerfcli.tomography.volume_files import SUFFIXES
-        from nerfcli.workflows.tomography_files import export_scan
+        from nerfcli.ct.training_files import export_scan
+        from nerfcli.ct.volume_files import SUFFIXES
 
         refuse_photo_options(folder, export, values, of_scans=_OF_SCANS)
         one_of(to, ("volume",), "--to")

@@ -10,7 +10,7 @@ import typer
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Json
-from nerfcli.workflows.machine import thread_count
+from nerfcli.machine import thread_count
 
 # Maximum number of characters per line of several values; longer lines are wrapped, and their continuations indented.
 WIDTH = 110

@@ -7,7 +7,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from nerfcli.holdout import check_holdout
+from nerfcli.captures.holdout import check_holdout
 
 Word = TypeVar("Word", str, str | None)
 

@@ -8,7 +8,7 @@ import typer
 from nerfcli.cli import options
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.workflows.machine import thread_count
+from nerfcli.machine import thread_count
 
 # The minimum is the number of photos that structure from motion needs.
 Frames = Annotated[
@@ -90,7 +90,7 @@ def poses(
       nerfcli poses photos/kitchen --intrinsics calibration/cameras.txt
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
-    from nerfcli.holdout import DEFAULT_HOLDOUT
+    from nerfcli.captures.holdout import DEFAULT_HOLDOUT
     from nerfcli.memory import default_memory_limit
     from nerfcli.poses.input.pairs import PAIRINGS
     from nerfcli.poses.input.settings import CAMERA_MODELS, PoseSettings

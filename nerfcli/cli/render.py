@@ -12,7 +12,7 @@ from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.scans import is_of_scan, refuse_photo_options, slices_of
 from nerfcli.errors import UserError
-from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.machine import device_name, thread_count
 
 if TYPE_CHECKING:
     from nerfcli.workflows.views import Views
@@ -169,11 +169,11 @@ def render(
       nerfcli render tooth-scene-run --slices z=0 --slices x=12.5
     """
     values = dict(locals())
-    from nerfcli.cameras.formats.camera_path import DEFAULT_FPS
-    from nerfcli.export.settings import OUTPUTS, ExportSettings
-    from nerfcli.runs.run import load_run
+    from nerfcli.captures.formats.camera_path import DEFAULT_FPS
+    from nerfcli.ct.result import is_reconstruction
+    from nerfcli.render.outputs import OUTPUTS, ExportSettings
     from nerfcli.splats.files import SUFFIXES
-    from nerfcli.tomography.result import is_reconstruction
+    from nerfcli.training.runs.run import load_run
     from nerfcli.workflows.render import RENDERS, folder_name, render_run, render_splats
     from nerfcli.workflows.views import Views, file_fps, usual_axis
 
@@ -262,9 +262,9 @@ def _render_scan(folder: Path, one_of_many: bool, *, given: dict[str, Any], cons
         UserError: it is no reconstruction, or an option is for photos.
         typer.BadParameter: scans do not have such outputs, views or slices.
     """
-    from nerfcli.tomography.result import OUTPUTS, is_reconstruction
+    from nerfcli.ct.result import OUTPUTS, is_reconstruction
+    from nerfcli.ct.training_files import render_scan
     from nerfcli.workflows.render import RENDERS
-    from nerfcli.workflows.tomography_files import render_scan
 
     outputs, output = given["outputs"], given["output"]
     if not is_reconstruction(folder):
@@ -318,7 +318,7 @@ def _write_cameras(
     folder: Path, target: Path, views: "Views", *, fps: float, overwrite: bool, console: Console
 ) -> None:
     """Write only the cameras of the views; see `workflows.views.write_frames`."""
-    from nerfcli.runs.run import Run
+    from nerfcli.training.runs.run import Run
     from nerfcli.workflows.views import chosen_frames, write_frames
 
     run = Run(folder)

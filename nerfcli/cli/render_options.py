@@ -9,8 +9,8 @@ import typer
 from nerfcli.cli.options import one_of, some_of
 
 if TYPE_CHECKING:
-    from nerfcli.export.settings import VideoSettings
     from nerfcli.render.depth import DepthRequest
+    from nerfcli.render.outputs import VideoSettings
     from nerfcli.workflows.views import PictureOptions
 
 Step = Annotated[
@@ -42,7 +42,7 @@ def depth_formats(text: str, *, outputs: tuple[str, ...], convention: str) -> tu
     Raises:
         typer.BadParameter: a format is unknown, or cannot hold the requested outputs.
     """
-    from nerfcli.export.settings import FORMATS
+    from nerfcli.render.outputs import FORMATS
 
     hint = "--depth-format"
     chosen = some_of(text, FORMATS, hint)
@@ -101,8 +101,8 @@ def video_settings(formats: str, fps: float) -> "VideoSettings":
     Raises:
         typer.BadParameter: a format is unknown, or cannot play so many frames per second.
     """
-    from nerfcli.export.settings import VideoSettings
-    from nerfcli.media.video import ENCODERS, GIF_FASTEST_FPS
+    from nerfcli.render.files.film import ENCODERS, GIF_FASTEST_FPS
+    from nerfcli.render.outputs import VideoSettings
 
     chosen = tuple(dict.fromkeys(formats.split(",")))
     for name in chosen:

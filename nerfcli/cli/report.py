@@ -8,7 +8,7 @@ import typer
 from nerfcli.cli.batch import STDIN, no_paths, stdin_paths
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads
-from nerfcli.workflows.machine import thread_count
+from nerfcli.machine import thread_count
 
 
 @command

@@ -9,7 +9,7 @@ from nerfcli.cli import options
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.poses import Frames, Intrinsics, Quality, Subfolders, sizes_of
-from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.machine import device_name, thread_count
 
 
 @command
@@ -45,13 +45,13 @@ def run(
       nerfcli run kitchen.mp4
       nerfcli run photos/kitchen --require "psnr>=25,registered>=0.9"
     """
+    from nerfcli.captures.holdout import DEFAULT_HOLDOUT
     from nerfcli.cli.evaluate import print_beside_field, print_numbers, requirements_of
-    from nerfcli.export.settings import OUTPUTS, ExportSettings, VideoSettings
-    from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.memory import default_memory_limit
     from nerfcli.poses.input.settings import PoseSettings
-    from nerfcli.runs.run import load_run
-    from nerfcli.runs.settings import TrainSettings, sizes_for
+    from nerfcli.render.outputs import OUTPUTS, ExportSettings, VideoSettings
+    from nerfcli.training.runs.run import load_run
+    from nerfcli.training.runs.settings import TrainSettings, sizes_for
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run, evaluate_splats
     from nerfcli.workflows.export import default_target, export_run
     from nerfcli.workflows.poses import estimate_poses, folder_of_photos, given_intrinsics, without_suffix

@@ -13,8 +13,8 @@ from nerfcli.cli.console import Console
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
-    from nerfcli.tomography.result import ReconstructionSettings
-    from nerfcli.workflows.evaluate import Evaluation
+    from nerfcli.ct.result import ReconstructionSettings
+    from nerfcli.ct.training_scores import ScanEvaluation
 
 # Options whose parameters have other names.
 _OPTIONS = {"include": "with", "exclude": "without", "form": "format"}
@@ -33,7 +33,7 @@ def reconstruction_settings(
     Raises:
         UserError: scans do not have such a component or type of field, or a component's value is not a number.
     """
-    from nerfcli.tomography.result import FIELDS, ReconstructionSettings
+    from nerfcli.ct.result import FIELDS, ReconstructionSettings
 
     field = given["field"]
     if field is not None and field not in FIELDS:
@@ -104,8 +104,8 @@ def refuse_scan(path: Path, command: str) -> None:
     Raises:
         UserError: the path is a scan or a reconstruction.
     """
-    from nerfcli.tomography.formats.read import recognise
-    from nerfcli.tomography.result import is_reconstruction
+    from nerfcli.ct.formats.read import recognise
+    from nerfcli.ct.result import is_reconstruction
 
     hint = f"{command} is for photos; commands for scans: convert, doctor, train, evaluate, render, export, info"
     if is_reconstruction(path):
@@ -116,14 +116,14 @@ def refuse_scan(path: Path, command: str) -> None:
 
 def is_of_scan(run: str, *, outputs: str | None, slices: list[str] | None) -> bool:
     """Return whether the options given to render, or its only run, are for scans."""
-    from nerfcli.tomography.result import OUTPUTS, is_reconstruction
+    from nerfcli.ct.result import OUTPUTS, is_reconstruction
 
     if slices or (outputs is not None and set(outputs.split(",")) & set(OUTPUTS)):
         return True
     return run != STDIN and is_reconstruction(Path(run))
 
 
-def print_scan_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None:
+def print_scan_numbers(run: Path, evaluation: "ScanEvaluation", console: Console) -> None:
     """Print a table of the methods; print nothing if the metrics were kept from an earlier call."""
     if evaluation.is_kept:
         return

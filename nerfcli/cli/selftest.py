@@ -8,10 +8,10 @@ import typer
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Quiet
 from nerfcli.errors import GATE_NOT_MET, UserError
-from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.machine import device_name, thread_count
 
 if TYPE_CHECKING:
-    from nerfcli.selftest.measure import Errors, Row
+    from nerfcli.kernels.selftest.measure import Errors, Row
 
 _COLUMNS = (
     "case",
@@ -52,8 +52,8 @@ def selftest(
     """
     import torch
 
-    from nerfcli.selftest.measure import MET, NOT_MET, by_formula
-    from nerfcli.selftest.table import rows
+    from nerfcli.kernels.selftest.measure import MET, NOT_MET, by_formula
+    from nerfcli.kernels.selftest.table import rows
 
     console = Console(quiet=quiet, json_lines=json)
     torch.set_num_threads(thread_count(0))

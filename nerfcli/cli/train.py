@@ -10,7 +10,7 @@ import typer
 from nerfcli.cli import options
 from nerfcli.cli.batch import STDIN, for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.workflows.machine import device_name, is_first, is_one_of_several, local_rank_and_size, thread_count
+from nerfcli.machine import device_name, is_first, is_one_of_several, local_rank_and_size, thread_count
 
 DEFAULT_BUDGET = "2m"
 # Parameters for X-ray scans.
@@ -119,13 +119,13 @@ def train(
       nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
     """
     values = dict(locals())
+    from nerfcli.ct.formats.read import recognise
+    from nerfcli.ct.scan import is_scan
     from nerfcli.errors import UserError, in_shell
     from nerfcli.field.kinds import KINDS
     from nerfcli.memory import default_memory_limit
-    from nerfcli.runs.components import Components, choose
-    from nerfcli.runs.settings import TrainSettings, sizes_for
-    from nerfcli.tomography.formats.read import recognise
-    from nerfcli.tomography.scan import is_scan
+    from nerfcli.training.runs.components import Components, choose
+    from nerfcli.training.runs.settings import TrainSettings, sizes_for
     from nerfcli.workflows.train import train_scene
     from nerfcli.workflows.train_plan import plan_training
 
@@ -143,7 +143,7 @@ def train(
 
     def train_one_scan(folder: Path, run: Path) -> None:
         from nerfcli.cli.scans import reconstruction_settings, refuse_photo_options
-        from nerfcli.workflows.tomography import train_scan
+        from nerfcli.ct.training import train_scan
 
         refuse_photo_options(folder, train, values, of_scans=_OF_SCANS)
         settings = reconstruction_settings(values, budget_seconds=budget_seconds, threads=thread_count(threads))

@@ -7,7 +7,7 @@ import typer
 
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Threads
-from nerfcli.workflows.machine import thread_count
+from nerfcli.machine import thread_count
 
 
 @command

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from nerfcli.media.colours import linear_light
+from nerfcli.photos.colours import linear_light
 
 # A channel shows no detail from this level on, of 255, or as near to 0.
 WHITE_LEVEL = 253

@@ -6,17 +6,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerfcli.cameras import rigid
-from nerfcli.cameras.formats.colmap import read_model
-from nerfcli.cameras.formats.finding import find_model
 from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_direction, views_of
+from nerfcli.captures.formats.colmap import read_model
+from nerfcli.captures.formats.finding import find_model
+from nerfcli.captures.scene import Scene
 from nerfcli.doctor.geometry import BASELINE_BAD, BASELINE_LOOK
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
-from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
-from nerfcli.media.geodesy import east_north_up
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
+from nerfcli.photos.geodesy import east_north_up
 from nerfcli.poses.judge.contradictions import FARTHEST
 from nerfcli.poses.model.reasons import FEW_FEATURES
-from nerfcli.scene import Scene
 
 # Inward-looking cameras surround the scene if they span at least this angle; otherwise they face its front.
 _AROUND_DEG = 180.0

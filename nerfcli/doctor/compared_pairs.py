@@ -12,11 +12,11 @@ import numpy as np
 from nerfcli.doctor import camera_motion
 from nerfcli.doctor.moving import Patch, moving_patches
 from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, PhotoFeatures
-from nerfcli.media.exif import Exif
-from nerfcli.media.focal_evidence import focal_evidence, usual_focal_px
-from nerfcli.multiview.epipolar import fundamental_matrix
-from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
-from nerfcli.multiview.stationary import Motions, in_place, motions
+from nerfcli.matching.epipolar import fundamental_matrix
+from nerfcli.matching.features import LOOSE_RATIO, mutual_matches
+from nerfcli.matching.stationary import Motions, in_place, motions
+from nerfcli.photos.exif import Exif
+from nerfcli.photos.focal_evidence import focal_evidence, usual_focal_px
 from nerfcli.poses.model.two_views import panorama_inliers
 
 # Epipolar tolerance of an inlier, pixels.

@@ -8,8 +8,8 @@ import numpy as np
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
-from nerfcli.findings import BAD, GOOD, LOOK, Finding, worst
-from nerfcli.multiview.graph import connected_groups
+from nerfcli.matching.graph import connected_groups
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, worst
 from nerfcli.poses.engine.retrieval import alike, likeness
 from nerfcli.poses.input.pairs import ALL_ALIKE_UP_TO
 from nerfcli.poses.model.reasons import FEW_MATCHES

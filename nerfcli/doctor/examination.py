@@ -6,17 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerfcli.cameras.calibration import Calibration, Picture, calibrated
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures.calibration import Calibration, Picture, calibrated
+from nerfcli.captures.scene import Scene
 from nerfcli.doctor import camera_layout, connectivity, geometry, inventory, pose_agreement, quality
 from nerfcli.doctor.compared_pairs import Pair, compare, focal_px
 from nerfcli.doctor.misplaced_groups import misplaced_groups, nearest_pairs
 from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, read_all
 from nerfcli.doctor.photo_list import ExaminedCapture
 from nerfcli.doctor.pose_agreement import pair_errors
-from nerfcli.findings import Finding, as_json, worst
+from nerfcli.pages.findings import Finding, as_json, worst
 from nerfcli.poses.judge.checks import Checks
-from nerfcli.scene import Scene
 
 
 @dataclass(frozen=True)

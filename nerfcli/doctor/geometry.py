@@ -9,8 +9,8 @@ from nerfcli.doctor.compared_pairs import FEWEST_PAIRS, Pair
 from nerfcli.doctor.moving import Patch
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
-from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
-from nerfcli.multiview.stationary import LEAST_FRACTION, together
+from nerfcli.matching.stationary import LEAST_FRACTION, together
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
 
 # Baseline over depth: 0.1 is an angle of 6 degrees between two rays to the same point.
 BASELINE_LOOK, BASELINE_BAD = 0.08, 0.03

@@ -9,8 +9,8 @@ import numpy as np
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
-from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_above, verdict_below
-from nerfcli.media.focal_evidence import focal_evidence, same_focal
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, verdict_above, verdict_below
+from nerfcli.photos.focal_evidence import focal_evidence, same_focal
 from nerfcli.poses.input.photos import MIN_PHOTOS
 
 ENOUGH_PHOTOS = 20

@@ -16,8 +16,8 @@ from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.doctor.pose_agreement import USUAL_BAD_PX, PairError, contradicts_from_px, usual
 from nerfcli.errors import several
-from nerfcli.findings import BAD, GOOD, Finding
-from nerfcli.multiview.graph import connected_groups
+from nerfcli.matching.graph import connected_groups
+from nerfcli.pages.findings import BAD, GOOD, Finding
 
 # Number of nearest cameras to which each photo is compared in addition to the pairs chosen without poses.
 NEAREST = 4

@@ -12,9 +12,9 @@ from nerfcli.doctor.examination import Diagnosis
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.doctor.quality import BLURRED, STOPS_LOOK
 from nerfcli.errors import several
-from nerfcli.findings import BAD, GOOD, LOOK, VERDICTS, Finding, worst
 from nerfcli.pages import page
 from nerfcli.pages.embedded_pictures import data_uri, picture_rule, png_bytes
+from nerfcli.pages.findings import BAD, GOOD, LOOK, VERDICTS, Finding, worst
 
 _WORDS = {GOOD: "good", LOOK: "worth a look", BAD: "fix this first"}
 

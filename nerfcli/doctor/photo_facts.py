@@ -11,11 +11,11 @@ import numpy as np
 
 from nerfcli.doctor import brightness, sharpness
 from nerfcli.errors import UserError
-from nerfcli.media.exif import Exif, read_exif
-from nerfcli.media.focal_evidence import with_digital_zoom
-from nerfcli.media.images import downscale, read_image
-from nerfcli.media.panoramas import MOST_OF_A_CAMERA, is_panorama
-from nerfcli.multiview.features import find_features
+from nerfcli.matching.features import find_features
+from nerfcli.photos.exif import Exif, read_exif
+from nerfcli.photos.focal_evidence import with_digital_zoom
+from nerfcli.photos.images import downscale, read_image
+from nerfcli.photos.panoramas import MOST_OF_A_CAMERA, is_panorama
 
 # Longer side of the pictures in which features are detected; all thresholds in pixels refer to this size.
 LONGER_SIDE_PX = 800

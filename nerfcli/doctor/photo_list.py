@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerfcli import scene as scenes
-from nerfcli.cameras.formats.registry import recognised
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.formats.registry import recognised
 from nerfcli.doctor.photo_facts import Source
 from nerfcli.errors import UserError, in_shell
-from nerfcli.media.images import list_photos, list_unreadable, name_in, where_photos_may_be
+from nerfcli.photos.images import list_photos, list_unreadable, name_in, where_photos_may_be
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.doctor.compared_pairs import FEWEST_PAIRS, Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
-from nerfcli.findings import BAD, GOOD, LOOK, Finding
-from nerfcli.multiview.epipolar import sampson_angles
+from nerfcli.matching.epipolar import sampson_angles
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding
 from nerfcli.poses.model.reasons import FEW_MATCHES
 
 # Photos that look alike match at the wrong place, too. They have fewer matches than true neighbours, so the strongest

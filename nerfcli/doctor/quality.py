@@ -7,8 +7,8 @@ import numpy as np
 from nerfcli.doctor.compared_pairs import FEWEST_PAIRS, Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
-from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_above, verdict_below, worst
-from nerfcli.multiview.graph import connected_groups
+from nerfcli.matching.graph import connected_groups
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, verdict_above, verdict_below, worst
 
 # log2 of the detail that a photo lacks relative to the others: a Gaussian blur of about 0.8 px takes 0.3 from a sharp
 # photo of 1600 px, one of 1.5 px takes 0.7.

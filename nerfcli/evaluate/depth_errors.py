@@ -10,15 +10,15 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
-from nerfcli.multiview.stereo import LONGER_SIDE_PX, dense_depths
-from nerfcli.multiview.tracks import Tracks
+from nerfcli.matching.stereo import LONGER_SIDE_PX, dense_depths
+from nerfcli.matching.tracks import Tracks
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.coverage import DepthMap, coverage_and_parallax, depth_maps, sees, small_frame
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
-from nerfcli.runs.run import Run
+from nerfcli.training.runs.run import Run
 
 
 def measure_depth_errors(

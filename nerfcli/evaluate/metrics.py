@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 from skimage.metrics import structural_similarity
 
-from nerfcli.photos.psnr import psnr_of
+from nerfcli.photos.colours import psnr_of
 
 # From Wang et al.: the Gaussian's standard deviation, and the width at which scikit-image cuts it off (3.5 sigma).
 SIGMA = 1.5

@@ -13,7 +13,7 @@ import numpy as np
 
 from nerfcli.evaluate.metrics import to_8_bit
 from nerfcli.evaluate.protocol import ComparedImages
-from nerfcli.media.images import write_png
+from nerfcli.photos.images import write_png
 
 PREDICTIONS = "predictions"
 INFO = "info.json"

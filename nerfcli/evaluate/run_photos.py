@@ -7,11 +7,11 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.billboards import Billboards, reduction
 from nerfcli.evaluate.protocol import HeldOutPhoto, over_white
-from nerfcli.photos.held_out_exposure import gain_sources, log_gains_of
 from nerfcli.photos.loading import downscaled_camera, load_photos
+from nerfcli.render.held_out_exposure import gain_sources, log_gains_of
 from nerfcli.render.model import Model
-from nerfcli.runs.config import RunConfig
-from nerfcli.runs.run import Run
+from nerfcli.training.runs.config import RunConfig
+from nerfcli.training.runs.run import Run
 
 
 def held_out_photos(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.media.exif import read_exif
+from nerfcli.photos.exif import read_exif
 
 
 def log_exposures(frames: Sequence[Frame]) -> np.ndarray:

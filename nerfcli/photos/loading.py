@@ -9,8 +9,8 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
-from nerfcli.media.images import downscale, read_image
-from nerfcli.media.masks import read_mask
+from nerfcli.photos.images import downscale, read_image
+from nerfcli.photos.masks import read_mask
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def load_photo(frame: Frame, factor: float, masks: str) -> LoadedPhoto:
 
 
 def downscaled_camera(camera: Camera, factor: float) -> Camera:
-    """Return the camera of a picture downscaled by `media.images.downscale`."""
+    """Return the camera of a picture downscaled by `photos.images.downscale`."""
     return camera.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
 
 

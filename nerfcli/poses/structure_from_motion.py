@@ -1,7 +1,7 @@
 """Structure from motion: from a folder of photos to a scene folder with poses, intrinsics and points.
 
 The photos are not copied into the scene and not changed. The cameras refer to upright pictures, as
-`media.images.read_image` returns them: pycolmap 4.2 does not apply the EXIF orientation, so the work folder gets
+`photos.images.read_image` returns them: pycolmap 4.2 does not apply the EXIF orientation, so the work folder gets
 upright copies of photos that are stored rotated.
 """
 
@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.atomic import write_json
-from nerfcli.cameras.calibration import Calibration
-from nerfcli.cameras.formats import scene_folder
+from nerfcli.captures.calibration import Calibration
+from nerfcli.captures.formats import scene_folder
+from nerfcli.captures.holdout import names_held_out
 from nerfcli.errors import UserError
-from nerfcli.holdout import names_held_out
-from nerfcli.media.images import list_photos, name_in
+from nerfcli.photos.images import list_photos, name_in
 from nerfcli.poses.engine.strict import held_out_last
 from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
 from nerfcli.poses.engine.turntable import MASKS, advised

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nerfcli.atomic import atomic_folder, clear_leftovers
-from nerfcli.cameras.formats.scene_folder import SCENE_FILE
+from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.exclusive import exclusive
 from nerfcli.poses.input.job import database_path
 

@@ -88,7 +88,7 @@ class Model:
             `photos.exif_exposure`.
         exif_slope: factor by which gains follow the exposures in EXIF, see `held_out_exposure.exif_slope`.
         exposures: log gains (3,) of held-out photos by name, estimated from the training photos where EXIF does not
-            give them; see `photos.held_out_exposure`.
+            give them; see `render.held_out_exposure`.
         beyond_exif: offsets (3,) to the gains that EXIF predicts, of held-out photos by name.
         sha256: SHA-256 of the file that the model was read from.
     """

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from nerfcli.errors import UserError
-from nerfcli.media.mesh_files import description_in, read_ply_header
-from nerfcli.media.model_facts import NOT_STATED
+from nerfcli.export.mesh_files import description_in, read_ply_header
+from nerfcli.export.model_facts import NOT_STATED
 from nerfcli.splats.gaussians import Gaussians
 from nerfcli.splats.ply import read_splat_ply, write_splat_ply
 from nerfcli.splats.spz import read_spz, write_spz
@@ -43,7 +43,7 @@ def write_splats(
     Viewers expect y to point down; see `Gaussians.moved`.
 
     Args:
-        description: unit, frame and others, as in `media.mesh_files`; in a .spz it is the comment of the gzip stream.
+        description: unit, frame and others, as in `export.mesh_files`; in a .spz it is the comment of the gzip stream.
         notify: called with a line about values that the format cannot hold.
 
     Raises:

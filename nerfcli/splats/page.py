@@ -14,7 +14,7 @@ from string import Template
 
 import numpy as np
 
-from nerfcli.media.mesh_files import ply_bytes
+from nerfcli.export.mesh_files import ply_bytes
 from nerfcli.pages.page import write_page
 from nerfcli.splats.gaussians import Gaussians
 from nerfcli.splats.ply import splat_columns

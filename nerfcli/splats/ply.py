@@ -13,7 +13,7 @@ import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from nerfcli.errors import UserError, listed, several
-from nerfcli.media.mesh_files import read_ply_header, write_ply
+from nerfcli.export.mesh_files import read_ply_header, write_ply
 from nerfcli.splats.gaussians import Gaussians
 
 # Logit that stands for an infinite one, in files in which an opacity of exactly 1 or 0 was converted: 1 - 2e-9.

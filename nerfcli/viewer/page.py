@@ -14,8 +14,8 @@ import numpy as np
 from nerfcli import __version__
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction
-from nerfcli.media.colours import levels_of
 from nerfcli.pages import page
+from nerfcli.photos.colours import levels_of
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import TOLERANCE
 from nerfcli.viewer.packing import PackedField

@@ -6,21 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli import scene as scenes
-from nerfcli.ablate.results import RUNS, MeasuredTraining, refuse_foreign, rows_of, write_results
-from nerfcli.ablate.variants import AUTO, CHOSEN, CaptureTraits, Variant, variants
-from nerfcli.cameras.formats.colmap import parse_colmap
-from nerfcli.cameras.formats.finding import find_model
+from nerfcli.bench.ablation_results import RUNS, MeasuredTraining, refuse_foreign, rows_of, write_results
+from nerfcli.bench.ablation_variants import AUTO, CHOSEN, CaptureTraits, Variant, variants
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.formats.colmap import parse_colmap
+from nerfcli.captures.formats.finding import find_model
+from nerfcli.captures.scene import Scene
 from nerfcli.errors import UserError
 from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.evaluate.sampled import SampledPixels
-from nerfcli.media.images import read_image
+from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.photos.exif_exposure import mean_log_exposure, relative_log_exposures
-from nerfcli.runs.files import STATE
-from nerfcli.runs.run import Run
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.photos.images import read_image
+from nerfcli.training.runs.files import STATE
+from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.workflows.train import train_scene, was_interrupted
 
 _SAME = "; the same pixels for all variants of a seed, other pixels for each seed"
@@ -52,7 +52,7 @@ def ablate_scene(
         The content of ablation.json.
 
     Raises:
-        UserError: see `nerfcli.train.loop.train`; or no photos are held out, or the folder holds something else.
+        UserError: see `nerfcli.training.loop.train`; or no photos are held out, or the folder holds something else.
     """
     scene = scenes.load(path)
     if not scene.test_frames:

@@ -4,17 +4,17 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from nerfcli.cameras.formats.registry import Format, UserInputs, recording
 from nerfcli.cameras.frame import Capture
-from nerfcli.cameras.orientation import describe_rescaling
-from nerfcli.cameras.stored_pixels import STORED, in_pixels, other_sizes
-from nerfcli.convert import detect
-from nerfcli.convert.check import TOLERANCE_PX
-from nerfcli.convert.conversion import ConventionOverrides, Conversion, TargetOptions, convert, load
-from nerfcli.convert.world_frame import WorldFrame, in_world_frame
+from nerfcli.captures import detect
+from nerfcli.captures.check import TOLERANCE_PX
+from nerfcli.captures.conversion import ConventionOverrides, Conversion, TargetOptions, convert, load
+from nerfcli.captures.formats.registry import Format, UserInputs, recording
+from nerfcli.captures.orientation import describe_rescaling
+from nerfcli.captures.stored_pixels import STORED, in_pixels, other_sizes
+from nerfcli.captures.world_frame import WorldFrame, in_world_frame
 from nerfcli.errors import several
-from nerfcli.media.images import HEIC_SUFFIXES
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.photos.images import HEIC_SUFFIXES
 
 
 def convert_capture(

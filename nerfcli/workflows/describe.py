@@ -7,19 +7,19 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from nerfcli import scene as scenes
 from nerfcli.cameras.camera import by_lens
-from nerfcli.cameras.formats.registry import UserInputs, recognise, recognised
-from nerfcli.cameras.formats.run_cameras import CAMERAS
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.orientation import describe_rescaling
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.formats.registry import UserInputs, recognise, recognised
+from nerfcli.captures.formats.run_cameras import CAMERAS
+from nerfcli.captures.orientation import describe_rescaling
+from nerfcli.ct.result import is_reconstruction, load_reconstruction
+from nerfcli.ct.volume_files import is_volume_file, volume_facts
 from nerfcli.errors import UserError
-from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
-from nerfcli.media.model_facts import SUFFIXES as MODEL_SUFFIXES
-from nerfcli.media.model_facts import is_splat_file, model_facts
-from nerfcli.runs.files import CONFIG, DEPTH_ERRORS, LOG, METRICS, REPORT
-from nerfcli.tomography.result import is_reconstruction, load_reconstruction
-from nerfcli.tomography.volume_files import is_volume_file, volume_facts
+from nerfcli.export.model_facts import SUFFIXES as MODEL_SUFFIXES
+from nerfcli.export.model_facts import is_splat_file, model_facts
+from nerfcli.render.files.file_facts import RENDERS, file_facts, renders_facts
+from nerfcli.training.runs.files import CONFIG, DEPTH_ERRORS, LOG, METRICS, REPORT
 
 # Suffixes of files of cameras; a .json may also be something else.
 _CAPTURE_SUFFIXES = (".sfm", ".json", ".xml", ".csv", ".out", ".npz")
@@ -38,7 +38,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         folder = folder.parent
     folder = _whole(folder)
     if _is_scan_to_describe(folder):
-        from nerfcli.workflows.scans import describe_scan
+        from nerfcli.ct.scans import describe_scan
 
         return describe_scan(folder)
     if is_reconstruction(folder):
@@ -64,7 +64,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         return renders_facts(folder)
     if not (folder / CONFIG).exists():
         return _describe_capture(folder)
-    from nerfcli.runs.run import Run
+    from nerfcli.training.runs.run import Run
     from nerfcli.workflows.describe_run import describe_run
 
     return describe_run(Run(folder))
@@ -84,7 +84,7 @@ def _is_scan_to_describe(path: Path) -> bool:
     """Return whether the path is a scan; single depth files and pictures are not, even if they are beside a scan."""
     if path.is_file() and path.suffix.lower() in (".npy", ".npz", ".tif", ".tiff", ".png", ".safetensors"):
         return False
-    from nerfcli.tomography.formats.read import recognise
+    from nerfcli.ct.formats.read import recognise
 
     return recognise(path) is not None
 

@@ -6,9 +6,9 @@ from typing import Any
 
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.cost import field_bytes
-from nerfcli.runs.camera_moves import camera_moves
-from nerfcli.runs.run import Run
-from nerfcli.train.sentinel import FAILURE_FORMAT, replay
+from nerfcli.training.runs.camera_moves import camera_moves
+from nerfcli.training.runs.run import Run
+from nerfcli.training.sentinel import FAILURE_FORMAT, replay
 
 
 def describe_run(run: Run) -> dict[str, Any]:

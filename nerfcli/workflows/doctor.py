@@ -5,12 +5,12 @@ from pathlib import Path
 import cv2
 
 from nerfcli.atomic import refuse_read_only
-from nerfcli.convert.camera_files import read_calibration
+from nerfcli.captures.camera_files import read_calibration
 from nerfcli.doctor.examination import Diagnosis, estimated_seconds, examine
 from nerfcli.doctor.page import refuse_foreign, write_page
 from nerfcli.doctor.photo_list import find_subject
 from nerfcli.errors import UserError
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.notices import Notify, Progress, no_progress, silent
 
 
 def examine_capture(

@@ -18,11 +18,11 @@ from nerfcli.evaluate.predictions import INFO, PREDICTIONS, predictions_are_ther
 from nerfcli.evaluate.protocol import PROTOCOL, ComparedImages, Extras, evaluate_model
 from nerfcli.evaluate.requirements import WHY_ABSENT, Requirement, known_numbers, unmet
 from nerfcli.evaluate.run_photos import held_out_photos_of, training_billboards
-from nerfcli.export.order import file_names
-from nerfcli.runs.files import LOG
-from nerfcli.runs.run import Run
-from nerfcli.workflows.machine import device_name, thread_count
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.machine import device_name, thread_count
+from nerfcli.notices import Notify, Progress, no_progress, silent
+from nerfcli.render.job import file_names
+from nerfcli.training.runs.files import LOG
+from nerfcli.training.runs.run import Run
 from nerfcli.workflows.splats import file_digest, load_splats
 
 

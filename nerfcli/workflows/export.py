@@ -6,20 +6,20 @@ import torch
 
 from nerfcli.atomic import cannot_write, refuse_read_only
 from nerfcli.errors import UserError
+from nerfcli.export.extent import check_box, scene_box
+from nerfcli.export.settings import SurfaceSettings
+from nerfcli.machine import device_name, thread_count
+from nerfcli.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.pages.page import write_page
 from nerfcli.photos.undistorted import pinhole_frame
 from nerfcli.render.model import Model
-from nerfcli.runs.run import Run
-from nerfcli.surface.extent import check_box, scene_box
-from nerfcli.surface.settings import SurfaceSettings
+from nerfcli.training.runs.run import Run
 from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import page_photos
 from nerfcli.viewer.proof import make_proof
 from nerfcli.viewer.seen_cells import seen_cells
 from nerfcli.workflows.export_geometry import export_mesh, export_points
-from nerfcli.workflows.machine import device_name, thread_count
-from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.workflows.photo_depths import photo_depths
 from nerfcli.workflows.splats import SplatSettings, export_splats
 

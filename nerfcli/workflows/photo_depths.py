@@ -15,14 +15,14 @@ from nerfcli.atomic import atomic_path
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError, several
 from nerfcli.evaluate.depth_errors import measure_depth_errors
-from nerfcli.media.masks import read_mask
+from nerfcli.notices import Notify
+from nerfcli.photos.masks import read_mask
 from nerfcli.render.coverage import MAX_SIZE, STEEPEST_DEG, DepthMap, depth_maps, small_frame
 from nerfcli.render.depth_errors import STRATA, DepthErrors
 from nerfcli.render.model import Model
-from nerfcli.runs.files import DEPTH_ERRORS, PHOTO_DEPTHS
-from nerfcli.runs.run import Run
 from nerfcli.sealed import digest, read_sealed, write_sealed
-from nerfcli.workflows.notices import Notify
+from nerfcli.training.runs.files import DEPTH_ERRORS, PHOTO_DEPTHS
+from nerfcli.training.runs.run import Run
 
 FORMAT, ERRORS_FORMAT = "nerfcli photo depths 1", "nerfcli depth errors 1"
 # Fraction of held-out pixels that must be matched for reliable intervals. Measured: with 60 % matched, 89 % of the

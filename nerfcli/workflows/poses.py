@@ -2,16 +2,16 @@
 
 from pathlib import Path
 
-from nerfcli.cameras.calibration import Calibration
-from nerfcli.cameras.formats.scene_folder import SCENE_FILE
-from nerfcli.convert.camera_files import read_calibration
+from nerfcli.captures.calibration import Calibration
+from nerfcli.captures.camera_files import read_calibration
+from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.errors import UserError, duration
+from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.input.plan import Plan, TimeEstimate
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 from nerfcli.poses.structure_from_motion import is_same_scene, photo_notes, plan_poses
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
 _STAGES = {
     "read": "photos read",

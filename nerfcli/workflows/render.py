@@ -7,13 +7,13 @@ from typing import Any
 import torch
 
 from nerfcli.errors import UserError
-from nerfcli.export.frames import export_frames, export_part
-from nerfcli.export.order import Order, refuse_foreign
-from nerfcli.export.settings import OUTPUTS, ExportSettings
+from nerfcli.machine import device_name, thread_count
+from nerfcli.notices import Notify, Progress, no_progress, part_of, silent
+from nerfcli.render.frames import export_frames, export_part
+from nerfcli.render.job import Order, refuse_foreign
+from nerfcli.render.outputs import OUTPUTS, ExportSettings
 from nerfcli.render.renderable import Renderable
-from nerfcli.runs.run import Run, load_run
-from nerfcli.workflows.machine import device_name, thread_count
-from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
+from nerfcli.training.runs.run import Run, load_run
 from nerfcli.workflows.photo_depths import depth_errors, photo_depths
 from nerfcli.workflows.splats import file_digest, load_splats
 from nerfcli.workflows.views import (

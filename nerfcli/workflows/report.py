@@ -7,16 +7,16 @@ import torch
 
 from nerfcli.atomic import refuse_read_only
 from nerfcli.errors import UserError
+from nerfcli.evaluate.report.page import mark_of, origin_of, page_html
+from nerfcli.evaluate.report.run_facts import captures_of, labels_of, read_facts
+from nerfcli.evaluate.report.views import common_names, look_at
 from nerfcli.evaluate.run_photos import held_out_photos_of
-from nerfcli.export.settings import depth_meta
+from nerfcli.machine import device_name, thread_count
+from nerfcli.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.pages.page import is_made_from, refuse_foreign, write_page
-from nerfcli.report.page import mark_of, origin_of, page_html
-from nerfcli.report.run_facts import captures_of, labels_of, read_facts
-from nerfcli.report.views import common_names, look_at
-from nerfcli.runs.files import REPORT
-from nerfcli.runs.run import load_run
-from nerfcli.workflows.machine import device_name, thread_count
-from nerfcli.workflows.notices import Notify, Progress, no_progress, part_of, silent
+from nerfcli.render.outputs import depth_meta
+from nerfcli.training.runs.files import REPORT
+from nerfcli.training.runs.run import load_run
 from nerfcli.workflows.photo_depths import photo_depths
 from nerfcli.workflows.views import Views, usual_depth
 

@@ -14,11 +14,10 @@ from nerfcli.errors import UserError
 from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.interrupts import deferred_interrupts
+from nerfcli.notices import Notify, Progress, part_of, silent
 from nerfcli.photos.loading import LoadedPhoto, load_photos
 from nerfcli.photos.undistorted import pinhole_of
 from nerfcli.render.model import Model
-from nerfcli.runs.files import SPLATS
-from nerfcli.runs.run import Run
 from nerfcli.splats.beside import pictures_beside, share_of_pictures
 from nerfcli.splats.files import read_splats, write_splats
 from nerfcli.splats.page import write_splat_page
@@ -27,8 +26,9 @@ from nerfcli.splats.render import SplatScene, near_of
 from nerfcli.splats.rows import rows_of
 from nerfcli.splats.start import count_for, gaussians_of_field
 from nerfcli.splats.state import RunSplats, load_splat_state, save_splats
+from nerfcli.training.runs.files import SPLATS
+from nerfcli.training.runs.run import Run
 from nerfcli.workflows.export_geometry import y_up_from_scene
-from nerfcli.workflows.notices import Notify, Progress, part_of, silent
 
 FORMAT = "nerfcli splat file 1"
 # Photos of the training that the field and the splats are compared on.

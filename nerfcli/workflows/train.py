@@ -6,20 +6,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from nerfcli import distributed
-from nerfcli import scene as scenes
 from nerfcli.atomic import clear_leftovers
-from nerfcli.cameras.orientation import describe_rescaling
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.orientation import describe_rescaling
+from nerfcli.captures.scene import Scene, describe_unused_masks
 from nerfcli.errors import UserError, listed, several
 from nerfcli.exclusive import exclusive
-from nerfcli.runs.config import split_hash
-from nerfcli.runs.files import CONFIG, LOCK, METRICS, STATE
-from nerfcli.runs.run import Run
-from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene, describe_unused_masks
-from nerfcli.train import loop
-from nerfcli.train.left_out import OCCLUDERS
-from nerfcli.workflows.machine import is_one_of_several
-from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.machine import is_one_of_several
+from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.training import loop
+from nerfcli.training.left_out import OCCLUDERS
+from nerfcli.training.runs.config import split_hash
+from nerfcli.training.runs.files import CONFIG, LOCK, METRICS, STATE
+from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.settings import TrainSettings
 
 
 def train_scene(
@@ -41,7 +41,7 @@ def train_scene(
 
     Example:
         >>> import nerfcli
-        >>> from nerfcli.runs.settings import TrainSettings
+        >>> from nerfcli.training.runs.settings import TrainSettings
         >>> run = nerfcli.train_scene("photos-scene", "photos-scene-run", TrainSettings(budget_seconds=60, threads=4))
         >>> run.summary.steps
 
@@ -60,7 +60,7 @@ def train_scene(
         The run, complete.
 
     Raises:
-        UserError: see `nerfcli.train.loop.train`; or a different run exists at `run`.
+        UserError: see `nerfcli.training.loop.train`; or a different run exists at `run`.
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     folder, run = Path(scene), Path(run)

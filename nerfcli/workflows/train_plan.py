@@ -4,9 +4,9 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerfcli import scene as scenes
-from nerfcli.photos.storage import InFiles, field_bytes, needs_of, storage_for
-from nerfcli.runs.settings import TrainSettings, automatic_downscale
+from nerfcli.captures import scene as scenes
+from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
+from nerfcli.training.storage import InFiles, field_bytes, needs_of, storage_for
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def plan_training(
     """Estimate the cost of `train_scene` without opening photos or writing anything.
 
     Example:
-        >>> from nerfcli.runs.settings import TrainSettings
+        >>> from nerfcli.training.runs.settings import TrainSettings
         >>> from nerfcli.workflows.train_plan import plan_training
         >>> plan_training("photos-scene", TrainSettings(budget_seconds=300)).memory_bytes
 

@@ -7,21 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfcli import scene as scenes
 from nerfcli.atomic import cannot_write
 from nerfcli.cameras import paths
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.camera_path import losses_camera_path, read_path, write_camera_path
-from nerfcli.cameras.formats.finding import find_camera_path
-from nerfcli.cameras.formats.registry import UserInputs, recognise
-from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture, Frame, frames_named
 from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
+from nerfcli.captures import scene as scenes
+from nerfcli.captures.formats.camera_path import losses_camera_path, read_path, write_camera_path
+from nerfcli.captures.formats.finding import find_camera_path
+from nerfcli.captures.formats.registry import UserInputs, recognise
+from nerfcli.captures.formats.transforms import write_transforms
 from nerfcli.errors import UserError
+from nerfcli.notices import Notify, warn_python
 from nerfcli.photos.loading import downscaled_camera
 from nerfcli.render.depth import DepthRequest
-from nerfcli.runs.run import Run
-from nerfcli.workflows.notices import Notify, warn_python
+from nerfcli.training.runs.run import Run
 
 PATHS = ("orbit", "ellipse", "spiral", "interpolate")
 # Files that `write_frames` writes.

@@ -11,8 +11,8 @@ from torch import Tensor
 from hard_cases import exact, exact_depths
 from hard_cases.exact_depths import FRACTIONS, quantile_name
 from nerfcli.kernels import LightEnds
-from nerfcli.selftest import textbook
-from nerfcli.selftest.cases import (
+from nerfcli.kernels.selftest import textbook
+from nerfcli.kernels.selftest.cases import (
     MEANINGLESS,
     Ray,
     Segments,
@@ -20,7 +20,7 @@ from nerfcli.selftest.cases import (
     depth_rays,
     thick_and_thin,
 )
-from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
+from nerfcli.kernels.selftest.measure import Errors, Precision, Row, largest_error
 
 # Rays with at most this many intervals form the coarse group; all others form the fine one.
 FEW = 15

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from itertools import accumulate
 
-from nerfcli.selftest.cases import Segments
+from nerfcli.kernels.selftest.cases import Segments
 
 DIGITS = 60
 

@@ -10,7 +10,7 @@ from decimal import Decimal, localcontext
 from itertools import pairwise
 
 from hard_cases.exact import DIGITS
-from nerfcli.selftest.cases import Ray
+from nerfcli.kernels.selftest.cases import Ray
 
 FRACTIONS = (0.5, 0.05, 0.95)
 # Optical depths below which sixty digits are too few for the closed forms: of mean and variance, and of the

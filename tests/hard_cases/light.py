@@ -11,9 +11,9 @@ from torch import Tensor
 
 from hard_cases import exact
 from hard_cases.exact import Composited
-from nerfcli.selftest import textbook
-from nerfcli.selftest.cases import FAR_SURFACE, MEANINGLESS, Group, Segments, deepest_ray, groups
-from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
+from nerfcli.kernels.selftest import textbook
+from nerfcli.kernels.selftest.cases import FAR_SURFACE, MEANINGLESS, Group, Segments, deepest_ray, groups
+from nerfcli.kernels.selftest.measure import Errors, Precision, Row, largest_error
 
 # A bfloat16 sum of more terms than this has no correct digits.
 MOST_IN_BFLOAT16 = 16

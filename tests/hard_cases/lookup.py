@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nerfcli import kernels
 from nerfcli.kernels import PixelTable, reference
-from nerfcli.selftest.cases import (
+from nerfcli.kernels.selftest.cases import (
     BETWEEN,
     BORDERS,
     EXACT_GRIDS,
@@ -24,7 +24,7 @@ from nerfcli.selftest.cases import (
     Point,
     hash_table,
 )
-from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
+from nerfcli.kernels.selftest.measure import Errors, Precision, Row, largest_error
 
 # 16 samples in one grid cell, each repeated 256 times: gradient sums are far larger than any of their terms.
 CROWD: tuple[Point, ...] = tuple((0.5 + 2.0**-9 * (k % 8), 0.25, 0.125 * (1 + k // 8)) for k in range(16))

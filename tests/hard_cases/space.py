@@ -15,9 +15,9 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.field.contraction import uncontract
 from nerfcli.kernels import HashGrid, March, Rays, reference
-from nerfcli.selftest import textbook
-from nerfcli.selftest.cases import CONTRACTED, DIRECTIONS
-from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
+from nerfcli.kernels.selftest import textbook
+from nerfcli.kernels.selftest.cases import CONTRACTED, DIRECTIONS
+from nerfcli.kernels.selftest.measure import Errors, Precision, Row, largest_error
 
 GIVEN = (1.0, 0.5, 0.25)
 WORLD = 1e6

@@ -6,7 +6,7 @@ import torch
 
 from hard_cases import depths, learning, light, lookup, space, views, volumes
 from nerfcli import kernels
-from nerfcli.selftest.measure import Precision, Row
+from nerfcli.kernels.selftest.measure import Precision, Row
 
 
 def precisions(device: str) -> tuple[Precision, ...]:

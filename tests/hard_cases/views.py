@@ -8,7 +8,7 @@ import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.selftest.measure import Errors, Row, largest_error
+from nerfcli.kernels.selftest.measure import Errors, Row, largest_error
 
 UNIT = 2.0**-53
 TINY = float(np.finfo(np.float64).tiny)

@@ -7,9 +7,9 @@ from decimal import Decimal, localcontext
 import torch
 
 from hard_cases.exact import DIGITS
-from nerfcli.selftest import operations
-from nerfcli.selftest.cases import THICKNESSES, VOLUME_FIRST, VOXEL
-from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
+from nerfcli.kernels.selftest import operations
+from nerfcli.kernels.selftest.cases import THICKNESSES, VOLUME_FIRST, VOXEL
+from nerfcli.kernels.selftest.measure import Errors, Precision, Row, largest_error
 
 # Number of layers along x, and the width in y and z, wide enough that sloped lines stay far from the sides.
 LAYERS, WIDE = 10, 33

@@ -16,7 +16,7 @@ from typing import Any
 
 import pycolmap
 
-from nerfcli.media.focal_evidence import usual_focal_px
+from nerfcli.photos.focal_evidence import usual_focal_px
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.model.two_views import count_matches
 

@@ -14,7 +14,7 @@ from typing import Any
 import pycolmap
 
 from nerfcli.errors import duration
-from nerfcli.multiview.graph import connected_groups
+from nerfcli.matching.graph import connected_groups
 from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.initial_focal import with_focal_lengths

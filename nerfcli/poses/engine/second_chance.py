@@ -13,7 +13,7 @@ from typing import Any
 import pycolmap
 
 from nerfcli.errors import duration, several
-from nerfcli.multiview.graph import consistent_groups
+from nerfcli.matching.graph import consistent_groups
 from nerfcli.poses.engine.database import keep_geometries
 from nerfcli.poses.engine.ladder import SMALLER_BASELINE
 from nerfcli.poses.engine.mapped import MappedModels, mapping_key, read_mapped, write_mapped

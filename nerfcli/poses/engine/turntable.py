@@ -20,11 +20,11 @@ import pycolmap
 from PIL import Image
 
 from nerfcli.errors import UserError
-from nerfcli.media.images import image_size, read_image
-from nerfcli.media.masks import read_mask
-from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
-from nerfcli.multiview.graph import connected_groups
-from nerfcli.multiview.stationary import Motions, Stationary, motions, together
+from nerfcli.matching.features import LOOSE_RATIO, mutual_matches
+from nerfcli.matching.graph import connected_groups
+from nerfcli.matching.stationary import Motions, Stationary, motions, together
+from nerfcli.photos.images import image_size, read_image
+from nerfcli.photos.masks import read_mask
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.engine.retrieval import coarsest
 from nerfcli.poses.input import still_background as still

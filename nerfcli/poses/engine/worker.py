@@ -10,6 +10,7 @@ Photos have numbers as names here: pycolmap sees `00000.jpg`, `00001.png`..., so
 cannot break the list of pairs.
 """
 
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -22,7 +23,6 @@ from typing import Any
 import pycolmap
 
 from nerfcli.child import take_stdout
-from nerfcli.finite import finite
 from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.ladder import climb
@@ -218,6 +218,34 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     seconds[stage] = round(time.perf_counter() - start, 3)
+
+
+def finite(content: Any) -> tuple[Any, dict[str, str]]:
+    """Copy plain content, with None in place of every non-finite number.
+
+    Args:
+        content: dictionaries, lists, tuples and plain values. Tuples come back as lists.
+
+    Returns:
+        The copy, and the replaced numbers by their path: `{"lenses.0.gain": "inf"}`.
+
+    Example:
+        >>> finite({"gain": [1.0, float("inf")]})
+        ({'gain': [1.0, None]}, {'gain.1': 'inf'})
+    """
+    replaced: dict[str, str] = {}
+
+    def copy(value: Any, place: str) -> Any:
+        if isinstance(value, dict):
+            return {key: copy(item, f"{place}.{key}" if place else str(key)) for key, item in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [copy(item, f"{place}.{index}" if place else str(index)) for index, item in enumerate(value)]
+        if isinstance(value, float) and not math.isfinite(value):
+            replaced[place] = str(float(value))
+            return None
+        return value
+
+    return copy(content, ""), replaced
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from nerfcli.media.images import downscale
+from nerfcli.photos.images import downscale
 
 # Longer sides, in pixels, of the pictures for measuring sharpness (about the size for extracting features) and motion.
 SHARPNESS_SIZE_PX = 960

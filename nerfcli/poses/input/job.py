@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from nerfcli.media.panoramas import PANORAMA
+from nerfcli.photos.panoramas import PANORAMA
 
 # Called with (stage, done, total) as the work proceeds.
 Report = Callable[[str, int, int], None]

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from nerfcli.errors import UserError, listed
-from nerfcli.media.masks import find_mask, read_mask
+from nerfcli.photos.masks import find_mask, read_mask
 from nerfcli.poses.input.job import WorkMask
 from nerfcli.poses.input.photos import Photos
 from nerfcli.poses.input.stages import stage_key

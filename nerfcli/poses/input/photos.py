@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError, several
-from nerfcli.media.exif import Exif, read_exif
-from nerfcli.media.focal_evidence import focal_evidence, same_focal, with_digital_zoom
-from nerfcli.media.images import list_photos, list_unreadable, name_in, read_image, where_photos_may_be
-from nerfcli.media.panoramas import is_panorama
+from nerfcli.photos.exif import Exif, read_exif
+from nerfcli.photos.focal_evidence import focal_evidence, same_focal, with_digital_zoom
+from nerfcli.photos.images import list_photos, list_unreadable, name_in, read_image, where_photos_may_be
+from nerfcli.photos.panoramas import is_panorama
 
 # Three views determine a scene up to scale, but leave nothing to check them with; four are the fewest that do.
 MIN_PHOTOS = 4

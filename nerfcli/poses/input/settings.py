@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from nerfcli.holdout import DEFAULT_HOLDOUT
+from nerfcli.captures.holdout import DEFAULT_HOLDOUT
 from nerfcli.poses.input.pairs import PAIRINGS
 
 # Choices of `camera_model`.
@@ -35,8 +35,8 @@ class PoseSettings:
     are doubled for panoramas, see `for_panoramas`.
     threads: -1 for all; with 1 thread the same seed gives the same poses. camera_model: one of `CAMERA_MODELS`.
     min_registered: the fraction of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a
-    text file with two names per line, only these pairs are matched. masks: a folder of masks, see `media.masks`.
-    holdout: the rule by which photos are held out, see `nerfcli.holdout`. strict: whether held-out photos are placed
+    text file with two names per line, only these pairs are matched. masks: a folder of masks, see `photos.masks`.
+    holdout: the rule by which photos are held out, see `captures.holdout`. strict: whether held-out photos are placed
     afterwards, with the result of the other photos fixed, see `strict`. accept_refused: whether a model that the checks
     refuse becomes the scene anyway. subfolders: whether photos in subfolders are used, those of each as of a camera of
     their own.

@@ -15,7 +15,7 @@ from PIL import Image
 import nerfcli
 from nerfcli.atomic import atomic_folder, write_json
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
-from nerfcli.media.video_input import MeasuredFrames, Video, measure_frames, open_video, read_frames
+from nerfcli.photos.video import MeasuredFrames, Video, measure_frames, open_video, read_frames
 from nerfcli.poses.input.frame_choice import (
     SHARPNESS_SIZE_PX,
     FrameMeasure,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from nerfcli.media.images import read_image
+from nerfcli.photos.images import read_image
 from nerfcli.poses.input.photos import Photo, Photos
 from nerfcli.poses.input.stages import file_key, read_stage, write_stage
 

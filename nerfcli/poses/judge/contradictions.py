@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from nerfcli.multiview.graph import Bottlenecks, connected_groups, spanning_tree
+from nerfcli.matching.graph import Bottlenecks, connected_groups, spanning_tree
 from nerfcli.poses.model.two_views import LEAST_ANGLE_DEG, Agreement, VerifiedPair, agreements
 
 # A pair with fewer may be wrong even if no other pair joins its photos.

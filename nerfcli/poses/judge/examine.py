@@ -7,7 +7,7 @@ from typing import Any
 
 import pycolmap
 
-from nerfcli.multiview.graph import connected_groups
+from nerfcli.matching.graph import connected_groups
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge.acceptance import Verdict, judge, nothing_placed
 from nerfcli.poses.judge.checks import Checks

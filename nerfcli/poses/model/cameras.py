@@ -5,12 +5,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from nerfcli.cameras.calibration import Calibration, PhotoCalibration, Picture, calibrated
-from nerfcli.cameras.orientation import counted, describe_rescaling, rescaling
+from nerfcli.captures.calibration import Calibration, PhotoCalibration, Picture, calibrated
+from nerfcli.captures.orientation import counted, describe_rescaling, rescaling
 from nerfcli.errors import UserError, several
-from nerfcli.media.exif import Exif
-from nerfcli.media.focal_evidence import focal_evidence
-from nerfcli.media.panoramas import MOST_OF_A_CAMERA, PANORAMA
+from nerfcli.photos.exif import Exif
+from nerfcli.photos.focal_evidence import focal_evidence
+from nerfcli.photos.panoramas import MOST_OF_A_CAMERA, PANORAMA
 from nerfcli.poses.input.job import CameraGroup
 from nerfcli.poses.input.photos import Photo, Photos, camera_groups
 from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL

@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from scipy.special import chdtri
 
-from nerfcli.media.focal_evidence import usual_focal_px
+from nerfcli.photos.focal_evidence import usual_focal_px
 from nerfcli.poses.model.lens_evidence import (
     NAMES,
     Estimate,

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from nerfcli.media.panoramas import PANORAMA
+from nerfcli.photos.panoramas import PANORAMA
 
 Array = NDArray[np.float64]
 

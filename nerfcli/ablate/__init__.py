@@ -1,1 +1,0 @@
-"""Ablation: train a model with and without each component and compare on held-out photos."""

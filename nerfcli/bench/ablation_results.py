@@ -1,0 +1,161 @@
+"""Results of an ablation: differences from the reference model with their intervals, and the files that hold them."""
+
+import csv
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from scipy.special import stdtrit
+
+from nerfcli.atomic import atomic_path, write_json
+from nerfcli.bench.ablation_variants import CHOSEN, Variant
+from nerfcli.errors import UserError
+
+RESULT, TABLE, RUNS = "ablation.json", "ablation.csv", "runs"
+FORMAT = "nerfcli ablation 2"
+# Confidence level of the intervals.
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class MeasuredTraining:
+    """One training: the mean PSNR over the held-out photos, measured as in `protocol`."""
+
+    variant: str
+    seed: int
+    psnr: float
+    seconds: float
+    steps: int
+    protocol: str
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """A variant against the chosen model.
+
+    Args:
+        psnr: mean PSNR over its seeds, in dB.
+        difference_db: mean PSNR difference of the variant from the chosen model, over the seeds that both have; None
+            for the chosen model itself and if they have no seed in common.
+        interval_db: half the width of the 95 % interval of that mean, by Student's t over seeds; None for one seed.
+        seconds, steps: means per training.
+        verdict: a short text such as "better"; empty where nothing can be compared.
+    """
+
+    name: str
+    psnr: float
+    difference_db: float | None
+    interval_db: float | None
+    seconds: float
+    steps: float
+    seeds: int
+    verdict: str
+    protocol: str
+
+
+def rows_of(measured: Sequence[MeasuredTraining], variants: Sequence[Variant]) -> list[ResultRow]:
+    """Return a row for each variant that was trained at least once, in the order of the variants."""
+    reference = {entry.seed: entry.psnr for entry in measured if entry.variant == CHOSEN}
+    rows = []
+    for variant in variants:
+        own = [entry for entry in measured if entry.variant == variant.name]
+        if not own:
+            continue
+        differences = [entry.psnr - reference[entry.seed] for entry in own if entry.seed in reference]
+        compared = bool(differences) and variant.name != CHOSEN
+        mean = statistics.fmean(differences) if compared else None
+        half = half_interval(differences) if compared else None
+        rows.append(
+            ResultRow(
+                variant.name,
+                statistics.fmean(entry.psnr for entry in own),
+                mean,
+                half,
+                statistics.fmean(entry.seconds for entry in own),
+                statistics.fmean(entry.steps for entry in own),
+                len(own),
+                _verdict(variant, mean, half),
+                own[-1].protocol,
+            )
+        )
+    return rows
+
+
+def half_interval(differences: Sequence[float]) -> float | None:
+    """Return half the width of the 95 % interval of the mean of normal differences; None for fewer than two.
+
+    Formula: t(0.975, n - 1) s / sqrt(n), with Student's t.
+    """
+    if len(differences) < 2:
+        return None
+    quantile = float(stdtrit(len(differences) - 1, 0.5 + CONFIDENCE / 2))
+    return quantile * statistics.stdev(differences) / math.sqrt(len(differences))
+
+
+def _verdict(variant: Variant, difference: float | None, half: float | None) -> str:
+    if difference is None:
+        return ""
+    if half is None:
+        return "one seed: no verdict"
+    if abs(difference) <= half:
+        return "no difference shown"
+    if variant.adds is None:
+        return "better" if difference > 0 else "worse"
+    if variant.adds:
+        return "would help" if difference > 0 else "would hurt"
+    return "not needed: better without it" if difference > 0 else "needed: worse without it"
+
+
+def write_results(
+    folder: Path, rows: Sequence[ResultRow], measured: Sequence[MeasuredTraining], about: dict[str, Any]
+) -> None:
+    """Write FOLDER/ablation.json and ablation.csv.
+
+    Args:
+        about: description of the ablation's subject, as plain values.
+    """
+    content = {
+        "format": FORMAT,
+        **about,
+        "rows": [asdict(row) for row in rows],
+        "trainings": [asdict(entry) for entry in measured],
+    }
+    write_json(folder / RESULT, content)
+    with atomic_path(folder / TABLE) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(ResultRow.__dataclass_fields__))
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in rows)
+
+
+def refuse_foreign(folder: Path) -> None:
+    """Raise if the folder contains something other than an ablation."""
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / RESULT).exists()):
+        raise UserError(f"{folder} exists and is not an ablation folder", "choose another folder with -o")
+
+
+def table_of(rows: Sequence[ResultRow]) -> list[tuple[str, ...]]:
+    """Return the cells of the printed table, in the order of `COLUMNS`."""
+
+    def difference(row: ResultRow) -> str:
+        if row.difference_db is None:
+            return ""
+        return f"{row.difference_db:+.2f}" + ("" if row.interval_db is None else f" ± {row.interval_db:.2f}")
+
+    return [
+        (
+            row.name,
+            f"{row.psnr:.2f}",
+            difference(row),
+            f"{row.seconds:.0f}",
+            f"{row.steps:.0f}",
+            str(row.seeds),
+            row.verdict,
+        )
+        for row in rows
+    ]
+
+
+COLUMNS = ("model", "PSNR", "difference, dB", "seconds", "steps", "seeds", "verdict")

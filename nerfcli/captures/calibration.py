@@ -1,0 +1,128 @@
+"""Known intrinsics, assigned to photos by name, else by size."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.captures.orientation import fit_to_picture
+from nerfcli.errors import UserError
+
+_SIZES_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The cameras of a calibration file.
+
+    Args:
+        path: the file, or the folder that was named.
+        cameras: the distinct cameras, in the order of the file.
+        of_image: index of each image's camera, by the image's name as the file lists it, with forward slashes.
+        upright: True if the cameras refer to upright pictures, False if to the stored pixels; see
+            `captures.orientation`.
+    """
+
+    path: Path
+    cameras: tuple[Camera, ...]
+    of_image: Mapping[str, int]
+    upright: bool = False
+
+    @property
+    def key(self) -> str:
+        """Hash of the content, independent of the file's location."""
+        content = [[camera.to_json() for camera in self.cameras], sorted(self.of_image.items()), self.upright]
+        return hashlib.blake2b(json.dumps(content).encode(), digest_size=16).hexdigest()
+
+    def to_json(self) -> dict[str, str]:
+        """Return {"file", "key"}, the record of the calibration that a scene keeps."""
+        return {"file": str(self.path.absolute()), "key": self.key}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The data by which a photo's calibration is looked up: its file, upright size and EXIF orientation."""
+
+    path: Path
+    width: int
+    height: int
+    orientation: int
+
+
+@dataclass(frozen=True)
+class PhotoCalibration:
+    """Camera of an upright photo, the index of the camera in the file, and whether the photo was found by name."""
+
+    camera: Camera
+    number: int
+    by_name: bool
+
+
+def calibrated(calibration: Calibration, pictures: Sequence[Picture]) -> tuple[PhotoCalibration, ...]:
+    """Return the camera of each photo, turned and rescaled to its upright picture.
+
+    Photos are matched to the file's images by name, without folders unless several images have the same name. A photo
+    that is not listed gets the only camera of its size, upright or as stored, or else the only one of its aspect ratio.
+
+    Raises:
+        UserError: a photo has no camera in the file, or several, or another aspect ratio than its camera.
+    """
+    listed: dict[str, dict[str, int]] = {}
+    for name, number in calibration.of_image.items():
+        listed.setdefault(name.replace("\\", "/").rpartition("/")[2], {})[name] = number
+    return tuple(_of_picture(calibration, picture, listed.get(picture.path.name, {})) for picture in pictures)
+
+
+def _of_picture(calibration: Calibration, picture: Picture, same_name: Mapping[str, int]) -> PhotoCalibration:
+    """Return the camera of a photo; `same_name` are the listed images of its name and the indices of their cameras."""
+    path = picture.path.as_posix()
+    same_folder = {number for name, number in same_name.items() if path.endswith(f"/{name}") and "/" in name}
+    listed = same_folder or set(same_name.values())
+    if len(listed) > 1:
+        raise UserError(
+            f"{calibration.path} lists {len(listed)} images called {picture.path.name}, with different cameras",
+            "give a file that lists only the cameras of these photos",
+        )
+    if listed:
+        number = next(iter(listed))
+        return PhotoCalibration(_fitted(calibration, number, picture), number, by_name=True)
+    size = {picture.width, picture.height}
+    sizes = [{camera.width, camera.height} for camera in calibration.cameras]
+    fitting = [n for n in range(len(sizes)) if sizes[n] == size and _fits(calibration, n, picture)]
+    if not fitting:
+        fitting = [n for n in range(len(sizes)) if _fits(calibration, n, picture)]
+    if len(fitting) == 1:
+        return PhotoCalibration(_fitted(calibration, fitting[0], picture), fitting[0], by_name=False)
+    what = f"photo {picture.path.name} of {picture.width}x{picture.height}"
+    if fitting:
+        raise UserError(
+            f"{calibration.path} does not list {what}, and {len(fitting)} of its cameras have that size",
+            "give a file that lists the photos by name, or one with a single camera of this size",
+        )
+    listed_sizes = list(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in calibration.cameras))
+    more = f" and {len(listed_sizes) - _SIZES_SHOWN} more" if len(listed_sizes) > _SIZES_SHOWN else ""
+    raise UserError(
+        f"{calibration.path} has no camera for {what}: it does not list it, and its cameras are for "
+        f"{', '.join(listed_sizes[:_SIZES_SHOWN])}{more}",
+        "intrinsics are for a particular aspect ratio; give the intrinsics of these photos, or remove --intrinsics",
+    )
+
+
+def _fits(calibration: Calibration, number: int, picture: Picture) -> bool:
+    """Return whether a camera has the aspect ratio of a picture, upright or as stored."""
+    camera = calibration.cameras[number]
+    shapes = [(picture.width, picture.height)]
+    if not calibration.upright and picture.orientation >= 5:
+        shapes.append((picture.height, picture.width))
+    return any(camera.has_shape(*shape) for shape in shapes)
+
+
+def _fitted(calibration: Calibration, number: int, picture: Picture) -> Camera:
+    orientation = 1 if calibration.upright else picture.orientation
+    measured = (picture.width, picture.height, orientation)
+    camera, _ = fit_to_picture(calibration.cameras[number], np.eye(4), path=picture.path, measure=lambda path: measured)
+    return camera

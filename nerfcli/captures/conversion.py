@@ -1,0 +1,236 @@
+"""Convert a capture: parse, apply corrections, refuse or accept losses, write, read back and compare, keep."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Capture
+from nerfcli.captures.axes import Convention, expressed, opencv_from_axes, reinterpreted
+from nerfcli.captures.check import Check, check, differs
+from nerfcli.captures.formats.registry import Format, UserInputs, recognise, with_masks, with_photos
+from nerfcli.captures.stored_pixels import STORED, UPRIGHT, ReorientedCapture, in_pixels
+from nerfcli.errors import GATE_NOT_MET, UserError
+
+
+@dataclass(frozen=True)
+class ConventionOverrides:
+    """The user's corrections of the convention; None or the default where the format is right.
+
+    Args: see `Convention`.
+    """
+
+    axes: str | None = None
+    inverted: bool = False
+    pixel_centre: float | None = None
+    intrinsics_scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class TargetOptions:
+    """Format and conventions of the written file.
+
+    Args:
+        axes, pixel_centre: see `Convention`; None for the format's own.
+        allow_loss: whether content that the format cannot hold may be dropped; observations always may.
+        pixels: which pixels of EXIF-turned photos the cameras refer to; None for those that programs of the format use.
+    """
+
+    form: Format
+    axes: str | None = None
+    pixel_centre: float | None = None
+    allow_loss: bool = False
+    overwrite: bool = False
+    pixels: str | None = None
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """Result of a conversion.
+
+    Args:
+        capture: the capture before losses.
+        losses: its contents that the format cannot hold, which were dropped.
+        loss_px: the largest shift of a pixel by the dropped lens terms.
+        check: the comparison of the written file with the capture.
+    """
+
+    path: Path
+    source_format: str
+    capture: Capture
+    losses: tuple[str, ...]
+    loss_px: float
+    check: Check
+    notes: tuple[str, ...] = ()
+
+
+def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tuple[Format, Path, Capture]:
+    """Read the capture in a file or folder, in the convention given by the user.
+
+    Returns:
+        The format, the file or folder that was parsed, the capture.
+
+    Raises:
+        UserError: there is no capture, it is damaged, or the given axes are invalid.
+    """
+    form, found = recognise(source)
+    capture = form.parse(found, given)
+    if given.images is not None:
+        capture = with_photos(capture, given.images)
+    if given.masks is not None:
+        capture = with_masks(capture, given.masks)
+    true_convention = Convention(
+        axes=form.axes if overrides.axes is None else overrides.axes,
+        inverted=overrides.inverted,
+        pixel_centre=0.5 if overrides.pixel_centre is None else overrides.pixel_centre,
+        intrinsics_scale=overrides.intrinsics_scale,
+    )
+    if true_convention != Convention(form.axes):
+        capture = reinterpreted(capture, true_convention, parsed_axes=form.axes)
+    return form, found, capture
+
+
+def convert(capture: Capture, target: Path, *, source_format: str, wanted: TargetOptions) -> Conversion:
+    """Write a capture in another format, read it back, and compare.
+
+    The file is kept only if cameras, poses and points agree, but for accepted losses; otherwise the previous files are
+    restored.
+
+    Args:
+        target: the file; or the folder, for formats that fill one and for a file with the format's usual name.
+
+    Raises:
+        UserError: losses are not allowed, the result exists, or the target cannot be written; with exit code 7, the
+            written file does not agree with the capture.
+    """
+    form = wanted.form
+    if form.write is None or form.losses is None:
+        raise UserError(f"{form.name} can be read, not written", "choose another format with --to", exit_code=2)
+    convention = _convention(form, wanted)
+    path = (
+        target
+        if not form.default_name or target.suffix == Path(form.default_name).suffix
+        else target / form.default_name
+    )
+    turned = in_pixels(capture, _pixels(form, wanted))
+    capture = turned.capture
+    off = len(turned.masks_left_out)
+    turned_masks = (f"{off} masks of photos with an EXIF orientation, which have the other orientation",) if off else ()
+    losses = (*turned_masks, *form.losses(capture))
+    # 2D features are data of structure from motion, which nobody expects in other formats: losing them is no reason to
+    # refuse.
+    refused = (*turned_masks, *form.losses(replace(capture, observations=None)))
+    if refused and not wanted.allow_loss:
+        raise UserError(
+            f"{form.name} cannot hold everything in this capture; it would lose: {'; '.join(losses)}",
+            "add --allow-loss to drop that, or use another format, such as nerfcli, which holds the most",
+        )
+    files = _files(form, path)
+    there = [file for file in files if file.exists()]
+    if there and not wanted.overwrite:
+        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another output path")
+    with _kept_on_success(path, there, files):
+        form.write(expressed(capture, convention, written_axes=form.axes), path)
+        checked, loss_px = _checked(capture, path, form, convention)
+    return Conversion(path, source_format, capture, losses, loss_px, checked, _orientation_notes(turned))
+
+
+def _pixels(form: Format, wanted: TargetOptions) -> str:
+    """Return which pixels of photos (stored or upright) the cameras of the written file refer to."""
+    if form.name == "nerfcli" and wanted.pixels == STORED:
+        raise UserError("the nerfcli format always uses upright photos", "remove --pixels", exit_code=2)
+    return wanted.pixels or (UPRIGHT if form.name == "nerfcli" else STORED)
+
+
+def _orientation_notes(turned: ReorientedCapture) -> tuple[str, ...]:
+    notes = []
+    if turned.num_turned:
+        stored = "as stored, as most programs expect" if turned.capture.pixels == STORED else "upright"
+        notes.append(f"{turned.num_turned} photos have an EXIF orientation: their cameras refer to pixels {stored}")
+    if turned.num_unknown:
+        notes.append(
+            f"{turned.num_unknown} photos are missing: if they have an EXIF orientation, their cameras will be wrong"
+        )
+    return tuple(notes)
+
+
+def _convention(form: Format, wanted: TargetOptions) -> Convention:
+    """Return the convention of the file to be written."""
+    axes = form.axes if wanted.axes is None else wanted.axes
+    if not np.array_equal(opencv_from_axes(axes), opencv_from_axes(form.axes)) and not form.open_axes:
+        raise UserError(
+            f"{form.name} prescribes the camera axes {form.axes}, not {axes}",
+            "remove --axes; programs that read this format expect its own axes",
+        )
+    pixel_centre = 0.5 if wanted.pixel_centre is None else wanted.pixel_centre
+    if pixel_centre != 0.5 and not form.open_centre:
+        raise UserError(
+            f"{form.name} prescribes the pixel convention: the top-left pixel's centre is (0.5, 0.5)",
+            "remove --pixel-center; programs that read this format expect its own convention",
+        )
+    return Convention(axes, pixel_centre=pixel_centre)
+
+
+def _checked(capture: Capture, path: Path, form: Format, convention: Convention) -> tuple[Check, float]:
+    """Compare the written file with the capture; return also the largest shift of a pixel by lost lens terms.
+
+    Raises:
+        UserError: with exit code 7, the file cannot be read back, or does not hold the capture.
+    """
+    assert form.losses is not None
+    ideal = {frame.camera: Camera.pinhole(*frame.camera.size, frame.camera.width) for frame in capture.frames}
+    without_lenses = replace(capture, frames=tuple(replace(f, camera=ideal[f.camera]) for f in capture.frames))
+    lenses_lost = bool(set(form.losses(capture)) - set(form.losses(without_lenses)))
+    try:
+        again = form.parse(path, UserInputs(camera=capture.frames[0].camera))
+        if convention != Convention(form.axes):
+            again = reinterpreted(again, convention, parsed_axes=form.axes)
+        checked = check(capture, again, form, own_lenses=lenses_lost or "cameras" in form.lacks)
+        lossy = check(capture, again, form, own_lenses="cameras" in form.lacks) if lenses_lost else None
+    except UserError as error:
+        message = f"{path} was not kept, as reading it back fails: {error.message}"
+        raise UserError(message, error.hint, exit_code=GATE_NOT_MET) from error
+    if checked.max_px > checked.tolerance_px:
+        raise differs(f"a ray is off by {checked.max_px:.3g} px; tolerance {checked.tolerance_px:.3g} px")
+    return checked, 0.0 if lossy is None else lossy.max_px
+
+
+def _files(form: Format, path: Path) -> list[Path]:
+    """Return all files that a format may write at `path`."""
+    folder = path.parent if form.default_name else path
+    return [folder / name.replace("*", path.stem) for name in form.files]
+
+
+@contextmanager
+def _kept_on_success(path: Path, there: list[Path], files: list[Path]) -> Iterator[None]:
+    """Set existing files aside; on any exception remove written files and new folders, and put the old files back."""
+    folders = {folder for file in files for folder in file.parents} | {path, *path.parents}
+    missing = sorted((folder for folder in folders if not folder.exists()), key=lambda folder: -len(folder.parts))
+    place = path.with_name(f".{path.name}.aside-{os.getpid()}")  # not the name that atomic_folder uses
+    aside = {file: place / file.name for file in there}
+    if there:
+        place.mkdir()
+    try:
+        for file, other in aside.items():
+            os.replace(file, other)
+        yield
+    except BaseException:
+        for file in files:
+            if file not in aside or aside[file].exists():
+                with suppress(OSError):  # a file that could not be written cannot be removed either
+                    file.unlink(missing_ok=True)
+        for file, other in aside.items():
+            if other.exists():
+                file.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(other, file)
+        for folder in missing:
+            with suppress(OSError):  # a folder that is not empty has files of others
+                folder.rmdir()
+        raise
+    finally:
+        shutil.rmtree(place, ignore_errors=True)

@@ -1,0 +1,244 @@
+"""Evidence for a convention: by how many pixels photos, their matches and cameras contradict each other.
+
+Each kind of evidence computes one error for every item, from the poses and from the viewing directions of pixels, which
+depend only on the intrinsics. An item behind a camera has an infinite error.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.axes import Convention, for_picture, shifted
+from nerfcli.errors import UserError
+from nerfcli.matching.epipolar import fundamental_matrix, sampson_angles
+from nerfcli.matching.features import Features, Matches, find_features, mutual_matches
+
+# The longer side of the photos in which features are detected: a larger one finds better features, but takes longer.
+LONGER_SIDE_PX = 1000
+# Fraction of the longer side by which matched features should move: less is explained by any poses.
+LEAST_MOVE = 0.04
+
+# Fewer matches than this may agree on a common epipolar geometry by chance.
+_LEAST_MATCHES = 20
+_EPIPOLAR_PX = 2.0
+# Most observations used: enough for a median, few enough to try hundreds of hypotheses.
+_MOST_OBSERVATIONS = 20_000
+# The rays of a match must be this far from parallel for their distances to the intersection to be meaningful.
+_LEAST_PARALLAX_PX = 3.0
+
+
+def match_neighbours(
+    frames: tuple[Frame, ...], *, progress: Callable[[float, str], None]
+) -> tuple[list[Matches], dict[int, Camera]]:
+    """Match photos with later ones in the order of names; return matches and the cameras for the photos' sizes.
+
+    A photo's partner is the next or next but one; or so much later that matched features move by `LEAST_MOVE`, as in a
+    video, whose neighbours are too close together for poses to matter. The matches of a pair agree on a common epipolar
+    geometry, estimated without poses or focal lengths. Pairs with few such matches are left out, as are frames whose
+    photo is not on disk.
+
+    Raises:
+        UserError: a photo cannot be read or has another shape than its camera.
+    """
+    present = [i for i, frame in enumerate(frames) if frame.has_photo]
+    present.sort(key=lambda index: (len(frames[index].name), frames[index].name))  # 9.jpg before 10.jpg
+    photos: dict[int, tuple[Camera, Features]] = {}
+
+    def photo(place: int) -> tuple[Camera, Features]:
+        if present[place] not in photos:
+            photos[present[place]] = _photo(frames[present[place]])
+        return photos[present[place]]
+
+    starts = np.unique(np.linspace(0, len(present) - 2, 24).round().astype(int)) if len(present) > 1 else ()
+    pairs, stride = [], 1
+    for done, start in enumerate(starts):
+        progress(done / len(starts), f"photo {done} of {len(starts)}")
+        found = None
+        while True:
+            partner = min(start + stride * (1 + start % 2), len(present) - 1)
+            matched = _matched(photo(start), photo(partner))
+            if matched is None and found is None and stride > 1:
+                stride //= 2  # the camera has become faster
+                continue
+            if matched is None:
+                break
+            found = Matches((present[start], present[partner]), matched)
+            if partner == len(present) - 1 or _move(matched, photo(start)[0]) >= LEAST_MOVE:
+                break
+            stride *= 2
+        if found is not None:
+            pairs.append(found)
+    return pairs, {index: camera for index, (camera, _) in photos.items()}
+
+
+def _move(matched: tuple[np.ndarray, np.ndarray], camera: Camera) -> float:
+    """Return the median movement of matched features from photo to photo, as a fraction of the longer side."""
+    moves = np.linalg.norm(matched[1] - matched[0], axis=1)
+    return float(np.median(moves)) / max(camera.size)
+
+
+def _photo(frame: Frame) -> tuple[Camera, Features]:
+    assert frame.image is not None
+    grey, camera = _stored_or_shown(frame.camera, frame.image)
+    return camera, find_features(grey, longer_side_px=LONGER_SIDE_PX, most=3000)
+
+
+def _stored_or_shown(camera: Camera, path: Path) -> tuple[np.ndarray, Camera]:
+    """Return the grey photo, as stored or turned upright by its EXIF orientation, and the camera for its size."""
+    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    error = UserError(f"{path} is not a readable picture", "replace it, or remove it from the folder")
+    for flag in (cv2.IMREAD_IGNORE_ORIENTATION, 0):
+        grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | flag) if len(data) else None
+        if grey is None:
+            continue
+        try:
+            return grey, camera.resized(grey.shape[1], grey.shape[0])
+        except UserError as mismatch:
+            error = UserError(f"{path}: {mismatch.message}", mismatch.hint)
+    raise error
+
+
+def _matched(first: tuple[Camera, Features], second: tuple[Camera, Features]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the positions (M, 2) of matches in both photos, or None if too few agree with each other."""
+    (camera, one), (other_camera, other) = first, second
+    a, b = mutual_matches(one.descriptors, other.descriptors)
+    if len(a) < _LEAST_MATCHES:
+        return None
+    pixels = one.pixels[a], other.pixels[b]
+    if camera.is_spherical or "FISHEYE" in camera.model:  # their matches do not fit a fundamental matrix
+        return pixels
+    # In pixels of the size at which features were detected, so that the threshold means the same for every photo.
+    scales = [min(1.0, LONGER_SIDE_PX / max(each.width, each.height)) for each in (camera, other_camera)]
+    _, agree = fundamental_matrix(
+        pixels[0] * scales[0], pixels[1] * scales[1], within_px=_EPIPOLAR_PX, trials=5000, least=_LEAST_MATCHES
+    )
+    return (pixels[0][agree], pixels[1][agree]) if agree.sum() >= _LEAST_MATCHES else None
+
+
+class ObservationEvidence:
+    """Observations of world points in photos.
+
+    The error of an observation is the angle between the viewing direction of its pixel and the direction to its point,
+    times the focal length.
+    """
+
+    threshold_px, shows_intrinsics = 4.0, True
+
+    def __init__(self, capture: Capture):
+        seen = capture.observations
+        assert seen is not None
+        rows = np.flatnonzero(seen.point_index >= 0)
+        if len(rows) > _MOST_OBSERVATIONS:
+            rows = np.sort(np.random.default_rng(0).choice(rows, _MOST_OBSERVATIONS, replace=False))
+        self.groups = seen.frame_index[rows]
+        self._points = capture.points[seen.point_index[rows]]
+        self._pixels = seen.pixels[rows]
+        self._cameras = [frame.camera for frame in capture.frames]
+        self.name = f"{len(rows)} observations of points in {len(np.unique(self.groups))} photos"
+
+    def directions(self, convention: Convention) -> tuple[np.ndarray, ...]:
+        """Return the unit viewing directions of the pixels, (M, 3), their validity and their pixels per radian."""
+        return _directions(self._cameras, self.groups, self._pixels, convention)
+
+    def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
+        """Return the error of each observation, (M,)."""
+        seen, valid, focal_px = directions
+        cam_from_world = rigid.inverse(world_from_cam)[self.groups]
+        towards = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], self._points) + cam_from_world[:, :3, 3]
+        angle = np.arctan2(np.linalg.norm(np.cross(seen, towards), axis=1), np.einsum("mi,mi->m", seen, towards))
+        # A point 90 degrees or more off its pixel's direction counts as behind the camera, for wide cameras too.
+        return np.where(valid & (angle < np.pi / 2), focal_px * angle, np.inf)
+
+
+class MatchEvidence:
+    """Matches, points that two photos both show.
+
+    The error of a match is its Sampson distance to the epipolar geometry of the two poses, as an angle times the focal
+    length.
+    """
+
+    threshold_px, shows_intrinsics = 4.0, True
+
+    def __init__(self, pairs: Sequence[Matches], cameras: dict[int, Camera], num_frames: int):
+        self.groups = np.repeat(np.arange(len(pairs)), [len(pair.pixels[0]) for pair in pairs])
+        self._pairs = np.array([pair.photos for pair in pairs]).T
+        self._first, self._second = self._pairs[:, self.groups]
+        self._first_pixels = np.concatenate([pair.pixels[0] for pair in pairs])
+        self._second_pixels = np.concatenate([pair.pixels[1] for pair in pairs])
+        stand_in = next(iter(cameras.values()))
+        self._cameras = [cameras.get(index, stand_in) for index in range(num_frames)]
+        self.name = f"{len(self.groups)} SIFT matches in {len(pairs)} pairs of photos"
+
+    def directions(self, convention: Convention) -> tuple[np.ndarray, ...]:
+        """Return unit viewing directions of both pixels of each match, (M, 3) twice, validity, pixels per radian."""
+        first, valid1, focal1 = _directions(self._cameras, self._first, self._first_pixels, convention)
+        second, valid2, focal2 = _directions(self._cameras, self._second, self._second_pixels, convention)
+        return first, second, valid1 & valid2, (focal1 + focal2) / 2
+
+    def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
+        """Return the error of each match, (M,)."""
+        first, second, valid, focal_px = directions
+        firsts, seconds = self._pairs
+        second_from_first = (rigid.inverse(world_from_cam[seconds]) @ world_from_cam[firsts])[self.groups]
+        rotation, t = second_from_first[:, :3, :3], second_from_first[:, :3, 3]
+        sampson, behind = sampson_angles(first, second, rotation, t)
+        turned = np.einsum("mij,mj->mi", rotation, first)  # the first direction in the second camera's axes
+        parallax = np.linalg.norm(np.cross(turned, second), axis=1) * focal_px > _LEAST_PARALLAX_PX
+        return np.where(valid & ~(behind & parallax) & np.isfinite(sampson), focal_px * sampson, np.inf)
+
+
+class FrustumEvidence:
+    """Visibility of scene points, of which each photo should show some: the error is 0 for a visible point.
+
+    It determines axes and directions, but not intrinsics: the wider the pictures, the more points they show.
+    """
+
+    threshold_px, shows_intrinsics = 0.0, False
+
+    def __init__(self, capture: Capture):
+        rng = np.random.default_rng(0)
+        frames = np.unique(np.linspace(0, len(capture.frames) - 1, 60).round().astype(int))
+        chosen = rng.choice(len(capture.points), min(len(capture.points), 300), replace=False)
+        self.groups = np.repeat(frames, len(chosen))
+        self._points = np.tile(capture.points[chosen], (len(frames), 1))
+        self._cameras = [frame.camera for frame in capture.frames]
+        self.name = f"the visibility of {len(chosen)} points in {len(frames)} photos"
+
+    def directions(self, convention: Convention) -> tuple[np.ndarray, ...]:
+        """Return nothing: intrinsics are those of the capture."""
+        return ()
+
+    def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
+        """Return 0 or infinity for each pair of a photo and a point, (M,)."""
+        cam_from_world = rigid.inverse(world_from_cam)[self.groups]
+        in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], self._points) + cam_from_world[:, :3, 3]
+        shown = np.zeros(len(self.groups), dtype=bool)
+        for camera, rows in _rows_of_each(self._cameras, self.groups):
+            shown[rows] = camera.shows(in_camera[rows])
+        return np.where(shown, 0.0, np.inf)
+
+
+def _directions(
+    cameras: Sequence[Camera], frame_index: np.ndarray, pixels: np.ndarray, convention: Convention
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the unit viewing directions (M, 3) of pixels of frames, their validity, and pixels per radian."""
+    directions, valid = np.zeros((len(pixels), 3)), np.zeros(len(pixels), dtype=bool)
+    focal_px = np.zeros(len(pixels))
+    for camera, rows in _rows_of_each(cameras, frame_index):
+        corrected = for_picture(shifted(camera, 0.5 - convention.pixel_centre), convention.intrinsics_scale)
+        directions[rows], valid[rows] = corrected.bearings(pixels[rows])
+        focal_px[rows] = corrected.focal_px
+    return directions, valid, focal_px
+
+
+def _rows_of_each(cameras: Sequence[Camera], index: np.ndarray) -> Iterator[tuple[Camera, np.ndarray]]:
+    """Yield each distinct camera, in the order of first appearance, and the rows of `index` (M,) that refer to it."""
+    places: dict[Camera, int] = {}
+    labels = np.array([places.setdefault(camera, len(places)) for camera in cameras], dtype=np.int64)[index]
+    order = np.argsort(labels, kind="stable")
+    yield from zip(places, np.split(order, np.searchsorted(labels[order], np.arange(1, len(places)))), strict=True)

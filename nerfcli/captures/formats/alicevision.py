@@ -1,0 +1,174 @@
+"""AliceVision's and Meshroom's .sfm (cameras.sfm, sfm.json), read only. All numbers in the file are texts.
+
+A view has a path, and the ids of a pose and of intrinsics. A pose is the rotation world_from_cam, row by row, and the
+centre, with OpenCV axes. Focal lengths in pixels are
+    fx = focalLength width / sensorWidth,  fy = fx pixelRatio    from version 1.2.5 on
+    fx = focalLength width / sensorWidth,  fy = fx / pixelRatio  from 1.2.2 on
+    pxFocalLength                                                before, one number or, from 1.2.0 on, two
+and the principal point is relative to the middle of the picture from 1.2.1 on, to its top-left corner before.
+Source: alicevision/AliceVision src/aliceVision: sfmDataIO/jsonIO.cpp, camera/cameraCommon.hpp, DistortionBrown.cpp.
+"""
+
+import os
+import posixpath
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats import lenses
+from nerfcli.captures.formats.fields import (
+    check_unique_names,
+    malformed,
+    name_of,
+    numbers,
+    read_json_object,
+    record_of,
+    shown,
+    size_of,
+)
+from nerfcli.captures.formats.limits import rigid_pose
+
+FILES = ("cameras.sfm", "sfm.sfm", "sfm.json")
+
+_EXPECTED = "expected the .sfm or .json file of AliceVision's StructureFromMotion or ConvertSfMFormat"
+# Number of distortion terms by the names of lenses; later versions name distortion apart, with the type pinhole.
+_RADIAL = {"pinhole": 0, "none": 0, "radial1": 1, "radialk1": 1, "radial3": 3, "radialk3": 3, "brown": 5}
+_FISHEYE = ("fisheye4", "fisheye")
+
+
+def is_alicevision(content: dict[str, Any]) -> bool:
+    """Return whether a JSON object has the keys of a reconstruction of AliceVision."""
+    return all(isinstance(content.get(key), list) for key in ("version", "views", "intrinsics", "poses"))
+
+
+def parse_alicevision(path: Path, *, images: Path | None = None) -> Capture:
+    """Read the views that have a pose, and the points if the file has them.
+
+    Photos are where the file says, or, as it usually comes from another machine, in `images` or beside the file.
+
+    Args:
+        images: the folder of the photos.
+
+    Raises:
+        UserError: the file is damaged (file and field are named), or it has a lens that no COLMAP model holds, or views
+            of a camera rig.
+    """
+    content = read_json_object(path)
+    if not is_alicevision(content):
+        raise malformed(str(path), "has no version, views, intrinsics or poses", _EXPECTED)
+    version = tuple(int(number) for number in _numbers(content["version"], 3, f"{path}: version"))
+    cameras = {
+        key: _camera(record, place, version)
+        for key, record, place in _identified(content["intrinsics"], "intrinsicId", f"{path}: intrinsics")
+    }
+    poses = {
+        key: _pose(record, place) for key, record, place in _identified(content["poses"], "poseId", f"{path}: poses")
+    }
+    views = [(record_of(view, f"{path}: views[{i}]"), f"{path}: views[{i}]") for i, view in enumerate(content["views"])]
+    paths = [name_of(view.get("path"), where) for view, where in views]
+    folder = _common_folder(paths)
+    frames = []
+    for (view, where), place in zip(views, paths, strict=True):
+        if "rigId" in view:
+            raise malformed(where, "belongs to a camera rig", "rigs are not supported; convert to COLMAP in Meshroom")
+        pose, camera = view.get("poseId"), view.get("intrinsicId")
+        if not isinstance(pose, str) or pose not in poses:
+            continue
+        if not isinstance(camera, str) or camera not in cameras:
+            raise malformed(where, f"intrinsicId is {shown(camera)}", "expected the id of one of the intrinsics")
+        name = place.removeprefix(folder)
+        image = images / name if images is not None else Path(place)
+        if images is None and not (image.is_absolute() and os.path.isfile(image)):
+            image = path.parent / name
+        frames.append(Frame(name, cameras[camera], poses[pose], image=image))
+    check_unique_names((frame.name for frame in frames), path)
+    points, colours = _points(content.get("structure", []), f"{path}: structure")
+    return Capture(tuple(frames), points, (), None, "alicevision", colours=colours)
+
+
+def _identified(records: list[Any], key: str, where: str) -> Iterator[tuple[str, dict[str, Any], str]]:
+    """Yield the id under `key`, the record and its place in the file for each record of a list."""
+    for index, value in enumerate(records):
+        place = f"{where}[{index}]"
+        record = record_of(value, place)
+        if not isinstance(record.get(key), str):
+            raise malformed(place, f"{key} is {shown(record.get(key))}", "expected an id, as text")
+        yield record[key], record, place
+
+
+def _common_folder(paths: list[str]) -> str:
+    """Return the folder, with a slash at its end, that all paths are in; empty if there is none."""
+    try:
+        folder = posixpath.commonpath([posixpath.dirname(path) for path in paths])
+    except ValueError:  # no paths, or absolute and relative ones
+        return ""
+    return f"{folder}/" if folder else ""
+
+
+def _numbers(value: Any, count: int, where: str) -> list[float]:
+    """Return a list of `count` numbers, which the file holds as texts."""
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise malformed(where, f"is {shown(value)}", f"expected a list of {count} numbers, as texts")
+    return numbers(value, count, where)
+
+
+def _number(record: dict[str, Any], key: str, where: str, *, default: str | None = None) -> float:
+    return _numbers([record.get(key, default)], 1, f"{where}: {key}")[0]
+
+
+def _pose(record: dict[str, Any], where: str) -> np.ndarray:
+    transform = record_of(record_of(record.get("pose"), f"{where}: pose").get("transform"), f"{where}: transform")
+    rotation = np.array(_numbers(transform.get("rotation"), 9, f"{where}: rotation")).reshape(3, 3)
+    centre = np.array(_numbers(transform.get("center"), 3, f"{where}: center"))
+    return rigid_pose(np.column_stack([rotation, centre]), where)
+
+
+def _camera(record: dict[str, Any], where: str, version: tuple[int, ...]) -> Camera:
+    size = size_of(_number(record, "width", where), _number(record, "height", where), where)
+    focal = _focal_lengths(record, size[0], version, where)
+    x, y = _numbers(record.get("principalPoint"), 2, f"{where}: principalPoint")
+    centre = (x, y) if version < (1, 2, 1) else (size[0] / 2 + x, size[1] / 2 + y)
+    kind = str(record.get("type", "")).lower()
+    if kind == "pinhole":
+        kind = str(record.get("distortionType", kind)).lower()
+    terms = record.get("distortionParams") or []  # an empty list is written as an empty text
+    values = [*_numbers(terms, len(terms) if isinstance(terms, list) else 0, f"{where}: distortionParams"), *(0.0,) * 5]
+    if kind in _FISHEYE:
+        radial = (values[0], values[1], values[2], values[3])
+        return lenses.fisheye_camera(size, focal, centre, radial=radial, where=where)
+    if kind not in _RADIAL:
+        supported = ", ".join((*_RADIAL, *_FISHEYE))
+        raise malformed(where, f"a lens of type {shown(kind)} is not supported", f"expected one of {supported}")
+    k1, k2, k3, p1, p2 = (value if index < _RADIAL[kind] else 0.0 for index, value in enumerate(values[:5]))
+    return lenses.brown_camera(size, focal, centre, radial=(k1, k2, k3), tangential=(p1, p2), where=where)
+
+
+def _focal_lengths(record: dict[str, Any], width: int, version: tuple[int, ...], where: str) -> tuple[float, float]:
+    """Return fx and fy in pixels."""
+    if version < (1, 2, 0):
+        focal = _number(record, "pxFocalLength", where)
+        return focal, focal
+    if version < (1, 2, 2):
+        fx, fy = _numbers(record.get("pxFocalLength"), 2, f"{where}: pxFocalLength")
+        return fx, fy
+    sensor, ratio = _number(record, "sensorWidth", where), _number(record, "pixelRatio", where, default="1")
+    if sensor <= 0 or ratio <= 0:
+        raise malformed(where, f"sensorWidth is {sensor:g} and pixelRatio {ratio:g}", "expected numbers above 0")
+    fx = _number(record, "focalLength", where) * width / sensor
+    return fx, fx * ratio if version >= (1, 2, 5) else fx / ratio
+
+
+def _points(value: Any, where: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return points (N, 3) and their colours (N, 3) uint8; the colours are None if there are no points."""
+    if not isinstance(value, list):
+        raise malformed(where, f"is {shown(value)}", "expected a list of points")
+    if not value:
+        return np.zeros((0, 3)), None
+    records = [record_of(item, f"{where}[{index}]") for index, item in enumerate(value)]
+    points = [_numbers(record.get("X"), 3, f"{where}[{index}]: X") for index, record in enumerate(records)]
+    colours = [_numbers(record.get("color"), 3, f"{where}[{index}]: color") for index, record in enumerate(records)]
+    return np.array(points), np.clip(np.rint(colours), 0, 255).astype(np.uint8)

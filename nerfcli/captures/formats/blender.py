@@ -1,0 +1,137 @@
+"""Blender captures of NeRF's synthetic scenes: transforms_train.json, transforms_val.json and transforms_test.json.
+
+Each file holds one horizontal field of view (camera_angle_x, radians) and the poses of its views; pixels are square,
+the principal point is the middle, and the picture's size is that of the PNG file, whose suffix file_path leaves out.
+Source: bmild/nerf load_blender.py.
+"""
+
+import math
+from collections import Counter
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from nerfcli.atomic import write_json
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.conventions import opengl_from_opencv_pose
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats.fields import read_json_object
+from nerfcli.captures.formats.transforms import (
+    SPLITS,
+    check_unique_names,
+    listed_frames,
+    relative_path,
+)
+from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
+from nerfcli.captures.orientation import Measure
+from nerfcli.errors import UserError
+
+
+def parse_blender(
+    folder: Path, measure: Measure, *, images: Path | None = None, camera: Camera | None = None
+) -> Capture:
+    """Read all views of a Blender capture, from the file of every split that exists.
+
+    Args:
+        measure: returns an image's upright size and EXIF orientation, which the files do not give. An image that is not
+            on disk gets the size of the other images in its file.
+        images: folder of the images, if they are not where the files say: under the listed paths, or their last parts.
+        camera: has the size of images that are not on disk if no image of a file is; by default the size of the first.
+
+    Raises:
+        UserError: a file is malformed or lists no image that is on disk, or there is no file.
+    """
+    frames, missing = list[Frame](), list[str]()
+    for split in SPLITS:
+        path = _file(folder, split)
+        if path.exists():
+            size = camera.size if camera else frames[0].camera.size if frames else None
+            content = read_json_object(path)
+            listed, unknown = listed_frames(path, content, measure, suffix=".png", images=images, size=size)
+            frames += [replace(frame, split=split) for frame in listed]
+            missing += unknown
+    if not frames:
+        raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")
+    check_unique_names(folder, frames)
+    return Capture(tuple(frames), np.zeros((0, 3)), tuple(missing), None, "blender")
+
+
+def losses_blender(capture: Capture) -> tuple[str, ...]:
+    """List the parts of a capture that Blender files cannot hold.
+
+    The files do not give picture sizes, so the size of a frame without an image is lost. Frames without a split go to
+    train.
+    """
+    sizes = sum(frame.image is None for frame in capture.frames)
+    lost = lost_of_cameras(capture, lost_to_pinhole)
+    off = sum(
+        camera_angle != shared
+        for split, frames in _by_split(capture).items()
+        for shared in [_shared_angle(frames)]
+        for camera_angle in map(_angle, frames)
+    )
+    lost += [f"the field of view of {off} frames (one per file)"] if off else []
+    lost += [f"the picture's size of {sizes} frames"] if sizes else []
+    return (*lost, *lost_parts(capture, holds=("splits",)))
+
+
+def write_blender(capture: Capture, folder: Path) -> None:
+    """Write a capture as transforms_{train,val,test}.json, for the splits that it has; all or none.
+
+    Frames without a split are written to train. The angle of a file is the one that most of its frames have.
+
+    Raises:
+        UserError: a spherical camera, an existing file of a split without frames, or a file that cannot be written.
+    """
+    refuse_spherical(capture, "field of view")
+    by_split = _by_split(capture)
+    stale = [_file(folder, split) for split in SPLITS if split not in by_split and _file(folder, split).exists()]
+    if stale:
+        raise UserError(
+            f"{stale[0]} already exists and belongs to another capture", "remove it or choose another folder"
+        )
+    with ExitStack() as undo:
+        for split, frames in by_split.items():
+            path = _file(folder, split)
+            records = [
+                {
+                    "file_path": _file_path(frame, folder),
+                    "transform_matrix": opengl_from_opencv_pose(frame.world_from_cam).tolist(),
+                }
+                for frame in frames
+            ]
+            if not path.exists():
+                undo.callback(path.unlink, missing_ok=True)
+            write_json(path, {"camera_angle_x": _shared_angle(frames), "frames": records})
+        undo.pop_all()
+
+
+def _file(folder: Path, split: str) -> Path:
+    return folder / f"transforms_{split}.json"
+
+
+def _by_split(capture: Capture) -> dict[str, list[Frame]]:
+    by_split: dict[str, list[Frame]] = {}
+    for split in SPLITS:
+        frames = [frame for frame in capture.frames if (frame.split or "train") == split]
+        if frames:
+            by_split[split] = frames
+    return by_split
+
+
+def _file_path(frame: Frame, folder: Path) -> str:
+    """Return the image's path as NeRF's own loader expects it: without .png, which it appends."""
+    path = PurePosixPath(relative_path(frame, folder))
+    text = str(path.with_suffix("")) if path.suffix == ".png" else str(path)
+    return text if text.startswith(("/", "../")) else f"./{text}"
+
+
+def _angle(frame: Frame) -> float:
+    """Return the horizontal field of view of a frame in radians, as if its principal point were in the middle."""
+    return 2 * math.atan(frame.camera.width / 2 / frame.camera.focal_lengths[0])
+
+
+def _shared_angle(frames: list[Frame]) -> float:
+    return Counter(map(_angle, frames)).most_common(1)[0][0]

@@ -1,0 +1,231 @@
+"""nerfstudio's camera-path JSON: the file that its viewer exports and that `ns-render camera-path` follows.
+
+    {"camera_type": "perspective" | "fisheye" | "equirectangular", "render_width", "render_height", "fps", "seconds",
+     "camera_path": [{"camera_to_world": 16 numbers row by row, "fov": degrees, "aspect"}, ...], "keyframes": [...]}
+
+Poses are world_from_cam with OpenGL axes. Focal lengths are (render_height / 2) / tan(fov / 2) for perspective and
+fisheye alike, with square pixels and the principal point in the middle; aspect is not used. nerfstudio's fisheye is the
+equidistant one, radius = focal length * angle, so a fisheye's fov is not its field of view: with fov 90, a picture is
+114.6 degrees high. Keyframes are the state of the viewer's editor; only camera_path is rendered.
+
+A path drawn in nerfstudio's viewer is in its normalised world, not in that of the scene.
+
+Sources: nerfstudio, cameras/camera_paths.py get_path_from_json; viewer/render_panel.py _write_json; cameras/cameras.py
+for the fisheye.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.atomic import write_json
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats.fields import read_json_object
+from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.unsupported import distortion, projection
+from nerfcli.errors import UserError
+
+# A larger width or height is taken for a damaged number.
+_MOST_PIXELS = 65536
+
+DEFAULT_FPS = 24.0
+
+_MODELS = {"perspective": "PINHOLE", "fisheye": "OPENCV_FISHEYE", "equirectangular": "EQUIRECTANGULAR"}
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """The views of a path, in order, and the number of frames per second."""
+
+    frames: tuple[Frame, ...]
+    fps: float
+
+
+def is_camera_path(content: dict[str, Any]) -> bool:
+    """Return whether a JSON object is a camera path rather than a transforms.json."""
+    return "camera_path" in content and "frames" not in content
+
+
+def read_path(path: Path) -> CameraPath:
+    """Read the path in a nerfstudio camera-path JSON; without fps or seconds it has 24 frames per second.
+
+    Raises:
+        UserError: the file is malformed; file and field are named.
+    """
+    content = read_json_object(path)
+    kind = content.get("camera_type", "perspective")
+    if not isinstance(kind, str) or kind.lower() not in _MODELS:
+        raise UserError(f"{path}: camera_type is {kind!r}", f"expected {', '.join(_MODELS)}")
+    width, height = (_pixels(content, key, path) for key in ("render_width", "render_height"))
+    records = content.get("camera_path")
+    if not isinstance(records, list) or not records:
+        raise UserError(
+            f"{path}: has no list camera_path",
+            'expected "camera_path": [{"camera_to_world": 16 numbers, "fov": degrees}, ...]; keyframes are not enough',
+        )
+    frames = []
+    for index, record in enumerate(records):
+        where = f"{path}: camera_path[{index}]"
+        if not isinstance(record, dict):
+            raise UserError(f"{where} is {_short(record)}", 'expected {"camera_to_world": 16 numbers, "fov": degrees}')
+        camera = _camera(record, kind.lower(), width, height, where=where)
+        frames.append(Frame(f"frame_{index:04d}", camera, _pose(record, where)))
+    return CameraPath(tuple(frames), _fps(content, len(frames), path))
+
+
+def parse_camera_path(path: Path) -> Capture:
+    """Read the views of a camera path as a capture without pictures; see `read_path`."""
+    return Capture(read_path(path).frames, np.zeros((0, 3)), (), None, "camera-path")
+
+
+def losses_camera_path(capture: Capture) -> tuple[str, ...]:
+    """List the parts of a capture that a camera path cannot hold, one clause each."""
+    frames = capture.frames
+    kept = _common_cameras(frames)
+    counts = {
+        "type of lens": sum(_kind(f.camera) != _kind(k) for f, k in zip(frames, kept, strict=True)),
+        "lens distortion": sum(bool(distortion(f.camera)) for f in frames),
+        "principal point": sum(f.camera != f.camera.centred() for f in frames),
+        "focal lengths that differ in x and y": sum(len(set(f.camera.focal_lengths)) > 1 for f in frames),
+        "picture size": sum(f.camera.size != k.size for f, k in zip(frames, kept, strict=True)),
+        "photo": sum(f.image is not None for f in frames),
+        "mask": sum(f.mask is not None for f in frames),
+        "split": sum(f.split is not None for f in frames),
+    }
+    clauses = [f"{name} of {count} of {len(frames)} views" for name, count in counts.items() if count]
+    if len(capture.points):
+        clauses.append(f"{len(capture.points)} points")
+    if capture.colours is not None:
+        clauses.append(f"colours of {len(capture.colours)} points")
+    if capture.observations is not None:
+        clauses.append("observations")
+    if capture.depth_bounds is not None:
+        clauses.append("depth bounds")
+    if capture.unit != "arbitrary":
+        clauses.append(f"the unit ({capture.unit})")
+    return tuple(clauses)
+
+
+def write_camera_path(capture: Capture, path: Path, *, fps: float = DEFAULT_FPS) -> None:
+    """Write the capture's views as a camera path, atomically; each one is a keyframe too, so that the viewer shows it.
+
+    The file has one type of lens and one picture size: those of most views. See `losses_camera_path`.
+
+    Raises:
+        UserError: there is no view, or the file cannot be written.
+    """
+    if not capture.frames:
+        raise UserError(f"there are no views to write to {path}", "a camera path needs at least one view")
+    cameras = _common_cameras(capture.frames)
+    width, height = cameras[0].size
+    records = []
+    for frame, camera in zip(capture.frames, cameras, strict=True):
+        pose = opengl_from_opencv_pose(frame.world_from_cam).ravel().tolist()
+        fov = 90.0 if camera.is_spherical else math.degrees(2 * math.atan2(height / 2, camera.focal_px))
+        records.append({"camera_to_world": pose, "fov": fov, "aspect": width / height})
+    content = {
+        "camera_type": _kind(cameras[0]),
+        "render_height": height,
+        "render_width": width,
+        "fps": fps,
+        "seconds": len(records) / fps,
+        "is_cycle": False,
+        "smoothness_value": 0.0,
+        "default_fov": records[0]["fov"],
+        "keyframes": [{"matrix": r["camera_to_world"], "fov": r["fov"], "aspect": r["aspect"]} for r in records],
+        "camera_path": records,
+    }
+    write_json(path, content)
+
+
+def _camera(record: dict[str, Any], kind: str, width: int, height: int, *, where: str) -> Camera:
+    if kind == "equirectangular":
+        return Camera("EQUIRECTANGULAR", width, height, (width, height))
+    fov = _number(record, "fov", where)
+    if not 0 < fov < 180:
+        raise UserError(f"{where}: fov is {fov}", "expected the vertical field of view in degrees, between 0 and 180")
+    focal = height / 2 / math.tan(math.radians(fov) / 2)
+    pinhole = Camera.pinhole(width, height, focal)
+    return pinhole if kind == "perspective" else Camera("OPENCV_FISHEYE", width, height, (*pinhole.params, 0, 0, 0, 0))
+
+
+def _pose(record: dict[str, Any], where: str) -> np.ndarray:
+    """Return `world_from_cam` (4, 4), OpenCV axes, exactly rigid."""
+    where = f"{where}.camera_to_world"
+    values = record.get("camera_to_world")
+    if isinstance(values, list) and len(values) in (3, 4) and all(isinstance(row, list) for row in values):
+        values = [value for row in values for value in row]
+    if not isinstance(values, list):
+        raise UserError(f"{where} is {_short(values)}", "expected 16 numbers, row by row")
+    matrix = _matrix(values, 4, where)
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise UserError(
+            f"{where}: the last row is {', '.join(f'{v:.4g}' for v in matrix[3])}",
+            "expected 0, 0, 0, 1: the matrix is stored row by row, with the position in the last column",
+        )
+    return opencv_from_opengl_pose(rigid_pose(matrix, where))
+
+
+def _matrix(values: list[Any], rows: int, where: str) -> np.ndarray:
+    """Return a matrix (rows, 4) from a flat list."""
+    if len(values) != 4 * rows:
+        raise UserError(f"{where} has {len(values)} numbers", f"expected {4 * rows} numbers, row by row")
+    numbers = [_number({f"[{i}]": value}, f"[{i}]", where) for i, value in enumerate(values)]
+    return np.array(numbers).reshape(rows, 4)
+
+
+def _number(record: dict[str, Any], key: str, where: str) -> float:
+    value = record.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e100:
+        raise UserError(f"{where}: {key} is {_short(value)}", "expected a finite number")
+    return float(value)
+
+
+def _pixels(content: dict[str, Any], key: str, path: Path) -> int:
+    value = _number(content, key, str(path))
+    if not 1 <= value <= _MOST_PIXELS or value != int(value):
+        raise UserError(f"{path}: {key} is {value:g}", f"expected an integer from 1 to {_MOST_PIXELS}")
+    return int(value)
+
+
+def _fps(content: dict[str, Any], count: int, path: Path) -> float:
+    """Return the frames per second: fps if given, else from seconds, else 24."""
+    for key in ("fps", "seconds"):
+        if content.get(key) is None:
+            continue
+        value = _number(content, key, str(path))
+        if not value > 0:
+            raise UserError(f"{path}: {key} is {value:g}", "expected a number above 0")
+        return value if key == "fps" else count / value
+    return DEFAULT_FPS
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _common_cameras(frames: Sequence[Frame]) -> tuple[Camera, ...]:
+    """Return the frames' cameras as the format can hold them: one type, one size, square pixels, no distortion."""
+    if not frames:
+        return ()
+    kind = Counter(_kind(frame.camera) for frame in frames).most_common(1)[0][0]
+    width, height = Counter(frame.camera.size for frame in frames).most_common(1)[0][0]
+    kept = []
+    for camera in (frame.camera for frame in frames):
+        # The format keeps the vertical field of view, whatever the picture's size.
+        focal = camera.focal_px * height / camera.height
+        params = (width, height) if kind == "equirectangular" else (focal, focal, width / 2, height / 2)
+        kept.append(Camera(_MODELS[kind], width, height, params + (0.0,) * 4 * (kind == "fisheye")))
+    return tuple(kept)
+
+
+def _kind(camera: Camera) -> str:
+    return "equirectangular" if camera.is_spherical else projection(camera)

@@ -1,0 +1,204 @@
+"""COLMAP models: cameras, images and points3D, as .bin or .txt.
+
+They are read here and not through pycolmap.Reconstruction, because pycolmap 4.2.1 does not fail on a truncated
+points3D.bin or frames.bin: it loops forever and fills the memory. The three files hold all that is needed. The rigs and
+frames files of COLMAP 4 say which images were taken together by a camera rig, but each image's own pose is in
+images.bin, and pycolmap reads a model without those two files.
+Source: colmap.github.io/format.html; colmap src/colmap/scene/reconstruction_io_binary.cc.
+"""
+
+import struct
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+from nerfcli.atomic import atomic_folder
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Capture
+from nerfcli.captures.formats import colmap_binary, colmap_text
+from nerfcli.captures.formats.colmap_model import ColmapImage, ColmapModel, capture_of, model_of
+from nerfcli.captures.formats.photo_names import IMAGE_FOLDERS
+from nerfcli.captures.formats.unsupported import lost_parts
+from nerfcli.errors import UserError
+
+FILES = ("cameras", "images", "points3D")
+# Models are replaced as a whole: new files would be wrong together with remaining files of another model.
+MODEL_FILES = tuple(f"{name}{suffix}" for name in (*FILES, "rigs", "frames") for suffix in (".bin", ".txt"))
+
+_ENCODINGS = {".bin": colmap_binary, ".txt": colmap_text}
+
+T = TypeVar("T")
+
+
+def is_model(folder: Path) -> bool:
+    """Return whether a folder contains the three files of a COLMAP model, binary or text."""
+    return any(all((folder / f"{name}{suffix}").is_file() for name in FILES) for suffix in _ENCODINGS)
+
+
+def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
+    """Read a COLMAP model: cameras, poses, points with colours, and all 2D features.
+
+    Frames are in the order of their image ids, and frames of one camera share the camera object. A capture does not
+    hold the ids, the mean reprojection error of each point, or rigs.
+
+    Args:
+        model_dir: holds cameras, images and points3D, as .bin (which wins) or .txt.
+        image_dir: the folder that the names of the images are relative to; nothing is looked up there.
+
+    Raises:
+        UserError: a file is missing, truncated or inconsistent; the file is named.
+    """
+    model = read_model(model_dir)
+    try:
+        return capture_of(model, image_dir)
+    except ValueError as error:
+        raise UserError(
+            f"{_file(model_dir, 'images')} and {_file(model_dir, 'points3D').name} do not belong together: {error}",
+            "the files come from different reconstructions; copy all of them again",
+        ) from error
+
+
+def parse_model(model_dir: Path, *, images: Path | None = None) -> Capture:
+    """Read a COLMAP model, with its photos in the folder that contains most of its names.
+
+    The folders tried are the given one (`images`); or images/ and the like in the model's folder or up to three folders
+    above it, then these folders themselves, as names may include the image folder.
+    """
+    capture = parse_colmap(model_dir)
+    homes = (model_dir, *model_dir.resolve().parents[:3])
+    folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
+    places = [*folders, *homes] if images is None else [images]
+    counts = [sum((place / frame.name).is_file() for frame in capture.frames) for place in places]
+    best = places[counts.index(max(counts))] if any(counts) else next(iter(folders), None)
+    if best is None:
+        return capture
+    return replace(capture, frames=tuple(replace(frame, image=best / frame.name) for frame in capture.frames))
+
+
+def read_model(model_dir: Path) -> ColmapModel:
+    """Read a COLMAP model as its files hold it, whether or not pictures are on disk; images are sorted by name.
+
+    Raises:
+        UserError: a file is missing, truncated or inconsistent; the file is named.
+    """
+    cameras_file, images_file, points_file = (_file(model_dir, name) for name in FILES)
+    encoding = _ENCODINGS[cameras_file.suffix]
+    cameras = _parse(cameras_file, encoding.cameras_from_bytes)
+    images = _parse(images_file, encoding.images_from_bytes)
+    point_ids, points, colours = _parse(points_file, encoding.points_from_bytes)
+    if not images:
+        raise UserError(f"{model_dir} has no registered images", "the reconstruction is empty; run it again")
+    for image in images:
+        _check_camera(image, cameras, images_file)
+    twice, count = Counter(image.name for image in images).most_common(1)[0]
+    if count > 1:
+        raise UserError(
+            f"{model_dir}: image {twice} is registered twice",
+            "each image must have one pose; reconstruct the model again",
+        )
+    return ColmapModel(cameras, tuple(sorted(images, key=lambda image: image.name)), points, point_ids, colours)
+
+
+def read_cameras(path: Path) -> tuple[dict[int, Camera], dict[str, int]]:
+    """Read the cameras of a cameras.bin or cameras.txt by id, and the camera ids by image name.
+
+    Image names are known only if the model's images file is beside it.
+
+    Raises:
+        UserError: a file is not readable, truncated or inconsistent; the file is named.
+    """
+    encoding = _ENCODINGS[path.suffix]
+    cameras = _parse(path, encoding.cameras_from_bytes)
+    images_file = path.with_name(f"images{path.suffix}")
+    if not images_file.is_file():
+        return cameras, {}
+    images = _parse(images_file, encoding.images_from_bytes)
+    for image in images:
+        _check_camera(image, cameras, images_file)
+    return cameras, {image.name: image.camera_id for image in images}
+
+
+def _check_camera(image: ColmapImage, cameras: Mapping[int, Camera], images_file: Path) -> None:
+    if image.camera_id not in cameras:
+        raise UserError(
+            f"{images_file}: image {image.name} refers to camera {image.camera_id}, which does not exist",
+            "the files come from different reconstructions; copy all of them again",
+        )
+
+
+def _file(model_dir: Path, name: str) -> Path:
+    """Return the file of a model, binary if its cameras are binary."""
+    return model_dir / f"{name}{'.bin' if (model_dir / 'cameras.bin').is_file() else '.txt'}"
+
+
+def _parse(path: Path, reader: Callable[[bytes], T]) -> T:
+    """Parse a file's bytes with `reader`, reporting any damage as one error that names the file."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(
+            f"{path}: {error.strerror or error}", "a COLMAP model needs cameras, images and points3D, as .bin or .txt"
+        ) from error
+    try:
+        return reader(data)
+    except (struct.error, ValueError, IndexError, KeyError) as error:
+        raise UserError(
+            f"{path} is damaged: {error}", "the file is truncated or was changed; copy or reconstruct the model again"
+        ) from error
+    except UserError as error:
+        raise UserError(f"{path}: {error.message}", error.hint) from error
+
+
+def losses_colmap(capture: Capture) -> tuple[str, ...]:
+    """List the parts of a capture that a binary COLMAP model cannot hold."""
+    return tuple(lost_parts(capture, holds=("points", "colours", "observations")))
+
+
+def losses_colmap_text(capture: Capture) -> tuple[str, ...]:
+    """List the parts of a capture that a COLMAP text model cannot hold: COLMAP truncates names at their first space."""
+    spaced = sum(" " in frame.name for frame in capture.frames)
+    names = [f"{spaced} names with spaces (COLMAP truncates them at the first space)"] if spaced else []
+    return (*losses_colmap(capture), *names)
+
+
+def write_colmap_binary(capture: Capture, path: Path) -> None:
+    """Write a capture as cameras.bin, images.bin and points3D.bin into the folder `path`, all or none.
+
+    Ids count from 1 in the order of the frames, equal cameras have one id, points without colours are black and their
+    reprojection errors -1 (not measured), as in COLMAP.
+
+    Raises:
+        UserError: a name that the files cannot hold, or a folder that cannot be written or holds other files.
+    """
+    _write(capture, path, ".bin", wrong=[f.name for f in capture.frames if not f.name or "\0" in f.name])
+
+
+def write_colmap_text(capture: Capture, path: Path) -> None:
+    """Write a capture as cameras.txt, images.txt and points3D.txt into the folder `path`, all or none.
+
+    As `write_colmap_binary`; numbers are written with full precision.
+
+    Raises:
+        UserError: a name that the files cannot hold, or a folder that cannot be written or holds other files.
+    """
+    names = [frame.name for frame in capture.frames]
+    wrong = [name for name in names if not name or name != name.strip() or "\n" in name or "\r" in name]
+    _write(capture, path, ".txt", wrong=wrong)
+
+
+def _write(capture: Capture, path: Path, suffix: str, *, wrong: list[str]) -> None:
+    if wrong:
+        raise UserError(f"the name {wrong[0]!r} cannot be written to a COLMAP model", "rename the photo")
+    others = {item.name for item in path.iterdir()} - set(MODEL_FILES) if path.is_dir() else set()
+    if others:
+        raise UserError(
+            f"{path} contains files other than a COLMAP model, such as {min(others)}",
+            "use a separate folder, such as sparse/0 in it",
+        )
+    encoding, model = _ENCODINGS[suffix], model_of(capture)
+    with atomic_folder(path) as partial:
+        (partial / f"cameras{suffix}").write_bytes(encoding.cameras_to_bytes(model))
+        (partial / f"images{suffix}").write_bytes(encoding.images_to_bytes(model))
+        (partial / f"points3D{suffix}").write_bytes(encoding.points_to_bytes(model))

@@ -1,0 +1,189 @@
+"""Read numbers and texts from files that may be damaged; every problem is one error that names file and field.
+
+`where` is always the file and the place in it, such as "poses.txt: line 3"; it begins the message.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from nerfcli.captures.formats.limits import MOST_PIXELS, MOST_UNITS
+from nerfcli.errors import UserError
+
+_LONGEST_NAME = 1000
+
+
+def malformed(where: str, what: str, hint: str) -> UserError:
+    """Create the error for a field: its location, the value found, and the value expected."""
+    return UserError(f"{where}: {what}", hint)
+
+
+def shown(value: Any) -> str:
+    """Return a value as text for a message: on one line and at most 60 characters long."""
+    text = repr(value) if not isinstance(value, dict | list) else f"a {type(value).__name__} of {len(value)}"
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def read_text(path: Path, expected: str) -> str:
+    """Read the text of a file in UTF-8, with or without a byte order mark.
+
+    Raises:
+        UserError: the file is missing, not readable, or not text; `expected` says what it should have been.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise malformed(str(path), error.strerror or str(error), expected) from error
+    except UnicodeDecodeError as error:
+        raise malformed(str(path), f"not UTF-8 text (byte {error.start})", expected) from error
+
+
+def read_json(path: Path, expected: str) -> Any:
+    """Read the value that a JSON file holds.
+
+    Raises:
+        UserError: as for `read_text`, or the text is not JSON, or is too deeply nested.
+    """
+    text = read_text(path, expected)
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        what = f"not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}"
+        raise malformed(str(path), what, "the file is truncated or was edited by hand; write it again") from error
+    except (ValueError, RecursionError) as error:  # a number with thousands of digits; too deep nesting
+        raise malformed(str(path), f"not valid JSON: {error}", expected) from error
+
+
+def read_json_object(path: Path) -> dict[str, Any]:
+    """Read the JSON object in a file.
+
+    Raises:
+        UserError: the file cannot be read, is not JSON, or does not hold an object.
+    """
+    return record_of(read_json(path, "expected a JSON file"), str(path))
+
+
+def content_lines(text: str) -> list[tuple[int, str]]:
+    """Return the lines that are neither empty nor comments (#), with their line numbers from 1."""
+    lines = enumerate(text.splitlines(), start=1)
+    return [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
+    """Return the numbers of a line of text.
+
+    Raises:
+        UserError: there are more or fewer than `count`, or one of them is not a finite number.
+    """
+    if len(words) != count:
+        found = "1 number" if len(words) == 1 else f"{len(words)} numbers"
+        raise malformed(where, f"has {found}", f"expected {count}")
+    try:
+        values = list(map(float, words))
+    except ValueError:
+        values = []
+    in_range = min(values, default=0) >= -MOST_UNITS and max(values, default=0) <= MOST_UNITS
+    if len(values) == count and in_range and math.isfinite(sum(values)):  # NaN may escape the comparisons, not the sum
+        return values
+    _refuse_number(words, where)
+
+
+def record_of(value: Any, where: str) -> dict[str, Any]:
+    """Return a JSON object.
+
+    Raises:
+        UserError: the value is not a JSON object.
+    """
+    if not isinstance(value, dict):
+        raise malformed(where, f"is {shown(value)}", "expected a JSON object {...}")
+    return value
+
+
+def number(record: dict[str, Any], key: str, where: str, *, default: float | None = None) -> float:
+    """Return a number of a JSON object, or `default` where the key is absent.
+
+    Raises:
+        UserError: the key is absent and there is no default, or its value is not a finite number.
+    """
+    value = record.get(key, default)
+    if not _is_number(value):
+        raise malformed(
+            where, f"{key} is {shown(value)}" if key in record else f"{key} is missing", "expected a number"
+        )
+    return float(value)
+
+
+def vector(record: dict[str, Any], key: str, count: int, where: str) -> np.ndarray:
+    """Return a list of `count` numbers of a JSON object, as float64.
+
+    Raises:
+        UserError: the key is absent, or its value is not such a list.
+    """
+    value = record.get(key)
+    if not isinstance(value, list) or len(value) != count or not all(map(_is_number, value)):
+        what = f"{key} is missing" if key not in record else f"{key} is {shown(value)}"
+        raise malformed(where, what, f"expected a list of {count} numbers")
+    return np.array(value, dtype=np.float64)
+
+
+def size_of(width: float, height: float, where: str) -> tuple[int, int]:
+    """Return the width and height of a picture as integers.
+
+    Raises:
+        UserError: one of them is not a whole number from 1 to `MOST_PIXELS`.
+    """
+    if not all(1 <= side <= MOST_PIXELS and side == int(side) for side in (width, height)):
+        what = f"width and height are {shown(width)} and {shown(height)}"
+        raise malformed(where, what, "expected the picture's size in pixels, as integers")
+    return int(width), int(height)
+
+
+def name_of(value: Any, where: str) -> str:
+    """Return the name of an image, with forward slashes.
+
+    Raises:
+        UserError: the value is not text, is empty, or cannot be the name of a file.
+    """
+    if not isinstance(value, str) or not value.strip() or len(value) > _LONGEST_NAME or not _is_plain(value):
+        raise malformed(where, f"the image's name is {shown(value)}", "expected the image's path as text")
+    return value.strip().replace("\\", "/")
+
+
+def check_unique_names(names: Iterable[str], path: Path) -> None:
+    """Check that no two frames have the same name.
+
+    Raises:
+        UserError: a name is listed twice, or none is listed.
+    """
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise malformed(str(path), f"image {shown(name)} is listed twice", "remove one of its two entries")
+        seen.add(name)
+    if not seen:
+        raise malformed(str(path), "lists no images with a pose", "the reconstruction is empty; run it again")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and -MOST_UNITS <= value <= MOST_UNITS
+
+
+def _is_plain(text: str) -> bool:
+    """Return whether a text has no control characters and no lone surrogates, which JSON may contain."""
+    return not any(ord(char) < 32 or ord(char) == 127 or 0xD800 <= ord(char) <= 0xDFFF for char in text)
+
+
+def _refuse_number(words: Iterable[str], where: str) -> NoReturn:
+    for word in words:
+        try:
+            if -MOST_UNITS <= float(word) <= MOST_UNITS:
+                continue
+            what = f"{shown(word)} is not finite" if not math.isfinite(float(word)) else f"{shown(word)} is too large"
+        except ValueError:
+            what = f"{shown(word)} is not a number"
+        raise malformed(where, what, "the file was changed or truncated; write it again")
+    raise AssertionError("called for valid numbers")

@@ -1,0 +1,176 @@
+"""LLFF captures: poses_bounds.npy beside images/ or images_4/, images_8/.
+
+Each row of the array holds a 3x5 matrix, row by row (the pose with axes down, right, backward; the centre; height,
+width, focal length of the full-size photo), and the depths of the nearest and farthest point. Rows are in the order of
+the sorted file names. Source: Fyusion/LLFF README, "Using your own poses without running COLMAP";
+llff/poses/pose_utils.py, save_poses.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.atomic import atomic_path
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats.limits import checked_camera, plausible, rigid_poses
+from nerfcli.captures.formats.npy import DAMAGED, array_of_npy
+from nerfcli.captures.formats.photo_names import IMAGE_FOLDERS, ListImages
+from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
+from nerfcli.errors import UserError
+
+FILE = "poses_bounds.npy"
+
+# Percentiles of the depths of a view's points that give its depth bounds. Source: pose_utils.py, save_poses.
+_NEAR_PERCENT, _FAR_PERCENT = 0.1, 99.9
+
+
+def parse_llff(folder: Path, list_images: ListImages) -> Capture:
+    """Read poses_bounds.npy; cameras are for the full-size photos.
+
+    The file does not name the photos. They are those of the first image folder that holds one per row. If there is no
+    image folder at all, frames are named image000, image001, ... and have no image.
+
+    Raises:
+        UserError: the array is damaged or of another shape, or image folders hold other numbers of images.
+    """
+    path = folder / FILE
+    rows = _read_rows(path)
+    images: list[Path] | list[None] = [None] * len(rows)
+    if any((folder / name).is_dir() for name in IMAGE_FOLDERS):
+        images = _images_of_rows(folder, len(rows), list_images)
+    frames = [
+        Frame(f"image{index:03d}" if image is None else _name(image), camera, world_from_cam, image=image)
+        for index, (image, (camera, world_from_cam)) in enumerate(zip(images, _views(path, rows), strict=True))
+    ]
+    return Capture(tuple(frames), np.zeros((0, 3)), (), rows[:, 15:].copy(), "llff")
+
+
+def losses_llff(capture: Capture) -> tuple[str, ...]:
+    """List the parts of a capture that poses_bounds.npy cannot hold.
+
+    Photos are identified by the order of their file names, so names are lost only if that order is ambiguous: if the
+    photos are in more than one folder.
+    """
+    folders = {Path(frame.name).parent for frame in capture.frames}
+    names = [f"the photos' {len(folders)} folders"] if len(folders) > 1 else []
+    parts = lost_parts(capture, holds=("depth bounds",))
+    return (*lost_of_cameras(capture, lost_to_pinhole), *names, *parts)
+
+
+def write_llff(capture: Capture, folder: Path) -> None:
+    """Write a capture as poses_bounds.npy into a folder, atomically; rows are in the order of the photos' names.
+
+    Depth bounds are the capture's own. Where it has none, they are the 0.1th and 99.9th percentile of the depths of the
+    points that a view observes, or if there are no observations, of those that lie within its picture. A view without
+    two such depths gets the widest bounds of the other views. The horizontal focal length is written.
+
+    Raises:
+        UserError: neither depth bounds nor points, a spherical camera, or a file that cannot be written.
+    """
+    refuse_spherical(capture, "focal length")
+    bounds = _percentile_bounds(capture) if capture.depth_bounds is None else capture.depth_bounds
+    poses = llff_from_opencv_pose(np.array([frame.world_from_cam for frame in capture.frames]))
+    sizes = [(frame.camera.height, frame.camera.width, frame.camera.focal_lengths[0]) for frame in capture.frames]
+    matrices = np.concatenate([poses[:, :3], np.array(sizes, dtype=np.float64)[:, :, None]], axis=2)  # (F, 3, 5)
+    rows = np.concatenate([matrices.reshape(-1, 15), bounds], axis=1)
+    order = sorted(range(len(rows)), key=lambda index: Path(capture.frames[index].name).name)
+    with atomic_path(folder / FILE) as partial:
+        np.save(partial, rows[order], allow_pickle=False)
+
+
+def _read_rows(path: Path) -> np.ndarray:
+    try:
+        rows = array_of_npy(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} is not a readable NumPy array ({str(error)[:200]})", DAMAGED) from error
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0 or rows.dtype.kind not in "fiu":
+        raise UserError(
+            f"{path}: array of shape {rows.shape}", "expected (images, 17): 3x5 pose and intrinsics, near and far depth"
+        )
+    return rows.astype(np.float64)
+
+
+def _views(path: Path, rows: np.ndarray) -> list[tuple[Camera, np.ndarray]]:
+    """Return the camera and `world_from_cam` of each row; rows of equal intrinsics share one camera."""
+    matrices = rows[:, :15].reshape(-1, 3, 5)
+    poses = opencv_from_llff_pose(rigid_poses(matrices[:, :, :4], lambda index: f"{path}: row {index}"))
+    bad = ~((rows[:, 15] > 0) & (rows[:, 15] < rows[:, 16]) & plausible(rows[:, 15:]))
+    if bad.any():
+        index = int(np.argmax(bad))
+        near, far = rows[index, 15:]
+        raise UserError(
+            f"{path}: row {index}: depth bounds {near:g} and {far:g}",
+            "expected 0 < near < far in the last two columns",
+        )
+    numbers = [tuple(row) for row in matrices[:, :, 4].tolist()]
+    cameras = {row: _camera(row, f"{path}: row {numbers.index(row)}") for row in dict.fromkeys(numbers)}
+    return [(cameras[row], pose) for row, pose in zip(numbers, poses, strict=True)]
+
+
+def _images_of_rows(folder: Path, count: int, list_images: ListImages) -> list[Path]:
+    found = []
+    for name in IMAGE_FOLDERS:
+        if not (folder / name).is_dir():
+            continue
+        images = list_images(folder / name)
+        if len(images) == count:
+            return images
+        found.append(f"{name}/ has {len(images)}")
+    raise UserError(
+        f"{folder / FILE} has {count} rows, but {', '.join(found) or 'the folder images/ is missing'}",
+        "there must be exactly one photo per row, sorted by name",
+    )
+
+
+def _name(image: Path) -> str:
+    return f"{image.parent.name}/{image.name}"
+
+
+def _camera(size_and_focal: Iterable[float], where: str) -> Camera:
+    height, width, focal = size_and_focal
+    if not min(height, width) >= 1 or not focal > 0 or not max(height, width, focal) < np.inf:  # True at NaN
+        raise UserError(
+            f"{where}: invalid height, width or focal length: {height:g}, {width:g}, {focal:g}",
+            "expected three positive numbers in the fifth column of the pose",
+        )
+    params = (focal, focal, round(width) / 2, round(height) / 2)
+    return checked_camera("PINHOLE", round(width), round(height), params, where=where)
+
+
+def _percentile_bounds(capture: Capture) -> np.ndarray:
+    """Return the nearest and farthest depth of each view, (frames, 2), from the points."""
+    bounds = np.full((len(capture.frames), 2), np.nan)
+    seen = _points_seen(capture)
+    for index, frame in enumerate(capture.frames):
+        depths = rigid.apply(rigid.inverse(frame.world_from_cam), capture.points[seen[index]])[:, 2]
+        depths = depths[depths > 0]
+        if len(depths):
+            bounds[index] = np.percentile(depths, [_NEAR_PERCENT, _FAR_PERCENT])
+    valid = bounds[:, 0] < bounds[:, 1]  # False at NaN
+    if not valid.any():
+        raise UserError(
+            f"poses_bounds.npy needs depth bounds, but none of the {len(capture.frames)} views sees two of the "
+            f"{len(capture.points)} points",
+            "convert from a format with points or depth bounds, such as a COLMAP model",
+        )
+    bounds[~valid] = bounds[valid, 0].min(), bounds[valid, 1].max()
+    return bounds
+
+
+def _points_seen(capture: Capture) -> list[np.ndarray]:
+    """Return the indices of the points that each view sees: those it observes, or else those within its picture."""
+    seen = capture.observations
+    if seen is not None and (seen.point_index >= 0).any():
+        with_point = seen.point_index >= 0
+        frame_index, point_index = seen.frame_index[with_point], seen.point_index[with_point]
+        order = np.argsort(frame_index, kind="stable")
+        starts = np.searchsorted(frame_index[order], np.arange(1, len(capture.frames)))
+        return np.split(point_index[order], starts)
+    return [
+        np.flatnonzero(frame.camera.shows(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points)))
+        for frame in capture.frames
+    ]

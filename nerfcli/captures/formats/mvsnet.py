@@ -1,0 +1,72 @@
+"""MVSNet's cameras, cams/00000000_cam.txt for images/00000000.jpg, as BlendedMVS and many networks use them; read only.
+
+    extrinsic
+    (4x4 matrix, cam_from_world with OpenCV axes)
+
+    intrinsic
+    (3x3 matrix, for the size of the photos)
+
+    DEPTH_MIN DEPTH_INTERVAL [DEPTH_NUM [DEPTH_MAX]]
+
+Source: YoYo000/MVSNet README, "File Formats", and colmap2mvsnet.py (principal points as in COLMAP).
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats.fields import check_unique_names, malformed, numbers, read_text
+from nerfcli.captures.formats.lenses import camera_of_matrix
+from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.photo_names import ListImages, PhotoOfStem
+from nerfcli.captures.orientation import Measure, stored_size
+
+CAMERA_FOLDER = "cams"
+CAMERA_FILES = "*_cam.txt"
+IMAGE_FOLDERS = ("images", "blended_images")
+
+_EXPECTED = "expected the word extrinsic, 16 numbers, the word intrinsic, 9 numbers, and a line of 2 to 4 depths"
+
+
+def parse_mvsnet(folder: Path, measure: Measure, list_images: ListImages, *, images: Path | None = None) -> Capture:
+    """Read the cameras in cams/, with their depth bounds where all files have them.
+
+    The photos are in `images`, by default images/ or blended_images/.
+
+    Raises:
+        UserError: a file is damaged (it is named), or no photo is on disk.
+    """
+    photos = PhotoOfStem(images, list_images, home=folder, names=IMAGE_FOLDERS)
+    frames, bounds = [], []
+    for file in sorted((folder / CAMERA_FOLDER).glob(CAMERA_FILES)):
+        cam_from_world, matrix, depths = _read(file)
+        image = photos.find(file.name.removesuffix(CAMERA_FILES[1:]))
+        if image is not None:
+            camera = camera_of_matrix(matrix, stored_size(image, measure), f"{file}: intrinsic")
+            frames.append(Frame(image.name, camera, rigid.inverse(cam_from_world), image=image))
+            bounds.append(depths)
+    missing = photos.missing(str(folder))
+    check_unique_names((frame.name for frame in frames), folder)
+    known = np.array(bounds) if None not in bounds else None
+    return Capture(tuple(frames), np.zeros((0, 3)), missing, known, "mvsnet")
+
+
+def _read(file: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, float] | None]:
+    """Return `cam_from_world` (4, 4), the matrix of intrinsics (3, 3), and nearest and farthest z if both are there."""
+    fields = read_text(file, _EXPECTED).split()
+    if len(fields) < 27 or fields[0] != "extrinsic" or fields[17] != "intrinsic" or len(fields) > 31:
+        raise malformed(str(file), "is not a camera of MVSNet", _EXPECTED)
+    pose = np.array(numbers(fields[1:17], 16, f"{file}: extrinsic")).reshape(4, 4)
+    matrix = np.array(numbers(fields[18:27], 9, f"{file}: intrinsic")).reshape(3, 3)
+    depths = numbers(fields[27:], len(fields) - 27, f"{file}: depths")
+    return rigid_pose(pose, f"{file}: extrinsic"), matrix, _bounds(depths)
+
+
+def _bounds(depths: list[float]) -> tuple[float, float] | None:
+    """Return nearest and farthest z; None if the farthest is not stated, or they are not in order."""
+    if len(depths) < 3:
+        return None
+    near, far = depths[0], depths[3] if len(depths) == 4 else depths[0] + depths[1] * depths[2]
+    return (near, far) if 0 < near < far else None

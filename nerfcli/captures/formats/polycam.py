@@ -1,0 +1,57 @@
+"""Raw data of Polycam's LiDAR captures (export "Raw data" in developer mode), read only.
+
+keyframes/corrected_cameras/ID.json belongs to keyframes/corrected_images/ID.jpg: t_00 to t_23 are the first three rows
+of world_from_cam with OpenGL axes, in metres, the world's y axis up; fx, fy, cx, cy are in pixels of a picture of width
+and height. Corrected photos are undistorted, and their poses are those after loop closure; captures too large for that
+have cameras/ and images/ only.
+Source: PolyCam/polyform README.md, "Polycam's data format", and polyform/convertors/instant_ngp.py.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.conventions import opencv_from_opengl_pose
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats.fields import check_unique_names, number, read_json_object, size_of
+from nerfcli.captures.formats.limits import checked_camera, rigid_pose
+from nerfcli.captures.formats.photo_names import ListImages, PhotoOfStem
+
+FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
+KEYFRAMES = "keyframes"
+
+_POSE = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
+
+
+def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
+    """Return the folders of cameras and photos of a capture's folder; None if it is not one of Polycam's."""
+    home = folder / KEYFRAMES
+    pairs = [(home / cameras, home / images) for cameras, images in FOLDERS if any((home / cameras).glob("*.json"))]
+    return next((pair for pair in pairs if pair[1].is_dir()), pairs[0] if pairs else None)
+
+
+def parse_polycam(folder: Path, list_images: ListImages, *, images: Path | None = None) -> Capture:
+    """Read the keyframes of a capture; the unit is the metre, by LiDAR.
+
+    The photos are in the folder beside the cameras, or in `images`.
+
+    Raises:
+        UserError: a file is damaged (file and field are named), or no photo is on disk.
+    """
+    found = polycam_folders(folder)
+    assert found is not None
+    photos, frames = PhotoOfStem(images, list_images, home=found[1]), []
+    for file in sorted(found[0].glob("*.json"), key=lambda file: (len(file.stem), file.stem)):
+        where, record = str(file), read_json_object(file)
+        fx, fy, cx, cy, *pose = (number(record, key, where) for key in ("fx", "fy", "cx", "cy", *_POSE))
+        size = size_of(number(record, "width", where), number(record, "height", where), where)
+        camera = checked_camera("PINHOLE", *size, (fx, fy, cx, cy), where=where)
+        image = photos.find(file.stem)
+        if image is not None:
+            world_from_cam = opencv_from_opengl_pose(rigid_pose(np.array(pose).reshape(3, 4), where))
+            frames.append(Frame(image.name, camera, world_from_cam, image=image))
+    missing = photos.missing(str(folder))
+    check_unique_names((frame.name for frame in frames), folder)
+    return Capture(
+        tuple(frames), np.zeros((0, 3)), missing, None, "polycam", unit="metre", unit_source="LiDAR (Polycam)"
+    )

@@ -1,0 +1,139 @@
+"""Folders with a text file for each photo that holds its pose: ScanNet, 7-Scenes, NSVF, SRN and many others; read only.
+
+    pose/0.txt                    color/0.jpg              intrinsic/intrinsic_color.txt    ScanNet
+    frame-000000.pose.txt         frame-000000.color.png   none: give --intrinsics          7-Scenes
+    pose/0_train_0000.txt         rgb/0_train_0000.png     intrinsics.txt                   NSVF: 0_, 1_, 2_ are splits
+
+A pose is a 4x4 matrix, row by row, or its first three rows: world_from_cam with OpenCV axes. Intrinsics are a 3x3, 3x4
+or 4x4 matrix for the size of the photos, or as SRN writes them: a line "f cx cy 0", more lines, and last "height width"
+of the pictures that these numbers are for.
+Source: ScanNet SensReader; Microsoft 7-Scenes readme.txt; facebookresearch/NSVF fairnr/data/data_utils.py
+(load_intrinsics, load_matrix); vsitzmann/scene-representation-networks util.py (parse_intrinsics).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, size_of
+from nerfcli.captures.formats.lenses import camera_of_matrix
+from nerfcli.captures.formats.limits import checked_camera, rigid_pose
+from nerfcli.captures.formats.photo_names import GIVE_CAMERA, ListImages, PhotoOfStem
+from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.errors import UserError
+
+POSE_FOLDERS = ("pose", "poses")
+IMAGE_FOLDERS = ("color", "rgb", "images", "image")
+
+_INTRINSICS = (
+    *("intrinsic/intrinsic_color.txt", "intrinsics/intrinsic_color.txt", "intrinsic_color.txt"),
+    *("intrinsics.txt", "camera-intrinsics.txt", "camera_intrinsics.txt", "intrinsic.txt"),
+)
+_EXPECTED = "expected a 4x4 matrix, world from camera"
+_SPLITS = {"0_": "train", "1_": "val", "2_": "test"}
+
+
+def pose_files(folder: Path) -> list[Path]:
+    """Return the files of a folder that may hold one pose each: those in pose/ or poses/, else *.pose.txt.
+
+    They are sorted by the length of their names, then by name, so that 10.txt comes after 9.txt.
+    """
+    found = next(filter(None, (list((folder / name).glob("*.txt")) for name in POSE_FOLDERS)), None)
+    return sorted(found or folder.glob("*.pose.txt"), key=lambda file: (len(file.name), file.name))
+
+
+def is_pose(path: Path) -> bool:
+    """Return whether a text file has as many numbers as a pose."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        return len(stream.read(10_000).split()) in (12, 16)
+
+
+def parse_pose_files(
+    folder: Path,
+    measure: Measure,
+    list_images: ListImages,
+    *,
+    camera: Camera | None = None,
+    images: Path | None = None,
+) -> Capture:
+    """Read the poses in a folder, and the intrinsics beside them.
+
+    A pose with numbers that are not finite is that of a photo that was not tracked, and gives no frame. Photos are
+    found by the names of the pose files; those that are not on disk are `missing`.
+
+    Args:
+        folder: holds the poses, see `pose_files`.
+        camera: of all photos, resized to them; None for the intrinsics in the folder.
+        images: the folder of the photos; by default color/, rgb/, images/ or image/, else that of the poses.
+
+    Raises:
+        UserError: a file is damaged (file and line are named), there are no intrinsics, or no photo is on disk.
+    """
+    files = pose_files(folder)
+    if images is None:
+        places = (folder / name for name in IMAGE_FOLDERS)
+        images = next((place for place in places if place.is_dir() and list_images(place)), files[0].parent)
+    photos, frames = PhotoOfStem(images, list_images, home=folder), []
+    camera_of_size = _cameras(folder, camera)
+    names_give_splits = all(file.name[:2] in _SPLITS for file in files)
+    for file in files:
+        world_from_cam = _pose(file)
+        stem = file.name.removesuffix(".txt").removesuffix(".pose")
+        image = photos.find(stem, f"{stem}.color")
+        if image is not None and world_from_cam is not None:
+            own_camera = camera_of_size(stored_size(image, measure))
+            split = _SPLITS[stem[:2]] if names_give_splits else None
+            frames.append(Frame(image.name, own_camera, world_from_cam, image=image, split=split))
+    missing = photos.missing(str(folder))
+    check_unique_names((frame.name for frame in frames), folder)
+    return Capture(tuple(frames), np.zeros((0, 3)), missing, None, "pose-files")
+
+
+def _pose(file: Path) -> np.ndarray | None:
+    """Return `world_from_cam` (4, 4); None if it has numbers that are not finite."""
+    fields = read_text(file, _EXPECTED).split()
+    if len(fields) not in (12, 16):
+        raise malformed(str(file), f"has {len(fields)} numbers", _EXPECTED)
+    if not _is_tracked(fields):
+        return None
+    return rigid_pose(np.array(numbers(fields, len(fields), str(file))).reshape(-1, 4), str(file))
+
+
+def _is_tracked(fields: Sequence[str]) -> bool:
+    """Return False if a number is infinite or NaN, as ScanNet writes the pose of a photo that was not tracked."""
+    try:
+        return all(math.isfinite(float(field)) for field in fields)
+    except ValueError:
+        return True  # not a number at all: an error that `numbers` reports
+
+
+def _cameras(folder: Path, camera: Camera | None) -> Callable[[tuple[int, int]], Camera]:
+    """Return the function that gives the camera of photos with a size."""
+    if camera is not None:
+        return lambda size: camera.resized(*size)
+    path = next((folder / name for name in _INTRINSICS if (folder / name).is_file()), None)
+    if path is None:
+        raise UserError(
+            f"{folder} has poses but no file of intrinsics, such as {_INTRINSICS[0]}",
+            GIVE_CAMERA,
+        )
+    rows = [line.split() for _, line in content_lines(read_text(path, "expected a matrix of intrinsics"))]
+    lengths = [len(row) for row in rows]
+    if lengths in ([3] * 3, [4] * 3, [4] * 4):
+        matrix = np.array([numbers(row, len(row), str(path)) for row in rows])[:3, :3]
+        return lambda size: camera_of_matrix(matrix, size, str(path))
+    if len(rows) < 2 or lengths[0] != 4 or lengths[-1] != 2:
+        raise malformed(
+            str(path),
+            f"has lines of {', '.join(map(str, lengths[:6]))} numbers" if lengths else "is empty",
+            'expected a 3x3 or 4x4 matrix, or first a line "f cx cy 0" and last "height width"',
+        )
+    focal, x, y, _ = numbers(rows[0], 4, str(path))
+    height, width = numbers(rows[-1], 2, str(path))
+    size = size_of(width, height, str(path))
+    calibrated = checked_camera("PINHOLE", *size, (focal, focal, x, y), where=str(path))
+    return lambda size: calibrated.resized(*size)

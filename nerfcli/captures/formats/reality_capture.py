@@ -1,0 +1,120 @@
+"""RealityCapture's and RealityScan's "Internal/External camera parameters" (.csv), read only.
+
+RealityCapture calls the columns name, x, y, alt, heading, pitch, roll, f, px, py, k1, k2, k3, k4, t1, t2; RealityScan 2
+calls some of them yaw, f_35mm, px_norm, py_norm. With s = max(width, height) of the photo in pixels:
+    focal length = f/36 s,  principal point = (width/2 + px s, height/2 + py s)
+since f is in millimetres on a frame 36 mm long, but px and py are fractions of that length. k1 to k3 are OpenCV's, t1
+is OpenCV's p2 and t2 its p1. The camera's centre is (x, y, alt), and its rotation with OpenGL axes
+    world_from_cam = Rz(-heading) Rx(pitch) Ry(roll)
+in degrees: with zeros it looks straight down with north (+y) at the top of the picture, and roll turns about north.
+Source: calibration.xml of RealityScan 2.2, the templates of its exports ("Internal/External camera parameters" with
+$(f*36), $(px); "OpenCV-compliant ..." with $(px*scale+width*0.5) and the order k1, k2, t2, t1, k3);
+nerfstudio process_data/realitycapture_utils.py for the rotation (it takes t1 for p1).
+"""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.conventions import opencv_from_opengl_pose
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats import lenses
+from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, read_text, shown
+from nerfcli.captures.formats.photo_names import measured_sizes
+from nerfcli.captures.orientation import Measure
+
+_EXPECTED = 'expected a file of RealityScan\'s export "Internal/External camera parameters"'
+
+_COLUMNS = {
+    "heading": ("heading", "yaw"),
+    "f": ("f", "f_35mm"),
+    "px": ("px", "px_norm"),
+    "py": ("py", "py_norm"),
+    **{key: (key,) for key in ("name", "x", "y", "alt", "pitch", "roll", "k1", "k2", "k3", "k4", "t1", "t2")},
+}
+_NUMBERS = ("x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+
+
+def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None = None) -> Capture:
+    """Read the cameras of the file, in the coordinates that it was exported in (z up); the unit stays arbitrary.
+
+    The file does not give the size of the photos, so they are measured; those that are not on disk are `missing`.
+    Distortion must be of one of the Brown models: the division model gives k1 another meaning, and the file does not
+    say which model it is.
+
+    Args:
+        images: the folder that the names in the file are relative to; by default the file's own.
+
+    Raises:
+        UserError: the file is damaged (file and line are named), has a lens that no COLMAP model holds, or none of its
+            photos is on disk.
+    """
+    names, rows, places = _table(path)
+    sizes, missing = measured_sizes(names, images or path.parent, measure, path)
+    value = {key: rows[:, index] for index, key in enumerate(_NUMBERS)}
+    angles = np.stack([-value["heading"], value["pitch"], value["roll"]], axis=-1)
+    rotations = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
+    poses = opencv_from_opengl_pose(rigid.from_parts(rotations, rows[:, :3]))
+    frames = []
+    for index, name in enumerate(names):
+        if name in sizes:
+            intrinsics: dict[str, float] = dict(zip(_NUMBERS[6:], rows[index, 6:].tolist(), strict=True))
+            camera = _camera(intrinsics, sizes[name][0], places[index])
+            frames.append(Frame(name, camera, poses[index], image=sizes[name][1]))
+    return Capture(tuple(frames), np.zeros((0, 3)), missing, None, "reality_capture")
+
+
+def _table(path: Path) -> tuple[list[str], np.ndarray, list[str]]:
+    """Return the images' names, their numbers (images, 15) in the order of `_NUMBERS`, and their places in the file."""
+    lines = read_text(path, _EXPECTED).splitlines()
+    start = next((index for index, line in enumerate(lines) if line.lower().startswith(("#name,", "name,"))), None)
+    if start is None:
+        raise malformed(str(path), "has no header line #name,x,y,alt,...", _EXPECTED)
+    header = [word.strip().lower() for word in lines[start].lstrip("#").split(",")]
+    columns = {}
+    for key, spellings in _COLUMNS.items():
+        found = [header.index(word) for word in spellings if word in header]
+        if not found:
+            raise malformed(f"{path}: line {start + 1}", f"has no column {' or '.join(spellings)}", _EXPECTED)
+        columns[key] = found[0]
+    names, rows, places = [], [], []
+    for index, line in enumerate(lines[start + 1 :], start=start + 2):
+        if not line.strip():
+            continue
+        where = f"{path}: line {index}"
+        words = _cells(line, where)
+        if len(words) != len(header):
+            raise malformed(where, f"has {len(words)} columns", f"expected {len(header)}, as in the file's first line")
+        names.append(name_of(words[columns["name"]], where))
+        rows.append(numbers([words[columns[key]] for key in _NUMBERS], len(_NUMBERS), where))
+        places.append(where)
+    check_unique_names(names, path)
+    return names, np.array(rows), places
+
+
+def _cells(line: str, where: str) -> list[str]:
+    """Return the cells of a line, in which a name with a comma is quoted."""
+    if '"' not in line:
+        return line.split(",")
+    try:
+        return next(csv.reader([line], strict=True))
+    except (csv.Error, StopIteration) as error:
+        raise malformed(where, f"is not a valid line of a table ({error})", _EXPECTED) from error
+
+
+def _camera(value: dict[str, float], size: tuple[int, int], where: str) -> Camera:
+    scale = max(size)
+    focal = (value["f"] / 36 * scale,) * 2
+    centre = (size[0] / 2 + value["px"] * scale, size[1] / 2 + value["py"] * scale)
+    if value["k4"] != 0:
+        raise malformed(
+            where,
+            f"k4 is {shown(value['k4'])}: a fourth radial term, which is not supported",
+            "align with the distortion model Brown3 or Brown3 with tangential2, and export again",
+        )
+    radial, tangential = (value["k1"], value["k2"], value["k3"]), (value["t2"], value["t1"])
+    return lenses.brown_camera(size, focal, centre, radial=radial, tangential=tangential, where=where)

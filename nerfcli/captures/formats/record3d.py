@@ -1,0 +1,70 @@
+"""Captures of the app Record3D, unpacked or exported as "EXR + RGB": metadata.json beside rgb/0.jpg, rgb/1.jpg, ...
+
+poses: a list of qx, qy, qz, qw, x, y, z for each frame: world_from_cam with OpenGL axes, in metres, the world's y axis
+up. perFrameIntrinsicCoeffs: fx, fy, cx, cy of each frame; K, column by column, is that of all frames where they are
+absent. w and h: the size of the pictures that these numbers are for. Read only.
+Source: nerfstudio process_data/record3d_utils.py; record3d.app, "Format of .r3d files".
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.cameras.conventions import opencv_from_opengl_pose
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats.fields import malformed, number, read_json_object, shown, size_of, vector
+from nerfcli.captures.formats.limits import checked_camera, quaternion_pose
+from nerfcli.captures.formats.photo_names import ListImages, PhotoOfStem
+
+FILES = ("metadata.json", "metadata")
+IMAGE_FOLDERS = ("rgb", "rgbd", "images")
+
+_POSES, _INTRINSICS = "poses", "perFrameIntrinsicCoeffs"
+
+
+def is_record3d(content: dict[str, Any]) -> bool:
+    """Return whether a JSON object has the keys of a capture by Record3D."""
+    return all(key in content for key in (_POSES, "K", "w", "h"))
+
+
+def parse_record3d(path: Path, list_images: ListImages, *, images: Path | None = None) -> Capture:
+    """Read the frames of a capture; the unit is the metre, by LiDAR or ARKit.
+
+    Args:
+        path: metadata.json, or metadata as in an unpacked .r3d file.
+        images: the folder of the photos; by default rgb/, rgbd/ or images/ beside the file.
+
+    Raises:
+        UserError: the file is damaged (file and field are named), or no photo is on disk.
+    """
+    content = read_json_object(path)
+    where = str(path)
+    size = size_of(number(content, "w", where), number(content, "h", where), where)
+    poses = content.get(_POSES)
+    if not isinstance(poses, list) or not poses:
+        raise malformed(where, f"{_POSES} is {shown(poses)}", "expected a list of poses")
+    photos = PhotoOfStem(images, list_images, home=path.parent, names=IMAGE_FOLDERS)
+    intrinsics, frames = _intrinsics(content, len(poses), where).tolist(), []
+    for index, pose in enumerate(poses):
+        place = f"{where}: {_POSES}[{index}]"
+        row = vector({"pose": pose}, "pose", 7, place)
+        world_from_cam = opencv_from_opengl_pose(quaternion_pose(row[:4], row[4:], place))
+        image = photos.find(str(index))
+        if image is not None:
+            camera = checked_camera("PINHOLE", *size, tuple(intrinsics[index]), where=where)
+            frames.append(Frame(image.name, camera, world_from_cam, image=image))
+    missing = photos.missing(where)
+    return Capture(
+        tuple(frames), np.zeros((0, 3)), missing, None, "record3d", unit="metre", unit_source="ARKit (Record3D)"
+    )
+
+
+def _intrinsics(content: dict[str, Any], count: int, where: str) -> np.ndarray:
+    """Return fx, fy, cx, cy of each frame, (count, 4)."""
+    rows = content.get(_INTRINSICS)
+    if not rows:
+        return np.tile(vector(content, "K", 9, where)[[0, 4, 6, 7]], (count, 1))
+    if not isinstance(rows, list) or len(rows) != count:
+        raise malformed(where, f"{_INTRINSICS} is {shown(rows)}", f"expected a list of {count}, one for each pose")
+    return np.array([vector({"row": row}, "row", 4, f"{where}: {_INTRINSICS}[{i}]") for i, row in enumerate(rows)])

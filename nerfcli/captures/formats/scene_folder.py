@@ -1,0 +1,310 @@
+"""A scene folder of nerfcli, as a capture: the COLMAP model sparse/0, and scene.json, nerfcli's own file beside it.
+
+scene.json states where the photos are, the split, masks and the unit of length.
+"""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli import __version__
+from nerfcli.atomic import write_json
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats.colmap import parse_colmap, read_model, write_colmap_binary
+from nerfcli.captures.formats.fields import read_json_object
+from nerfcli.captures.formats.photo_names import seen_from
+from nerfcli.captures.holdout import default_split
+from nerfcli.captures.stored_pixels import UPRIGHT
+from nerfcli.errors import UserError
+from nerfcli.photos.masks import find_mask
+
+SCENE_FILE = "scene.json"
+MODEL_FOLDER = "sparse/0"
+SCENE_FILES = (SCENE_FILE, *(f"{MODEL_FOLDER}/{name}.bin" for name in ("cameras", "images", "points3D")))
+SCENE_VERSION = 1
+UNITS = ("arbitrary", "metre")
+UNUSED = "unused"
+
+
+@dataclass(frozen=True)
+class Description:
+    """Content of a scene.json.
+
+    Args:
+        image_folder: folder of the photos, which the names of the model's images are relative to; need not exist.
+        model_dir: the COLMAP model, whose cameras refer to upright photos.
+        unit, unit_source: as in `Scene`.
+        listed: names of frames by their use: "test", "val", or "unused" for those that the split leaves out.
+        masks: the folder of the masks, or the mask of each photo that has one.
+        depth_bounds: nearest and farthest z by the name of the frame, in scene units; empty where they are not known.
+        provenance: how the scene was made: command, settings, versions; empty if unknown.
+    """
+
+    path: Path
+    image_folder: Path
+    model_dir: Path
+    unit: str
+    unit_source: str | None
+    listed: Mapping[str, frozenset[str]]
+    masks: Path | Mapping[str, Path] | None
+    depth_bounds: Mapping[str, tuple[float, float]]
+    provenance: Mapping[str, Any]
+
+    def described(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
+        """Return the frames of the model with their masks and splits; the split of unused frames is None."""
+        return tuple(replace(f, mask=self._mask_of(f.name), split=self._split_of(f.name)) for f in frames)
+
+    def bounds_of(self, frames: Sequence[Frame]) -> np.ndarray | None:
+        """Return the nearest and farthest z of frames, (frames, 2), if the file gives them for all of the frames."""
+        if not self.depth_bounds or not all(frame.name in self.depth_bounds for frame in frames):
+            return None
+        return np.array([self.depth_bounds[frame.name] for frame in frames]).reshape(-1, 2)
+
+    def _mask_of(self, name: str) -> Path | None:
+        if self.masks is None or isinstance(self.masks, Path):
+            return None if self.masks is None else find_mask(name, self.masks)
+        mask = self.masks.get(name)
+        if mask is not None and not mask.is_file():
+            raise UserError(
+                f"{self.path}: {mask}, the mask of {name}, does not exist", "restore it, or remove it from the file"
+            )
+        return mask
+
+    def _split_of(self, name: str) -> str | None:
+        part = next((part for part, names in self.listed.items() if name in names), "train")
+        return None if part == UNUSED else part
+
+
+def read_description(root: Path) -> Description:
+    """Read the scene.json of a folder, whether or not its photos exist.
+
+    Raises:
+        UserError: it is missing, of another version, or malformed; the key is named.
+    """
+    path = root / SCENE_FILE
+    content = read_json_object(path)
+    if content.get("measurement") == "transmission":
+        raise UserError(
+            f"{root} is an X-ray scan, not a scene of photos",
+            "use convert, doctor, info or train with it, and evaluate, render or export with its run",
+        )
+    if content.get("version") != SCENE_VERSION:
+        raise UserError(
+            f"{path}: unknown version {content.get('version')!r}, expected {SCENE_VERSION}",
+            "update nerfcli, or estimate the poses again with nerfcli poses",
+        )
+
+    def place(text: str) -> Path:
+        return Path(os.path.normpath(root.resolve() / text))
+
+    image_folder = place(_text(content, "image_folder", path))
+    model_dir = root / _text(content, "model", path)
+    unit = _text(content, "unit", path)
+    if unit not in UNITS:
+        raise UserError(f"{path}: unit is {unit!r}", f"expected {' or '.join(UNITS)}")
+    source, masks = content.get("unit_source"), content.get("masks")
+    provenance = content.get("provenance")
+    if isinstance(masks, dict):
+        masks = {name: place(_text(masks, name, path)) for name in masks}
+    elif masks is not None:
+        masks = place(_text(content, "masks", path))
+    return Description(
+        path=path,
+        image_folder=image_folder,
+        model_dir=model_dir,
+        unit=unit,
+        unit_source=source if isinstance(source, str) else None,
+        listed=_listed_names(content, path),
+        masks=masks,
+        depth_bounds=_listed_bounds(content, path),
+        provenance=provenance if isinstance(provenance, dict) else {},
+    )
+
+
+def save(
+    scene_dir: Path,
+    *,
+    image_folder: Path,
+    provenance: dict[str, Any],
+    unit: str = "arbitrary",
+    unit_source: str | None = None,
+    masks: Path | Mapping[str, Path] | None = None,
+    split: Mapping[str, str | None] | None = None,
+    depth_bounds: Mapping[str, tuple[float, float]] | None = None,
+) -> None:
+    """Write scene.json beside the COLMAP model in scene_dir/sparse/0, and fix the held-out split.
+
+    Args:
+        scene_dir: contains sparse/0, whose cameras refer to upright photos (EXIF orientation applied).
+        image_folder: the photos; stored relative to the scene folder, so that both can be moved together.
+        provenance: plain values: versions, command, settings.
+        unit: "arbitrary" or "metre".
+        unit_source: source of the metric scale.
+        masks: a folder of masks, named as in `photos.masks.find_mask`; or masks by the name of the photo.
+        split: "train", "test", "val" or None (unused) by the name of the photo; by default every 8th is held out.
+        depth_bounds: nearest and farthest z by name, in scene units, if they are known without points.
+
+    Raises:
+        UserError: the model cannot be read, or scene.json cannot be written.
+    """
+    if unit not in UNITS:
+        raise ValueError(f"unit must be one of {UNITS}, got {unit!r}")
+    model = read_model(scene_dir / MODEL_FOLDER)
+    points = model.points
+    if split is None:
+        parts = {"test": sorted(default_split([image.name for image in model.images]))}
+    else:
+        listed = {part: sorted(name for name, of in split.items() if of == part) for part in ("test", "val")}
+        unused = sorted(name for name, of in split.items() if of is None)
+        parts = {"test": listed["test"], **{k: v for k, v in (("val", listed["val"]), (UNUSED, unused)) if v}}
+    if isinstance(masks, Path):
+        mask_entry: Any = seen_from(scene_dir, masks.resolve())
+    else:
+        mask_entry = {name: seen_from(scene_dir, mask.resolve()) for name, mask in (masks or {}).items()} or None
+    content = {
+        "version": SCENE_VERSION,
+        "image_folder": seen_from(scene_dir, image_folder.resolve()),
+        "model": MODEL_FOLDER,
+        "split": parts,
+        "masks": mask_entry,
+        "unit": unit,
+        "unit_source": unit_source,
+        "frame_from_world": None,
+        "bounds": {
+            "points_min": points.min(axis=0).tolist() if len(points) else None,
+            "points_max": points.max(axis=0).tolist() if len(points) else None,
+        },
+        **({"depth_bounds": {name: list(pair) for name, pair in depth_bounds.items()}} if depth_bounds else {}),
+        "provenance": provenance,
+    }
+    write_json(scene_dir / SCENE_FILE, content)
+
+
+def _text(content: dict[str, Any], key: str, path: Path) -> str:
+    value = content.get(key)
+    if not isinstance(value, str) or not value:
+        raise UserError(f"{path}: {key} is {value!r}", "expected text; nerfcli poses writes this file")
+    return value
+
+
+def _listed_names(content: dict[str, Any], path: Path) -> dict[str, frozenset[str]]:
+    """Return the names under "test", "val" and "unused" of the split; only "test" is required."""
+    split = content.get("split")
+    names: dict[str, frozenset[str]] = {}
+    for part in ("test", "val", UNUSED):
+        listed = split.get(part, None if part == "test" else []) if isinstance(split, dict) else None
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            what = f"{path}: split.{part} is not a list of image names"
+            raise UserError(what, 'expected "split": {"test": ["a.jpg", ...]}')
+        names[part] = frozenset(listed)
+    return names
+
+
+def _listed_bounds(content: dict[str, Any], path: Path) -> dict[str, tuple[float, float]]:
+    listed = content.get("depth_bounds") or {}
+    try:
+        bounds = {name: (float(near), float(far)) for name, (near, far) in dict(listed).items()}
+    except (TypeError, ValueError) as error:
+        raise UserError(
+            f"{path}: depth_bounds are not pairs of numbers", 'expected {"a.jpg": [near, far], ...}'
+        ) from error
+    for name, (near, far) in bounds.items():
+        if not 0 < near < far < math.inf:
+            raise UserError(f"{path}: depth_bounds of {name} are {near:g} and {far:g}", "expected 0 < near < far")
+    return bounds
+
+
+def parse_scene(path: Path, *, images: Path | None = None) -> Capture:
+    """Read the scene in a folder, with the photos of another folder if one is given.
+
+    Raises:
+        UserError: scene.json or the model is damaged.
+    """
+    described = read_description(path)
+    capture = parse_colmap(described.model_dir, images or described.image_folder)
+    frames = described.described(capture.frames)
+    return replace(
+        capture,
+        frames=frames,
+        unit=described.unit,
+        unit_source=described.unit_source,
+        depth_bounds=described.bounds_of(frames),
+        pixels=UPRIGHT,
+    )
+
+
+def losses_scene(capture: Capture) -> tuple[str, ...]:
+    """List the contents of a capture that a scene folder cannot hold.
+
+    In a scene, the names of photos are paths relative to one folder; photos with other names are renamed. Listed photos
+    without a file are reported when the scene is loaded.
+    """
+    _, names = _named(capture)
+    renamed = sum(frame.name != name for frame, name in zip(capture.frames, names, strict=True))
+    return (f"the names of {renamed} photos, which become paths relative to one folder",) if renamed else ()
+
+
+def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any] | None = None) -> None:
+    """Write a capture, whose cameras are for upright photos, as a scene into a folder.
+
+    Masks are listed one by one. A split in the capture is kept; otherwise every 8th photo is held out.
+
+    Args:
+        provenance: further entries of the provenance in scene.json, besides the command and the version.
+
+    Raises:
+        UserError: a frame has no photo, no photo is on disk, or the folder cannot be written.
+    """
+    image_folder, names = _named(capture)
+    if not any(frame.has_photo for frame in capture.frames):
+        raise UserError(
+            f"none of the {len(capture.frames)} photos exists, such as {capture.frames[0].image}",
+            "a scene needs its photos; give their folder with --images",
+        )
+    capture = replace(
+        capture, frames=tuple(replace(frame, name=name) for frame, name in zip(capture.frames, names, strict=True))
+    )
+    write_colmap_binary(capture, folder / MODEL_FOLDER)
+    bounds = None
+    if capture.depth_bounds is not None:
+        pairs = capture.depth_bounds.tolist()
+        bounds = {frame.name: (near, far) for frame, (near, far) in zip(capture.frames, pairs, strict=True)}
+    split = {frame.name: frame.split for frame in capture.frames}
+    save(
+        folder,
+        image_folder=image_folder,
+        provenance={"command": "convert", "from": capture.kind, "nerfcli": __version__, **(provenance or {})},
+        unit=capture.unit,
+        unit_source=capture.unit_source,
+        masks={frame.name: frame.mask for frame in capture.frames if frame.mask is not None},
+        split=split if {"test", "val"} & set(split.values()) else None,
+        depth_bounds=bounds,
+    )
+
+
+def _named(capture: Capture) -> tuple[Path, list[str]]:
+    """Return a folder of the photos, from which the frames' names lead to them if possible, and their names in it."""
+    images = []
+    for frame in capture.frames:
+        if frame.image is None:
+            raise UserError(
+                f"{frame.name} has no photo, which a scene requires",
+                "give the photo folder with --images, or convert to another format",
+            )
+        images.append(os.path.abspath(frame.image))
+    names = [frame.name for frame in capture.frames]
+    first = names[0].split("/")
+    if images[0].replace(os.sep, "/").endswith("/" + names[0]):
+        root = Path(images[0]).parents[len(first) - 1]
+        if all(os.path.normpath(root / name) == image for name, image in zip(names, images, strict=True)):
+            return root, names
+    try:
+        root = Path(os.path.commonpath([os.path.dirname(image) for image in images]))
+    except ValueError as error:  # on several drives
+        raise UserError("the photos are on several drives", "put them into one folder") from error
+    return root, [Path(image).relative_to(root).as_posix() for image in images]

@@ -1,0 +1,145 @@
+"""Trajectories of the TUM and KITTI benchmarks: poses without cameras, pictures or points.
+
+TUM: a line "timestamp tx ty tz qx qy qz qw" for each pose. KITTI: a line with the first three rows of a 4x4 matrix, row
+by row; its frames are identified only by their order in the file. Both are world_from_cam with OpenCV axes.
+Sources: cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; cvlibs.net/datasets/kitti, odometry devkit, readme.txt.
+"""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.atomic import atomic_path
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, shown
+from nerfcli.captures.formats.limits import quaternion_pose, rigid_pose
+from nerfcli.captures.formats.photo_names import GIVE_CAMERA
+from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
+from nerfcli.errors import UserError
+
+_TUM_EXPECTED = "expected lines of timestamp tx ty tz qx qy qz qw"
+_KITTI_EXPECTED = "expected lines of 12 numbers, the first three rows of a 4x4 matrix"
+
+_NUMBER = re.compile(r"[+-]?\d{1,20}(\.\d{0,20})?([eE][+-]?\d{1,2})?", re.ASCII)
+_PICTURE = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp)$", re.IGNORECASE)
+
+
+def parse_tum(path: Path, camera: Camera | None) -> Capture:
+    """Read a trajectory in the TUM format; a frame's name is its timestamp as written in the file.
+
+    Args:
+        camera: of all frames, since the file has none.
+
+    Raises:
+        UserError: the file is damaged (file and line are named), or no camera is given.
+    """
+    return _parse(path, camera, _tum_pose, expected=_TUM_EXPECTED, kind="tum")
+
+
+def parse_kitti(path: Path, camera: Camera | None) -> Capture:
+    """Read a trajectory in the KITTI format; a frame's name is its index in six digits, as KITTI names its pictures.
+
+    `camera` and the errors are those of `parse_tum`.
+    """
+    return _parse(path, camera, _kitti_pose, expected=_KITTI_EXPECTED, kind="kitti")
+
+
+def losses_tum(capture: Capture) -> tuple[str, ...]:
+    """List the parts of a capture that a TUM trajectory cannot hold."""
+    return _losses(capture, named=_timestamps(capture) == [frame.name for frame in capture.frames])
+
+
+def losses_kitti(capture: Capture) -> tuple[str, ...]:
+    """List the parts of a capture that a KITTI trajectory cannot hold."""
+    return _losses(capture, named=all(frame.name == _indexed(i) for i, frame in enumerate(capture.frames)))
+
+
+def write_tum(capture: Capture, path: Path) -> None:
+    """Write a capture's poses in the TUM format, atomically, with full precision.
+
+    The timestamps are the frames' names where all of them are different numbers, without the suffix of a picture
+    ("1305031102.175304.png"); else the frames' indices.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    poses = np.stack([frame.world_from_cam for frame in capture.frames])
+    wxyz = rigid.quaternion_from_rotation(poses[:, :3, :3])
+    rows = np.concatenate([poses[:, :3, 3], wxyz[:, [1, 2, 3, 0]]], axis=1)
+    for timestamp, row in zip(_timestamps(capture), rows.tolist(), strict=True):
+        lines.append(" ".join([timestamp, *map(repr, row)]))
+    _write(lines, path)
+
+
+def write_kitti(capture: Capture, path: Path) -> None:
+    """Write a capture's poses in the KITTI format, atomically, with full precision.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    rows = [frame.world_from_cam[:3].ravel().tolist() for frame in capture.frames]
+    _write([" ".join(map(repr, row)) for row in rows], path)
+
+
+def _parse(
+    path: Path,
+    camera: Camera | None,
+    pose_of: Callable[[int, list[str], str], tuple[str, np.ndarray]],
+    *,
+    expected: str,
+    kind: str,
+) -> Capture:
+    if camera is None:
+        raise UserError(
+            f"{path}: a {kind.upper()} trajectory contains poses but no camera",
+            GIVE_CAMERA,
+        )
+    frames = []
+    for index, (number, line) in enumerate(content_lines(read_text(path, expected))):
+        name, world_from_cam = pose_of(index, line.split(), f"{path}: line {number}")
+        frames.append(Frame(name, camera, world_from_cam))
+    if not frames:
+        raise malformed(str(path), "has no pose", expected)
+    check_unique_names((frame.name for frame in frames), path)
+    return Capture(tuple(frames), np.zeros((0, 3)), (), None, kind)
+
+
+def _tum_pose(_: int, words: list[str], where: str) -> tuple[str, np.ndarray]:
+    if len(words) != 8:
+        raise malformed(where, f"has {len(words)} numbers", "expected 8")
+    values = np.array(numbers(words[1:], 7, where))
+    world_from_cam = quaternion_pose(values[3:], values[:3], where)
+    if not _NUMBER.fullmatch(words[0]):
+        raise malformed(where, f"its timestamp is {shown(words[0])}", "expected seconds, such as 1305031102.1753")
+    return words[0], world_from_cam
+
+
+def _kitti_pose(index: int, words: list[str], where: str) -> tuple[str, np.ndarray]:
+    return _indexed(index), rigid_pose(np.array(numbers(words, 12, where)).reshape(3, 4), where)
+
+
+def _indexed(index: int) -> str:
+    return f"{index:06d}"
+
+
+def _timestamps(capture: Capture) -> list[str]:
+    """Return the frames' names without the suffix of a picture where all are different numbers, else their indices."""
+    stems = [_PICTURE.sub("", frame.name.rsplit("/", 1)[-1]) for frame in capture.frames]
+    if all(map(_NUMBER.fullmatch, stems)) and len(set(stems)) == len(stems):
+        return stems
+    return [str(index) for index in range(len(stems))]
+
+
+def _losses(capture: Capture, *, named: bool) -> tuple[str, ...]:
+    names = [] if named else [f"names of {len(capture.frames)} frames"]
+    return (*lost_of_cameras(capture, lambda _: ["intrinsics"]), *names, *lost_parts(capture, holds=()))
+
+
+def _write(lines: list[str], path: Path) -> None:
+    with atomic_path(path) as partial:
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")

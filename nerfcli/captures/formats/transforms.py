@@ -1,0 +1,277 @@
+"""transforms.json: the camera files of nerfstudio and instant-ngp; Blender's (NeRF) are of the same kind.
+
+Poses in these files are world_from_cam with OpenGL axes. Pixel positions are as in COLMAP, without a half-pixel offset.
+Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips.md and scripts/colmap2nerf.py.
+"""
+
+from collections import Counter
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from nerfcli.atomic import write_json
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
+from nerfcli.cameras.frame import Capture, Frame, Size
+from nerfcli.captures.formats.fields import malformed, read_json_object
+from nerfcli.captures.formats.limits import rigid_poses
+from nerfcli.captures.formats.photo_names import seen_from
+from nerfcli.captures.formats.ply import read_ply_points, write_ply
+from nerfcli.captures.formats.transforms_cameras import (
+    camera_of_record,
+    given_size,
+    lost_to_transforms,
+    record_of_camera,
+)
+from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
+from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.errors import UserError
+
+SPLITS = ("train", "val", "test")
+
+# Tried in this order where a file_path has no suffix, as in the Blender captures.
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
+
+
+def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
+    """Read a transforms.json, whether or not its images exist; those without a known size are `missing`.
+
+    Poses and points stay in the file's own world. nerfstudio's applied_transform and applied_scale say how that world
+    came from the original world of the poses (COLMAP's). They are not undone, since the cameras would then no longer
+    match the fields that were trained on the file.
+
+    Args:
+        path: the JSON file; paths in it are relative to its folder.
+        measure: returns an image's upright size and EXIF orientation; needed only if the file lacks `w` or `h`.
+
+    Raises:
+        UserError: the file, or the PLY file of points that it names, is malformed or missing; file and field are named.
+    """
+    content = read_json_object(path)
+    frames, missing = listed_frames(path, content, measure)
+    splits = _listed_splits(path, content)
+    frames = [replace(frame, split=splits.get(frame.name)) for frame in frames]
+    check_unique_names(path, frames)
+    points, colours = _points_beside(path, content)
+    return Capture(tuple(frames), points, tuple(missing), None, "transforms", colours=colours)
+
+
+def losses_transforms(capture: Capture) -> tuple[str, ...]:
+    """List the parts of a capture that a transforms.json cannot hold. Points go into a PLY file next to it."""
+    parts = lost_parts(capture, holds=("masks", "points", "colours", "splits"))
+    return (*lost_of_cameras(capture, lost_to_transforms), *parts)
+
+
+def write_transforms(capture: Capture, path: Path) -> None:
+    """Write a capture as nerfstudio's transforms.json (OpenGL axes), atomically; instant-ngp reads it too.
+
+    Intrinsics are written once if all frames share them. Paths of images and masks are relative to the file's folder;
+    an image whose path is unknown gets its frame's name. Points are written beside the file, as NAME_points.ply.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    intrinsics = {
+        camera: record_of_camera(camera) for camera in dict.fromkeys(frame.camera for frame in capture.frames)
+    }
+    shared = len(intrinsics) == 1
+    content: dict[str, Any] = dict(next(iter(intrinsics.values()))) if shared else {}
+    file_paths = [relative_path(frame, path.parent) for frame in capture.frames]
+    for split in SPLITS:
+        listed = [text for text, frame in zip(file_paths, capture.frames, strict=True) if frame.split == split]
+        if listed:
+            content[f"{split}_filenames"] = listed
+    records = []
+    for file_path, frame in zip(file_paths, capture.frames, strict=True):
+        record = {} if shared else dict(intrinsics[frame.camera])
+        record["file_path"] = file_path
+        if frame.mask is not None:
+            record["mask_path"] = seen_from(path.parent, frame.mask)
+        record["transform_matrix"] = opengl_from_opencv_pose(frame.world_from_cam).tolist()
+        records.append(record)
+    cloud = path.with_name(f"{path.stem}_points.ply")
+    if len(capture.points):
+        content["ply_file_path"] = cloud.name
+    with ExitStack() as undo:
+        if len(capture.points):
+            existed = cloud.exists()
+            write_ply(capture, cloud)
+            undo.callback(lambda: None if existed else cloud.unlink(missing_ok=True))
+        write_json(path, {**content, "frames": records})
+        undo.pop_all()
+
+
+def records_of(path: Path, content: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the entries of the list `frames`.
+
+    Raises:
+        UserError: there is no such list, or it is empty.
+    """
+    records = content.get("frames")
+    if not isinstance(records, list) or not records or not all(isinstance(item, dict) for item in records):
+        raise malformed(
+            str(path), "has no list of frames", 'expected "frames": [{"file_path", "transform_matrix"}, ...]'
+        )
+    return records
+
+
+def listed_frames(
+    path: Path,
+    content: dict[str, Any],
+    measure: Measure | None,
+    *,
+    suffix: str = "",
+    images: Path | None = None,
+    size: Size | None = None,
+) -> tuple[list[Frame], list[str]]:
+    """Return the frames of a file as listed, and the names of images whose size is unknown, which have no frame.
+
+    Frames with equal intrinsics share one camera.
+
+    Args:
+        measure: returns an image's size, if the file does not give it. An image that is not on disk either gets the
+            size of the other images, if they all have the same; if none has one, it is an error.
+        suffix: appended to a file_path without a suffix if no such image is on disk, as the format does.
+        images: a folder where images are looked for first: under the paths that the file lists, or their last parts.
+        size: of the images, if the file does not give it and none is on disk.
+    """
+    records = records_of(path, content)
+    poses = _poses(path, records)
+    merged = [{**content, **record} for record in records]
+    wheres = [f"{path}: frames[{index}]" for index in range(len(records))]
+    places, names = [], []
+    is_path = not any("file_path" in record for record in records)  # the views of a camera path have no photo
+    for index, (record, where) in enumerate(zip(records, wheres, strict=True)):
+        listed = _listed_path({"file_path": f"frame_{index:04d}"} if is_path else record, where)
+        plain = listed.replace("\\", "/")
+        found = None
+        if images is not None:
+            found = _find_image(images, plain) or _find_image(images, PurePosixPath(plain).name)
+        found = found or _find_image(path.parent, listed)
+        ending = suffix if found is None and not PurePosixPath(plain).suffix else "" if found is None else found.suffix
+        names.append(_name_of(listed, where, suffix=ending))
+        places.append(found or path.parent / (plain if plain.endswith(ending) else plain + ending))
+    sizes = _sizes(merged, places, wheres, measure=measure, default=size)
+    cameras: dict[Camera, Camera] = {}
+    frames, missing = [], []
+    for record, where, known, name, image, pose in zip(merged, wheres, sizes, names, places, poses, strict=True):
+        if known is None:
+            missing.append(name)
+            continue
+        camera = camera_of_record(record, known, where)
+        mask = record.get("mask_path")
+        if mask is not None and (not isinstance(mask, str) or not mask):
+            raise malformed(where, f"mask_path is {mask!r:.80}", "expected the mask's path as text")
+        if mask is not None:
+            mask = _find_image(path.parent, mask) or path.parent / mask.replace("\\", "/")
+        frames.append(Frame(name, cameras.setdefault(camera, camera), pose, image=image, mask=mask))
+    return frames, missing
+
+
+def relative_path(frame: Frame, folder: Path) -> str:
+    """Return a frame's image path relative to a folder, with forward slashes, or its name if it has no image."""
+    return frame.name if frame.image is None else seen_from(folder, frame.image)
+
+
+def _sizes(
+    records: list[dict[str, Any]],
+    images: list[Path],
+    wheres: list[str],
+    *,
+    measure: Measure | None,
+    default: Size | None,
+) -> list[Size | None]:
+    """Return the width and height of each frame's picture, given, measured, or the only ones known; None if unknown."""
+    sizes = [given_size(record, where) for record, where in zip(records, wheres, strict=True)]
+    if measure is not None:
+        sizes = [
+            stored_size(image, measure) if size is None and image.is_file() else size
+            for size, image in zip(sizes, images, strict=True)
+        ]
+    given = {size for size in sizes if size is not None} or ({default} if default else set[Size]())
+    if not given:
+        raise malformed(wheres[0], f"w and h are missing, and {images[0]} does not exist", "add the image, or w and h")
+    return [next(iter(given)) if size is None and len(given) == 1 else size for size in sizes]
+
+
+def check_unique_names(path: Path, frames: list[Frame]) -> None:
+    """Raise a UserError where two frames have the same name."""
+    twice, count = Counter(frame.name for frame in frames).most_common(1)[0]
+    if count > 1:
+        raise UserError(f"{path}: image {twice} is listed twice", "remove one of its two entries in frames")
+
+
+def _listed_path(record: dict[str, Any], where: str) -> str:
+    listed = record.get("file_path")
+    if not isinstance(listed, str) or not listed:
+        raise malformed(where, f"file_path is {listed!r:.80}", "expected the image's path as text")
+    return listed
+
+
+def _name_of(listed: str, where: str, *, suffix: str = "") -> str:
+    """Return a name with forward slashes and without "./"; absolute paths are reduced to the file name."""
+    pure = PurePosixPath(listed.replace("\\", "/"))
+    if pure.is_absolute() or ":" in str(pure).split("/")[0]:
+        pure = PurePosixPath(pure.name)
+    name = str(pure)
+    if not pure.name:
+        raise malformed(where, f"file_path is {listed!r:.80}", "expected the path of an image")
+    return name if name.endswith(suffix) else name + suffix
+
+
+def _find_image(folder: Path, listed: str) -> Path | None:
+    for text in dict.fromkeys((listed, listed.replace("\\", "/"))):
+        exact = folder / text
+        for candidate in (exact, *(exact.with_name(exact.name + suffix) for suffix in _SUFFIXES if exact.name)):
+            if candidate.is_file():
+                return candidate
+    return None
+
+
+def _poses(path: Path, records: list[dict[str, Any]]) -> np.ndarray:
+    """Return `world_from_cam` (frames, 4, 4), OpenCV axes, rigid."""
+    matrices = np.stack([_matrix(record, f"{path}: frames[{index}]")[:3] for index, record in enumerate(records)])
+    rigid = rigid_poses(matrices, lambda index: f"{path}: frames[{index}].transform_matrix")
+    return opencv_from_opengl_pose(rigid)
+
+
+def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
+    """Return the matrix of a frame, (4, 4) or (3, 4)."""
+    if "transform_matrix" not in record:
+        raise malformed(where, "transform_matrix is missing", "expected 4 rows of 4 numbers, world from camera")
+    try:
+        matrix = np.array(record["transform_matrix"], dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise malformed(where, "transform_matrix is not a matrix", "expected 4 rows of 4 numbers") from error
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise malformed(where, f"transform_matrix has shape {matrix.shape}", "expected 4 rows of 4 numbers")
+    return matrix
+
+
+def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read points (N, 3) and colours (N, 3) of the PLY file that ply_file_path names; no points if it is not given."""
+    cloud = content.get("ply_file_path")
+    if cloud is None:
+        return np.zeros((0, 3)), None
+    if not isinstance(cloud, str) or not cloud:
+        raise malformed(str(path), f"ply_file_path is {cloud!r:.80}", "expected the path of a PLY file as text")
+    try:
+        return read_ply_points(path.parent / cloud.replace("\\", "/"))
+    except UserError as error:
+        raise malformed(f"{path}: ply_file_path", error.message, error.hint) from error
+
+
+def _listed_splits(path: Path, content: dict[str, Any]) -> dict[str, str]:
+    """Return the split of each name in nerfstudio's train_filenames, val_filenames and test_filenames."""
+    splits = {}
+    for split in SPLITS:
+        listed = content.get(f"{split}_filenames", [])
+        if not isinstance(listed, list) or not all(isinstance(item, str) for item in listed):
+            raise malformed(
+                str(path), f"{split}_filenames is not a list of paths", "expected a list of file_path texts"
+            )
+        splits.update({_name_of(item, f"{path}: {split}_filenames"): split for item in listed})
+    return splits

@@ -1,0 +1,141 @@
+"""The keys that describe a camera in a transforms.json: fl_x, cx, k1, camera_model, ..., from and to cameras.
+
+Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips.md and src/nerf_loader.cu.
+"""
+
+import math
+from typing import Any
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.captures.formats.fields import malformed
+from nerfcli.captures.formats.limits import checked_camera
+from nerfcli.captures.formats.unsupported import distortion, projection
+
+_INTRINSICS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+_PERSPECTIVE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+_FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE")
+
+# Lens models of instant-ngp that COLMAP does not have.
+_FOREIGN = ("ftheta_p0", "latlong")
+
+# The format's keys for the distortion terms of COLMAP's models; other terms have no key.
+_KEY_OF_TERM = {
+    "SIMPLE_RADIAL": {"k": "k1"},
+    "RADIAL": {"k1": "k1", "k2": "k2"},
+    "OPENCV": {"k1": "k1", "k2": "k2", "p1": "p1", "p2": "p2"},
+    "FULL_OPENCV": {"k1": "k1", "k2": "k2", "p1": "p1", "p2": "p2", "k3": "k3"},
+    "SIMPLE_RADIAL_FISHEYE": {"k": "k1"},
+    "RADIAL_FISHEYE": {"k1": "k1", "k2": "k2"},
+    "OPENCV_FISHEYE": {"k1": "k1", "k2": "k2", "k3": "k3", "k4": "k4"},
+    "THIN_PRISM_FISHEYE": {"k1": "k1", "k2": "k2", "k3": "k3", "k4": "k4"},
+    "RAD_TAN_THIN_PRISM_FISHEYE": {"k0": "k1", "k1": "k2", "k2": "k3", "k3": "k4"},
+}
+
+
+def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str) -> Camera:
+    """Return the camera of a frame.
+
+    Args:
+        record: the frame's keys, merged over those of the whole file.
+        size: of the picture that the numbers are for.
+
+    Raises:
+        UserError: no focal length, an invalid number, or an unknown lens model.
+    """
+    width, height = size
+    model = record.get("camera_model")
+    if model == "EQUIRECTANGULAR":
+        return checked_camera("EQUIRECTANGULAR", width, height, (width, height), where=where)
+    foreign = next((key for key in _FOREIGN if record.get(key) not in (None, False)), None)
+    if foreign is not None:
+        raise malformed(where, f"the lens model of {foreign} is not supported", "undistort the pictures first")
+    fx = _focal(record, "x", width, where)
+    fy = _focal(record, "y", height, where)
+    if fx is None and fy is None:
+        raise malformed(where, "neither fl_x nor camera_angle_x is given", "expected the focal length or field of view")
+    fx = fx if fx is not None else fy
+    # Blender's files give only the horizontal angle, since pixels are square.
+    fy = fy if fy is not None else fx
+    assert fx is not None
+    assert fy is not None
+    cx, cy = number(record, "cx", where), number(record, "cy", where)
+    head = (fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+    k1, k2, k3, k4, p1, p2 = (number(record, key, where) or 0.0 for key in _INTRINSICS)
+    if model in _FISHEYE_MODELS or record.get("is_fisheye") is True:
+        if p1 or p2:
+            raise malformed(where, "a fisheye camera with p1 or p2", "expected k1 to k4 only (OpenCV's fisheye)")
+        return checked_camera("OPENCV_FISHEYE", width, height, (*head, k1, k2, k3, k4), where=where)
+    if model not in _PERSPECTIVE_MODELS:
+        supported = ", ".join(str(name) for name in (*_PERSPECTIVE_MODELS[1:], *_FISHEYE_MODELS, "EQUIRECTANGULAR"))
+        raise malformed(where, f"camera_model {model!r:.80} is not supported", f"expected one of {supported}")
+    if k4:
+        raise malformed(where, f"k4 is {k4} without a fisheye camera", "k1, k2, k3, p1, p2 are the perspective terms")
+    if k3:
+        params = (*head, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+        return checked_camera("FULL_OPENCV", width, height, params, where=where)
+    if k1 or k2 or p1 or p2:
+        return checked_camera("OPENCV", width, height, (*head, k1, k2, p1, p2), where=where)
+    return checked_camera("PINHOLE", width, height, head, where=where)
+
+
+def record_of_camera(camera: Camera) -> dict[str, Any]:
+    """Return the keys that describe a camera, without the terms that the format cannot hold."""
+    size = {"w": camera.width, "h": camera.height}
+    if camera.is_spherical:
+        return {"camera_model": "EQUIRECTANGULAR", **size}
+    (fx, fy), (cx, cy) = camera.focal_lengths, camera.principal_point
+    keys = _KEY_OF_TERM.get(camera.model, {})
+    terms = {keys[name]: value for name, value in distortion(camera).items() if name in keys}
+    model = "OPENCV_FISHEYE" if projection(camera) == "fisheye" else "OPENCV" if terms else "PINHOLE"
+    return {"camera_model": model, **size, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, **terms}
+
+
+def lost_to_transforms(camera: Camera) -> list[str]:
+    """Return the distortion terms of a camera that the format has no key for."""
+    keys = _KEY_OF_TERM.get(camera.model, {})
+    return [name for name in distortion(camera) if name not in keys]
+
+
+def given_size(record: dict[str, Any], where: str) -> tuple[int, int] | None:
+    """Return the width and height under `w` and `h`, or None if one of them is missing.
+
+    Raises:
+        UserError: they are not whole numbers of pixels.
+    """
+    width, height = number(record, "w", where), number(record, "h", where)
+    if width is None or height is None:
+        return None
+    if width < 1 or height < 1 or width != int(width) or height != int(height):
+        raise malformed(
+            where, f"w and h are {width} and {height}", "expected the picture's size in pixels, as integers"
+        )
+    return int(width), int(height)
+
+
+def number(record: dict[str, Any], key: str, where: str) -> float | None:
+    """Return the number under a key, or None if there is none.
+
+    Raises:
+        UserError: the value is not a finite number.
+    """
+    value = record.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:  # True at NaN
+        raise malformed(where, f"{key} is {value!r:.80}", "expected a finite number")
+    return float(value)
+
+
+def _focal(record: dict[str, Any], axis: str, size_px: int, where: str) -> float | None:
+    focal = number(record, f"fl_{axis}", where)
+    if focal is not None:
+        if focal <= 0:
+            raise malformed(where, f"fl_{axis} is {focal}", "expected a focal length in pixels above 0")
+        return focal
+    angle = number(record, f"camera_angle_{axis}", where)
+    if angle is None:
+        return None
+    if not 0 < angle < math.pi:
+        raise malformed(where, f"camera_angle_{axis} is {angle}", "expected radians between 0 and pi")
+    return size_px / 2 / math.tan(angle / 2)

@@ -1,0 +1,107 @@
+"""Checks that need a quick reconstruction: the centre of rotation and beam hardening."""
+
+import numpy as np
+
+from nerfcli.ct.centre import FEWEST_VIEWS, FINE, centre_of
+from nerfcli.ct.checks.sample import Sample
+from nerfcli.ct.formats.assemble import axis_column
+from nerfcli.ct.quick import Row, highest_contrast_row, predicted, reconstructed
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, verdict_above
+
+CENTRE_LOOK, CENTRE_BAD = 0.3, 1.0
+# Views of a parallel beam that are half a turn apart, to within this many steps, count as opposite.
+_OPPOSITE = 1.01
+HARDENING_LOOK, HARDENING_BAD = 0.05, 0.25
+# Below this fraction of explained variance, the object has several materials, whose effect looks like beam hardening.
+ONE_MATERIAL = 0.97
+
+
+def centre(sample: Sample) -> Finding | str:
+    """Estimate the centre of rotation."""
+    scan = sample.scan
+    if scan.geometry.views < FEWEST_VIEWS:
+        return "too few views"
+    row = highest_contrast_row(scan)
+    stated = axis_column(scan.geometry)
+    found = centre_of(row.thinned())
+    column = stated - found.shift
+    number = abs(found.shift) if found.is_off else 0.0
+    verdict = verdict_above(number, look=CENTRE_LOOK, bad=CENTRE_BAD)
+    pair = mirror_centre(row)
+    by_pair = f"; opposite views give {pair:.1f}" if pair is not None else ""
+    return Finding(
+        "centre of rotation",
+        verdict,
+        f"axis at column {column:.2f} ± {found.error:.2f}; the scan states {stated:.2f}{by_pair}",
+        abs(found.shift),
+        f"look from {CENTRE_LOOK:g} columns, bad from {CENTRE_BAD:g}, if it predicts other views significantly better",
+        "" if verdict == GOOD else f"convert with --centre-of-rotation {column:.2f}, or let train estimate it",
+    )
+
+
+def mirror_centre(row: Row) -> float | None:
+    """Estimate the column of the axis from two opposite views of a parallel beam; None if there are none."""
+    geometry = row.geometry
+    if geometry.beam != "parallel":
+        return None
+    angles = np.arctan2(geometry.emitter[:, 1], geometry.emitter[:, 0])
+    step = float(np.median(np.abs(np.diff(np.unwrap(angles))))) if len(angles) > 1 else 0.0
+    apart = np.abs(np.angle(np.exp(1j * (angles - angles[0] - np.pi))))
+    other = int(np.argmin(apart))
+    if apart[other] > _OPPOSITE * step:
+        return None
+    one, two = row.integrals[0].astype(np.float64), row.integrals[other].astype(np.float64)
+    columns = np.arange(len(one), dtype=np.float64)
+    least, best = np.inf, None
+    for middle in np.arange(0.3 * len(one), 0.7 * len(one), 0.25):
+        mirrored = np.interp(2 * middle - columns, columns, two, left=np.nan, right=np.nan)
+        there = np.isfinite(mirrored)
+        error = float(np.mean((one[there] - mirrored[there]) ** 2)) if there.sum() > len(one) // 3 else np.inf
+        if error < least:
+            least, best = error, float(middle)
+    return best
+
+
+def beam_hardening(sample: Sample) -> Finding | str:
+    """Measure how far line integrals fall below proportionality to path lengths, in an object of one material."""
+    if sample.scan.geometry.views < FEWEST_VIEWS:
+        return "too few views"
+    row = highest_contrast_row(sample.scan).thinned().binned(FINE)
+    volume, grid = reconstructed(row)
+    inside = volume > _otsu(volume)
+    lengths = predicted(inside.astype(np.float32), row, grid)
+    longest = float(np.quantile(lengths, 0.999))
+    used = lengths > 0.1 * longest
+    if longest <= 0 or used.sum() < 100:
+        return "no object found"
+    length, p = lengths[used].astype(np.float64) / longest, row.integrals[used].astype(np.float64)
+    (straight, bent), *_ = np.linalg.lstsq(np.stack([length, length**2], axis=1), p, rcond=None)
+    left = p - straight * length - bent * length**2
+    explained = 1 - float(left.var() / p.var())
+    if explained < ONE_MATERIAL:
+        return f"path lengths explain {100 * explained:.0f} % of the line integrals: the object is not of one material"
+    number = float(-bent / straight) if straight > 0 else 0.0
+    verdict = BAD if number >= HARDENING_BAD else LOOK if number >= HARDENING_LOOK else GOOD
+    return Finding(
+        "beam hardening",
+        verdict,
+        f"the line integral of the longest path is {100 * number:.3g} % below the trend of short paths "
+        f"(path length explains {100 * explained:.4g} % of the variance)",
+        number,
+        f"look from {100 * HARDENING_LOOK:g} %, bad from {100 * HARDENING_BAD:g} %",
+        ""
+        if verdict == GOOD
+        else "values inside come out too low (cupping): filter the beam, or correct line integrals by a polynomial",
+    )
+
+
+def _otsu(volume: np.ndarray) -> float:
+    """Return the threshold between two classes of values. Source: Otsu 1979, IEEE SMC 9(1)."""
+    counts, edges = np.histogram(volume, bins=256)
+    middles = (edges[:-1] + edges[1:]) / 2
+    below = np.cumsum(counts)
+    above = below[-1] - below
+    sums = np.cumsum(counts * middles)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
+    return float(middles[int(np.nanargmax(np.where(above > 0, between, np.nan)))])

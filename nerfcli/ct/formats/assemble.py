@@ -1,0 +1,223 @@
+"""Build a scan from the output of a reader and the user's options: check values, mark dead pixels."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.captures.holdout import names_held_out
+from nerfcli.ct.circle import Circle
+from nerfcli.ct.formats.scan_options import MILLIMETRES, ScanOptions, check_pixel_size
+from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.open_beam import OpenBeam
+from nerfcli.ct.scan import Kind, Scan, held_out_views
+from nerfcli.errors import UserError, several
+
+# A scan with a smaller fraction of finite values than this is refused.
+LEAST_FINITE = 0.5
+# Largest plausible transmission, and largest line integral that a detector can measure.
+MOST_TRANSMISSION, MOST_INTEGRAL = 3.0, 30.0
+UNKNOWN_UNIT = "unit"
+_EMPTY = "the projections are empty: export them again"
+
+
+@dataclass(frozen=True)
+class ReaderOutput:
+    """Output of a reader.
+
+    Args:
+        path: the file or folder, for errors.
+        form: name of the format.
+        values: (V, rows, columns).
+        kind: type of the values.
+        geometry: a circle where the format states one, else vectors.
+        unit: unit of lengths, such as "mm" or `UNKNOWN_UNIT`.
+        beam: the open beam, for counts.
+        photons: number of photons for a transmission of 1, if the values are not counts.
+        held_out: views that the format holds out; None if it does not state any.
+        names: names of the views, for error messages.
+        notes: notes for the user.
+        history: further entries for `Scan.history`.
+        stated_mm: millimetres per unit of length in the file, already applied; 1 if the file states no unit.
+    """
+
+    path: Path
+    form: str
+    values: np.ndarray
+    kind: Kind
+    geometry: Circle | ScanGeometry
+    unit: str
+    beam: OpenBeam | None = None
+    photons: float | None = None
+    held_out: Sequence[int] | None = None
+    names: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    history: Mapping[str, Any] | None = None
+    stated_mm: float = 1.0
+
+
+def scan_of(found: ReaderOutput, given: ScanOptions) -> Scan:
+    """Build the scan.
+
+    Raises:
+        UserError: views and geometry do not fit together, values are implausible, or the user's options do not fit.
+    """
+    notes = list(found.notes)
+    values = _checked(found)
+    unit, placed = _in_millimetres(found, given)
+    if given.mirrored:
+        placed = replace(placed, mirrored=not placed.mirrored) if isinstance(placed, Circle) else placed.mirrored()
+    geometry = placed.geometry() if isinstance(placed, Circle) else placed
+    if values.shape != (geometry.views, geometry.rows, geometry.columns):
+        views, rows, columns = values.shape
+        raise UserError(
+            f"{found.path}: {views} projections of {columns} x {rows} pixels for {geometry.views} angles and a "
+            f"detector of {geometry.columns} x {geometry.rows}",
+            "projections, angles and detector size of one scan belong together: check that no file is missing",
+        )
+    if unit == "mm":
+        check_pixel_size(float(np.linalg.norm(geometry.column_step[0])), where=str(found.path))
+    if given.centre_column is not None:
+        placed = moved = _with_centre(placed, geometry, given.centre_column)
+        geometry = moved.geometry() if isinstance(moved, Circle) else moved
+    values, usable = _usable(found, values, notes)
+    photons = _photons(found, given)
+    history = {
+        "format": found.form,
+        "source": str(found.path),
+        **(found.history or {}),
+        "notes": notes,
+        **({"circle": placed.to_json()} if isinstance(placed, Circle) else {}),
+    }
+    beam = found.beam
+    return Scan(
+        geometry,
+        found.kind,
+        values,
+        None if beam is None else beam.values,
+        None if beam is None else beam.dark,
+        photons,
+        usable,
+        _held_out(found, given, len(values)),
+        unit,
+        history,
+    )
+
+
+def _checked(found: ReaderOutput) -> np.ndarray:
+    """Return the values as float32; raise if they are implausible for their kind."""
+    values = np.asarray(found.values, dtype=np.float32)
+    if values.ndim != 3 or 0 in values.shape:
+        raise UserError(
+            f"{found.path}: projections of shape {values.shape}", "expected views x rows x columns, none of them 0"
+        )
+    if len(values) < 2:
+        raise UserError(f"{found.path} has one projection", "a reconstruction needs views from several angles")
+    finite = np.isfinite(values)
+    fraction = float(finite.mean())
+    if fraction < LEAST_FINITE:
+        raise UserError(
+            f"{found.path}: only {100 * fraction:.0f} % of the values are finite",
+            "the file is damaged: export it again",
+        )
+    high = float(np.quantile(values[finite][:: max(1, int(finite.sum()) // 1_000_000)], 0.999))
+    if found.kind == "transmission" and high > MOST_TRANSMISSION:
+        raise UserError(
+            f"{found.path}: transmissions up to {high:.4g}, where 1 is the open beam",
+            "these look like detector values: give flats or the white level, or divide by them",
+        )
+    if found.kind == "line_integral" and high > MOST_INTEGRAL:
+        raise UserError(
+            f"{found.path}: line integrals up to {high:.4g}, which no photon would pass",
+            "these look like detector values, or a unit was applied twice",
+        )
+    if float(np.ptp(values[finite])) == 0:
+        raise UserError(f"{found.path}: all values are {values[finite][0]:g}", _EMPTY)
+    return values
+
+
+def _in_millimetres(found: ReaderOutput, given: ScanOptions) -> tuple[str, Circle | ScanGeometry]:
+    """Return the unit of lengths, and the geometry in that unit; it is mm if the user gave a unit."""
+    if given.unit is None:
+        return found.unit, found.geometry
+    factor = MILLIMETRES.get(given.unit)
+    if factor is None:
+        raise UserError(
+            f"--unit {given.unit} is not a unit of length", f"choose one of {', '.join(sorted(MILLIMETRES))}"
+        )
+    return "mm", found.geometry.scaled(factor / found.stated_mm)
+
+
+def _with_centre(placed: Circle | ScanGeometry, geometry: ScanGeometry, column: float) -> Circle | ScanGeometry:
+    if not -geometry.columns < column < 2 * geometry.columns:
+        raise UserError(
+            f"--centre-of-rotation {column:g} is far outside the {geometry.columns} columns",
+            "give the column that the axis is projected to, 0 for the first pixel's centre",
+        )
+    moved = axis_column(geometry) - column
+    if isinstance(placed, Circle):
+        sign = -1 if placed.mirrored else 1
+        return replace(placed, column_shift=placed.column_shift + sign * moved)
+    return placed.shifted(moved)
+
+
+def axis_column(geometry: ScanGeometry) -> float:
+    """Return the column onto which the origin is projected, median over views: the centre of rotation."""
+    origin = np.zeros((1, 3))
+    return float(np.median([geometry.pixel_of(view, origin)[0, 0] for view in range(geometry.views)]))
+
+
+def _usable(found: ReaderOutput, values: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the values with neutral numbers where they are not finite, and the mask of usable ones."""
+    finite = np.isfinite(values)
+    usable = None if found.beam is None or found.beam.usable.all() else found.beam.usable
+    if usable is not None:
+        notes.append(f"{several(int((~usable).sum()), 'dead pixel')} left out")
+    # Empty frames come from a shutter that stayed shut, or were never written.
+    empty = (
+        (np.ptp(np.where(finite, values, 0), axis=(1, 2)) == 0) if values[0].size > 1 else np.zeros(len(values), bool)
+    )
+    if empty.all():
+        raise UserError(f"{found.path}: all projections are empty", _EMPTY)
+    if empty.any():
+        notes.append(f"{several(int(empty.sum()), 'empty projection')} left out; the first is {_named(found, empty)}")
+    if not finite.all():
+        notes.append(f"{several(int((~finite).sum()), 'non-finite value')} left out")
+        neutral = {"counts": 0.0, "transmission": 1.0, "line_integral": 0.0}[found.kind]
+        values = np.where(finite, values, np.float32(neutral))
+    if not finite.all() or empty.any():
+        good = finite & ~empty[:, None, None]
+        usable = good if usable is None else good & usable
+    return values, usable
+
+
+def _named(found: ReaderOutput, which: np.ndarray) -> str:
+    index = int(np.argmax(which))
+    return found.names[index] if index < len(found.names) else f"number {index}"
+
+
+def _photons(found: ReaderOutput, given: ScanOptions) -> float | None:
+    """Return the photons per detector value for counts, else per transmission of 1."""
+    if given.photons is not None:
+        if not (np.isfinite(given.photons) and given.photons > 0):
+            raise UserError(f"--photons {given.photons:g}", "give the photons per pixel of the open beam, above 0")
+        if found.kind == "line_integral":
+            raise UserError(
+                "--photons does not apply to line integrals: their noise is no longer that of counting",
+                "leave it out, or convert transmissions or counts",
+            )
+        if found.beam is not None:
+            return given.photons / float(np.median(found.beam.values[found.beam.usable]))
+        return given.photons
+    return found.photons if found.beam is None else found.beam.photons_per_value
+
+
+def _held_out(found: ReaderOutput, given: ScanOptions, views: int) -> tuple[int, ...]:
+    if given.holdout is not None:
+        names = [f"{view:05d}" for view in range(views)]
+        return tuple(sorted(int(name) for name in names_held_out(given.holdout, names)))
+    if found.held_out is None:
+        return held_out_views(views)
+    return tuple(sorted(int(view) for view in found.held_out))

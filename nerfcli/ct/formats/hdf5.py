@@ -1,0 +1,201 @@
+"""DataExchange and NXtomo, both HDF5: parallel beams of synchrotrons, with flats and darks.
+
+These files state neither the direction of rotation nor the side from which columns are numbered. The source is assumed
+to turn counter-clockwise seen from +z, and columns to run from left to right seen from the source.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.ct.circle import Circle
+from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
+from nerfcli.ct.formats.scan_options import ScanOptions, angles_in_radians, millimetres
+from nerfcli.ct.open_beam import check_sizes, open_beam_of
+from nerfcli.ct.scan import Scan
+from nerfcli.errors import UserError
+
+SUFFIXES = (".h5", ".hdf5", ".hdf", ".nxs", ".nx")
+# Names of the pixel size, in order of preference: the size at the object before that of the camera.
+_PIXEL_WIDTH = (
+    *("sample_x_pixel_size", "actual_pixel_size_x", "x_actual_pixel_size", "pixel_size_x"),
+    *("x_pixel_size", "pixel_size", "resolution"),
+)
+_PIXEL_HEIGHT = tuple(name.replace("_x", "_y").replace("x_", "y_") for name in _PIXEL_WIDTH)
+# Values of image_key.
+_PROJECTION, _FLAT, _DARK = 0, 1, 2
+
+
+def read_data_exchange(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
+    """Read a DataExchange file: exchange/data, data_white, data_dark and theta.
+
+    Raises:
+        UserError: it cannot be read, lacks something, or its parts do not fit together.
+    """
+    with _opened(path) as file:
+        data = _frames(file, "exchange/data", path)
+        theta = _dataset(file, "exchange/theta", path, "the angles of the projections")
+        angles = angles_in_radians(theta[...], views=len(data), unit=_unit(theta), where=f"{path}: exchange/theta")
+        flats = _frames(file, "exchange/data_white", path) if "exchange/data_white" in file else None
+        darks = _frames(file, "exchange/data_dark", path) if "exchange/data_dark" in file else None
+        sides = _pixel_mm(file, path)
+    return _parallel(path, "data-exchange", data, angles, flats=flats, darks=darks, sides=sides, given=given)
+
+
+def read_nxtomo(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
+    """Read a NeXus file with an NXtomo entry: frames with an image_key (0 projections, 1 flats, 2 darks).
+
+    Raises:
+        UserError: as for `read_data_exchange`.
+    """
+    with _opened(path) as file:
+        key_name = _first(file, "image_key", path)
+        key = np.asarray(file[key_name][...]).reshape(-1)
+        folder = key_name.rpartition("/")[0]
+        data_name = f"{folder}/data" if f"{folder}/data" in file else _first(file, "data", path)
+        data = _frames(file, data_name, path)
+        if len(key) != len(data):
+            raise UserError(
+                f"{path}: {len(key)} image keys for {len(data)} frames", "each frame needs one: write the file again"
+            )
+        angle_name = _first(file, "rotation_angle", path)
+        all_angles = np.asarray(file[angle_name][...]).reshape(-1)
+        unit = _unit(file[angle_name])
+        control = [name for name in _walk(file) if name.endswith("image_key_control")]
+        # Frames for alignment have key 0 and a control of -1.
+        aligned = np.asarray(file[control[0]][...]).reshape(-1) < 0 if control else np.zeros(len(key), bool)
+        sides = _pixel_mm(file, path)
+    chosen = (key == _PROJECTION) & ~aligned if len(aligned) == len(key) else key == _PROJECTION
+    if not chosen.any():
+        raise UserError(f"{path}: no frame has image_key 0", "projections have the key 0, flats 1, darks 2")
+    if len(all_angles) == len(key):
+        all_angles = all_angles[chosen]
+    angles = angles_in_radians(all_angles, views=int(chosen.sum()), unit=unit, where=f"{path}: {angle_name}")
+    flats, darks = data[key == _FLAT], data[key == _DARK]
+    return _parallel(
+        *(path, "nxtomo", data[chosen], angles),
+        flats=flats if len(flats) else None,
+        darks=darks if len(darks) else None,
+        sides=sides,
+        given=given,
+    )
+
+
+def hdf5_form(path: Path) -> str | None:
+    """Return "data-exchange", "nxtomo", or None for other HDF5 files.
+
+    Raises:
+        UserError: the file cannot be opened as HDF5.
+    """
+    with _opened(path) as file:
+        if "exchange/data" in file or "exchange" in file:
+            return "data-exchange"
+        return "nxtomo" if any(name.rpartition("/")[2] == "image_key" for name in _walk(file)) else None
+
+
+def _parallel(
+    path: Path,
+    form: str,
+    data: np.ndarray,
+    angles: np.ndarray,
+    *,
+    flats: np.ndarray | None,
+    darks: np.ndarray | None,
+    sides: tuple[float, float, float] | None,
+    given: ScanOptions,
+) -> Scan:
+    check_sizes(data.shape, flats=flats, darks=darks, path=path)
+    notes = ["the file does not say which way the source moved: counter-clockwise around the object is assumed"]
+    width, height, stated = (1.0, 1.0, 1.0) if sides is None else sides
+    circle = Circle("parallel", tuple(angles.tolist()), width, height, data.shape[1], data.shape[2])
+    unit = "mm" if sides is not None else UNKNOWN_UNIT
+    if sides is None and given.unit is None:
+        unit = "voxel"
+        notes.append("the file does not state the pixel size: lengths are in pixels")
+    beam = None
+    if flats is None:
+        if float(np.nanquantile(data, 0.999)) > 1.5:
+            raise UserError(
+                f"{path} has no flats: the open beam is unknown",
+                "add them (data_white, or image_key 1), or store transmissions instead of detector values",
+            )
+        notes.append("there are no flats: values are taken as transmissions")
+    else:
+        beam = open_beam_of(flats, darks)
+    kind = "transmission" if beam is None else "counts"
+    return scan_of(ReaderOutput(path, form, data, kind, circle, unit, beam=beam, notes=notes, stated_mm=stated), given)
+
+
+def _opened(path: Path) -> Any:
+    import h5py
+
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        if not path.exists():
+            raise UserError(f"{path} does not exist", "give the path of an HDF5 file") from error
+        raise UserError(f"{path} cannot be read as HDF5: {error}", "it is damaged: copy it again") from error
+
+
+def _dataset(file: Any, name: str, path: Path, what: str) -> Any:
+    import h5py
+
+    if name not in file or not isinstance(file[name], h5py.Dataset):
+        raise UserError(f"{path} has no {name}", f"it should hold {what}: write the file again with them")
+    return file[name]
+
+
+def _frames(file: Any, name: str, path: Path) -> np.ndarray:
+    dataset = _dataset(file, name, path, "frames")
+    try:
+        array = np.asarray(dataset[...], dtype=np.float32)
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(f"{path}: {name} cannot be read: {error}", "the file is damaged: copy it again") from error
+    if array.ndim == 2:
+        array = array[None]
+    if array.ndim != 3:
+        raise UserError(f"{path}: {name} has shape {array.shape}", "expected frames x rows x columns")
+    return array
+
+
+def _walk(file: Any) -> list[str]:
+    """Return the names of all datasets, in the order of the file."""
+    import h5py
+
+    names: list[str] = []
+    file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return names
+
+
+def _first(file: Any, name: str, path: Path) -> str:
+    for found in _walk(file):
+        if found.rpartition("/")[2] == name:
+            return found
+    raise UserError(f"{path} has no {name}", "an NXtomo entry has image_key, data and rotation_angle")
+
+
+def _unit(dataset: Any) -> str | None:
+    for name in ("units", "unit"):
+        if name in dataset.attrs:
+            value = dataset.attrs[name]
+            return value.decode() if isinstance(value, bytes) else str(value)
+    return None
+
+
+def _pixel_mm(file: Any, path: Path) -> tuple[float, float, float] | None:
+    """Return width and height of a pixel in mm, and the mm per unit of the width; None if the file has no size."""
+    names = {found.rpartition("/")[2]: found for found in _walk(file)}
+    width = next((names[name] for name in _PIXEL_WIDTH if name in names), None)
+    if width is None:
+        return None
+    height = next((names[name] for name in _PIXEL_HEIGHT if name in names), width)
+    sides, units = [], []
+    for name in (width, height):
+        value = np.asarray(file[name][...]).reshape(-1)
+        unit = _unit(file[name]) or "m"  # the unit of NeXus
+        if len(value) == 0 or not np.issubdtype(value.dtype, np.number):
+            return None
+        units.append(millimetres(unit, where=f"{path}: {name}"))
+        sides.append(float(value[0]) * units[-1])
+    return sides[0], sides[1], units[0]

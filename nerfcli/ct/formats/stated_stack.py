@@ -1,0 +1,206 @@
+"""Pictures with a scan.json that describes them, for scanners whose own format is not supported.
+
+    {"projections": "proj/*.tif", "flats": "flats/*.tif", "darks": "darks/*.tif",
+     "kind": "counts", "beam": "cone", "unit": "mm", "pixel_size": [0.2, 0.2],
+     "source_origin": 410.7, "source_detector": 553.7,
+     "angles_deg": {"first": 0, "step": 0.5}, "direction": "counter-clockwise"}
+
+| key | meaning |
+|---|---|
+| projections | pattern of TIFF, PNG or BMP files, one TIFF of many pages, or a .npy of views x rows x columns |
+| kind | counts (with flats or white_level), transmission, or line_integral |
+| flats, darks | patterns, or .npy; white_level: a number instead of flats |
+| beam | cone or parallel |
+| unit | of lengths: mm, um, m, ... |
+| pixel_size | width and height of a pixel of the detector, or one number |
+| source_origin, source_detector | distances, of cone beams |
+| angles_deg, angles_rad | a list; or first and step |
+| direction | rotation of the source around the object, seen from above: counter-clockwise (default) or clockwise |
+| mirrored | true if columns are numbered from right to left, seen from the source |
+| centre_of_rotation | the column that the axis is projected to; the middle if it is not given |
+| centre_row | the row that the plane of the source crosses; the middle if it is not given |
+| photons | per pixel of the open beam |
+| held_out | list of views, from 0 |
+| truth | for a simulated scan: volume (.npy, z x y x x, around the origin), voxel_size, attenuation_per_value |
+| vectors | instead of angles and distances: views x 12 numbers as ASTRA's cone_vec or parallel3d_vec |
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.ct.circle import Circle
+from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
+from nerfcli.ct.formats.pictures import SUFFIXES, numbered, read_stack
+from nerfcli.ct.formats.scan_options import ScanOptions, angles_in_radians, millimetres
+from nerfcli.ct.formats.statement import Statement, read_object
+from nerfcli.ct.geometry import Beam, ScanGeometry, from_vectors
+from nerfcli.ct.open_beam import OpenBeam, check_sizes, open_beam_of
+from nerfcli.ct.scan import KINDS, Kind, Scan
+from nerfcli.ct.truth import described_truth
+from nerfcli.errors import UserError
+
+NAME = "scan.json"
+_HINT = "a scan.json states projections, kind, beam, pixel_size, unit and angles_deg; see nerfcli's guide of tomography"
+_KEYS = (
+    *("projections", "flats", "darks", "white_level", "kind", "beam", "unit", "pixel_size", "source_origin"),
+    *("source_detector", "angles_deg", "angles_rad", "direction", "mirrored", "centre_of_rotation", "centre_row"),
+    *("photons", "held_out", "vectors", "truth", "note"),
+)
+
+
+def read_stated_stack(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
+    """Read a folder with a scan.json, or the scan.json itself.
+
+    Raises:
+        UserError: it cannot be read, states something unknown, lacks something, or does not fit the pictures.
+    """
+    file = path / NAME if path.is_dir() else path
+    fields = read_object(file, hint=_HINT)
+    unknown = [name for name in fields.names if name not in _KEYS]
+    if unknown:
+        raise UserError(f"{file}: {unknown[0]!r} is not a key of scan.json", f"the keys are {', '.join(_KEYS)}")
+    kind = _one_of(fields, "kind", KINDS)
+    beam_kind: Beam = "cone" if _one_of(fields, "beam", ("cone", "parallel")) == "cone" else "parallel"
+    values = _pictures(file, fields.text("projections"), "projections")
+    views, rows, columns = values.shape
+    factor = millimetres(fields.text("unit"), where=f"{file}: unit")
+    if "vectors" in fields:
+        geometry: Circle | ScanGeometry = _vectors(fields, beam_kind, factor, rows=rows, columns=columns)
+    else:
+        geometry = _circle(fields, beam_kind, views=views, rows=rows, columns=columns).scaled(factor)
+    measured: Kind = next(name for name in KINDS if name == kind)
+    beam = _open_beam(file, fields, values.shape) if measured == "counts" else None
+    photons = fields.positive("photons") if "photons" in fields else None
+    found = ReaderOutput(
+        *(path, "stack", values, measured, geometry, "mm"),
+        beam=beam,
+        photons=photons if beam is None else None,
+        held_out=_held_out(fields, views),
+        history=_truth(fields, factor),
+        stated_mm=factor,
+    )
+    if photons is not None and given.photons is None and measured != "line_integral":
+        given = replace(given, photons=photons)
+    return scan_of(found, given)
+
+
+def _circle(fields: Statement, beam: Beam, *, views: int, rows: int, columns: int) -> Circle:
+    where = str(fields.path)
+    name = "angles_rad" if "angles_rad" in fields else "angles_deg"
+    stated = fields.value(name)
+    if stated is None:
+        raise UserError(f"{where} has no angles_deg", _HINT)
+    if isinstance(stated, dict):
+        steps = Statement(fields.path, stated, hint="angles are a list, or an object with first and step")
+        stated = steps.number("first", 0.0) + steps.number("step") * np.arange(views)
+    try:
+        numbers = np.asarray(stated, dtype=np.float64).reshape(-1)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{where}: {name} is not a list of numbers", _HINT) from error
+    angles = angles_in_radians(numbers, views=views, unit=name.removeprefix("angles_"), where=f"{where}: {name}")
+    direction = str(fields.value("direction", "counter-clockwise"))
+    if direction not in ("counter-clockwise", "clockwise"):
+        raise UserError(f"{where}: direction {direction!r}", "write counter-clockwise or clockwise, seen from above")
+    sides = fields.value("pixel_size")
+    sides = list(sides) if isinstance(sides, list) else [sides, sides]
+    if len(sides) != 2 or not all(isinstance(side, int | float) and side > 0 for side in sides):
+        raise UserError(f"{where}: pixel_size is {fields.value('pixel_size')!r}", "width and height above 0")
+    mirrored = bool(fields.value("mirrored", False))
+    middle = (columns - 1) / 2, (rows - 1) / 2
+    shift = middle[0] - fields.number("centre_of_rotation", middle[0])
+    return Circle(
+        beam,
+        tuple(((-1 if direction == "clockwise" else 1) * angles).tolist()),
+        *(float(sides[0]), float(sides[1]), rows, columns),
+        fields.positive("source_origin") if beam == "cone" else 0.0,
+        fields.positive("source_detector") if beam == "cone" else 0.0,
+        column_shift=-shift if mirrored else shift,
+        row_shift=middle[1] - fields.number("centre_row", middle[1]),
+        mirrored=mirrored,
+    )
+
+
+def _vectors(fields: Statement, beam: Beam, factor: float, *, rows: int, columns: int) -> ScanGeometry:
+    try:
+        vectors = np.asarray(fields.value("vectors"), dtype=np.float64)
+        scale = np.full(12, factor)
+        if beam == "parallel":
+            scale[:3] = 1
+        return from_vectors(beam, vectors * scale, rows=rows, columns=columns)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{fields.path}: vectors: {error}", "give 12 numbers per view, as ASTRA's cone_vec") from error
+
+
+def _open_beam(file: Path, fields: Statement, shape: tuple[int, ...]) -> OpenBeam:
+    darks = _pictures(file, fields.text("darks"), "darks") if "darks" in fields else None
+    if "flats" in fields:
+        flats = _pictures(file, fields.text("flats"), "flats")
+    elif "white_level" in fields:
+        flats = np.full((1, *shape[1:]), fields.positive("white_level"), dtype=np.float32)
+    else:
+        raise UserError(f"{file}: counts without flats", "name the flats, or a white_level, or say kind transmission")
+    check_sizes(shape, flats=flats, darks=darks, path=file)
+    return open_beam_of(flats, darks)
+
+
+def _pictures(file: Path, pattern: str, what: str) -> np.ndarray:
+    place = file.parent / pattern
+    if place.suffix == ".npy":
+        try:
+            array = np.load(place, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise UserError(f"{place} cannot be read: {error}", f"{file.name} names it for the {what}") from error
+        array = array[None] if array.ndim == 2 else array
+        if array.ndim != 3 or not np.issubdtype(array.dtype, np.number):
+            raise UserError(f"{place} has shape {array.shape}", "expected views x rows x columns of numbers")
+        return array.astype(np.float32)
+    if place.is_dir():
+        paths = numbered(place)
+    elif place.suffix.lower() in SUFFIXES and "*" not in pattern and "?" not in pattern:
+        paths = [place]
+    else:
+        paths = numbered(place.parent, place.name)
+    if not paths:
+        raise UserError(f"no {what} match {place}", f"{file.name} names them: TIFF, PNG or BMP files")
+    return read_stack(paths)
+
+
+def _held_out(fields: Statement, views: int) -> list[int] | None:
+    stated: Any = fields.value("held_out")
+    if stated is None:
+        return None
+    if not isinstance(stated, list) or not all(isinstance(view, int) and 0 <= view < views for view in stated):
+        raise UserError(f"{fields.path}: held_out is {stated!r}", f"a list of views from 0 to {views - 1}")
+    return stated
+
+
+def _truth(fields: Statement, factor: float) -> dict[str, Any]:
+    """Describe the true volume, centred on the origin; its stated attenuation is in the inverse of the stated unit."""
+    if "truth" not in fields:
+        return {}
+    given = fields.value("truth")
+    if not isinstance(given, dict):
+        raise UserError(
+            f"{fields.path}: truth is {given!r}", "an object with volume, voxel_size, attenuation_per_value"
+        )
+    stated = Statement(fields.path, given, hint="truth has volume, voxel_size and attenuation_per_value")
+    path = fields.path.parent / stated.text("volume")
+    try:
+        shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}", f"{fields.path.name} names it as the true volume") from error
+    if len(shape) != 3:
+        raise UserError(f"{path} has shape {shape}", "a volume is z x y x x")
+    size = stated.positive("voxel_size") * factor
+    value = stated.positive("attenuation_per_value") / factor
+    return described_truth(path, "zyx", shape, size=size, attenuation_per_value=value)
+
+
+def _one_of(fields: Statement, name: str, choices: tuple[str, ...]) -> str:
+    text = fields.text(name)
+    if text not in choices:
+        raise UserError(f"{fields.path}: {name} {text!r}", f"choose one of {', '.join(choices)}")
+    return text

@@ -1,0 +1,119 @@
+"""Folders with geometry.json, transforms_train.json and transforms_test.json, whose pictures are transmissions.
+
+The transforms are those of NeRF (OpenGL axes, principal point from the corner of the first pixel) with
+"measurement": "transmission"; 16-bit pictures hold I / I0 with 65535 for 1. A .npy of all projections beside them may
+be given instead: transmissions, or line integrals if its name contains line_integral. Test views are held out.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.ct.circle import circle_of
+from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
+from nerfcli.ct.formats.pictures import read_stack
+from nerfcli.ct.formats.scan_options import ScanOptions
+from nerfcli.ct.formats.statement import Statement, read_object
+from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.scan import Scan
+from nerfcli.ct.truth import described_truth
+from nerfcli.errors import UserError
+
+NAME = "geometry.json"
+TRANSFORMS = ("transforms_train.json", "transforms_test.json")
+WHITE = 65535.0
+_HINT = "expected geometry.json, transforms_train.json and transforms_test.json, with transmissions"
+
+
+def read_transmission_transforms(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
+    """Read the folder, one of its JSON files, or a .npy in it with the projections in the order of their angles.
+
+    Raises:
+        UserError: it cannot be read, lacks something, or its parts do not fit together.
+    """
+    folder = path if path.is_dir() else path.parent
+    stated = read_object(folder / NAME, hint=_HINT)
+    frames, lens = _frames(folder)
+    pitch = stated.positive("detector_pitch")
+    distance = stated.positive("source_detector_distance")
+    expected = stated.value("n_projections")
+    if isinstance(expected, int) and expected != len(frames):
+        raise UserError(
+            f"{folder}: {len(frames)} frames in the transforms, but {NAME} states {expected}", "a transform is missing"
+        )
+    poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
+    if poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+        raise UserError(f"{folder}: transforms of shape {poses.shape[1:]}", "each frame has a 4 x 4 matrix of numbers")
+    right, up, back, source = (poses[:, :3, k] for k in range(4))
+    columns, rows = lens.whole("w"), lens.whole("h")
+    for name in ("fl_x", "fl_y"):
+        if abs(lens.positive(name) * pitch - distance) > 1e-6 * distance:
+            raise UserError(
+                f"{folder}: {name} is {lens.positive(name):g} px of {pitch:g}, the detector {distance:g} away",
+                "both give the distance of the detector: correct one of them",
+            )
+    geometry = ScanGeometry("cone", source, source - distance * back, pitch * right, -pitch * up, rows, columns)
+    geometry = geometry.shifted(columns / 2 - lens.number("cx"), rows / 2 - lens.number("cy"))
+    values, kind, photons = _values(path, folder, frames)
+    circle, apart = circle_of(geometry)
+    found = ReaderOutput(
+        *(path, "transmission-transforms", values),
+        kind="line_integral" if kind == "line_integral" else "transmission",
+        geometry=circle if apart < 1e-6 else geometry,
+        unit="voxel" if stated.number("voxel_size", 0.0) == 1 else UNKNOWN_UNIT,
+        photons=photons,
+        held_out=[view for view, frame in enumerate(frames) if frame["part"] == TRANSFORMS[1]],
+        names=[str(frame["file_path"]) for frame in frames],
+        history=_truth(folder, stated),
+    )
+    return scan_of(found, given)
+
+
+def _frames(folder: Path) -> tuple[list[dict[str, Any]], Statement]:
+    """Return the frames of both transforms in the order of their pictures' names, and the fields of the lens."""
+    frames: list[dict[str, Any]] = []
+    lens = None
+    for name in TRANSFORMS:
+        if name == TRANSFORMS[1] and not (folder / name).exists():
+            continue
+        content = read_object(folder / name, hint=_HINT)
+        lens = lens or content
+        listed = content.value("frames")
+        if not isinstance(listed, list) or not listed:
+            raise UserError(f"{folder / name} has no frames", _HINT)
+        for frame in listed:
+            if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= set(frame):
+                raise UserError(f"{folder / name}: a frame lacks file_path or transform_matrix", _HINT)
+            frames.append({**frame, "part": name})
+    assert lens is not None
+    names = [frame["file_path"] for frame in frames]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise UserError(f"{folder}: {twice} is listed twice", "no view may be trained on and held out")
+    return sorted(frames, key=lambda frame: str(frame["file_path"])), lens
+
+
+def _values(path: Path, folder: Path, frames: list[dict[str, Any]]) -> tuple[np.ndarray, str, float | None]:
+    """Return the values, their kind, and the photons that the name of a .npy states."""
+    if path.suffix == ".npy":
+        try:
+            values = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise UserError(f"{path} cannot be read: {error}", "it is damaged: export it again") from error
+        photons = re.search(r"I0_(\d+)", path.stem)
+        kind = "line_integral" if "line_integral" in path.stem else "transmission"
+        return values, kind, float(photons[1]) if photons and kind == "transmission" else None
+    return read_stack([folder / str(frame["file_path"]) for frame in frames]) / WHITE, "transmission", None
+
+
+def _truth(folder: Path, stated: Statement) -> dict[str, Any]:
+    """Describe the measured volume, 8-bit values with x fastest, if its file exists; else return nothing."""
+    name = stated.value("volume")
+    found = re.search(r"(\d+)x(\d+)x(\d+)_uint8", str(name))
+    if not isinstance(name, str) or not found or not (folder / name).is_file() or "mu_per_unit_value" not in stated:
+        return {}
+    counts = [int(number) for number in found.groups()]
+    size, value = stated.number("voxel_size", 1.0), stated.number("mu_per_unit_value") / 255
+    return described_truth(folder / name, "zyx", counts[::-1], size=size, attenuation_per_value=value, dtype="uint8")

@@ -1,0 +1,174 @@
+"""Quick reconstruction of one detector row, to test geometries.
+
+A volume fitted to every second view has to predict the others, which it can only do if the geometry is right.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli import kernels
+from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.grid import VoxelGrid
+from nerfcli.ct.scan import Scan
+
+# Number of accelerated steps of the reconstruction; more steps fit noise.
+STEPS = 15
+MOST_VIEWS = 96
+# Rows of a cone beam within this fraction of the detector's height from the plane of the source count as fan beams.
+FAN_PART = 0.05
+
+
+@dataclass(frozen=True)
+class Row:
+    """Line integrals of one detector row, as a scan in a plane.
+
+    Args:
+        geometry: with one row, everything at z = 0.
+        integrals: (V, columns) float32.
+    """
+
+    geometry: ScanGeometry
+    integrals: np.ndarray
+
+    def binned(self, columns: int) -> "Row":
+        """Return the row with at most `columns` columns, each a mean of neighbours."""
+        factor = -(-self.geometry.columns // columns)
+        kept = self.geometry.columns // factor
+        means = self.integrals[:, : kept * factor].reshape(len(self.integrals), kept, factor).mean(2)
+        return Row(self.geometry.binned(factor), means)
+
+    def thinned(self) -> "Row":
+        """Return the row with at most `MOST_VIEWS` views, at equal steps."""
+        views = len(self.integrals)
+        index = np.unique(np.linspace(0, views - 1, min(MOST_VIEWS, views)).round().astype(int))
+        return Row(self.geometry.select(index), self.integrals[index])
+
+
+def highest_contrast_row(scan: Scan, views: np.ndarray | None = None) -> Row:
+    """Choose the row with the most contrast; for a cone beam, only among rows near the plane of the source.
+
+    Args:
+        views: indices of the views to read; all if not given.
+    """
+    views = np.arange(scan.geometry.views) if views is None else views
+    geometry = scan.geometry.select(views)
+    rows = np.arange(geometry.rows)
+    if geometry.beam == "cone" and geometry.rows > 1:
+        middle = _row_of_source(geometry)
+        rows = rows[np.abs(rows - middle) <= max(0.5, FAN_PART * geometry.rows)]
+        rows = rows if len(rows) else np.array([int(np.clip(round(middle), 0, geometry.rows - 1))])
+    some = views[:: max(1, len(views) // 16)]
+    shown = filled(scan, some)[:, rows].std(axis=(0, 2))
+    row = int(rows[int(np.argmax(shown))])
+    flat = np.array([1.0, 1.0, 0.0])
+    emitter = geometry.emitter * flat
+    if geometry.beam == "parallel":
+        emitter = emitter / np.linalg.norm(emitter, axis=1, keepdims=True)
+    centre = geometry.centre + (row - (geometry.rows - 1) / 2) * geometry.row_step
+    plane = replace(geometry, emitter=emitter, centre=centre * flat, column_step=geometry.column_step * flat, rows=1)
+    return Row(plane, filled(scan, views, row)[:, 0])
+
+
+def filled(scan: Scan, views: np.ndarray, row: int | None = None) -> np.ndarray:
+    """Return line integrals (views, rows or 1, columns) with unusable pixels interpolated along their row."""
+    if row is not None:
+        scan = scan.only_rows(row, row + 1)
+    integrals = scan.line_integrals(views)
+    usable = scan.of_views("usable", views)
+    if usable is None:
+        return integrals
+    integrals = integrals.copy()
+    bad = ~np.broadcast_to(usable, integrals.shape)
+    columns = np.arange(integrals.shape[2])
+    for view, line in np.unique(np.argwhere(bad)[:, :2], axis=0):
+        good = ~bad[view, line]
+        integrals[view, line] = np.interp(columns, columns[good], integrals[view, line, good]) if good.any() else 0
+    return integrals
+
+
+def misfit(row: Row, *, shift: float = 0.0, mirrored: bool = False) -> np.ndarray:
+    """Return mean squared errors (views // 2,) with which a reconstruction from every second view predicts the others.
+
+    Args:
+        shift: columns that the detector is moved by, see `ScanGeometry.shifted`.
+        mirrored: whether its columns are read from the other side.
+    """
+    geometry = row.geometry.mirrored() if mirrored else row.geometry
+    geometry = geometry.shifted(shift)
+    views = np.arange(geometry.views)
+    fitted, left = views[::2], views[1::2]
+    grid = _grid(geometry)
+    volume = _reconstructed(geometry.select(fitted), row.integrals[fitted], grid)
+    others = _forward(volume, _rays(geometry.select(left)), grid).reshape(len(left), -1).numpy()
+    return ((others - row.integrals[left]) ** 2).mean(1)
+
+
+def predicted(volume: np.ndarray, row: Row, grid: VoxelGrid) -> np.ndarray:
+    """Return line integrals (V, columns) of a volume (Y, X) along the rays of a row."""
+    return _forward(torch.from_numpy(volume[None]), _rays(row.geometry), grid).reshape(row.integrals.shape).numpy()
+
+
+def reconstructed(row: Row) -> tuple[np.ndarray, VoxelGrid]:
+    """Return a quick reconstruction from all views, (Y, X), and its grid."""
+    grid = _grid(row.geometry)
+    return _reconstructed(row.geometry, row.integrals, grid)[0].numpy(), grid
+
+
+def _reconstructed(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid) -> Tensor:
+    """Reconstruct a volume (1, Y, X) by SIRT with positivity and Nesterov's momentum."""
+    measured = torch.from_numpy(np.ascontiguousarray(integrals, dtype=np.float32).reshape(-1))
+    rays = _rays(geometry)
+    ones = torch.ones(grid.shape)
+    chord = _forward(ones, rays, grid)
+    by_ray = torch.where(chord > grid.size, 1 / chord.clamp_min(grid.size), 0)
+    met = _backward(torch.ones_like(chord), rays, grid)
+    by_voxel = torch.where(met > 0, 1 / met.clamp_min(1e-3 * float(met.max())), 0)
+    volume = torch.zeros(grid.shape)
+    ahead, momentum = volume, 1.0
+    for _ in range(STEPS):
+        left = (measured - _forward(ahead, rays, grid)) * by_ray
+        stepped = (ahead + by_voxel * _backward(left, rays, grid)).clamp_min(0)
+        following = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
+        ahead = stepped + (momentum - 1) / following * (stepped - volume)
+        volume, momentum = stepped, following
+    return volume
+
+
+def _forward(volume: Tensor, rays: tuple[Tensor, Tensor], grid: VoxelGrid) -> Tensor:
+    return _backend().project(volume, *rays, first=grid.first, size=grid.size)
+
+
+def _backward(values: Tensor, rays: tuple[Tensor, Tensor], grid: VoxelGrid) -> Tensor:
+    return _backend().back_project(values, *rays, shape=grid.shape, first=grid.first, size=grid.size)
+
+
+def _backend() -> kernels.Backend:
+    return kernels.backend_for(torch.device("cpu"), torch.float32)
+
+
+def _rays(geometry: ScanGeometry) -> tuple[Tensor, Tensor]:
+    origins, directions = geometry.rays()
+    return (
+        torch.from_numpy(np.ascontiguousarray(origins.reshape(-1, 3))),
+        torch.from_numpy(np.ascontiguousarray(directions.reshape(-1, 3))),
+    )
+
+
+def _grid(geometry: ScanGeometry) -> VoxelGrid:
+    """Return a square grid around the circle that the outermost ray touches, with voxels of a pixel's size."""
+    _, width = geometry.pixel_at_origin
+    origins, directions = geometry.rays()
+    across = np.abs(origins[..., 0] * directions[..., 1] - origins[..., 1] * directions[..., 0]).max()
+    count = 2 * int(np.ceil(float(across) / width)) + 1
+    edge = -(count - 1) / 2 * width
+    return VoxelGrid((1, count, count), (edge, edge, 0.0), width)
+
+
+def _row_of_source(geometry: ScanGeometry) -> float:
+    """Return the detector row at the height of the source, median over views."""
+    lift = geometry.emitter[:, 2] - geometry.centre[:, 2]
+    down = np.where(geometry.row_step[:, 2] == 0, -1.0, geometry.row_step[:, 2])
+    return (geometry.rows - 1) / 2 + float(np.median(lift / down))

@@ -1,0 +1,187 @@
+"""A reconstruction: the volume that was fitted to a scan, and the run folder that holds it.
+
+RUN/reconstruction.json records what was fitted, how, and the decisions taken; RUN/volume.npy holds the attenuation, and
+RUN/marks.npy marks the voxels that the views do not determine, see `marks`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.atomic import atomic_path
+from nerfcli.ct.grid import VoxelGrid
+from nerfcli.ct.scan import MEASUREMENT, array_digest, read_array
+from nerfcli.errors import UserError
+from nerfcli.sealed import read_sealed, write_sealed
+
+DESCRIPTION = "reconstruction.json"
+VOLUME = "volume.npy"
+MARKS = "marks.npy"
+METRICS = "metrics.json"
+LOCK = ".train.lock"
+
+FIELDS = ("voxels", "hash")
+# Outputs that can be rendered from a reconstruction.
+OUTPUTS = ("projection", "transmission", "residual")
+
+
+@dataclass(frozen=True)
+class ReconstructionSettings:
+    """Settings for fitting a volume to a scan.
+
+    Args:
+        budget_seconds: time limit for everything, trials included; None for no limit.
+        passes: number of passes over all views; None for no limit.
+        field: one of `FIELDS`.
+        voxel_size: in the scan's unit; None for the size of a pixel at the object.
+        strength: weight of total variation, see `reconstruct`.
+        centre: offset of the detector in columns; None to estimate it.
+        tilt: rotation of the detector in its plane in radians; None to estimate it.
+        air: whether the open beam of each view is measured in its pixels beside the object; None to decide by the data.
+        seed: seed for a hash grid's initial values and its choice of pixels and samples.
+        threads: number of CPU threads; 0 for all.
+
+    Raises:
+        UserError: there is neither a budget nor a number of passes, or a number is out of range.
+    """
+
+    budget_seconds: float | None = None
+    passes: int | None = None
+    field: str = "voxels"
+    voxel_size: float | None = None
+    strength: float = 1.0
+    centre: float | None = None
+    tilt: float | None = None
+    air: bool | None = None
+    seed: int = 0
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        if self.budget_seconds is None and self.passes is None:
+            raise UserError(
+                "no stopping criterion: neither --budget nor --steps is given", "give --budget 2m or --steps 30"
+            )
+        if self.voxel_size is not None and not self.voxel_size > 0:
+            raise UserError(f"invalid voxel size {self.voxel_size:g}", "give --voxel-size a length above 0")
+        if not 0 <= self.strength < float("inf"):
+            raise UserError(
+                f"invalid weight of total variation: {self.strength:g}", "give a number of 0 or more, or leave it out"
+            )
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A volume and how it was made.
+
+    Args:
+        volume: (Z, Y, X) attenuation in 1 / unit, float32.
+        marks: (Z, Y, X) uint8, see `marks`.
+        grid: position and size of its voxels.
+        unit: unit of lengths.
+        scan: folder of the scan, as the user named it.
+        scan_digest: digest of the measurements, see `Scan.digest`.
+        settings: as given.
+        used: the strength, centre, tilt and factors of the open beam that were used.
+        decisions: a sentence for each setting that was decided by the data.
+        passes, seconds: passes of the fit, and seconds in total.
+        settled: whether the last pass hardly changed the volume.
+        missing_wedge_deg: range of directions without rays, see `marks.missing_wedge_deg`.
+        versions: versions of the programs used.
+        learned: arrays of a hash grid, keyed by file name, which `volume` samples; empty for voxels.
+        complete: False if the fit was interrupted.
+    """
+
+    volume: np.ndarray
+    marks: np.ndarray
+    grid: VoxelGrid
+    unit: str
+    scan: Path
+    scan_digest: str
+    settings: ReconstructionSettings
+    used: Mapping[str, Any] = field(default_factory=dict)
+    decisions: tuple[str, ...] = ()
+    passes: int = 0
+    seconds: float = 0.0
+    settled: bool = False
+    missing_wedge_deg: float = 0.0
+    versions: Mapping[str, str] = field(default_factory=dict)
+    learned: Mapping[str, np.ndarray] = field(default_factory=dict)
+    complete: bool = True
+
+
+def is_reconstruction(run: Path) -> bool:
+    """Return whether a folder is a run that `save_reconstruction` wrote."""
+    try:
+        return (run / DESCRIPTION).is_file() and read_sealed(run / DESCRIPTION).get("measurement") == MEASUREMENT
+    except (OSError, ValueError):
+        return False
+
+
+def save_reconstruction(run: Path, result: Reconstruction) -> None:
+    """Write a run's folder; reconstruction.json is written last and lists the digests of the arrays.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    digests = {}
+    for name, array in {VOLUME: result.volume, MARKS: result.marks, **result.learned}.items():
+        with atomic_path(run / name) as partial:
+            np.save(partial, array, allow_pickle=False)
+        digests[name] = array_digest(array)
+    write_sealed(
+        run / DESCRIPTION,
+        {
+            "measurement": MEASUREMENT,
+            "scan": str(result.scan),
+            "scan_digest": result.scan_digest,
+            "unit": result.unit,
+            "grid": {"shape": list(result.grid.shape), "first": list(result.grid.first), "size": result.grid.size},
+            "settings": asdict(result.settings),
+            "used": dict(result.used),
+            "decisions": list(result.decisions),
+            "passes": result.passes,
+            "seconds": result.seconds,
+            "settled": result.settled,
+            "complete": result.complete,
+            "missing_wedge_deg": result.missing_wedge_deg,
+            "arrays": digests,
+            "versions": dict(result.versions),
+        },
+    )
+
+
+def load_reconstruction(run: Path) -> Reconstruction:
+    """Read what `save_reconstruction` wrote.
+
+    Raises:
+        UserError: there is none, or its files are damaged.
+    """
+    try:
+        content = read_sealed(run / DESCRIPTION)
+        arrays = {name: read_array(run / name, digest) for name, digest in content["arrays"].items()}
+        grid, settings = content["grid"], content["settings"]
+        if settings["strength"] is None:  # earlier runs could choose it
+            settings["strength"] = content["used"]["strength"]
+        return Reconstruction(
+            arrays.pop(VOLUME),
+            arrays.pop(MARKS),
+            VoxelGrid.of(grid["shape"], grid["first"], grid["size"]),
+            content["unit"],
+            Path(content["scan"]),
+            content["scan_digest"],
+            ReconstructionSettings(**settings),
+            content["used"],
+            tuple(content["decisions"]),
+            content["passes"],
+            content["seconds"],
+            content["settled"],
+            content["missing_wedge_deg"],
+            content["versions"],
+            arrays,
+            complete=content.get("complete", True),  # earlier runs do not say
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{run} cannot be read as a reconstruction: {error}", "train the scan again") from error

@@ -1,0 +1,374 @@
+"""Reconstruct a scan: correct its geometry, choose weights, fit a volume."""
+
+import platform
+import time
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nerfcli import __version__
+from nerfcli.atomic import clear_leftovers
+from nerfcli.ct.calibrate import air_factors, beside_object, detector_tilt, model_error
+from nerfcli.ct.centre import FEWEST_VIEWS, centre_of
+from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.grid import VoxelGrid, grid_of_scan
+from nerfcli.ct.hash_fit import fit_hash, hash_volume, new_arrays
+from nerfcli.ct.likelihood import Poisson, likelihood_of
+from nerfcli.ct.marks import TRUNCATED, UNSEEN, marks, marks_in_words, missing_wedge_deg
+from nerfcli.ct.quick import highest_contrast_row
+from nerfcli.ct.reconstruct import Fit, Problem, Projector, finer, mean_attenuation, reconstruct, start
+from nerfcli.ct.result import (
+    LOCK,
+    METRICS,
+    Reconstruction,
+    ReconstructionSettings,
+    is_reconstruction,
+    load_reconstruction,
+    save_reconstruction,
+)
+from nerfcli.ct.scan import Scan, load_scan
+from nerfcli.errors import UserError
+from nerfcli.exclusive import exclusive
+from nerfcli.machine import thread_count
+from nerfcli.memory import default_memory_limit
+from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
+
+# Fraction of the time budget for the trial of the model error, and of the time left for the coarse start.
+TRIAL_FRACTION, COARSE_FRACTION = 0.0375, 0.1
+# Minimum fraction of the budget for the fit, even if the trials before it took longer than planned.
+LEAST_FRACTION = 0.25
+COARSE_PASSES = 6
+# Maximum number of passes of a fit that is limited only by time.
+MOST_PASSES = 200
+# Memory of a fit per voxel: volume, momentum, gradient, curvature, threshold, best volume and three duals, with copies.
+BYTES_OF_VOXEL = 52
+# The open beam drifts if its standard deviation between views exceeds this many standard errors.
+DRIFT = 3.0
+
+
+def train_scan(
+    scan: str | Path,
+    run: str | Path,
+    settings: ReconstructionSettings,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    warn: Notify = warn_python,
+    progress: Progress = no_progress,
+) -> Reconstruction:
+    """Fit a volume to a scan, keep an existing one with the same settings, or refuse to touch another one.
+
+    Args:
+        scan: a folder that `nerfcli convert` wrote.
+        settings: budget, field, and values that are not to be estimated from the scan.
+        resume: continue from the volume in `run`; start from the beginning if there is none.
+
+    Raises:
+        UserError: the scan cannot be read, or `run` holds something else, or an interrupted fit without `resume`.
+        KeyboardInterrupt: passed on; the volume fitted so far has been written.
+    """
+    folder, run = Path(scan), Path(run)
+    loaded = load_scan(folder)
+    earlier = load_reconstruction(run) if is_reconstruction(run) and not overwrite else None
+    if earlier is not None:
+        same = earlier.scan_digest == loaded.digest and _wanted(earlier.settings) == _wanted(settings)
+        if same and earlier.complete:
+            again = "give a larger --budget or --steps" if resume else "add --overwrite to fit again"
+            notify(f"{run} is kept: it is complete and has these settings; {again}")
+            return earlier
+        if same and not resume:
+            raise UserError(
+                f"{run} holds a fit that was interrupted after pass {earlier.passes}",
+                "add --resume to continue, or --overwrite to replace it",
+            )
+        continued = earlier.scan_digest == loaded.digest and earlier.settings.field == settings.field
+        if not (same or (resume and continued)):
+            raise UserError(
+                f"{run} holds another reconstruction", "choose another folder with --output, or add --overwrite"
+            )
+    elif _holds_something(run) and not (overwrite and is_reconstruction(run)):
+        raise UserError(f"{run} exists and is not a reconstruction", "choose another folder with --output")
+    with exclusive(run / LOCK, f"another nerfcli train is writing {run}"):
+        clear_leftovers(run)
+        if loaded.kind != "line_integral" and loaded.photons_per_value is None:
+            warn("photons per detector value not given: estimated from the noise of neighbouring pixels")
+        threads = thread_count(settings.threads)
+        torch.set_num_threads(threads)
+        result, interrupt = _fit(loaded, folder, settings, earlier=earlier if resume else None, progress=progress)
+        (run / METRICS).unlink(missing_ok=True)  # they belong to the volume that is replaced
+        save_reconstruction(run, result)
+    if interrupt is not None:
+        notify(f"the volume of pass {result.passes} is saved in {run}; to continue, add --resume to the same command")
+        raise interrupt
+    for sentence in result.decisions:
+        notify(sentence)
+    return result
+
+
+def corrected_by(geometry: ScanGeometry, centre: float, tilt: float) -> ScanGeometry:
+    """Return the geometry with its centre shifted by `centre` columns and its detector turned by `tilt` radians."""
+    shifted = geometry.shifted(centre) if centre else geometry
+    return shifted.tilted(tilt) if tilt else shifted
+
+
+def _holds_something(run: Path) -> bool:
+    """Return whether a folder has more than the hidden files that an interrupted reconstruction leaves."""
+    return run.is_dir() and any(not path.name.startswith(".") for path in run.iterdir())
+
+
+def _wanted(settings: ReconstructionSettings) -> ReconstructionSettings:
+    """Return the settings without the number of threads, which does not make a different reconstruction."""
+    return replace(settings, threads=0)
+
+
+def _fit(
+    scan: Scan,
+    folder: Path,
+    settings: ReconstructionSettings,
+    *,
+    earlier: Reconstruction | None,
+    progress: Progress,
+) -> tuple[Reconstruction, KeyboardInterrupt | None]:
+    """Fit the volume, and return what interrupted the fit, if anything; before the fit, an interrupt is passed on."""
+    begun = time.perf_counter() - (0.0 if earlier is None else earlier.seconds)
+    decisions: list[str] = []
+    views = scan.training_views
+    # Check memory first: correcting the geometry takes seconds, and hardly changes the number of voxels.
+    _fits_memory(grid_of_scan(scan.geometry, settings.voxel_size) if earlier is None else earlier.grid)
+    centre, tilt = _geometry(scan, settings, earlier, decisions, progress)
+    geometry = corrected_by(scan.geometry, centre, tilt)
+    grid = earlier.grid if earlier is not None else grid_of_scan(geometry, settings.voxel_size)
+    if earlier is not None:
+        strength, error = float(earlier.used["strength"]), float(earlier.used["model_error"])
+    else:
+        progress(0.0, "model error")
+        most = None if settings.budget_seconds is None else TRIAL_FRACTION * settings.budget_seconds
+        strength, error = settings.strength, model_error(scan, geometry, grid, seconds=most)
+        if error > 0:
+            decisions.append(f"model error: line integrals are uncertain by {error:.2g} beyond photon noise")
+    likelihood = likelihood_of(scan, views)
+    factors = None
+    if earlier is not None:
+        factors = earlier.used.get("air")
+    elif settings.air is not False and isinstance(likelihood, Poisson):
+        factors = _air(scan, geometry, grid, likelihood, strength, forced=settings.air is True, decisions=decisions)
+    if factors is not None and isinstance(likelihood, Poisson):
+        likelihood = likelihood.scaled(torch.tensor(factors))
+    if isinstance(likelihood, Poisson):
+        likelihood = likelihood.with_model_error(error)
+    problem = Problem(geometry.select(views), likelihood, grid)
+
+    used = {"strength": strength, "model_error": error, "centre": centre, "tilt": tilt, "air": factors}
+    limit = Limit(settings.passes, settings.budget_seconds, begun, 0 if earlier is None else earlier.passes)
+    if settings.field == "hash":
+        used["start"] = mean_attenuation(problem) if earlier is None else earlier.used["start"]
+        fit, learned, interrupt = _fit_hash(
+            problem, used, limit, earlier=earlier, seed=settings.seed, progress=progress
+        )
+    else:
+        if earlier is not None:
+            fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
+        else:
+            fit = _coarse_start(scan, geometry, grid, factors, (strength, error), limit.seconds)
+        fit, interrupt = _fit_voxels(problem, fit, strength, limit, progress=progress)
+        learned = {}
+    found = marks(problem.geometry, grid)
+    decisions += [f"{words}; they are marked" for words in marks_in_words(found, (UNSEEN, TRUNCATED))]
+    wedge = missing_wedge_deg(problem.geometry)
+    if wedge > 0:
+        decisions.append(f"missing wedge of {wedge:.0f} degrees: edges along its directions are not determined")
+    result = Reconstruction(
+        fit.volume.numpy(),
+        found,
+        grid,
+        scan.unit,
+        folder,
+        scan.digest,
+        settings,
+        used,
+        tuple(decisions),
+        fit.passes,
+        time.perf_counter() - begun,
+        fit.settled,
+        wedge,
+        {"nerfcli": __version__, "python": platform.python_version(), "torch": version("torch")},
+        learned,
+        complete=interrupt is None,
+    )
+    return result, interrupt
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Stopping criterion of a fit.
+
+    Args:
+        total_passes, total_seconds: limits including earlier passes and the time before the fit; None for no limit.
+        begun: `time.perf_counter` at the start, less the seconds of an earlier run.
+        done: number of passes of an earlier run.
+    """
+
+    total_passes: int | None
+    total_seconds: float | None
+    begun: float
+    done: int
+
+    @property
+    def passes(self) -> int | None:
+        """Number of passes left, at least one."""
+        return None if self.total_passes is None else max(self.total_passes - self.done, 1)
+
+    @property
+    def seconds(self) -> float | None:
+        """Seconds left, at least `LEAST_FRACTION` of the total."""
+        if self.total_seconds is None:
+            return None
+        return max(self.total_seconds - (time.perf_counter() - self.begun), LEAST_FRACTION * self.total_seconds)
+
+
+def _fit_voxels(
+    problem: Problem, fit: Fit, strength: float, limit: Limit, *, progress: Progress
+) -> tuple[Fit, KeyboardInterrupt | None]:
+    kept = deque([fit], maxlen=1)
+    try:
+        fitted = reconstruct(
+            problem,
+            fit,
+            strength=strength,
+            passes=limit.passes or MOST_PASSES,
+            seconds=limit.seconds,
+            progress=progress,
+            keep=kept.append,
+        )
+        return fitted, None
+    except KeyboardInterrupt as interrupt:
+        return kept[-1], interrupt
+
+
+def _fit_hash(
+    problem: Problem,
+    used: Mapping[str, Any],
+    limit: Limit,
+    *,
+    earlier: Reconstruction | None,
+    seed: int,
+    progress: Progress,
+) -> tuple[Fit, dict[str, np.ndarray], KeyboardInterrupt | None]:
+    """Fit a hash grid; return its volume on the voxel grid, its learned arrays, and what interrupted it."""
+    learned = new_arrays(seed) if earlier is None else earlier.learned
+    volume = hash_volume(problem.grid, used["start"], learned, passes=limit.done)
+    interrupt: KeyboardInterrupt | None = None
+    try:
+        fit_hash(
+            problem,
+            volume,
+            strength=used["strength"],
+            seed=seed + limit.done,
+            passes=limit.passes,
+            seconds=limit.seconds,
+            progress=progress,
+        )
+    except KeyboardInterrupt as came:
+        interrupt = came
+    # The last step ends a little beyond a pass.
+    passes = max(1, round(volume.passes))
+    return Fit(volume.on_grid(problem.grid), torch.zeros(0), passes), volume.arrays, interrupt
+
+
+def _geometry(
+    scan: Scan,
+    settings: ReconstructionSettings,
+    earlier: Reconstruction | None,
+    decisions: list[str],
+    progress: Progress,
+) -> tuple[float, float]:
+    if earlier is not None:
+        return float(earlier.used["centre"]), float(earlier.used["tilt"])
+    centre, tilt = settings.centre, settings.tilt
+    if centre is None and len(scan.training_views) < FEWEST_VIEWS:
+        centre = 0.0
+    if centre is None:
+        progress(0.0, "centre of rotation")
+        found = centre_of(highest_contrast_row(scan, scan.training_views).thinned())
+        centre = found.shift if found.is_off else 0.0
+        if found.is_off:
+            decisions.append(f"centre of rotation: shifted by {found.shift:+.2f} ± {found.error:.2f} columns")
+    if tilt is None:
+        found = detector_tilt(replace(scan, geometry=scan.geometry.shifted(centre)))
+        tilt = found.value if found.holds else 0.0
+        if found.holds:
+            decisions.append(
+                f"detector tilt: {np.rad2deg(found.value):+.2f} degrees, which lowers chi-square of left-out views "
+                f"by {found.gain:.3g} ± {found.error:.2g}"
+            )
+    return centre, tilt
+
+
+def _air(
+    scan: Scan,
+    geometry: ScanGeometry,
+    grid: VoxelGrid,
+    likelihood: Poisson,
+    strength: float,
+    *,
+    forced: bool,
+    decisions: list[str],
+) -> list[float] | None:
+    """Estimate factors on the open beam of each training view; None if, unless forced, they vary no more than noise."""
+    views = scan.training_views
+    binning = max(1, geometry.columns // 96)
+    coarse, small = geometry.binned(binning).select(views), grid.coarser(binning)
+    binned = likelihood_of(scan, views, binning=binning)
+    assert isinstance(binned, Poisson)
+    problem = Problem(coarse, binned, small)
+    fit = reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES)
+    integrals = Projector(coarse, small).forward(fit.volume, np.arange(len(views)))
+    factors = air_factors(binned, integrals)
+    photons = torch.where(beside_object(binned, integrals), binned.counts, 0).sum(1)
+    error = float((1 / photons.clamp_min(1)).sqrt().median())
+    spread = float(factors.std()) if len(factors) > 1 else 0.0
+    if not forced and spread <= DRIFT * error:
+        return None
+    decisions.append(
+        f"open beam: corrected per view; it varies by {100 * spread:.2f} % between views, of which noise explains "
+        f"{100 * error:.2f} %"
+    )
+    return [float(f) for f in factors]
+
+
+def _coarse_start(
+    scan: Scan,
+    geometry: ScanGeometry,
+    grid: VoxelGrid,
+    factors: list[float] | None,
+    weights: tuple[float, float],
+    seconds: float | None,
+) -> Fit:
+    """Return a start for the fine grid, interpolated from a fit with voxels and pixels twice as large."""
+    views = scan.training_views
+    small = grid.coarser(2)
+    likelihood = likelihood_of(scan, views, binning=2)
+    strength, error = weights
+    if isinstance(likelihood, Poisson):
+        likelihood = likelihood.with_model_error(error)
+        likelihood = likelihood if factors is None else likelihood.scaled(torch.tensor(factors))
+    problem = Problem(geometry.binned(2).select(views), likelihood, small)
+    limit = None if seconds is None else COARSE_FRACTION * seconds
+    return finer(reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES, seconds=limit), grid)
+
+
+def _fits_memory(grid: VoxelGrid) -> None:
+    needed, limit = BYTES_OF_VOXEL * grid.voxels, default_memory_limit()
+    if limit is not None and needed > limit:
+        size = " x ".join(str(count) for count in reversed(grid.shape))
+        raise UserError(
+            f"{size} voxels need {needed / 1e9:.1f} GB of memory; the limit is {limit / 1e9:.1f} GB",
+            f"choose larger voxels with --voxel-size (now {grid.size:.3g})",
+        )

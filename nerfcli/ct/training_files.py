@@ -1,0 +1,184 @@
+"""Files of a reconstruction: projections, residuals, slices, volumes."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nerfcli.ct.grid import VoxelGrid
+from nerfcli.ct.likelihood import Likelihood, likelihood_of
+from nerfcli.ct.marks import MEANINGS, UNSEEN, marks_in_words
+from nerfcli.ct.reconstruct import Projector
+from nerfcli.ct.result import Reconstruction, load_reconstruction
+from nerfcli.ct.training_scores import corrected, scan_of
+from nerfcli.ct.volume_files import VolumeFile, write_volume
+from nerfcli.errors import UserError
+from nerfcli.machine import thread_count
+from nerfcli.notices import Notify, Progress, no_progress, silent
+from nerfcli.photos.images import write_png
+from nerfcli.render.files.preview import coloured
+
+# Residuals are shown from minus to plus this many standard deviations of the noise.
+RESIDUAL_RANGE = 4.0
+
+
+def render_scan(
+    run: str | Path,
+    target: str | Path,
+    *,
+    outputs: tuple[str, ...] = ("projection",),
+    views: str = "test",
+    slices: tuple[tuple[str, float], ...] = (),
+    threads: int = 0,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> list[Path]:
+    """Write projections of a reconstruction, or slices through it, as float32 TIFF with a PNG to look at.
+
+    Args:
+        run: the folder that `train_scan` wrote.
+        outputs: some of `OUTPUTS`: line integrals, transmissions, and (measured - predicted) in units of the noise.
+        views: "test" for the held-out ones, "train" for the fitted ones.
+        slices: (axis, position in the scan's unit); if given, slices and their marks replace the projections.
+        threads: number of CPU threads; 0 for all.
+
+    Returns:
+        The paths of the float files.
+
+    Raises:
+        UserError: there is no reconstruction or no held-out view, a slice is outside the volume, or a file exists.
+    """
+    run, target = Path(run), Path(target)
+    torch.set_num_threads(thread_count(threads))
+    result = load_reconstruction(run)
+    if slices:
+        cuts = {target / f"{name}.tif": cut for axis, at in slices for name, cut in _slice(result, axis, at).items()}
+        _refuse_existing(*cuts, overwrite=overwrite)
+        for path, (values, high) in cuts.items():
+            # Picture rows run downwards, but the vertical axis of a slice points up.
+            _write_picture(path, values[::-1].copy(), 0.0, high)
+        return list(cuts)
+    scan = scan_of(result, run)
+    chosen = np.array(scan.held_out, dtype=int) if views == "test" else scan.training_views
+    if len(chosen) == 0:
+        raise UserError(f"{run} has no held-out views", "render the training views with --cameras train")
+    geometry = corrected(scan.geometry, result).select(chosen)
+    projector, likelihood = Projector(geometry, result.grid), likelihood_of(scan, chosen)
+    volume = torch.from_numpy(np.array(result.volume))
+    top = float(np.nanmax(scan.line_integrals(chosen)))
+    paths = {(view, name): target / name / f"{view:04d}.tif" for view in chosen for name in outputs}
+    _refuse_existing(*paths.values(), overwrite=overwrite)
+    for number, view in enumerate(chosen):
+        index = np.array([number])
+        integrals = projector.forward(volume, index)
+        pictures = {
+            "projection": (integrals, 0.0, top),
+            "transmission": (torch.exp(-integrals), 0.0, 1.0),
+            "residual": (residual_of(likelihood, integrals, torch.from_numpy(index)), -RESIDUAL_RANGE, RESIDUAL_RANGE),
+        }
+        for name in outputs:
+            values, low, high = pictures[name]
+            _write_picture(paths[view, name], values.view(geometry.rows, geometry.columns).numpy(), low, high)
+        progress((number + 1) / len(chosen), f"view {view}")
+    notify(f"{len(paths)} pictures of {len(chosen)} views; line integrals up to {top:.3g}")
+    return list(paths.values())
+
+
+def export_scan(
+    run: str | Path, target: str | Path, *, water: float | None = None, overwrite: bool = False, notify: Notify = silent
+) -> list[Path]:
+    """Write the volume of a reconstruction as .nrrd, .mha, .nii or .tif, and its marks beside it.
+
+    Voxels that no view sees are NaN. TARGET-marks has the marks of all voxels that the views do not determine, see
+    `marks`; it is written only if there are any.
+
+    Args:
+        run: the folder that `train_scan` wrote.
+        target: the file; its suffix determines the format.
+        water: attenuation of water in 1 / unit, to write Hounsfield units, 1000 (mu / water - 1); None for attenuation.
+
+    Raises:
+        UserError: there is no reconstruction, or a file exists.
+    """
+    target = Path(target)
+    result = load_reconstruction(Path(run))
+    marks = np.asarray(result.marks)
+    values = np.where(marks & UNSEEN, np.float32(np.nan), result.volume).astype(np.float32)
+    quantity = f"1/{result.unit}"
+    if water is not None:
+        values, quantity = (1000 * (values / np.float32(water) - 1)).astype(np.float32), "HU"
+    beside = target.with_name(f"{target.stem}-marks{target.suffix}")
+    _refuse_existing(target, beside, overwrite=overwrite)
+    write_volume(target, VolumeFile(values, result.grid, result.unit, quantity))
+    written = [target]
+    if marks.any():
+        quantity = "marks: " + ", ".join(f"{mark} {meaning}" for mark, meaning in MEANINGS.items())
+        write_volume(beside, VolumeFile(marks, result.grid, result.unit, quantity))
+        written.append(beside)
+        for words in marks_in_words(marks):
+            notify(f"{beside.name}: {words}")
+    return written
+
+
+def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
+    """Interpolate a slice across an axis at a position in the scan's unit; NaN where no view sees the volume.
+
+    Raises:
+        UserError: the position is outside the volume.
+    """
+    grid: VoxelGrid = result.grid
+    positions = grid.axis(axis)
+    half = grid.size / 2
+    if not positions[0] - half <= at <= positions[-1] + half:
+        raise UserError(
+            f"{axis}={at:g} is outside the volume ({positions[0]:.4g} to {positions[-1]:.4g} {result.unit})",
+            "choose a position in this range",
+        )
+    place = float(np.clip((at - positions[0]) / grid.size, 0, len(positions) - 1))
+    low = min(int(place), max(len(positions) - 2, 0))
+    high = min(low + 1, len(positions) - 1)
+    number = "zyx".index(axis)
+    layers = [
+        np.where(np.take(result.marks, k, number) & UNSEEN, np.nan, np.take(result.volume, k, number))
+        for k in (low, high)
+    ]
+    fraction = place - low
+    return (
+        ((1 - fraction) * layers[0] + fraction * layers[1]).astype(np.float32)
+        if fraction
+        else layers[0].astype(np.float32)
+    )
+
+
+def residual_of(likelihood: Likelihood, integrals: torch.Tensor, views: torch.Tensor) -> torch.Tensor:
+    """Return measured minus predicted line integrals in units of their noise."""
+    # The slope is that of the negative log likelihood: negative where the measured integral exceeds the predicted one.
+    return -torch.sign(likelihood.slope(integrals, views)) * likelihood.deviance(integrals, views).sqrt()
+
+
+def _slice(result: Reconstruction, axis: str, at: float) -> dict[str, tuple[np.ndarray, float]]:
+    """Return a slice and, if it has any, the marks of the nearest layer: values and upper display limit, by name."""
+    top = float(np.nanquantile(np.asarray(result.volume), 0.999))
+    layer = int(np.argmin(np.abs(result.grid.axis(axis) - at)))
+    found = np.take(result.marks, layer, "zyx".index(axis)).astype(np.float32)
+    pictures = {f"{axis}={at:g}": (slice_of(result, axis, at), top)}
+    if found.any():
+        pictures[f"{axis}={at:g}-marks"] = (found, float(sum(MEANINGS)))
+    return pictures
+
+
+def _write_picture(path: Path, values: np.ndarray, low: float, high: float) -> None:
+    import tifffile
+
+    from nerfcli.atomic import atomic_path
+
+    with atomic_path(path) as partial:
+        tifffile.imwrite(partial, values.astype(np.float32), photometric="minisblack", compression="zlib")
+    write_png(path.with_suffix(".png"), coloured(values, lo=low, hi=high, colour_map="grey"))
+
+
+def _refuse_existing(*paths: Path, overwrite: bool) -> None:
+    there = [path for path in paths if path.exists()]
+    if there and not overwrite:
+        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another path with -o")

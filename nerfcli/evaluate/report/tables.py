@@ -1,0 +1,228 @@
+"""The tables of a report: a column for each run, or a row for each photo, stage, component or setting."""
+
+from collections.abc import Callable, Sequence
+from html import escape
+from typing import Any
+
+from nerfcli.evaluate.report.run_facts import RunFacts, captures_of
+from nerfcli.pages.tables import table
+
+_MEGA = 1e6
+
+
+def numbers_html(runs: Sequence[RunFacts]) -> str:
+    """Format the metrics of the runs and their protocols."""
+    return _columns(runs, _NUMBERS) + _protocols_html(runs)
+
+
+def capture_html(runs: Sequence[RunFacts]) -> str:
+    """Format the captures of the runs and their poses."""
+    return _columns(runs, _CAPTURE)
+
+
+def _columns(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Callable[[RunFacts], str]]]) -> str:
+    """Return a table with a column for each run; rows that are empty for all runs are left out."""
+    cells = [(name, *(read(run) for run in runs)) for name, read in rows]
+    kept = [row for row in cells if any(row[1:])]
+    return table(("", *(run.label for run in runs)), kept, numbers=range(1, len(runs) + 1))
+
+
+def _protocols_html(runs: Sequence[RunFacts]) -> str:
+    """Return the evaluation protocols, each once."""
+    protocols = dict.fromkeys(str(run.metrics["protocol"]) for run in runs if run.metrics)
+    return "".join(f'<p class="legend"><b>protocol</b> {escape(protocol)}</p>' for protocol in protocols)
+
+
+def metric(key: str, form: str) -> Callable[[RunFacts], str]:
+    """Return a formatter of a mean over the held-out photos; it gives "" if there is none."""
+    return _of("mean", key, form)
+
+
+def _of(part: str, key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
+    def read(run: RunFacts) -> str:
+        content: dict[str, Any] = (run.metrics if part in ("mean", "training", "render") else run.poses) or {}
+        value = content.get(part, content).get(key) if part else content.get(key)
+        return form.format(value / scale) if isinstance(value, int | float) else ""
+
+    return read
+
+
+def render_time(form: str) -> Callable[[RunFacts], str]:
+    """Return a formatter of the seconds per picture; it gives "" if they were not measured."""
+    return _of("render", "seconds_per_image", form)
+
+
+def _of_kind(kind: str) -> Callable[[RunFacts], str]:
+    def read(run: RunFacts) -> str:
+        group = (run.metrics or {}).get("kinds", {}).get(kind)
+        return f"{group['psnr']:.2f} dB ({group['images']})" if group else ""
+
+    return read
+
+
+def _shape(run: RunFacts) -> str:
+    shape = (run.metrics or {}).get("shape")
+    return f"{shape['gain_db']:+.2f} dB" if shape else ""
+
+
+def _number(value: float | None, digits: int) -> str:
+    """Format a number with `digits` decimals; "" for None."""
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def last_logged(key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
+    """Return a formatter of the last logged value; it gives "" if there is none."""
+    return lambda run: form.format(run.log[-1][key] / scale) if run.log and key in run.log[-1] else ""
+
+
+def _size(run: RunFacts) -> str:
+    cameras = {(frame.camera.width, frame.camera.height) for frame in (*run.frames.train, *run.frames.test)}
+    return ", ".join(f"{width} x {height}" for width, height in sorted(cameras)[:4])
+
+
+def _unit(run: RunFacts) -> str:
+    source = run.config.unit_source
+    return (run.config.unit or "") + (f" ({source})" if source else "")
+
+
+def registered(run: RunFacts) -> str:
+    """Format the number of photos with a pose; "" if the poses came from elsewhere."""
+    return f"{run.poses['registered']} of {run.poses['total']}" if run.poses and "registered" in run.poses else ""
+
+
+def _lenses(run: RunFacts) -> str:
+    return ", ".join(f"{lens['model']} ({lens['images']} photos)" for lens in (run.poses or {}).get("cameras", []))
+
+
+def _verdict(run: RunFacts) -> str:
+    verdict = (run.poses or {}).get("verdict")
+    return ("passed all checks" if verdict.get("accepted") else "not accepted") if verdict else ""
+
+
+def photos_html(runs: Sequence[RunFacts]) -> str:
+    """Format PSNR and SSIM of every held-out photo by every run, in a table for each capture."""
+    tables = (_photos_html([runs[index] for index in capture], of_many=len(runs) > 1) for capture in captures_of(runs))
+    return "".join(filter(None, tables)) or "<p>Not measured.</p>"
+
+
+def _photos_html(runs: Sequence[RunFacts], *, of_many: bool) -> str:
+    by_run = [{image["name"]: image for image in (run.metrics or {}).get("images", [])} for run in runs]
+    names = sorted({name for images in by_run for name in images})
+    if not names:
+        return ""
+    columns = ["photo"]
+    for run in runs:
+        of = f"{run.label}: " if of_many else ""
+        columns += [f"{of}PSNR, dB", f"{of}SSIM"]
+    rows = []
+    for name in names:
+        row = [name]
+        for images in by_run:
+            image = images.get(name, {})
+            row += [_number(image.get("psnr"), 2), _number(image.get("ssim"), 4)]
+        view = next((images[name]["view"] for images in by_run if "view" in images.get(name, {})), None)
+        rows.append([*row, *_novelty(view)])
+    columns += ["nearest training view", "distance / scene radius", "degrees between", "type of view"]
+    return table(columns, rows, numbers=range(1, len(columns)))
+
+
+def _novelty(view: dict[str, Any] | None) -> list[str]:
+    """Format how far a held-out view is from the nearest training view."""
+    if view is None:
+        return ["", "", "", ""]
+    distance, angle = _number(view.get("distance_relative"), 3), _number(view.get("angle_deg"), 1)
+    return [str(view.get("nearest") or ""), distance, angle, str(view.get("kind") or "")]
+
+
+def ledger_html(runs: Sequence[RunFacts]) -> str:
+    """Format a table of the stages that used the held-out photos."""
+    words = {True: "yes", False: "no", None: "not known"}
+    rows = [
+        (run.label, entry["stage"], words[entry["saw_held_out"]], entry["how"])
+        for run in runs
+        for entry in (run.metrics or {}).get("ledger", [])
+    ]
+    if not rows:
+        return "<p>Unknown: the run was not evaluated.</p>"
+    return table(("run", "stage", "used held-out photos", "how"), rows)
+
+
+def selection_html(runs: Sequence[RunFacts]) -> str:
+    """Format the automatic selection of components; "" without one."""
+    rows = [
+        (
+            run.label,
+            f"{decision.component}={str(decision.value).lower()}",
+            "" if decision.gain_db is None else f"{decision.gain_db:+.2f} ± {decision.error_db:.2f}",
+            "" if decision.cost is None else f"{decision.cost:+.0%}",
+            "yes" if decision.kept else "no",
+            decision.why,
+        )
+        for run in runs
+        if run.config.selection is not None
+        for decision in run.config.selection.decisions
+    ]
+    if not rows:
+        return ""
+    columns = ("run", "component", "gain, dB", "time", "kept", "why")
+    return f"<h2>Selected components</h2>{table(columns, rows, numbers=(2, 3))}"
+
+
+def settings_html(runs: Sequence[RunFacts]) -> str:
+    """Format all settings and versions; rows in which runs differ are marked and come first."""
+    per_run = [
+        _flat({"settings": run.config.settings.to_json(), "versions": dict(run.config.versions)}) for run in runs
+    ]
+    keys = list(dict.fromkeys(key for settings in per_run for key in settings))
+    rows = [(key, *(settings.get(key, "") for settings in per_run)) for key in keys]
+    differing = [row for row in rows if len(set(row[1:])) > 1]
+    same = [row for row in rows if len(set(row[1:])) == 1]
+    marked = [(f"differs: {row[0]}", *row[1:]) for row in differing]
+    return table(("", *(run.label for run in runs)), [*marked, *same], numbers=range(1, len(runs) + 1))
+
+
+def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    flat: dict[str, str] = {}
+    for key, value in content.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{name}.")
+        else:
+            flat[name] = "-" if value is None else str(value)
+    return flat
+
+
+_NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
+    ("PSNR on held-out photos", metric("psnr", "{:.2f} dB")),
+    ("SSIM", metric("ssim", "{:.4f}")),
+    ("LPIPS", metric("lpips", "{:.4f}")),
+    ("PSNR after colour alignment", metric("psnr_colour_aligned", "{:.2f} dB")),
+    ("PSNR on views between training views (interpolation)", _of_kind("interpolation")),
+    ("PSNR on views beyond training views (extrapolation)", _of_kind("extrapolation")),
+    ("gain over billboards (a model without geometry)", _shape),
+    ("training", last_logged("seconds", "{:.1f} s")),
+    ("steps", last_logged("step", "{:,.0f}")),
+    ("samples per second", _of("training", "samples_per_second", "{:.2f} M", _MEGA)),
+    ("peak memory", last_logged("peak_memory_bytes", "{:.0f} MB", _MEGA)),
+    ("checkpoint", lambda run: f"{run.field_bytes / _MEGA:.1f} MB"),
+    ("time per picture", render_time("{:.2f} s")),
+    ("measured on", lambda run: str((run.metrics or {}).get("device", ""))),
+)
+
+
+_CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
+    ("scene", lambda run: run.config.scene.name),
+    ("format", lambda run: run.config.scene_kind or ""),
+    ("training photos", lambda run: str(len(run.frames.train))),
+    ("held-out photos", lambda run: str(len(run.frames.test))),
+    ("size", _size),
+    ("unit of length", _unit),
+    ("poses found", registered),
+    ("result", _verdict),
+    ("lenses", _lenses),
+    ("points", _of("", "points", "{:,.0f}")),
+    ("mean reprojection error", _of("", "mean_reprojection_error_px", "{:.2f} px")),
+    ("blur due to pose uncertainty, median", _of("pose_blur_px", "median", "{:.2f} px")),
+    ("blur due to pose uncertainty, maximum", _of("pose_blur_px", "largest", "{:.2f} px")),
+    ("time of structure from motion", _of("seconds", "total", "{:.0f} s")),
+)

@@ -1,0 +1,158 @@
+"""Held-out photos beside their renderings: picture, error, depth, and number of photos that see the surface."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
+from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
+from nerfcli.evaluate.report.run_facts import RunFacts
+from nerfcli.photos.colours import levels_of
+from nerfcli.render.coverage import DepthMap, small_frame
+from nerfcli.render.depth import DepthRequest
+from nerfcli.render.files.preview import coloured
+from nerfcli.render.model import Model
+from nerfcli.render.one_frame import with_coverage
+from nerfcli.render.pictures import render_picture
+
+# Mean absolute difference of the channels at the last colour of error maps, sRGB in [0, 1].
+ERROR_RANGE = 0.2
+ERROR_COLOURS = "viridis"
+# Longer side of coverage maps in pixels, and the number of photos at their last colour.
+COVERAGE_PX, COVERAGE_RANGE = 320, 8
+COVERAGE_COLOURS = "viridis"
+_COVERAGE = DepthRequest("median", "ray")
+
+
+@dataclass(frozen=True)
+class HeldOutRenderings:
+    """Renderings of a held-out photo by a run.
+
+    Args:
+        name: name of the photo.
+        photo, picture, error: (H, W, 3) uint8 sRGB; RGBA photos on white.
+        depth: (H, W) in the unit of the scene, NaN where there is none.
+        coverage: (h, w) number of training photos that see the surface, in a smaller picture; NaN where there is none.
+        psnr, ssim: of the picture against the photo over the used pixels, as in `evaluate`; SSIM may be unknown.
+    """
+
+    name: str
+    photo: np.ndarray
+    picture: np.ndarray
+    error: np.ndarray
+    depth: np.ndarray
+    coverage: np.ndarray
+    psnr: float
+    ssim: float | None
+
+    @property
+    def with_depth(self) -> float:
+        """Fraction of the pixels with a depth."""
+        return float(np.isfinite(self.depth).mean())
+
+
+def common_names(runs: Sequence[RunFacts], count: int) -> list[str]:
+    """Choose up to `count` photos that all runs hold out: `spread_evenly` by PSNR of the first evaluated run."""
+    names = [frame.name for frame in runs[0].frames.test]
+    for run in runs[1:]:
+        held_out = {frame.name for frame in run.frames.test}
+        names = [name for name in names if name in held_out]
+    measured = next((run.metrics for run in runs if run.metrics is not None), {})
+    quality = {image["name"]: image["psnr"] for image in measured.get("images", [])}
+    return spread_evenly(names, count, quality=quality)
+
+
+def look_at(
+    model: Model,
+    held_out: Sequence[HeldOutPhoto],
+    *,
+    depth: DepthRequest,
+    photo_depths: Sequence[DepthMap],
+    on_progress: Callable[[float], None],
+) -> list[HeldOutRenderings]:
+    """Render held-out photos of a run.
+
+    Args:
+        held_out: the photos; their masks must leave pixels to compare.
+        photo_depths: depths of all training photos.
+    """
+    views = []
+    for photo in held_out:
+        picture = render_picture(model, photo.frame, background=background_of(model, photo), depth=depth)
+        assert picture.depth is not None
+        compared = compare(photo, picture)
+        rendered, used = to_8_bit(compared.rendered), compared.used
+        views.append(
+            HeldOutRenderings(
+                name=photo.frame.name,
+                photo=compared.photo,
+                picture=rendered,
+                error=error_map(rendered, compared.photo, used=used),
+                depth=picture.depth,
+                coverage=_coverage_map(model, photo.frame, photo_depths),
+                psnr=psnr(rendered, compared.photo, used=used),
+                ssim=ssim(rendered, compared.photo, used=used),
+            )
+        )
+        on_progress(len(views) / len(held_out))
+    return views
+
+
+def _coverage_map(model: Model, frame: Frame, photo_depths: Sequence[DepthMap]) -> np.ndarray:
+    """Count the training photos that see the surface in each pixel of a small picture (h, w)."""
+    small = small_frame(frame, COVERAGE_PX)
+    picture = render_picture(model, small, background=model.background, depth=_COVERAGE)
+    seen = with_coverage(picture, small, axis=_COVERAGE.axis, photo_depths=photo_depths)
+    assert seen.coverage is not None
+    return seen.coverage
+
+
+def coverage_picture(coverage: np.ndarray) -> np.ndarray:
+    """Colour a map of coverage, as uint8 RGB; hatched where there is no surface."""
+    return coloured(coverage, lo=0.0, hi=float(COVERAGE_RANGE), colour_map=COVERAGE_COLOURS)
+
+
+def depth_range(views: Sequence[HeldOutRenderings]) -> tuple[float, float]:
+    """Return the 1st and 99th percentile of all defined depths; (0, 1) if there are none."""
+    valid = np.concatenate([np.empty(0), *(view.depth[np.isfinite(view.depth)] for view in views)])
+    if not len(valid):
+        return 0.0, 1.0
+    low, high = np.percentile(valid, (1, 99)).tolist()
+    return low, high
+
+
+def error_map(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np.ndarray:
+    """Colour the mean absolute difference of the channels, from 0 to `ERROR_RANGE`; grey where pixels are unused.
+
+    Args:
+        picture, photo: (H, W, 3) uint8.
+        used: (H, W) bool.
+
+    Returns:
+        (H, W, 3) uint8.
+    """
+    difference = np.abs(picture.astype(np.float64) - photo).mean(-1) / 255.0
+    level = np.rint(np.clip(difference / ERROR_RANGE, 0.0, 1.0) * 255.0).astype(np.uint8)
+    colours = levels_of(ERROR_COLOURS)[level]
+    colours[~used] = 128
+    return colours
+
+
+def spread_evenly(names: Sequence[str], count: int, *, quality: dict[str, float]) -> list[str]:
+    """Choose up to `count` names, in their order: the worst, the best, and evenly between by rank of quality.
+
+    Args:
+        names: names of held-out photos.
+        count: >= 0.
+        quality: PSNR by name; if it is not known for all, the names are spread by their order.
+    """
+    if len(names) <= count:
+        return list(names)
+    if count == 0:
+        return []
+    ranked = sorted(names, key=lambda name: quality[name]) if all(name in quality for name in names) else list(names)
+    ranks = np.rint(np.linspace(0, len(ranked) - 1, count)).astype(int)
+    chosen = {ranked[rank] for rank in ranks}
+    return [name for name in names if name in chosen]

@@ -1,0 +1,79 @@
+"""Describe files of meshes and points as plain values."""
+
+from pathlib import Path
+from typing import Any
+
+from nerfcli.errors import UserError
+from nerfcli.export.mesh_files import description_in, read_glb_json, read_ply_header
+
+# Note for files without a description.
+NOT_STATED = "unit and frame"
+SUFFIXES = (".ply", ".glb", ".obj")
+
+
+def is_splat_file(path: Path) -> bool:
+    """Return whether a file is a .spz, or a .ply whose points have colours by direction.
+
+    Raises:
+        UserError: the header of a .ply is damaged.
+    """
+    suffix = path.suffix.lower()
+    return path.is_file() and (suffix == ".spz" or (suffix == ".ply" and "f_dc_0" in read_ply_header(path)[1]))
+
+
+def model_facts(path: Path) -> dict[str, Any]:
+    """Return the facts about a file: kind, format, counts, and what nerfcli wrote into it: unit, frame, run, ...
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    if not path.is_file():
+        raise UserError(f"there is no {path}", "give a file that exists")
+    match path.suffix.lower():
+        case ".ply":
+            elements, properties, comments, _ = read_ply_header(path)
+            vertices, faces = elements.get("vertex", 0), elements.get("face")
+            return {**_described(comments), **_counts("PLY", vertices, faces), "properties": " ".join(properties)}
+        case ".glb":
+            return _glb_facts(path)
+        case _:
+            return _obj_facts(path)
+
+
+def _glb_facts(path: Path) -> dict[str, Any]:
+    content = read_glb_json(path)
+    described = content.get("asset", {}).get("extras") or {"not_stated": NOT_STATED}
+    try:
+        primitive = content["meshes"][0]["primitives"][0]
+        positions = content["accessors"][primitive["attributes"]["POSITION"]]
+        faces = content["accessors"][primitive["indices"]]["count"] // 3
+        return {
+            **described,
+            **_counts("GLB", positions["count"], faces),
+            "low": positions["min"],
+            "high": positions["max"],
+        }
+    except (KeyError, IndexError, TypeError):  # written by another program: it may contain anything
+        return {**described, "kind": "mesh", "format": "GLB", "note": "its first mesh has no list of triangles"}
+
+
+def _obj_facts(path: Path) -> dict[str, Any]:
+    counts, comments = {"v": 0, "f": 0}, []
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for line in file:
+            word = line.partition(" ")[0]
+            if word in counts:
+                counts[word] += 1
+            elif word == "#":
+                comments.append(line[1:].strip())
+    if not counts["v"]:
+        raise UserError(f"{path} has no vertices", "copy or export it once more")
+    return {**_described(comments), **_counts("OBJ", counts["v"], counts["f"])}
+
+
+def _counts(form: str, vertices: int, faces: int | None) -> dict[str, Any]:
+    return {"kind": "mesh" if faces else "points", "format": form, "vertices": vertices, "faces": faces}
+
+
+def _described(comments: list[str]) -> dict[str, Any]:
+    return description_in(comments) or {"not_stated": NOT_STATED}

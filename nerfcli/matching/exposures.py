@@ -1,0 +1,86 @@
+"""Exposures of photos, estimated from the ratio of light at pixels that show the same point."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from nerfcli.cameras.rigid import apply, inverse
+from nerfcli.matching.graph import connected_groups
+from nerfcli.matching.stereo import CONSISTENT, DenseDepth
+from nerfcli.photos.colours import linear_light
+from nerfcli.photos.loading import LoadedPhoto
+
+# Only levels between these are used.
+DARKEST, BRIGHTEST = 20, 240
+# Fewer common pixels do not tell the difference of two photos' exposures.
+FEWEST_PIXELS = 50
+
+
+def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]) -> np.ndarray:
+    """Estimate the logarithms (P, 3) of the gains of photos in linear light, per channel, with mean 0.
+
+    The log ratio of a pair is the median over its common pixels. Differences between log gains fit these log ratios by
+    least absolute errors. NaN for photos that share too little with the others to be compared.
+    """
+    levels = [np.ascontiguousarray(photo.pixels[..., :3]) for photo in photos]
+    # Averaged, so that misalignments by a pixel hardly matter, and not 0, so that logarithms are finite.
+    around = [cv2.blur(pixels, (3, 3)).astype(np.float64) / 255.0 for pixels in levels]
+    light = [linear_light(np.maximum(pixels, 1e-3)) for pixels in around]
+    maps = []
+    for photo, depth in zip(photos, dense, strict=True):
+        distances = np.full(photo.pixels.shape[:2], np.nan)
+        distances[depth.pixels[:, 1], depth.pixels[:, 0]] = depth.distances
+        maps.append(distances)
+    centres = np.array([photo.frame.centre for photo in photos])
+    pairs, ratios, counts = [], [], []
+    generator = np.random.default_rng(0)
+    for one, (photo, depth) in enumerate(zip(photos, dense, strict=True)):
+        chosen = generator.permutation(len(depth.pixels))[:2000]
+        pixels = depth.pixels[chosen]
+        bearings, _ = photo.frame.camera.bearings(pixels + 0.5)
+        points = apply(photo.frame.world_from_cam, bearings * depth.distances[chosen][:, None])
+        apart = np.linalg.norm(centres - centres[one], axis=1)
+        for other in np.argsort(apart, kind="stable")[1:13].tolist():  # the nearest twelve
+            second = photos[other]
+            camera = second.frame.camera
+            away = np.linalg.norm(points - second.frame.centre, axis=1)
+            places, seen = camera.project(apply(inverse(second.frame.world_from_cam), points))
+            seen &= camera.contains(places)
+            column, row = np.where(seen[:, None], places, 0).astype(np.int64).T
+            with np.errstate(invalid="ignore"):
+                seen &= np.abs(maps[other][row, column] / np.maximum(away, 1e-12) - 1.0) < CONSISTENT
+            both = np.concatenate([levels[one][pixels[:, 1], pixels[:, 0]], levels[other][row, column]], axis=1)
+            seen &= ((both > DARKEST) & (both < BRIGHTEST)).all(1)
+            if seen.sum() < FEWEST_PIXELS:
+                continue
+            ratio = light[other][row[seen], column[seen]] / light[one][pixels[seen, 1], pixels[seen, 0]]
+            pairs.append((one, other))
+            ratios.append(np.median(np.log(ratio), axis=0))
+            counts.append(min(int(seen.sum()), 500))  # errors of neighbouring pixels are correlated
+    return _gains(len(photos), np.array(pairs).reshape(-1, 2), np.array(ratios).reshape(-1, 3), np.array(counts))
+
+
+def _gains(count: int, pairs: np.ndarray, ratios: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Fit log gains (count, 3) to log ratios (N, 3) of pairs (N, 2); NaN outside the largest connected group."""
+    gains = np.full((count, 3), np.nan)
+    group = connected_groups(range(count), [tuple(pair) for pair in pairs.tolist()])[0] if count else []
+    if len(group) < 2:
+        return gains
+    inside = np.isin(pairs[:, 0], group)
+    place = np.full(count, -1)
+    place[group] = np.arange(len(group))
+    first, second = place[pairs[inside]].T
+    design = np.zeros((len(first) + 1, len(group)))
+    design[np.arange(len(first)), second] = 1.0
+    design[np.arange(len(first)), first] -= 1.0
+    design[-1] = 1.0  # the mean log gain is 0
+    for channel in range(3):
+        wanted = np.append(ratios[inside, channel], 0.0)
+        robust, found = np.ones(len(first)), np.zeros(len(group))
+        for _ in range(5):
+            root = np.append(np.sqrt(weights[inside] * robust), 1.0)
+            found = np.linalg.lstsq(design * root[:, None], wanted * root, rcond=None)[0]
+            robust = 1.0 / np.maximum(np.abs(design[:-1] @ found - wanted[:-1]), 0.01)
+        gains[group, channel] = found
+    return gains

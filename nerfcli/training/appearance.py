@@ -1,0 +1,145 @@
+"""Parts that are learned besides the field: the background, the exposures of the photos, and their cameras."""
+
+import torch
+from torch import Tensor, nn
+
+from nerfcli.errors import UserError
+from nerfcli.field.background import SphereBackground
+from nerfcli.field.exposure import Exposure
+from nerfcli.training.losses import over_background
+from nerfcli.training.pool import PixelBatch, Pool
+from nerfcli.training.refinement import Refinement, rate_at
+from nerfcli.training.runs.components import LEARNED_BACKGROUNDS, Components
+
+# Learning rates as multiples of the field's: at lower ones, short trainings come only a part of the way.
+BACKGROUND_RATE, EXPOSURE_RATE = 5.0, 2.0
+# A field whose cameras learn gets its detail later, see `Appearance.fraction_of_detail`.
+DETAIL_DELAY = 0.125
+# At or above this level, a photo tells only that the light was at least that bright.
+SATURATED = 254.5 / 255
+# A ray with less opacity has no meaningful colour of its own.
+LEAST_OPACITY = 1e-3
+# Initial background levels are kept this far from 0 and 1, which a sigmoid does not reach.
+LEAST_LEVEL = 0.02
+
+
+class Appearance(nn.Module):
+    """The parts that the components require, and how they enter the colour of a ray.
+
+    Args:
+        log_gains: (photos, 3) logarithms of their initial exposures, NaN where unknown.
+        log_focal: see `Refinement`.
+
+    Raises:
+        UserError: a background is to be learned behind photos with alpha.
+    """
+
+    def __init__(self, components: Components, pool: Pool, *, log_gains: Tensor, log_focal: float = 0.0):
+        super().__init__()
+        device = pool.colours.device
+        kind = components.background
+        if kind in LEARNED_BACKGROUNDS and pool.has_alpha:
+            raise UserError(
+                f"--with background={kind} does not work with these photos: their alpha channel says that the "
+                "background is empty",
+                "remove the option, or use photos without alpha",
+            )
+        self.background: SphereBackground | None = None
+        if kind in LEARNED_BACKGROUNDS:
+            self.background = (SphereBackground(1) if kind == "constant" else SphereBackground()).to(device)
+        self.exposure: Exposure | None = None
+        if components.exposure != "none":
+            gains = log_gains.to(device, torch.float32)
+            known = gains.isfinite().all(1)
+            # Known exposures are fixed: with few photos, view dependence would take the place of learned ones.
+            learned = ~known if components.exposure == "matched" else torch.ones_like(known)
+            self.exposure = Exposure(torch.where(known[:, None], gains, 0.0), learned)
+            self.exposure.requires_grad_(components.exposure != "exif")
+        self.cameras = None if components.cameras == "fixed" else Refinement(components.cameras, pool, log_focal)
+        self.is_random = kind == "random" or (kind == "auto" and pool.has_alpha)
+        self._pool = pool
+        self.sky: Tensor | None = None
+
+    @torch.no_grad()
+    def show_sky(self, sky: Tensor) -> None:
+        """Initialise a learned background with the median colour of the sky, which unseen directions keep.
+
+        Args:
+            sky: (pixels,) bool, the pixels of the pool that show the sky.
+        """
+        colours = self._pool.colours[sky]
+        if self.background is None or len(colours) == 0:
+            return
+        median = (colours[:, :3].float().median(0).values / 255.0).clamp(LEAST_LEVEL, 1.0 - LEAST_LEVEL)
+        self.background.logits.add_(torch.logit(median)[:, None, None, None])
+        self.sky = sky
+
+    def groups(self) -> list[tuple[list[nn.Parameter], float]]:
+        """Return the parameters to optimise, with their learning rates as multiples of the field's."""
+        rates = ((self.background, BACKGROUND_RATE), (self.exposure, EXPOSURE_RATE))
+        learned = [(list(part.parameters()), rate) for part, rate in rates if part is not None]
+        return [(tensors, rate) for tensors, rate in learned if tensors[0].requires_grad]
+
+    def fraction_of_detail(self, fraction: float) -> float:
+        """Return the fraction of the budget whose detail the field may have.
+
+        Cameras find their poses in a coarse field; a fine field learns to show each photo from its wrong pose.
+        """
+        return fraction if self.cameras is None else (1.0 - DETAIL_DELAY) * fraction - DETAIL_DELAY
+
+    def gradients(self) -> dict[str, Tensor]:
+        """Return by name the gradients of the parameters that have one."""
+        return {name: tensor.grad for name, tensor in self.named_parameters() if tensor.grad is not None}
+
+    def refined(self, drawn: PixelBatch) -> PixelBatch:
+        """Return the same pixels, with the rays of the current cameras."""
+        return drawn if self.cameras is None else self.cameras.refined(drawn)
+
+    def with_learning_rays(self, drawn: PixelBatch, fraction: float) -> PixelBatch:
+        """Return the same as `refined`, with rays that collect gradients while cameras learn."""
+        refined = self.refined(drawn)
+        if self.cameras is None or rate_at(fraction) == 0.0:
+            return refined
+        return refined._replace(
+            origins=refined.origins.clone().requires_grad_(), directions=refined.directions.clone().requires_grad_()
+        )
+
+    def behind(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return the colours (count, 3) that rays are composited on: black or random.
+
+        Photos with alpha are composited on random colours, so that only opacity explains them. Other photos fill the
+        frame and are put on black: random colours shining through the initial fog would drown everything else.
+        """
+        device = self._pool.colours.device
+        if self.is_random:
+            return torch.rand(count, 3, generator=generator, device=device)
+        return torch.zeros(count, 3, device=device)
+
+    def compared(
+        self, rendered: Tensor, transmittance: Tensor, drawn: PixelBatch, *, behind: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the predicted and the measured colours of pixels, both (R, 3) sRGB.
+
+        Args:
+            rendered: (R, 3) composited on `behind`.
+            transmittance: (R,) the fraction of light that passes through the field.
+            behind: (R, 3) colours behind the field.
+        """
+        if self.background is not None:
+            rendered = rendered + transmittance[:, None] * self.background(drawn.directions)
+        measured = over_background(drawn.colours, behind)
+        if self.exposure is None:
+            return rendered, measured
+        photos = self._pool.photo_of(drawn.numbers)
+        if not self._pool.has_alpha:
+            return _up_to_white(self.exposure(rendered, photos), drawn.colours), measured
+        # Exposures apply to the object only, not to the colour that was put behind it.
+        opacity = 1.0 - transmittance[:, None]
+        own = (rendered - transmittance[:, None] * behind).clamp_min(0.0) / opacity.clamp_min(LEAST_OPACITY)
+        own = _up_to_white(self.exposure(own, photos), drawn.colours)
+        return opacity * own + transmittance[:, None] * behind, measured
+
+
+def _up_to_white(rendered: Tensor, colours: Tensor) -> Tensor:
+    """Clip rendered colours (R, 3) to white where those of the photo (R, 3 or 4) are white."""
+    return torch.where(colours[:, :3] < SATURATED, rendered, rendered.clamp_max(1.0))

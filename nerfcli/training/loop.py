@@ -1,0 +1,233 @@
+"""The training of a scene from photos to checkpoint, within a budget of time or steps."""
+
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from nerfcli import distributed, kernels
+from nerfcli.atomic import cannot_write
+from nerfcli.captures.scene import Scene
+from nerfcli.errors import LOST_RANK, UserError
+from nerfcli.field.checkpoint import load_tensors
+from nerfcli.field.cost import field_bytes
+from nerfcli.interrupts import deferred_interrupts
+from nerfcli.training.checkpoints import Checkpoints, Totals, decisions_of, restore
+from nerfcli.training.fitting import Fitting
+from nerfcli.training.left_out import remove_left_out, write_left_out
+from nerfcli.training.preparation import Prepared, prepare
+from nerfcli.training.runs.config import RunConfig, write_config
+from nerfcli.training.runs.decisions import Selection
+from nerfcli.training.runs.files import FIELD, LOG, STATE
+from nerfcli.training.runs.log import LogEntry, append_log, cut_log
+from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.sentinel import FAILURES, Sentinel
+from nerfcli.training.waypoints import FRACTIONS, forget_waypoints, keep_waypoint, measure_waypoints
+
+CHECKPOINT_SECONDS = 30.0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """State of a training: fraction of the budget, steps, training seconds, loss, speed."""
+
+    fraction: float
+    step: int
+    seconds: float
+    loss: float
+    samples_per_second: float
+
+
+def train(
+    scene: Scene,
+    run: Path,
+    settings: TrainSettings,
+    *,
+    resume: bool,
+    memory_bytes: int | None = None,
+    notify: Callable[[str], None],
+    on_progress: Callable[[Progress], None],
+) -> None:
+    """Fit a field to the scene's training photos and write the run folder.
+
+    The held-out photos are not opened before the last checkpoint has been written.
+
+    Args:
+        scene: photos, cameras and split.
+        run: the folder to write; must not hold a run unless `resume`.
+        settings: budget, resolution, seed, device.
+        resume: go on from the run's last checkpoint to the budget or step count of `settings`, which count from 0.
+        memory_bytes: limit of resident memory; photos that do not fit are kept in files, and the result is the same. On
+            a GPU, limit of its memory, into which everything has to fit.
+        on_progress: called after every step.
+
+    Raises:
+        UserError: too little memory, unreadable photos, numbers that became non-finite, nothing to resume, a folder
+            that cannot be written, or another process that has ended; a checkpoint has then been written.
+        KeyboardInterrupt: passed on after a checkpoint has been written.
+    """
+    torch.set_num_threads(settings.threads)
+    kernels.prepare(notify, settings.device)
+    saved = distributed.from_first(lambda: load_tensors(run / STATE, settings.device) if resume else None)
+    begun = distributed.from_first(lambda: None if saved is None else decisions_of(run, settings, saved[1]))
+    # A training resumed with a larger budget keeps its number of rows.
+    rows = settings.log2_rows or (saved[1]["field"].get("log2_rows") if saved is not None else None)
+    with_all_threads = replace(settings, threads=sum(distributed.gathered(settings.threads)))
+    settings = replace(settings, log2_rows=rows or with_all_threads.chosen_log2_rows)
+    prepared = prepare(scene, settings, run=run, memory_bytes=memory_bytes, begun=begun, notify=notify)
+    fitting = prepared.fitting()
+    notify(f"field: {fitting.field.settings.size_text}; {field_bytes(fitting.field) / 1e6:.2f} MB")
+    if saved is not None:
+        totals = restore(fitting, run, *saved)
+        cut_log(run, fitting.step)
+        forget_waypoints(run, after=fitting.step)
+        notify(f"resumed at step {fitting.step}, {totals.seconds:.1f} s")
+    else:
+        totals = Totals(seconds=prepared.seconds, searched=prepared.seconds)
+        _clear(run)
+    if prepared.occluders is not None:
+        named = zip(prepared.pool.frames, prepared.occluders, strict=True)
+        write_left_out(run, {frame.name: ~mask for frame, mask in named}, notify=notify)
+    selection = prepared.selection if begun is None else begun.selection
+    _describe(scene, run, settings, prepared, selection=selection)
+    checkpoints = Checkpoints(run, fitting, totals, prepared=prepared, scene=scene)
+    checkpoints.write_cameras()
+    sentinel = Sentinel(fitting, prepared.pool, run=run, notify=notify)
+    distributed.gathered(None)  # wait until all processes have loaded their photos
+    with deferred_interrupts() as interrupts:
+
+        def after_step(progress: Progress) -> None:
+            with distributed.interrupted_together():
+                on_progress(progress)
+                prepared.storage.release_pages()
+                interrupts.raise_if_pending()
+
+        try:
+            _run(fitting, totals, sentinel=sentinel, checkpoints=checkpoints, run=run, on_progress=after_step)
+        except KeyboardInterrupt:
+            if not fitting.in_step:
+                sentinel.settle()
+                checkpoints.write()
+            raise
+        except UserError as error:
+            if error.exit_code == LOST_RANK:  # nothing has been learned from that step
+                checkpoints.write()
+            raise
+        checkpoints.write()
+    if fitting.rollbacks:
+        notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
+    if distributed.rank() == 0:
+        measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)
+
+
+def _clear(run: Path) -> None:
+    """Create the run folder, and remove files of an earlier training from it."""
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        for old in (run / STATE, run / FIELD, run / LOG, *run.glob(FAILURES)):
+            old.unlink(missing_ok=True)
+        remove_left_out(run)
+    except OSError as error:
+        raise cannot_write(run, error) from error
+    forget_waypoints(run)
+
+
+def _describe(
+    scene: Scene, run: Path, requested: TrainSettings, prepared: Prepared, *, selection: Selection | None
+) -> None:
+    """Write RUN/config.json."""
+    described = RunConfig.describing(
+        scene,
+        requested,
+        factor=prepared.factor,
+        contraction=prepared.extent.contraction,
+        selection=selection,
+    )
+    write_config(run, described)
+
+
+def _run(
+    fitting: Fitting,
+    totals: Totals,
+    *,
+    sentinel: Sentinel,
+    checkpoints: Checkpoints,
+    run: Path,
+    on_progress: Callable[[Progress], None],
+) -> None:
+    """Step until the budget is used up.
+
+    The clock is stopped while waypoints and checkpoints are written.
+    """
+    settings = fitting.settings
+    last_saved = totals.seconds
+    loss = 0.0
+    logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
+
+    def speeds() -> tuple[float, float]:
+        seconds = max(totals.seconds - logged_seconds, 1e-9)
+        return (totals.samples - logged_samples) / seconds, (totals.rays - logged_rays) / seconds
+
+    def log() -> None:
+        nonlocal logged_samples, logged_rays, logged_seconds
+        samples_per_second, rays_per_second = speeds()
+        entry: LogEntry = {
+            "step": fitting.step,
+            "seconds": round(totals.seconds, 3),
+            "loss": loss,
+            "samples": totals.samples,
+            "rays": totals.rays,
+            "samples_per_second": round(samples_per_second),
+            "rays_per_second": round(rays_per_second),
+            "peak_memory_bytes": peak_memory_bytes(),
+            "rollbacks": fitting.rollbacks,
+        }
+        append_log(run, entry)
+        logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
+
+    waypoints = [fraction for fraction in FRACTIONS if fraction > _fraction(settings, fitting.step, totals)]
+    try:
+        while (fraction := _fraction(settings, fitting.step, totals)) < 1.0:
+            began = time.perf_counter()
+            result = sentinel.advance(fraction)
+            totals.seconds += distributed.largest(time.perf_counter() - began)
+            totals.samples += result.samples
+            totals.rays += result.rays
+            loss = result.loss
+            fraction = _fraction(settings, fitting.step, totals)
+            on_progress(Progress(fraction, fitting.step, totals.seconds, loss, speeds()[0]))
+            checkpoint_due = totals.seconds - last_saved >= CHECKPOINT_SECONDS
+            if checkpoint_due or (waypoints and fraction >= waypoints[0]):
+                sentinel.settle()
+                fraction = _fraction(settings, fitting.step, totals)
+            if waypoints and fraction >= waypoints[0]:
+                waypoints = [later for later in waypoints if later > fraction]
+                keep_waypoint(run, fitting.step, checkpoints.model())
+                log()
+            elif totals.seconds - logged_seconds >= 1.0:
+                log()
+            if checkpoint_due:
+                checkpoints.write()
+                last_saved = totals.seconds
+    finally:
+        # An interrupt may come before the last steps are logged, and a resumed training may have no step left to log.
+        if totals.seconds > logged_seconds:
+            log()
+
+
+def _fraction(settings: TrainSettings, step: int, totals: Totals) -> float:
+    """Return the used fraction of the budget: the larger of that of time, without the search, and that of steps."""
+    left = settings.budget_seconds - totals.searched if settings.budget_seconds else 0.0
+    by_time = (totals.seconds - totals.searched) / left if left > 0 else 0.0
+    by_steps = step / settings.steps if settings.steps else 0.0
+    return min(1.0, max(by_time, by_steps))
+
+
+def peak_memory_bytes() -> int:
+    """Return the peak resident memory of this process."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere else

@@ -1,0 +1,94 @@
+"""Adam for a field: on the weights, which every sample uses, and on the rows that a step has touched."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from nerfcli.field.interface import Field
+from nerfcli.kernels import AdamStep
+from nerfcli.training.adam import BETAS, EPS, Adam
+
+
+class FieldOptimiser:
+    """Adam's moments for a field's rows and weights.
+
+    `sink` accumulates the gradient of the rows: it is allocated once, passed to `Backend.render_rays`, and zero again
+    after each step. None for a field without rows.
+    """
+
+    def __init__(self, field: Field):
+        self._field = field
+        rows = field.rows()
+        self._weights = {name: parameter for name, parameter in field.named_parameters() if parameter is not rows}
+        self._adam = Adam(self._weights.values())
+        self.sink = self._first = self._second = None
+        if rows is not None:
+            self.sink, self._first, self._second = (torch.zeros_like(rows, requires_grad=False) for _ in range(3))
+
+    def zero_grad(self) -> None:
+        """Clear the gradients of the weights; the step that used those of the rows has cleared them already."""
+        self._adam.zero_grad()
+
+    def weights(self) -> list[Tensor]:
+        """Return all parameters but the rows."""
+        return list(self._weights.values())
+
+    def gradients(self) -> dict[str, Tensor]:
+        """Return by name the gradients that any non-finite number reaches: those of the weights, or of rows alone."""
+        if not self._weights and self.sink is not None:
+            return {"rows": self.sink}
+        return {name: weight.grad for name, weight in self._weights.items() if weight.grad is not None}
+
+    def step(self, number: int, rate: float, *, decay: float) -> None:
+        """Take step `number`, counted from 1, at a learning rate and with a weight decay of rows."""
+        rate = rate * self._field.rate_factor
+        self._adam.step(rate)
+        rows = self._field.rows()
+        if rows is not None and self.sink is not None and self._first is not None and self._second is not None:
+            step = AdamStep(number, rate, BETAS, EPS, decay)
+            self._field.backend.adam_rows(rows, self.sink, self._first, self._second, step=step)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the state for `restore`, without the field's own tensors."""
+        tensors: dict[str, Tensor] = {}
+        if self._first is not None and self._second is not None:
+            tensors |= {"table_first": self._first, "table_second": self._second}
+        return tensors | self._adam.state("adam")
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Restore the state from `state`; other tensors are ignored."""
+        if self._first is not None:
+            self._first, self._second = tensors["table_first"], tensors["table_second"]
+        if self.sink is not None:
+            self.sink.zero_()  # a step may have failed before using it
+        self._adam.restore(tensors, "adam")
+
+
+class PartsOptimiser:
+    """Adam for groups of parameters learned besides the field, each with a multiple of the field's learning rate."""
+
+    def __init__(self, groups: Sequence[tuple[Sequence[Tensor], float]]):
+        self._groups = [(Adam(parameters), multiple) for parameters, multiple in groups]
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for adam, _ in self._groups:
+            adam.zero_grad()
+
+    def step(self, rate: float) -> None:
+        """Take one step at multiples of a learning rate."""
+        for adam, multiple in self._groups:
+            adam.step(rate * multiple)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the state for `restore`, without the parts' own tensors."""
+        tensors: dict[str, Tensor] = {}
+        for number, (adam, _) in enumerate(self._groups):
+            tensors |= adam.state(f"parts_adam.{number}")
+        return tensors
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Restore the state from `state`; other tensors are ignored."""
+        for number, (adam, _) in enumerate(self._groups):
+            adam.restore(tensors, f"parts_adam.{number}")

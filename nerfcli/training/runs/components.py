@@ -1,0 +1,174 @@
+"""Optional parts of a model and of its training, each chosen independently.
+
+A component is a field of `Components`. `CHOICES` gives for each component the value that switches it off, the value
+that `--with NAME` stands for, and the values that `--with NAME=VALUE` allows.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from nerfcli.errors import UserError
+
+Value = bool | int | float | str
+Change = tuple[str, Value]
+
+# Colours behind the field.
+BACKGROUNDS = ("auto", "black", "constant", "random", "sphere")
+LEARNED_BACKGROUNDS = ("constant", "sphere")
+EXPOSURES = ("none", "exif", "matched", "learned")
+CAMERAS = ("fixed", "poses", "focal", "all")
+# Meaning of black in a mask: unknown, or empty space.
+MASKS = ("ignore", "empty")
+# Components of earlier versions, each with the value that switched it off.
+_FORMER = {"overlap": False, "entropy": 0.0, "pixels": "anywhere", "movers": False}
+# Spherical harmonics up to this degree: 16 of them.
+MOST_DEGREES = 3
+
+
+@dataclass(frozen=True)
+class Components:
+    """Components of the model and of its loss. The defaults suit nearly every scene.
+
+    Args:
+        background: colour behind the field: "black"; learned, "constant" or by direction ("sphere"); "random" in
+            training, for photos with alpha; "auto" is random for photos with alpha and black for all others.
+        view: dependence of colours on the viewing direction: highest degree of the spherical harmonics that the colour
+            network takes, 0 (no dependence) to 3.
+        exposure: gains of the photos, see `field.exposure`: "none"; from "exif"; from "matched" pixels, see
+            `matching.exposures`, and learned for photos without such pixels; or all "learned", starting from EXIF.
+        cameras: camera parameters of the training photos that are trained with the field: "poses"; "focal", the focal
+            length of each lens; "all", both and radial distortion; or "fixed", none. See `refinement`.
+        masks: meaning of black in masks: "ignore", not used; or "empty", empty space, as with alpha.
+        points: weight of known distances, see `training.losses.distance_losses`.
+        stereo: whether the points include pixels of training photos with a depth from stereo matching, see
+            `matching.stereo`.
+        near: whether gradients near a camera are scaled down; see `reference.scale_gradients`.
+        distortion: weight of `kernels.RaySums.distortion`; 0.05 is best or as good as any on real and synthetic
+            captures.
+        antialias: whether details smaller than a pixel fade out of its view; see `reference.hash_encode`.
+        occluders: whether pixels are left out where something hides a surface that other photos see; see
+            `matching.occluders`.
+    """
+
+    background: str = "auto"
+    view: int = MOST_DEGREES
+    exposure: str = "none"
+    cameras: str = "fixed"
+    masks: str = "ignore"
+    points: float = 0.0
+    stereo: bool = False
+    near: bool = True
+    distortion: float = 0.05
+    antialias: bool = False
+    occluders: bool = False
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "Components":
+        """Read the components of a run of this or an earlier version; missing ones have their defaults.
+
+        Raises:
+            UserError: see `without_former`.
+            TypeError: a component is unknown.
+        """
+        return cls(**without_former(content, _FORMER))
+
+
+def without_former(content: Mapping[str, Any], former: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of a run without those that only earlier versions had.
+
+    Args:
+        former: names of these, each with the only value that can still be read.
+
+    Raises:
+        UserError: one has another value.
+    """
+    for name, value in former.items():
+        if content.get(name, value) != value:
+            had = f"{name}={str(content[name]).lower()}"
+            raise UserError(f"its training had {had}, unknown to this version", "use the version that trained it")
+    return {name: value for name, value in content.items() if name not in former}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Allowed values of a component.
+
+    Args:
+        off, on: values that `--without` and `--with` stand for.
+        allowed: all values; None for any number that is not negative.
+    """
+
+    off: Value
+    on: Value
+    allowed: tuple[Value, ...] | None
+
+    def value(self, name: str, text: str) -> Value:
+        """Parse the value of a component.
+
+        Raises:
+            UserError: the value is not allowed.
+        """
+        if self.allowed is not None:
+            for value in self.allowed:
+                if text == str(value).lower():
+                    return value
+            listed = ", ".join(str(value).lower() for value in self.allowed)
+            raise _wrong(name, text, f"one of {listed}")
+        try:
+            number = float(text)
+        except ValueError as error:
+            raise _wrong(name, text, "a number") from error
+        if not 0.0 <= number < float("inf"):
+            raise _wrong(name, text, "a number of at least 0")
+        return number
+
+
+CHOICES = {
+    "background": Choice("black", "sphere", BACKGROUNDS),
+    "view": Choice(0, MOST_DEGREES, tuple(range(MOST_DEGREES + 1))),
+    "exposure": Choice("none", "learned", EXPOSURES),
+    "cameras": Choice("fixed", "poses", CAMERAS),
+    "masks": Choice("ignore", "empty", MASKS),
+    "points": Choice(0.0, 0.1, None),
+    "stereo": Choice(False, True, (False, True)),
+    "near": Choice(False, True, (False, True)),
+    "distortion": Choice(0.0, 0.05, None),
+    "antialias": Choice(False, True, (False, True)),
+    "occluders": Choice(False, True, (False, True)),
+}
+assert tuple(CHOICES) == tuple(field.name for field in fields(Components))
+
+
+def choose(start: Components, *, included: Sequence[str], excluded: Sequence[str]) -> Components:
+    """Return `start` with some components switched on and off.
+
+    Args:
+        start: values of the components that are not named.
+        included: components to switch on, each as NAME or NAME=VALUE.
+        excluded: names of components to switch off.
+
+    Raises:
+        UserError: an unknown name or value, or a component that is named twice.
+    """
+    values: dict[str, Any] = {}
+    for text, on in [*((text, True) for text in included), *((text, False) for text in excluded)]:
+        name, given, value = text.partition("=")
+        if name not in CHOICES or (given and not on):
+            option = "--with" if on else "--without"
+            raise UserError(f"{option} {text}: unknown component", f"choose from {', '.join(CHOICES)}", 2)
+        if name in values:
+            raise UserError(f"component {name} is given twice", "give it once, with --with or --without", 2)
+        choice = CHOICES[name]
+        values[name] = choice.value(name, value) if given else choice.on if on else choice.off
+    return replace(start, **values)
+
+
+def differences(components: Components) -> dict[str, Value]:
+    """Return the components that differ from the defaults, with their values."""
+    default = Components()
+    return {name: value for name in CHOICES if (value := getattr(components, name)) != getattr(default, name)}
+
+
+def _wrong(name: str, text: str, expected: str) -> UserError:
+    return UserError(f"--with {name}={text}: expected {expected}", f"for example --with {name}={CHOICES[name].on}", 2)

@@ -1,0 +1,161 @@
+"""Settings of a training."""
+
+import dataclasses
+import math
+from bisect import bisect
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.errors import UserError
+from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.kinds import KINDS
+from nerfcli.kernels import CONTRACTIONS
+from nerfcli.training.runs.components import Components, without_former
+
+DOWNSCALES = (1, 2, 4, 8)
+# `--downscale auto` takes the largest pictures whose longer side is at most this many pixels.
+AUTO_LONGER_SIDE_PX = 800
+# Sizes of a training on a GPU, which small steps do not keep busy, and which has room for large tables.
+GPU_SIZES: dict[str, Any] = {"first_samples_per_step": 2**16, "samples_per_step": 2**18, "log2_rows": 19}
+# Number of steps in which the samples per step double. Small steps learn more per sample at first, so short trainings
+# have many of them; later, large steps are better and cost less per sample.
+DOUBLING_STEPS = 600
+# Expected number of samples per second and CPU thread, for trainings with a time budget.
+SAMPLES_PER_SECOND = 1e6
+# Short trainings learn more with few rows, each of which is seen often; long ones need more rows for the detail in the
+# photos. The number of rows doubles at each of these numbers of samples. With 2^19 rows, the file of a field has 68 MB
+# and a step is an eighth slower than with 2^18.
+FEWEST_LOG2_ROWS, DOUBLE_ROWS_FROM = 16, (37e6, 74e6, 400e6)
+# Settings of earlier versions, with the only value that can still be read.
+_FORMER = {"photo_fraction": 1.0, "random_start": 0.0, "blocks": 0, "block": 0, "levels": 8, "width": 32}
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Settings of a training.
+
+    Args:
+        budget_seconds: training time, without loading and held-out checks; None for no limit.
+        steps: total number of optimiser steps, including those before a resume; None for no limit.
+        downscale: photos are averaged over squares of this many pixels; None for automatic.
+        contraction: mapping of space to the unit cube of the field, see `kernels.contraction`; None for automatic:
+            "none" for photos with alpha, which show only an object, "l2" for others.
+        seed: seed of all random numbers.
+        device: a torch device name.
+        first_samples_per_step, samples_per_step: target number of field samples of a step, at the start and at most;
+            determines the number of rays. Small steps learn more per sample, large ones cost less per sample.
+        learning_rate, final_learning_rate: learning rate of Adam at the start and at the end of the budget.
+        warmup_steps: steps over which the learning rate rises from 0.
+        log2_rows: size of a hash grid, see `HashFieldSettings`; None for automatic, see `chosen_log2_rows`.
+        components: components of the model and of its loss.
+        field: kind of field, one of `kinds.KINDS`.
+        field_memory_bytes: memory limit of the field's numbers; None for the default of the kind, see
+            `sizes.chosen_size`.
+        model: "default" uses the components as given, "auto" selects those that are not `fixed` for the scene, see
+            `selection`.
+        fixed: names of components that the user has chosen.
+
+    Raises:
+        UserError: no limit or a non-positive one, or another setting that is invalid or cannot be combined.
+    """
+
+    budget_seconds: float | None = 120.0
+    steps: int | None = None
+    downscale: int | None = None
+    contraction: str | None = None
+    seed: int = 0
+    device: str = "cpu"
+    threads: int = 1
+    first_samples_per_step: int = 2**13
+    samples_per_step: int = 2**16
+    learning_rate: float = 1e-2
+    final_learning_rate: float = 1e-3
+    warmup_steps: int = 50
+    log2_rows: int | None = None
+    components: Components = dataclasses.field(default_factory=Components)
+    field: str = HashFieldSettings.kind
+    field_memory_bytes: int | None = None
+    model: str = "default"
+    fixed: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 4 <= (self.log2_rows or 4) <= 24:
+            raise UserError(f"invalid size of the field: log2-rows {self.log2_rows}", "it must be between 4 and 24")
+        if self.budget_seconds is None and self.steps is None:
+            raise UserError(
+                "no stopping criterion: neither --budget nor --steps is given", "give --budget, --steps, or both"
+            )
+        if (self.budget_seconds or 1) <= 0 or (self.steps or 1) <= 0:
+            raise UserError("the training budget must be positive", "for example --budget 2m or --steps 2000")
+        if self.downscale not in (None, *DOWNSCALES):
+            raise UserError(f"invalid downscale factor {self.downscale}", "choose auto, 1, 2, 4 or 8")
+        if self.field not in KINDS:
+            raise UserError(f"unknown type of field: {self.field!r}", f"choose {', '.join(KINDS)}")
+        if self.components.antialias and self.field != HashFieldSettings.kind:
+            message = f"--with antialias does not work with --field {self.field}: it needs the levels of a hash grid"
+            raise UserError(message, "use --field hash, or remove --with antialias", 2)
+        if self.components.stereo and not self.components.points and (self.model != "auto" or "points" in self.fixed):
+            raise UserError(
+                "--with stereo needs points: it adds to their pixels", "add --with points, or remove --with stereo", 2
+            )
+        if self.contraction not in (None, *CONTRACTIONS):
+            raise UserError(f"unknown contraction {self.contraction!r}", f"choose auto, {', '.join(CONTRACTIONS)}")
+
+    def samples_at(self, step: float) -> float:
+        """Return the target number of samples of a step; the first is step 0."""
+        growth = 2.0 ** min(step / DOUBLING_STEPS, 16)  # finite for any step
+        return min(self.samples_per_step, growth * self.first_samples_per_step)
+
+    @property
+    def expected_samples(self) -> float:
+        """Approximate number of samples of the whole training, the lesser of those by steps and by time and threads."""
+        by_steps, by_time = math.inf, math.inf
+        if self.steps is not None:
+            growth = max(1.0, self.samples_per_step / self.first_samples_per_step)
+            rising = min(self.steps, DOUBLING_STEPS * math.log2(growth))
+            rise = DOUBLING_STEPS / math.log(2) * (self.samples_at(rising) - self.samples_at(0))
+            by_steps = rise + (self.steps - rising) * self.samples_per_step
+        if self.budget_seconds is not None:
+            by_time = SAMPLES_PER_SECOND * self.threads * self.budget_seconds
+        return min(by_steps, by_time)
+
+    @property
+    def chosen_log2_rows(self) -> int:
+        """Binary logarithm of the rows of each table: as given, or chosen by the length of the training."""
+        if self.log2_rows is not None:
+            return self.log2_rows
+        return FEWEST_LOG2_ROWS + bisect(DOUBLE_ROWS_FROM, self.expected_samples)
+
+    def to_json(self) -> dict[str, Any]:
+        return {**asdict(self), "fixed": list(self.fixed)}
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> "TrainSettings":
+        """Read the content that `to_json` returned, in this or an earlier version; missing entries have their defaults.
+
+        Raises:
+            UserError: see `without_former`.
+        """
+        names = {entry.name for entry in dataclasses.fields(cls)}
+        given = without_former(content, _FORMER)
+        entries: dict[str, Any] = {name: value for name, value in given.items() if name in names}
+        entries["components"] = Components.from_json(content.get("components", {}))
+        entries["fixed"] = tuple(content.get("fixed", ()))
+        return cls(**entries)
+
+
+def sizes_for(device: str) -> dict[str, Any]:
+    """Return the settings for a device that differ from the defaults of `TrainSettings`."""
+    return GPU_SIZES if device.startswith("cuda") else {}
+
+
+def automatic_downscale(camera: Camera) -> int:
+    """Return the smallest downscale that brings the longer side to `AUTO_LONGER_SIDE_PX` or below; twice that for
+    panoramas, which show more with as many pixels.
+    """
+    most = 2 * AUTO_LONGER_SIDE_PX if camera.is_spherical else AUTO_LONGER_SIDE_PX
+    for factor in DOWNSCALES:
+        if max(camera.width, camera.height) / factor <= most:
+            return factor
+    return DOWNSCALES[-1]

@@ -1,0 +1,319 @@
+"""Select the components of a model: each candidate against the current model, in paired short trainings.
+
+A component is added only if its gain exceeds the noise, and removed only if that surely loses hardly anything. Gain
+and noise are measured, not assumed: every candidate continues the same start with the same seeds and pixels as the
+model that it would change, and the variation of the gains between seeds and between photos gives their error. A
+component that is kept is in the model that the next one has to improve: two that correct the same fault are not both
+needed.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from nerfcli.matching.camera_check import CameraCheck
+from nerfcli.training.runs.components import CHOICES, MOST_DEGREES, Change, Components
+from nerfcli.training.runs.decisions import Decision, Selection, untried
+from nerfcli.training.selection.diagnostics import Diagnostics
+from nerfcli.training.selection.judgement import Rule, judge_evidence, judge_likely, judge_supported
+from nerfcli.training.selection.race import Race, SearchBudget
+from nerfcli.training.selection.trials import Trials
+
+# Fraction of the budget for all trials together, and fraction of that for the training that they continue.
+SEARCH_FRACTION, START_FRACTION = 0.15, 0.2
+# A search whose first training would have fewer steps tells nothing, and is skipped.
+FEWEST_STEPS = 120
+# No machine takes that many steps in less time than this, and a vain attempt would cost the training time.
+LEAST_START_SECONDS = 0.3
+# A start of this many steps tells as much as a longer one.
+MOST_START_STEPS = 250
+# Spread of the photos' brightness, in logarithms of light. Below the first number, exposures do not help; above the
+# second, they are likely, and a smaller gain in the trial is enough.
+LEAST_EXPOSURE_SPREAD, LIKELY_EXPOSURE_SPREAD = 0.06, 0.11
+# With up to this many photos, as many as there are harmonics, view dependence explains exposures as well, and learned
+# ones drift towards none: they stay at the values from matched pixels. With more photos, learning also corrects what
+# adds up along a ring of cameras.
+FEW_PHOTOS = (MOST_DEGREES + 1) ** 2
+# Fraction of pixels that show distant things. Below the first number, the field itself shows a sky as well; above the
+# second, a sky is likely, and a smaller gain in the trial is enough.
+LEAST_FAR_FRACTION, LIKELY_FAR_FRACTION = 0.01, 0.1
+# If a larger fraction of pixels looks like a sky, there is one.
+LEAST_SKY_FRACTION = 0.05
+# A colour by direction predicts a sky better than one colour by at least this, unlike surfaces that a coarse field has
+# put far away. Or it predicts it this well: an overcast sky has one colour.
+LEAST_SKY_DB, LEAST_SKY_PSNR = 1.0, 22.0
+# Cameras with an epipolar error below this are as good as the features: structure from motion leaves 0.1 to 0.4.
+LEAST_MISS_PX = 0.6
+# Poses with at least this epipolar error at any focal length are wrong; in between, a trial decides.
+SURELY_MISSED_PX = 1.2
+# The focal length from matches is used if it differs from the given one by this many standard errors and this much in
+# the logarithm, and reduces the epipolar error to this fraction.
+FOCAL_ERRORS, LEAST_FOCAL, MISS_FRACTION = 5.0, 0.003, 0.85
+# Values of "cameras" with which focal lengths are learned.
+LEARN_FOCAL = ("focal", "all")
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Facts about a scene and the requested components, before training.
+
+    Args:
+        has_alpha: whether the photos have alpha: then nothing is behind the object.
+        has_exif: whether exposures in EXIF differ.
+        cameras_known: reason to trust the cameras, shown to the user; None if they may be wrong.
+        cameras: their check against matched features; None if there is none.
+        points: number of pixels that see a point at a known distance.
+        stereo: number of pixels with a depth from stereo matching.
+        sky_fraction: fraction of the pixels that look like a sky, see `matching.sky`.
+        sky_confirmed: whether 3D points confirm that it is one.
+        occluded_fraction: fraction of the pixels where something hides a surface that other photos see.
+        photos: number of training photos.
+        exposure_spread: standard deviation of the photos' brightness at points that they share, in logarithms of light.
+        fixed: names of the components that the user has set.
+    """
+
+    field: str
+    has_alpha: bool
+    has_exif: bool
+    cameras_known: str | None = None
+    cameras: CameraCheck | None = None
+    points: int = 0
+    stereo: int = 0
+    sky_fraction: float = 0.0
+    sky_confirmed: bool = False
+    occluded_fraction: float = 0.0
+    photos: int = 0
+    exposure_spread: float = 0.0
+    fixed: tuple[str, ...] = ()
+
+
+def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components, float, list[Decision]]:
+    """Return the model with what matched features show about the cameras, the log focal factor, and the decisions.
+
+    Features may show that focal lengths have to change by this factor (its logarithm is 0 otherwise) or that poses do
+    not fit. Trials cannot decide on focal lengths: a model that has begun with a wrong one is bent to fit, and stays so
+    for long. For the same reason, a requested model with learned lenses begins with the focal length from features. For
+    poses, a trial is too short to show more than that learning them does no harm; features show that they are wrong.
+    """
+    check, learns = facts.cameras, requested.cameras in LEARN_FOCAL
+    if check is None or ("cameras" in facts.fixed and not learns):
+        return requested, 0.0, []
+    given, changed = check.misses_px
+    if math.isfinite(check.error):
+        per_cent = 100.0 * math.expm1(check.log_focal)
+        direction = "longer" if per_cent > 0 else "shorter"
+        reason = (
+            f"{check.matches} matched features suggest a focal length {abs(per_cent):.2f} % "
+            f"(± {100.0 * check.error:.2f} %) {direction}; epipolar error {given:.2f} px -> {changed:.2f} px"
+        )
+    else:
+        reason = (
+            f"the epipolar error of {check.matches} matched features is {given:.2f} px, more at other focal lengths"
+        )
+    is_sure = abs(check.log_focal) > max(LEAST_FOCAL, FOCAL_ERRORS * check.error)
+    # With wrong poses, any focal length may seem best; the right one leaves hardly any error.
+    is_sure = is_sure and changed < min(MISS_FRACTION * given, LEAST_MISS_PX)
+    if is_sure:
+        value = requested.cameras if learns else "focal"
+        return replace(requested, cameras=value), check.log_focal, [untried("cameras", value, reason, kept=True)]
+    if learns:
+        return requested, 0.0, []
+    decisions = [untried("cameras", "focal", f"not tried, {reason}")]
+    if min(check.misses_px) < SURELY_MISSED_PX:
+        return requested, 0.0, decisions
+    reason = (
+        f"the epipolar error of {check.matches} matched features is at least {min(check.misses_px):.2f} px at "
+        "any focal length"
+    )
+    return replace(requested, cameras="poses"), 0.0, [*decisions, untried("cameras", "poses", reason, kept=True)]
+
+
+def may_use_points(requested: Components, facts: Facts) -> bool:
+    """Return whether triangulated points may be used for depth supervision.
+
+    The cameras must fit. With alpha, which tells where space is empty, points help only at first: on lego they cost
+    half a decibel, through the time that their rays take.
+    """
+    if "points" in facts.fixed:
+        return bool(requested.points)
+    fit = facts.cameras is None or facts.cameras.misses_px[0] < LEAST_MISS_PX
+    return fit and requested.cameras == "fixed" and not facts.has_alpha
+
+
+def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bool:
+    """Return whether stereo matching may add to the points; it relies on the given cameras, as points do."""
+    return requested.stereo if "stereo" in facts.fixed else has_time and facts.points > 0
+
+
+def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
+    """Return the model with components that photos support before any training, unless set, and the decisions.
+
+    These are points, at which rays should end, depths from stereo matching, the omission of what hides surfaces that
+    other photos see, exposures from shared pixels, and a sky that 3D points confirm. They are in the model from the
+    first step on: later, density has formed elsewhere already.
+    """
+    wanted: list[tuple[Change, str]] = []
+    if facts.points and may_use_points(requested, facts):
+        wanted.append((("points", CHOICES["points"].on), f"{facts.points:,} pixels see a 3D point at a known distance"))
+        if facts.stereo:
+            wanted.append((("stereo", True), f"several photos agree on the depth of {facts.stereo} pixels"))
+        if facts.occluded_fraction:
+            reason = f"{100.0 * facts.occluded_fraction:.1f} % of the pixels hide surfaces that other photos see"
+            wanted.append((("occluders", True), reason))
+        if facts.exposure_spread > LIKELY_EXPOSURE_SPREAD:
+            per_cent = 100.0 * math.expm1(facts.exposure_spread)
+            reason = f"photos differ in brightness by {per_cent:.0f} % at the same points"
+            wanted.append((("exposure", "matched" if facts.photos <= FEW_PHOTOS else "learned"), reason))
+    if facts.sky_confirmed:
+        reason = f"{100.0 * facts.sky_fraction:.0f} % of the pixels look like a sky, with hardly any 3D point in front"
+        wanted.append((("background", "sphere"), reason))
+    wanted = [(change, reason) for change, reason in wanted if change[0] not in facts.fixed]
+    values: dict[str, Any] = dict(change for change, _ in wanted)
+    model = replace(requested, **values)
+    return model, [untried(*change, reason, kept=True) for change, reason in wanted]
+
+
+def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list[Change], list[Decision]]:
+    """Return changes that may help a scene, and decisions on those that nothing supports.
+
+    Args:
+        start: components of the model so far.
+        signs: diagnostics of its first training.
+    """
+    candidates: list[Change] = []
+    declined: list[Decision] = []
+    if facts.has_exif and start.exposure == "none":
+        candidates.append(("exposure", "exif"))
+    has_gains = start.exposure in ("matched", "learned")
+    if not has_gains and signs.exposure_spread > LEAST_EXPOSURE_SPREAD:
+        candidates.append(("exposure", "learned"))
+    elif not has_gains:
+        spread = 100.0 * math.expm1(signs.exposure_spread)
+        declined.append(
+            untried("exposure", "learned", f"not tried, photos differ in brightness by only {spread:.1f} %")
+        )
+    check = facts.cameras
+    if facts.cameras_known is not None:
+        declined.append(untried("cameras", "poses", f"not tried, {facts.cameras_known}"))
+    elif check is None:
+        candidates.append(("cameras", "poses"))
+        # In a trial, a right focal length changes as much as a wrong one, because of the coarse field.
+        declined.append(untried("cameras", "focal", "not tried, too few matched features to decide"))
+    elif min(check.misses_px) < LEAST_MISS_PX:
+        reason = f"not tried, the epipolar error of matched features is only {min(check.misses_px):.2f} px"
+        declined.append(untried("cameras", "poses", reason))
+    else:
+        candidates.append(("cameras", "poses"))
+    against_sky = None if facts.sky_fraction > LEAST_SKY_FRACTION else _against_sky(signs)
+    if not facts.has_alpha and against_sky is None:
+        candidates.append(("background", "sphere"))
+    elif not facts.has_alpha:
+        declined.append(untried("background", "sphere", f"not tried, {against_sky}"))
+    open_ones = [(name, value) for name, value in candidates if getattr(start, name) != value]
+    return (
+        [change for change in open_ones if change[0] not in facts.fixed],
+        [decision for decision in declined if decision.component not in facts.fixed],
+    )
+
+
+def _against_sky(signs: Diagnostics) -> str | None:
+    """Return why no sky is expected; None if there may be one."""
+    far = f"{100.0 * signs.far_fraction:.1f} % of the pixels see mostly distant surfaces"
+    if signs.far_fraction <= LEAST_FAR_FRACTION:
+        return f"only {far}"
+    one, painted = signs.sky_psnr
+    if painted < LEAST_SKY_PSNR and painted - one < LEAST_SKY_DB:
+        return (
+            f"{far}, but viewing direction does not explain their colours: {painted:.1f} dB with it, {one:.1f} dB with "
+            "one colour"
+        )
+    return None
+
+
+def rules(candidates: Sequence[Change], signs: Diagnostics, facts: Facts) -> dict[Change, Rule]:
+    """Return the rules for candidates that other evidence than a trial supports."""
+    found: dict[Change, Rule] = {}
+    for change in candidates:
+        if change[0] == "cameras" and facts.cameras is not None:
+            found[change] = judge_supported  # photos disagree
+        if change[0] == "background" and facts.sky_fraction > LEAST_SKY_FRACTION:
+            found[change] = judge_supported  # pixels look like a sky
+        elif change[0] == "background" and signs.far_fraction > LIKELY_FAR_FRACTION:
+            found[change] = judge_likely
+        if change[0] == "exposure" and signs.exposure_spread > LIKELY_EXPOSURE_SPREAD:
+            found[change] = judge_likely
+    return found
+
+
+def removals(start: Components, facts: Facts) -> list[Change]:
+    """Return changes that remove components from a half-trained model: only for a hash grid, which keeps its shape."""
+    return [("view", 0)] if start.view and "view" not in facts.fixed and facts.field == "hash" else []
+
+
+def _without_poses(model: Components) -> Components:
+    """Return the model for trials, without learned poses unless they are what is tried.
+
+    Poses take a third of the time, and trials of other components are too short for them to improve.
+    """
+    return replace(model, cameras="fixed") if model.cameras == "poses" else model
+
+
+def is_worth_a_search(seconds: float | None, steps: int | None) -> bool:
+    """Return whether the budget is large enough for a search; see `select`."""
+    if seconds is not None:
+        return START_FRACTION * SEARCH_FRACTION * seconds >= LEAST_START_SECONDS
+    return round(START_FRACTION * SEARCH_FRACTION * (steps or 0)) >= FEWEST_STEPS
+
+
+def select(
+    trials: Trials,
+    requested: Components,
+    facts: Facts,
+    *,
+    seconds: float | None,
+    steps: int | None,
+) -> Selection:
+    """Find the components that a scene needs.
+
+    Candidates are compared in a race, see `race.Race`. After that, components of the model are removed if hardly
+    anything is lost.
+
+    Args:
+        requested: the components to keep where nothing supports a change.
+        seconds: for all trials together; None to go by `steps`.
+        steps: for all trials together, if there is no time budget.
+
+    Returns:
+        The selection; if the budget is too small for a first training of `FEWEST_STEPS`, only what needs no trial.
+    """
+    budget = SearchBudget(seconds, steps)
+    first_steps = MOST_START_STEPS if seconds is not None else round(START_FRACTION * (steps or 0))
+    model, decided = with_evidence(requested, facts)
+    start = trials.begin(
+        _without_poses(model),
+        steps=min(first_steps, MOST_START_STEPS),
+        seconds=math.inf if seconds is None else START_FRACTION * seconds,
+        fewest=FEWEST_STEPS,
+    )
+    if start is None:
+        return Selection(model, tuple(decided), budget.spent)
+    budget.charge(start.steps)
+    if decided:
+        without = trials.begin(_without_poses(requested), steps=start.steps)
+        assert without is not None  # no minimum number of steps was given
+        budget.charge(without.steps)
+        decided = [
+            judge_evidence([without.trial], (one.component, one.value), [start.trial], by_time=budget.is_time)
+            for one in decided  # all together: they share one trial
+        ]
+        if not decided[0].kept:
+            model, start = requested, without
+    candidates, declined = proposals(model, start.signs, facts)
+    race = Race(trials, start, budget, _without_poses(model))
+    race.run(candidates, removals(model, facts), rules(candidates, start.signs, facts))
+    values: dict[str, Any] = dict(race.kept)
+    chosen = replace(model, **values)
+    is_found = chosen.exposure == "learned" and model.exposure != "learned"
+    gains = race.log_gains if is_found else None
+    return Selection(chosen, (*decided, *race.decisions.values(), *declined), budget.spent, gains)
