@@ -10,7 +10,8 @@ from torch import Tensor
 
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.field.hash_field import HashField, HashFieldSettings
-from nerfcli.render.model import Marching, Model
+from nerfcli.render.model import Model
+from nerfcli.render.trained_field import Marching
 
 # Length of the steps into which rays are cut; it moves a border of the fog by at most half a step.
 STEP = 1 / 256

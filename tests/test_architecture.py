@@ -168,6 +168,18 @@ def test_the_rules_have_no_circle():
         seen |= ready
 
 
+def test_no_files_import_each_other_in_a_circle():
+    files = {path.relative_to(ROOT.parent).with_suffix("").parts: path for path in FILES}
+    waiting = {}
+    for parts, path in files.items():
+        names = [tuple(name.split(".")) for _, name in imported(path) if name.startswith("nerfcli.")]
+        # "from a import b" means the file a/b.py if there is one, else a.py.
+        waiting[parts] = {name if name in files else name[:-1] for name in names} & set(files)
+    while ready := {parts for parts, needed in waiting.items() if not needed & set(waiting)}:
+        waiting = {parts: needed for parts, needed in waiting.items() if parts not in ready}
+    assert not waiting
+
+
 def test_heavy_libraries_stay_where_they_belong():
     wrong = []
     for path in FILES:

@@ -22,7 +22,8 @@ from nerfcli.field.fourier_field import fourier_features
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.kernels import spherical_harmonics
 from nerfcli.render import model as model_file
-from nerfcli.render.model import Marching, Model, load_model, save_model
+from nerfcli.render.model import Model, load_model, save_model
+from nerfcli.render.trained_field import Marching
 
 TINY = HashFieldSettings(contraction="none", levels=3, log2_rows=8, coarsest=4, finest=32, width=16)
 

@@ -23,7 +23,8 @@ from nerfcli.field.kinds import KINDS, fresh_field, settings_from_json
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
 from nerfcli.kernels import HashGrid, March, Rays, RaySums, Targets, numba_cpu, reference, spherical_harmonics
 from nerfcli.photos.loading import load_photos
-from nerfcli.render.model import Marching, Model, load_model, save_model
+from nerfcli.render.model import Model, load_model, save_model
+from nerfcli.render.trained_field import Marching
 from nerfcli.training import fitting
 from nerfcli.training.fitting import Fitting
 from nerfcli.training.optimiser import FieldOptimiser

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerfcli import distributed, kernels
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.kernels import March, Rays, numba_cpu, reference
-from nerfcli.render.model import Marching
+from nerfcli.render.trained_field import Marching
 from nerfcli.training.open_cells import FINE_SIDE, OCCUPANCY_SIDE, REFRESH_EVERY, REFRESH_TURNS, OpenCells
 
 CPU = torch.device("cpu")

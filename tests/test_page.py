@@ -31,9 +31,10 @@ from nerfcli.kernels import grid_coordinates
 from nerfcli.kernels.reference.encoding import hash_encode
 from nerfcli.render.coverage import DepthMap, depth_maps
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.model import Marching, Model
+from nerfcli.render.model import Model
 from nerfcli.render.one_frame import with_coverage
 from nerfcli.render.pictures import render_picture
+from nerfcli.render.trained_field import Marching
 from nerfcli.training.runs.run import Run
 from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_rows
 from nerfcli.viewer.page import PageNumbers, page_html

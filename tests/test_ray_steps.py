@@ -7,7 +7,7 @@ import torch
 
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.voxel_field import VoxelFieldSettings
-from nerfcli.render.model import Marching
+from nerfcli.render.trained_field import Marching
 from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.strides import DETAILED_STEPS, RaySteps, halvings

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nerfcli.render.model import Marching
+from nerfcli.render.trained_field import Marching
 
 
 def test_equal_steps_cover_near_to_far():

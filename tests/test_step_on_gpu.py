@@ -23,7 +23,7 @@ from nerfcli.captures.scene import Scene
 from nerfcli.kernels.triton_cuda import launch
 from nerfcli.kernels.triton_cuda.backend import TritonBackend
 from nerfcli.photos.loading import load_photos
-from nerfcli.render.model import Marching
+from nerfcli.render.trained_field import Marching
 from nerfcli.training import pool as pools
 from nerfcli.training.fitting import Fitting
 from nerfcli.training.point_depth import PointDepths, PointRays

@@ -29,8 +29,9 @@ from nerfcli.captures import scene
 from nerfcli.errors import INTERRUPTED
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.model import Marching, Model, save_model
+from nerfcli.render.model import Model, save_model
 from nerfcli.render.pictures import RenderedPicture, render_picture
+from nerfcli.render.trained_field import Marching
 from nerfcli.training import loop
 from nerfcli.training.runs.files import FIELD
 from nerfcli.training.runs.run import Run

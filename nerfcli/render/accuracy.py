@@ -16,10 +16,10 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.field.background import colours_behind
 from nerfcli.kernels import RaysSeen
 from nerfcli.render.depth import DepthRequest, fractions, requested
-from nerfcli.render.model import Model
 from nerfcli.render.pictures import RenderedPicture
 from nerfcli.render.rays import pixel_rays
 from nerfcli.render.tracing import render_rays, uniform_cuts
+from nerfcli.render.trained_field import TrainedField
 
 IN_WORDS = (
     "these numbers concern the rendering, not how close the field is to the scene: truncation_of_colour bounds what "
@@ -85,7 +85,7 @@ def truncation_bounds(picture: RenderedPicture, tolerance: float) -> dict[str, f
 
 @torch.no_grad()
 def measure_error(
-    model: Model, frame: Frame, *, depth: DepthRequest | None, tolerance: float, seed: int = 0
+    model: TrainedField, frame: Frame, *, depth: DepthRequest | None, tolerance: float, seed: int = 0
 ) -> MeasuredError:
     """Render the centres of 256 random pixels with finer and finer intervals; the same pixels for the same seed.
 
@@ -117,7 +117,7 @@ def refined(cuts: Tensor, parts: int) -> Tensor:
 
 
 def _renderings(
-    model: Model, frame: Frame, pixels: np.ndarray, *, depth: DepthRequest | None, tolerance: float
+    model: TrainedField, frame: Frame, pixels: np.ndarray, *, depth: DepthRequest | None, tolerance: float
 ) -> tuple[Tensor, Tensor]:
     """Return colours (4, P, 3), depths (4, P): as rendered; then at `TIGHT` with intervals whole and cut in 2 and 4."""
     rays = pixel_rays(frame, model.training_from_scene, pixels=pixels, device=model.device)

@@ -12,9 +12,9 @@ from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.background import Background, colours_behind
 from nerfcli.kernels import LightEnds
 from nerfcli.render.depth import DepthRequest, disagreement, fractions, median, requested, spread
-from nerfcli.render.model import Model
 from nerfcli.render.rays import PictureRays, successive_rays
 from nerfcli.render.tracing import TOLERANCE, render_rays
+from nerfcli.render.trained_field import TrainedField
 
 RAYS_PER_TILE = 2**14
 # Rays and their background are computed in blocks of this many, so that their last bits do not depend on the tile.
@@ -56,7 +56,7 @@ class RenderedPicture:
 
 @torch.no_grad()
 def render_picture(
-    model: Model,
+    model: TrainedField,
     frame: Frame,
     *,
     background: Background,
@@ -104,7 +104,7 @@ def render_picture(
     return RenderedPicture(rgb, opacity, depth_map, spread_map, disagreement_map, median_map, error, valid)
 
 
-def default_rays_per_tile(model: Model) -> int:
+def default_rays_per_tile(model: TrainedField) -> int:
     """Return the number of rays rendered at a time on the device of a model."""
     if model.device.type != "cuda":
         return RAYS_PER_TILE
@@ -134,7 +134,13 @@ def straight_rgba(picture: RenderedPicture) -> np.ndarray:
 
 
 def _render_tile(
-    model: Model, rays: PictureRays, part: slice, *, background: Tensor, depth: DepthRequest | None, tolerance: float
+    model: TrainedField,
+    rays: PictureRays,
+    part: slice,
+    *,
+    background: Tensor,
+    depth: DepthRequest | None,
+    tolerance: float,
 ) -> tuple[Tensor, ...]:
     """Render the pixels of some rays: colour, opacity, truncation error, validity; if requested, depth, spread,
     disagreement and median.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nerfcli.kernels import March, Rays, RaysSeen
 from nerfcli.kernels.interface import UNSEEN
-from nerfcli.render.model import Marching, Model
+from nerfcli.render.trained_field import Marching, TrainedField
 
 # The default: a quarter of a grey level.
 TOLERANCE = 1 / 1020
@@ -28,7 +28,7 @@ def deepest(tolerance: float) -> float:
 
 
 def render_rays(
-    model: Model,
+    model: TrainedField,
     origins: Tensor,
     directions: Tensor,
     *,

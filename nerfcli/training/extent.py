@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.captures.scene import Scene
-from nerfcli.render.model import Marching
+from nerfcli.render.trained_field import Marching
 from nerfcli.training.normalisation import (
     NARROW_SPREAD,
     box_frame,

@@ -13,7 +13,7 @@ from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import fresh_field
 from nerfcli.field.sizes import chosen_size
 from nerfcli.kernels import March, Rays, Targets
-from nerfcli.render.model import Marching
+from nerfcli.render.trained_field import Marching
 from nerfcli.training.appearance import Appearance
 from nerfcli.training.delayed import Delayed
 from nerfcli.training.losses import colour_losses, distance_losses

@@ -13,7 +13,7 @@ from nerfcli.cameras.paths import focus_point
 from nerfcli.cameras.rigid import Similarity, apply, inverse
 from nerfcli.captures.scene import Scene
 from nerfcli.errors import UserError
-from nerfcli.render.model import Marching
+from nerfcli.render.trained_field import Marching
 
 # Rays end at this many ball radii: contracted space reaches to infinity, but resolves nothing beyond.
 FARTHEST = 300.0

@@ -6,8 +6,8 @@ from torch.nn.functional import max_pool3d
 
 from nerfcli import distributed
 from nerfcli.field.interface import Field
-from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import DECAY, Occupancy
+from nerfcli.render.trained_field import Marching
 
 OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8

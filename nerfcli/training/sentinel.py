@@ -23,7 +23,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.kinds import settings_from_json
-from nerfcli.render.model import Marching
+from nerfcli.render.trained_field import Marching
 from nerfcli.training.fitting import Fitting, StepResult
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.runs.settings import TrainSettings

@@ -6,7 +6,7 @@ from torch import Tensor
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
 from nerfcli.field.sizes import cube_side
-from nerfcli.render.model import Marching
+from nerfcli.render.trained_field import Marching
 from nerfcli.training.normalisation import NEAR_PER_POINT
 
 # Until this fraction of the budget, steps along rays are this many times as long as those of the capture: the initial

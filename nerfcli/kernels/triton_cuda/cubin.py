@@ -17,15 +17,31 @@ import tempfile
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, NamedTuple
 
 import triton
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 
-if TYPE_CHECKING:
-    from nerfcli.kernels.triton_cuda.launch import Variant
+
+class Variant(NamedTuple):
+    """A kernel with the argument types and constants for which it is compiled.
+
+    Args:
+        kernel: the function under `triton.jit`.
+        types: of the non-constant arguments, in order.
+        aligned: indices of the pointers that are multiples of `launch.ALIGNMENT`, among these arguments.
+        constants: names and values.
+        warps, stages: of Triton's options.
+    """
+
+    kernel: Any
+    types: tuple[str, ...]
+    aligned: tuple[int, ...]
+    constants: tuple[tuple[str, Any], ...]
+    warps: int
+    stages: int
 
 
 @dataclass(frozen=True)
@@ -62,7 +78,7 @@ MOST_BYTES = 2**26
 _MOST_EXTRA = 3
 
 
-def compiled(variant: "Variant", capability: int) -> Cubin:
+def compiled(variant: Variant, capability: int) -> Cubin:
     """Return the machine code of a variant for a compute capability such as 90, from the disk if it is there.
 
     Raises:
@@ -92,7 +108,7 @@ def is_compiled() -> bool:
     return any(folder().glob(f"{_environment()}-*.cubin"))
 
 
-def compile_now(variant: "Variant", capability: int) -> Cubin:
+def compile_now(variant: Variant, capability: int) -> Cubin:
     """Compile a variant as `compiled` does, without the cache on disk."""
     from triton import knobs
     from triton.backends.compiler import GPUTarget
@@ -164,7 +180,7 @@ def _prune(place: Path) -> None:
         total -= size
 
 
-def _digest(variant: "Variant", capability: int) -> str:
+def _digest(variant: Variant, capability: int) -> str:
     described = (variant.kernel.__module__, variant.kernel.__name__, *variant[1:], capability)
     return hashlib.blake2b(str(described).encode(), digest_size=20).hexdigest()
 

@@ -6,7 +6,7 @@ Triton's interpreter (TRITON_INTERPRET=1, read when Triton is imported) the same
 
 import os
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import triton
@@ -14,6 +14,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfcli.kernels.triton_cuda import cubin, driver
+from nerfcli.kernels.triton_cuda.cubin import Variant
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET", "").lower() in ("1", "true", "on", "yes", "y")
 # The oldest compute capability that Triton supports, and the oldest Triton that these kernels compile with.
@@ -40,25 +41,6 @@ class Size(int):
         size = cls(interpreted if INTERPRETED else compiled)
         size.compiled = compiled
         return size
-
-
-class Variant(NamedTuple):
-    """A kernel with the argument types and constants for which it is compiled.
-
-    Args:
-        kernel: the function under `triton.jit`.
-        types: of the non-constant arguments, in order.
-        aligned: indices of the pointers that are multiples of `ALIGNMENT`, among these arguments.
-        constants: names and values.
-        warps, stages: of Triton's options.
-    """
-
-    kernel: Any
-    types: tuple[str, ...]
-    aligned: tuple[int, ...]
-    constants: tuple[tuple[str, Any], ...]
-    warps: int
-    stages: int
 
 
 # `triton.jit` without its types, by which functions that only kernels may call never return.
