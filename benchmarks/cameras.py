@@ -31,9 +31,9 @@ from rich.table import Table
 from nerfcli import kernels
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, apply, inverse, rotation_from_vector, vector_from_rotation
-from nerfcli.captures import scene
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import read_cameras
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.protocol import Extras, HeldOutPhoto, evaluate_model
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
@@ -42,7 +42,7 @@ from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.files import FIELD
 from nerfcli.training.runs.settings import TrainSettings
 
-# Scene, downscale, and what is refined. The last four need no refinement: their loss in PSNR is its cost.
+# Capture, downscale, and what is refined. The last four need no refinement: their loss in PSNR is its cost.
 CASES = (
     ("poses-balls", 1, "poses"),
     ("moves-balls", 1, "poses"),
@@ -77,7 +77,7 @@ class Trained:
     cpu_seconds: float
 
 
-def with_truth(capture: Scene, folder: Path) -> Scene:
+def with_truth(capture: Capture, folder: Path) -> Capture:
     """Return the scene with the true cameras of its photos."""
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     poses, params = truth.get("world_from_cam", {}), truth.get("params")
@@ -136,7 +136,7 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt((values**2).sum(axis=-1).mean()))
 
 
-def fit(given: Scene, truth: Scene, choice: str, *, seed: int, steps: int, downscale: int, samples: int) -> Trained:
+def fit(given: Capture, truth: Capture, choice: str, *, seed: int, steps: int, downscale: int, samples: int) -> Trained:
     """Train with cameras "fixed", "true" or refined, and measure."""
     settings = TrainSettings(
         budget_seconds=None,
@@ -234,7 +234,7 @@ def main(
         for name, downscale, kind in CASES:
             if (only and name not in only) or not (scenes / name).is_dir():
                 continue
-            given = scene.load(scenes / name)
+            given = load_scene(scenes / name)
             truth = with_truth(given, scenes / name)
             for seed in range(seeds):
                 for choice in choices.split(","):

@@ -23,8 +23,9 @@ from PIL import ExifTags, Image
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import scene_folder
 from nerfcli.captures.formats.colmap import write_colmap_binary
 from nerfcli.captures.holdout import default_split

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels
-from nerfcli.captures import scene
+from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.held_out_exposure import log_gains_of
@@ -83,7 +83,7 @@ def fit(folder: Path, choice: str, *, seed: int, steps: int, downscale: int, sam
         components=components,
         model="auto" if choice == "auto" else "default",
     )
-    capture = scene.load(folder)
+    capture = load_scene(folder)
     began = used = 0.0
     samples = 0.0
 

@@ -120,12 +120,12 @@ def stages(samples: int, log2_rows: int, device: Any, repeats: int) -> dict[str,
     code = hash_grid.encode(points, table, resolutions, widths=None, dtype=torch.float16)
     density, rgb = networks.radiance(code, directions, index, layers, degree=3)
     by_density, by_rgb = 1e-6 * torch.randn_like(density), 1e-6 * torch.randn_like(rgb)
-    one, sink = torch.ones(1, device=device), torch.zeros(8, 2**log2_rows, 4, device=device)
+    one, table_grad = torch.ones(1, device=device), torch.zeros(8, 2**log2_rows, 4, device=device)
     thick, colours = (x.detach().clone().requires_grad_() for x in (density, rgb))
     lengths, background = ends - starts, torch.zeros(rays, 3, device=device)
     march = March(edges, torch.ones(64, 64, 64, dtype=torch.bool, device=device), "l2", 7.0)
     along = Rays(origins, directions, torch.rand(rays, device=device))
-    master, first, second = (torch.zeros_like(sink) for _ in range(3))
+    master, first, second = (torch.zeros_like(table_grad) for _ in range(3))
     capacity = marching.Capacity()
     grid = HashGrid(table.float(), resolutions, layers)
     named = {"scale": one, "widths": None}
@@ -143,16 +143,16 @@ def stages(samples: int, log2_rows: int, device: Any, repeats: int) -> dict[str,
         composite()[0].sum().backward()
 
     def adam() -> None:
-        sink.fill_(1e-6)
+        table_grad.fill_(1e-6)
         row_adam.adam_rows(
-            master, sink, first, second, half=table, step=AdamStep(1, 1e-3, (0.9, 0.99), 1e-15)
+            master, table_grad, first, second, half=table, step=AdamStep(1, 1e-3, (0.9, 0.99), 1e-15)
         )  # fmt: skip
 
     functions: dict[str, Callable[[], Any]] = {
         "march": lambda: marching.occupied_samples(along, march),
         "visible": lambda: marching.visible_samples(along, march, grid, table=table, capacity=capacity),
         "encode": lambda: hash_grid.encode(points, table, resolutions, widths=None, dtype=torch.float16),
-        "encode backward": lambda: hash_grid.add_table_gradient(sink, points, code, resolutions, **named),
+        "encode backward": lambda: hash_grid.add_table_gradient(table_grad, points, code, resolutions, **named),
         "points backward": lambda: hash_grid.points_gradient(points, table, code, resolutions, **named),
         "density": lambda: networks.density(code, layers),
         "radiance": lambda: networks.radiance(code, directions, index, layers, degree=3),
@@ -160,7 +160,7 @@ def stages(samples: int, log2_rows: int, device: Any, repeats: int) -> dict[str,
         "composite": composite,
         "composite, both ways": composite_both,
         "distortion": lambda: compositing.distortion(density, starts, ends, offsets),
-        "depth": lambda: depth.light_ends(density, starts, ends, offsets=offsets, fractions=(0.5,)),
+        "depth": lambda: depth.ray_termination(density, starts, ends, offsets=offsets, fractions=(0.5,)),
         "adam of all rows, with fill": adam,
     }
     return {name: 1e9 * timed(function, device, repeats) / count for name, function in functions.items()}
@@ -168,7 +168,7 @@ def stages(samples: int, log2_rows: int, device: Any, repeats: int) -> dict[str,
 
 def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[Any, Any]:
     """Return a fresh training with the GPU kernels, and the similarity to its training frame."""
-    from nerfcli.captures import scene
+    from nerfcli.captures.loading import load_scene
     from nerfcli.kernels.triton_cuda.backend import TritonBackend
     from nerfcli.photos.loading import load_photos
     from nerfcli.training.extent import choose_extent
@@ -176,7 +176,7 @@ def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[
     from nerfcli.training.pool import PixelPool
     from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 
-    captured = scene.load(capture)
+    captured = load_scene(capture)
     first = captured.train_frames[0].camera
     dry = device.type == "cpu"
     frames = captured.train_frames[:3] if dry else captured.train_frames
@@ -258,7 +258,6 @@ def quality(capture: Path, device: str, seconds: int, folder: Path, *, dry: bool
 def pictures(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
     """Return square pictures per second (800x800 at full size) after a short training."""
     from nerfcli.cameras.camera import Camera
-    from nerfcli.captures import scene
     from nerfcli.render.model import Model
     from nerfcli.render.pictures import render_picture
 
@@ -268,7 +267,9 @@ def pictures(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
     model = Model(
         fitting.field, fitting.cells.coarse, fitting.marching, (1.0, 1.0, 1.0), frame_of_training, unit="arbitrary"
     )
-    frame = scene.load(capture).train_frames[0]
+    from nerfcli.captures.loading import load_scene
+
+    frame = load_scene(capture).train_frames[0]
     side = sizes.picture
     focal = frame.camera.focal_px * side / frame.camera.width
     frame = replace(frame, camera=Camera("SIMPLE_PINHOLE", side, side, (focal, side / 2, side / 2)))

@@ -35,7 +35,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.alignment import align
-from nerfcli.captures import scene as scenes
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import TOO_FEW_PHOTOS
 from nerfcli.photos.images import image_size, list_images
 
@@ -150,7 +150,7 @@ def read_truth(capture: Path, photos: Path) -> Truth:
     if (home / "cameras_sphere.npz").is_file():
         return _truth_of_projections(home / "cameras_sphere.npz", photos, names)
     if (home / "transforms.json").is_file():
-        frames = scenes.load(home / "transforms.json").frames
+        frames = load_scene(home / "transforms.json").frames
         poses = {Path(frame.name).name: frame.world_from_cam for frame in frames}
         return Truth(poses, {Path(frame.name).name: frame.camera.focal_px for frame in frames})
     return Truth({}, {})
@@ -204,7 +204,7 @@ def measure(capture: Path, quality: str, folder: Path, *, seed: int, threads: in
         return Row(name, quality, registered=0, total=0)
     if done != 0:
         raise SystemExit(done)
-    found = scenes.load(target)
+    found = load_scene(target)
     report = json.loads((target / "poses_report.json").read_text(encoding="utf-8"))
     truth = read_truth(capture, found.frames[0].image.parent if found.frames[0].image else source)
     both = [frame for frame in found.frames if frame.name in truth.world_from_cam]

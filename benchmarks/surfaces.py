@@ -30,7 +30,7 @@ from nerfcli.export.fusion import fuse
 from nerfcli.export.marching import Mesh, mesh_of, simplified, surface_of, without_small_pieces
 from nerfcli.kernels import grid_coordinates
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.files.float_tiff import read_any_tiff
+from nerfcli.render.files.float_maps import read_any_tiff
 from nerfcli.render.model import Model
 from nerfcli.training.runs.run import load_run
 

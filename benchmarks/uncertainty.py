@@ -22,7 +22,7 @@ from rich.table import Table
 from scipy import stats
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.captures import scene as scenes
+from nerfcli.captures.loading import load_scene
 from nerfcli.render.coverage import coverage_and_parallax, depth_maps, small_frame
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
@@ -157,8 +157,8 @@ def main(
     torch.set_num_threads(threads)
     place, names = output / "scene", output / "held_out.txt"
     desk_scene(place) if folder is None else kitchen_scene(place, folder)
-    names.write_text("\n".join(withheld(scenes.load(place).frames)), encoding="utf-8")
-    scene = scenes.load(place, holdout=str(names))
+    names.write_text("\n".join(withheld(load_scene(place).frames)), encoding="utf-8")
+    scene = load_scene(place, holdout=str(names))
     if folder is None:
         whole = [frame for frame in scene.test_frames if (DESK_DEPTHS / f"{Path(frame.name).stem}.tiff").exists()]
         truths = [desk_truth(frame) for frame in whole]

@@ -23,7 +23,7 @@ __all__ = [
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from nerfcli.captures.scene import load as load_scene
+    from nerfcli.captures.loading import load_scene
     from nerfcli.training.runs.run import load_run
     from nerfcli.workflows.evaluate import evaluate_run
     from nerfcli.workflows.export import export_run
@@ -37,13 +37,11 @@ _MODULES = {
     "evaluate_run": "nerfcli.workflows.evaluate",
     "export_run": "nerfcli.workflows.export",
     "load_run": "nerfcli.training.runs.run",
-    "load_scene": "nerfcli.captures.scene",
+    "load_scene": "nerfcli.captures.loading",
     "load_splats": "nerfcli.workflows.splats",
     "render_run": "nerfcli.workflows.render",
     "train_scene": "nerfcli.workflows.train",
 }
-# Functions that have a different name in their module.
-_NAMES = {"load_scene": "load"}
 
 
 def __getattr__(name: str) -> object:
@@ -51,7 +49,7 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module 'nerfcli' has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(_MODULES[name]), _NAMES.get(name, name))
+    return getattr(import_module(_MODULES[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -9,7 +9,8 @@ from PIL import Image
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture, Observations
 
 # Every model of COLMAP, with all of its terms in use.
 CAMERAS = {

@@ -21,8 +21,9 @@ from fog import fog, foggy_cells
 from hypothesis import settings
 
 from nerfcli.atomic import write_json
-from nerfcli.captures import scene
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import write_cameras
+from nerfcli.captures.loading import load_scene
 from nerfcli.render.model import Model, save_model
 from nerfcli.training import preparation, waypoints
 from nerfcli.training.extent import Extent, choose_extent
@@ -79,12 +80,12 @@ def _few_held_out_pixels() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def spheres() -> scene.Scene:
-    return scene.load(SPHERES)
+def spheres() -> Capture:
+    return load_scene(SPHERES)
 
 
 @pytest.fixture(scope="session")
-def spheres_run(spheres: scene.Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def spheres_run(spheres: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Train on the spheres, briefly but for real, once for all pytest-xdist processes. Do not write into this run."""
     shared = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
@@ -112,7 +113,7 @@ def small_photo_depths(monkeypatch: pytest.MonkeyPatch) -> None:
 def coarse_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut rays into an eighth of the steps: after a step of training all space is fog, and pictures take seconds."""
 
-    def choose(captured: scene.Scene, settings: TrainSettings, *, fills_frame: bool) -> Extent:
+    def choose(captured: Capture, settings: TrainSettings, *, fills_frame: bool) -> Extent:
         extent = choose_extent(captured, settings, fills_frame=fills_frame)
         return replace(extent, marching=extent.marching.stretched(8.0))
 
@@ -137,14 +138,14 @@ def capture(tmp_path: Path) -> Path:
 def finished(capture: Path) -> Path:
     """A run of `capture` whose field is fog; nothing was trained."""
     run = capture.with_name("spheres-run")
-    loaded = scene.load(capture)
+    loaded = load_scene(capture)
     similarity, _ = object_frame(loaded)
     cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     write_run(run, loaded, fog(cells, similarity, background=(1.0, 1.0, 1.0), step=1 / 32), factor=8)
     return run
 
 
-def write_run(run: Path, captured: scene.Scene, model: Model, *, factor: int) -> None:
+def write_run(run: Path, captured: Capture, model: Model, *, factor: int) -> None:
     """Write the folder that a training of seven steps at 1 / factor of the resolution leaves, with the given model."""
     settings = TrainSettings(budget_seconds=None, steps=7)
     run.mkdir()

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras.frame import Capture
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import BAD_INPUT, UserError
 
 MOST_SECONDS = 20

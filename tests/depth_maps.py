@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.render.files.depth_pictures import DepthMeta
-from nerfcli.render.files.exr import write_exr
-from nerfcli.render.files.float_tiff import write_tiff
+from nerfcli.render.files.float_maps import write_exr, write_npy, write_tiff
 from nerfcli.render.files.levels import write_png16
-from nerfcli.render.files.npy import write_npy
 
 META = DepthMeta("conditional", "ray", "arbitrary", 0.5)
 FULL_META = DepthMeta(

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import format_named
 from nerfcli.captures.formats.run_cameras import write_cameras
 

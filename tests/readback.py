@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from nerfcli.cameras.frame import Capture
+from nerfcli.captures.capture import Capture
 
 # After the principal point, their parameters are the first of OpenCV's distortion terms k1 k2 p1 p2 k3 k4 k5 k6.
 # Source: docs.opencv.org calib3d, "Detailed Description"; colmap src/colmap/sensor/models.h.

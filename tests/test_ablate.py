@@ -8,8 +8,16 @@ import pytest
 from conftest import SPHERES
 from typer.testing import CliRunner
 
-from nerfcli.bench.ablation_results import MeasuredTraining, half_interval, rows_of
-from nerfcli.bench.ablation_variants import AUTO, CHOSEN, CaptureTraits, Variant, variants
+from nerfcli.bench.ablation import (
+    AUTO,
+    CHOSEN,
+    CaptureTraits,
+    MeasuredTraining,
+    Variant,
+    half_interval,
+    rows_of,
+    variants,
+)
 from nerfcli.cli import app
 from nerfcli.training.runs.components import CHOICES, Components
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from nerfcli.training.adam import BETAS, EPS, Adam
+from nerfcli.training.optimiser import BETAS, EPS, Adam
 
 
 @pytest.fixture(autouse=True)

@@ -74,10 +74,10 @@ def learned(
     rows = field.rows()
     assert rows is not None
     # Gradients are added to the ones that the sink already contains.
-    sink = torch.ones_like(rows, requires_grad=False) if with_sink else None
+    table_grad = torch.ones_like(rows, requires_grad=False) if with_sink else None
     distances = None if targets.distances is None else targets.distances[:count].to(dtype)
     seen = field.backend.render_rays(
-        rays, march, field.medium(), targets._replace(distances=distances), background=background, sink=sink
+        rays, march, field.medium(), targets._replace(distances=distances), background=background, table_grad=table_grad
     )
     total = torch.zeros((), dtype=dtype)
     for values in seen[:4]:
@@ -86,7 +86,7 @@ def learned(
     assert (rows.grad is None) == with_sink or not len(rays.origins)
     gradients = {f"gradient of {key}": value.grad for key, value in field.named_parameters() if value is not rows}
     gradients |= {"gradient of origins": rays.origins.grad, "gradient of directions": rays.directions.grad}
-    gradients["gradient of rows"] = rows.grad if sink is None else sink - 1.0
+    gradients["gradient of rows"] = rows.grad if table_grad is None else table_grad - 1.0
     return {**seen._asdict(), **{key: value for key, value in gradients.items() if value is not None}}
 
 
@@ -386,7 +386,7 @@ def test_rays_that_meet_nothing_see_the_background(wanted):
     assert torch.equal(sums.rgb, background)
     assert sums.transmittance.tolist() == [1.0] * 5
     assert sums.distortion.tolist() == [0.0] * 5
-    assert sums.off_target.tolist() == [1.0]
+    assert sums.depth_loss.tolist() == [1.0]
     assert int(sums.samples) == 0
     seen = field.backend.trace_rays(rays, march, field.medium(), background=background)
     assert torch.equal(seen.rgb, background)

@@ -16,8 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nerfcli.bench import measurement
-from nerfcli.bench.machine import is_busy, processor_name
-from nerfcli.bench.measurement import FINER, measure_renderings, smaller
+from nerfcli.bench.measurement import FINER, is_busy, measure_renderings, processor_name, smaller
 from nerfcli.bench.results import Point, pareto, spread, table_of
 from nerfcli.bench.settings import (
     SHORTEST_TRAINING_SECONDS,
@@ -31,7 +30,7 @@ from nerfcli.bench.settings import (
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import BAD_INPUT, INTERRUPTED
 from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
@@ -55,7 +54,7 @@ def _few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def foggy(spheres: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def foggy(spheres: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the spheres in which nothing was trained: a cube of fog. Shared by tests, so do not write into it."""
     run = tmp_path_factory.mktemp("foggy") / "run"
     similarity, _ = object_frame(spheres)

@@ -13,7 +13,7 @@ from conftest import SPHERES
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import from_parts, rotation_from_vector
-from nerfcli.captures import scene as scenes
+from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.billboards import (
     COMPARED_PIXELS,
     Billboards,
@@ -186,7 +186,7 @@ def test_the_distance_of_a_round_wall_is_found():
 
 
 def test_the_spheres_have_a_shape(spheres_run):
-    scene = scenes.load(SPHERES)
+    scene = load_scene(SPHERES)
     photos = [over_white(photo.pixels) for photo in load_photos(scene.train_frames, factor=1, threads=1)]
     held_out = [HeldOutPhoto(p.frame, p.pixels, p.used) for p in load_photos(scene.test_frames, factor=1, threads=1)]
     metrics = evaluate_model(
@@ -202,7 +202,7 @@ def test_the_spheres_have_a_shape(spheres_run):
 
 def test_a_comparison_that_cannot_be_computed_ends_no_evaluation(spheres_run, monkeypatch: pytest.MonkeyPatch):
     """The metrics of the photos equal those without the comparison, and a warning says why it is missing."""
-    scene = scenes.load(SPHERES)
+    scene = load_scene(SPHERES)
     photos = [over_white(photo.pixels) for photo in load_photos(scene.train_frames, factor=1, threads=1)]
     held_out = [
         HeldOutPhoto(p.frame, p.pixels, p.used) for p in load_photos(scene.test_frames[:1], factor=1, threads=1)

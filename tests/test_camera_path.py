@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats.camera_path import (
     is_camera_path,
     losses_camera_path,

@@ -24,14 +24,14 @@ from typer.exceptions import TyperException
 
 from nerfcli import cli
 from nerfcli.atomic import write_json
-from nerfcli.captures import scene
+from nerfcli.captures.loading import fingerprint, load_scene
 from nerfcli.cli.options import seconds_from_text
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TERMINATED, TOO_FEW_PHOTOS, in_shell
 from nerfcli.interrupts import install_handlers
 from nerfcli.machine import thread_count
 from nerfcli.photos.images import read_image
 from nerfcli.photos.masks import write_masks
-from nerfcli.render.files.float_tiff import read_tiff
+from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.training import loop
 from nerfcli.training.loop import Progress
 from nerfcli.training.runs import settings
@@ -414,7 +414,7 @@ def test_info_of_a_scene(capture):
         5,
         1,
     )
-    assert result_json["fingerprint"] == scene.fingerprint(scene.load(capture))
+    assert result_json["fingerprint"] == fingerprint(load_scene(capture))
     plain = nerfcli("info", capture).stdout
     assert plain.splitlines()[0] == str(capture)
     assert "  kind: blender" in plain
@@ -530,7 +530,7 @@ def test_a_finished_training_is_kept_another_one_refused_and_overwritten_on_dema
 def test_masks_of_an_earlier_training_are_removed_unless_the_scene_has_them(capture, tmp_path):
     run, masked = capture.with_name("spheres-run"), tmp_path / "masked"
     assert nerfcli("train", capture, *QUICK).exit_code == 0
-    first = scene.load(capture).train_frames[0]
+    first = load_scene(capture).train_frames[0]
     write_masks(run / "occluders", {first.name: np.zeros((first.camera.height, first.camera.width), bool)})
     converted = nerfcli("convert", capture, masked, "--to", "nerfcli", "--masks", run / "occluders")
     assert converted.exit_code == 0, converted.stderr

@@ -16,13 +16,14 @@ from views import BROWN, FISHEYE, PANORAMA, PINHOLE, PRISM, RADIAL, RATIONAL, SQ
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import OPENCV_FROM_LLFF, OPENCV_FROM_OPENGL
-from nerfcli.cameras.frame import Capture, Observations
 from nerfcli.captures.axes import Convention, all_axes, expressed, opencv_from_axes, reinterpreted
+from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.conversion import ConventionOverrides, TargetOptions, convert, load
 from nerfcli.captures.formats import blender, transforms, transforms_cameras
 from nerfcli.captures.formats.colmap import write_colmap_binary
-from nerfcli.captures.formats.ply import write_ply
-from nerfcli.captures.formats.registry import FORMATS, UserInputs, format_named, recognise
+from nerfcli.captures.formats.format import UserInputs
+from nerfcli.captures.formats.ply import write_points
+from nerfcli.captures.formats.registry import FORMATS, format_named, recognise
 from nerfcli.cli.convert import FORMATS_WRITTEN
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
 
@@ -292,10 +293,13 @@ FAULTS = {
     "half a pixel": ("transforms", transforms, "record_of_camera", half_a_pixel, "a ray is off by 0.707 px"),
     "flipped axes": ("blender", blender, "opengl_from_opencv_pose", lambda pose: pose, "a ray is off by"),
     "moved points": (
-        *("transforms", transforms, "write_ply"),
-        *(lambda c, path: write_ply(replace(c, points=c.points[:, ::-1]), path), "60 points instead of 60, or other"),
+        *("transforms", transforms, "write_points"),
+        *(
+            lambda c, path: write_points(replace(c, points=c.points[:, ::-1]), path),
+            "60 points instead of 60, or other",
+        ),
     ),
-    "no PLY file": ("transforms", transforms, "write_ply", lambda c, path: None, "reading it back fails"),
+    "no PLY file": ("transforms", transforms, "write_points", lambda c, path: None, "reading it back fails"),
 }
 
 
@@ -334,7 +338,7 @@ def test_points_alone(tmp_path):
     assert result.stderr.endswith("points.ply: read back\n")
     capture = capture_of([PINHOLE])
     shifted = replace(capture, points=capture.points + 1e-9)
-    wrong = replace(format_named("ply"), write=lambda _, path: write_ply(shifted, path))
+    wrong = replace(format_named("ply"), write=lambda _, path: write_points(shifted, path))
     with pytest.raises(UserError, match="60 points instead of 60, or other positions"):
         convert(capture, tmp_path / "2.ply", source_format="made", wanted=TargetOptions(wrong, allow_loss=True))
 

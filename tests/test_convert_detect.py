@@ -14,9 +14,10 @@ from views import BROWN, PINHOLE, capture_of
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.frame import Frame
 from nerfcli.captures import evidence
 from nerfcli.captures.axes import Convention, expressed, for_picture, opencv_from_axes, poses_of, reinterpreted
+from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.detect import Detection, detect
 from nerfcli.captures.evidence import LEAST_MOVE, MatchEvidence, match_neighbours
 from nerfcli.captures.formats.colmap import write_colmap_text

@@ -15,14 +15,15 @@ from views import BROWN, PINHOLE, PRISM, capture_of
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture
-from nerfcli.captures import scene as scenes
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.conversion import ConventionOverrides, TargetOptions, convert, load
 from nerfcli.captures.formats import colmap_binary
 from nerfcli.captures.formats.colmap import write_colmap_binary
-from nerfcli.captures.formats.registry import UserInputs, format_named
+from nerfcli.captures.formats.format import UserInputs
+from nerfcli.captures.formats.registry import format_named
 from nerfcli.captures.formats.scene_folder import write_scene
 from nerfcli.captures.formats.transforms import write_transforms
+from nerfcli.captures.loading import load_scene
 from nerfcli.captures.stored_pixels import in_pixels
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
 from nerfcli.photos.images import read_image
@@ -97,7 +98,7 @@ def test_a_known_distance_reaches_training_as_metres(tmp_path):
     result = nerfcli("convert", source, tmp_path / "my scene", "--to", "nerfcli", "--distance", distance, "--json")
     assert result.exit_code == 0, result.stderr
     assert {name: data for name, data in listing(tmp_path).items() if "my scene" not in name} == before
-    scene = scenes.load(tmp_path / "my scene")
+    scene = load_scene(tmp_path / "my scene")
     assert (scene.kind, scene.unit, scene.unit_source) == ("nerfcli", "metre", "1 known distance")
     assert scene.test_names == {first.name}
     assert scene.frames[0].image == tmp_path / "images" / first.name
@@ -127,7 +128,7 @@ def test_a_folder_of_masks_reaches_training(tmp_path):
     assert result.exit_code == 0, result.stderr
     count = len(capture.frames)
     assert f"{count - 1} masks" in result.stderr
-    frames = scenes.load(tmp_path / "scene").frames
+    frames = load_scene(tmp_path / "scene").frames
     assert [frame.mask is None for frame in frames] == [index == 1 for index in range(count)]
     assert all(frame.mask is None or frame.mask.parent.is_relative_to(masks) for frame in frames)
     assert json.loads(nerfcli("info", tmp_path / "scene", "--json").stdout)["masks"] == count - 1
@@ -173,7 +174,7 @@ def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
     result = nerfcli("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
     assert result.exit_code == 0, result.stderr
     assert "3 photos have an EXIF orientation: their cameras refer to pixels upright" in result.stderr
-    scene = scenes.load(tmp_path / "scene")
+    scene = load_scene(tmp_path / "scene")
     _, _, parsed = load(tmp_path / "scene", UserInputs(), ConventionOverrides())
     assert parsed.observations is not None
     for index, frame in enumerate(scene.frames):
@@ -209,7 +210,7 @@ def test_other_programs_get_cameras_for_the_pixels_as_they_are_stored(form, plac
     assert "3 photos have an EXIF orientation: their cameras refer to pixels as stored" in result.stderr
     assert farthest_px(capture, load(tmp_path / place, UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
     if form in ("colmap", "colmap-text", "transforms"):
-        trained = scenes.load(tmp_path)
+        trained = load_scene(tmp_path)
         assert trained.kind == form.removesuffix("-text")
         assert farthest_px(upright, replace(upright, frames=trained.frames)) < LIMIT_PX
 
@@ -257,7 +258,7 @@ def test_markers_are_sought_in_photos_as_the_scene_shows_them(tmp_path):
 def test_a_split_is_kept_and_else_every_eighth_photo_is_held_out(splits, test, train, tmp_path):
     capture = split_into(photographed(capture_of([PINHOLE]), tmp_path / "images"), *splits)
     made_scene(capture, tmp_path / "scene")
-    scene = scenes.load(tmp_path / "scene")
+    scene = load_scene(tmp_path / "scene")
     names = [frame.name for frame in capture.frames]
     assert [frame.name for frame in scene.test_frames] == [names[i] for i in test]
     assert [frame.name for frame in scene.train_frames] == [names[i] for i in train]
@@ -271,13 +272,13 @@ def test_masks_and_depth_bounds_of_any_layout_are_kept(tmp_path):
     capture = masked(capture, tmp_path / "some" / "masks", 1, 4)
     bounds = np.array([(1.0 + index, 9.0) for index in range(6)])
     made_scene(replace(capture, depth_bounds=bounds), tmp_path / "scene")
-    scene = scenes.load(tmp_path / "scene")
+    scene = load_scene(tmp_path / "scene")
     assert [f.mask for f in scene.frames] == [f.mask for f in capture.frames]
     np.testing.assert_array_equal(scene.depth_bounds, bounds)
     assert capture.frames[4].mask is not None
     capture.frames[4].mask.unlink()
     with pytest.raises(UserError, match=r"the mask of photo 04\.png, does not exist"):
-        scenes.load(tmp_path / "scene")
+        load_scene(tmp_path / "scene")
 
 
 def test_a_mask_that_lies_otherwise_is_a_loss(tmp_path):
@@ -287,7 +288,7 @@ def test_a_mask_that_lies_otherwise_is_a_loss(tmp_path):
     with pytest.raises(UserError, match="1 masks of photos with an EXIF orientation"):
         made_scene(capture, tmp_path / "scene")
     made_scene(capture, tmp_path / "scene", allow_loss=True)
-    frames = scenes.load(tmp_path / "scene").frames
+    frames = load_scene(tmp_path / "scene").frames
     assert [frame.mask is not None for frame in frames] == [True, False, True, False, False, False]
 
 
@@ -297,7 +298,7 @@ def test_photos_in_several_folders_get_their_paths_for_names(tmp_path):
     with pytest.raises(UserError, match="the names of 6 photos, which become paths relative to one folder"):
         made_scene(replace(capture, frames=frames), tmp_path / "scene")
     made_scene(replace(capture, frames=frames), tmp_path / "scene", allow_loss=True)
-    assert [frame.name for frame in scenes.load(tmp_path / "scene").frames][2:4] == ["a/photo 02.png", "b/photo 03.png"]
+    assert [frame.name for frame in load_scene(tmp_path / "scene").frames][2:4] == ["a/photo 02.png", "b/photo 03.png"]
 
 
 def test_views_without_photos_make_no_scene(tmp_path):
@@ -334,7 +335,7 @@ def test_a_scene_is_replaced_only_with_overwrite_and_restored_after_a_fault(tmp_
     distance = ("--distance", '"photo 00.png" "photo 01.png" 1.5')
     place = tmp_path / "scene"
     assert nerfcli("convert", place, place, "--to", "nerfcli", "--overwrite", *distance).exit_code == 0
-    assert scenes.load(place).unit == "metre"
+    assert load_scene(place).unit == "metre"
 
 
 # Intrinsics for another size

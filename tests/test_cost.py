@@ -6,12 +6,10 @@ import pytest
 
 from nerfcli import kernels
 from nerfcli.errors import UserError
-from nerfcli.field.cost import field_bytes, parameter_bytes, parameter_count
 from nerfcli.field.fourier_field import FourierFieldSettings
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
-from nerfcli.field.kinds import KINDS, fresh_field
-from nerfcli.field.sizes import chosen_size
+from nerfcli.field.kinds import KINDS, chosen_size, field_bytes, fresh_field, parameter_bytes, parameter_count
 from nerfcli.field.voxel_field import VoxelFieldSettings
 
 HASH = HashFieldSettings(contraction="none")

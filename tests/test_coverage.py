@@ -17,7 +17,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.captures.formats.run_cameras import RunCameras
-from nerfcli.export.mesh_files import read_ply_header
+from nerfcli.ply import read_ply_header
 from nerfcli.render.coverage import (
     DepthMap,
     coverage_and_parallax,
@@ -297,7 +297,6 @@ def test_a_mesh_says_how_many_photos_see_its_points(run, tmp_path):
     path = tmp_path / "a.ply"
     result = nerfcli("export", run, "--to", "mesh", "--voxel-size", "0.1", "-o", path)
     assert result.exit_code == 0, result.stderr
-    _, columns, comments, _ = read_ply_header(path)
-    assert "photos" in str(columns)
-    assert "parallax_deg" in str(columns)
-    assert any("largest angle between the rays of two photos" in comment for comment in comments)
+    header = read_ply_header(path)
+    assert {"photos", "parallax_deg"} <= header.vertex_properties.keys()
+    assert any("largest angle between the rays of two photos" in comment for comment in header.comments)

@@ -21,8 +21,8 @@ from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.depth_errors import LEAST_PIXELS, DepthErrors
-from nerfcli.render.files.exr import read_exr
 from nerfcli.render.files.file_facts import depth_meta_of
+from nerfcli.render.files.float_maps import read_exr
 from nerfcli.render.pictures import render_picture
 from nerfcli.training.runs.files import DEPTH_ERRORS
 from nerfcli.training.runs.run import Run

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles import quadrature_of_end_density, quadrature_of_squares
 
-from nerfcli.kernels import LightEnds, numba_cpu, reference
+from nerfcli.kernels import RayTermination, numba_cpu, reference
 from nerfcli.kernels.reference import depth
 from nerfcli.render.depth import DepthRequest, disagreement, fractions, requested, spread
 
@@ -40,14 +40,14 @@ def test_moment_and_conditional_are_exact_for_piecewise_constant_density(seed):
 def test_splitting_an_interval_changes_nothing_but_max_weight(seed, cut, at, exponent):
     density, starts, ends, offsets = ray(seed, scale=10.0**exponent)
     middle = starts[cut] + at * (ends[cut] - starts[cut])
-    split = depth.light_ends(
+    split = depth.ray_termination(
         torch.cat([density[: cut + 1], density[cut:]]),
         torch.cat([starts[: cut + 1], middle[None], starts[cut + 1 :]]),
         torch.cat([ends[:cut], middle[None], ends[cut:]]),
         offsets=torch.tensor([0, 6]),
         fractions=(0.05, 0.5, 0.9),
     )
-    whole = depth.light_ends(density, starts, ends, offsets=offsets, fractions=(0.05, 0.5, 0.9))
+    whole = depth.ray_termination(density, starts, ends, offsets=offsets, fractions=(0.05, 0.5, 0.9))
     for name in ("opacity", "transmittance", "mean", "spread", "quantiles"):
         # Lengths are differences of distances, which are below 6.
         torch.testing.assert_close(
@@ -59,7 +59,7 @@ def test_splitting_an_interval_changes_nothing_but_max_weight(seed, cut, at, exp
 @pytest.mark.parametrize("seed", range(4))
 def test_spread_is_the_standard_deviation_of_the_end_density(seed):
     density, starts, ends, offsets = ray(seed)
-    light = depth.light_ends(density, starts, ends, offsets=offsets, fractions=())
+    light = depth.ray_termination(density, starts, ends, offsets=offsets, fractions=())
     mean = light.mean.item()
     mass, first = quadrature_of_end_density(density.numpy(), starts.numpy() - mean, ends.numpy() - mean)
     assert first / mass == pytest.approx(0, abs=1e-8)
@@ -95,7 +95,7 @@ def test_mean_fraction_gradcheck_on_both_sides_of_the_series():
     assert torch.autograd.gradcheck(depth.mean_fraction, x)
 
 
-@pytest.mark.parametrize("name", ["opacity", "transmittance", "mean", "spread", "heaviest", "largest", "quantiles"])
+@pytest.mark.parametrize("name", ["opacity", "transmittance", "mean", "spread", "peak", "peak_weight", "quantiles"])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 30.0])
 def test_gradcheck(name, scale):
     density, starts, ends, _ = ray(7, count=6, scale=scale)
@@ -103,7 +103,7 @@ def test_gradcheck(name, scale):
     arguments = tuple(x.clone().requires_grad_() for x in (density, starts, ends))
 
     def function(*values):
-        result = getattr(depth.light_ends(*values, offsets=offsets, fractions=(0.001, 0.4)), name)
+        result = getattr(depth.ray_termination(*values, offsets=offsets, fractions=(0.001, 0.4)), name)
         return result[~result.isnan()]
 
     assert len(function(*arguments)) >= 2
@@ -113,7 +113,7 @@ def test_gradcheck(name, scale):
 def test_gradients_are_finite_at_the_extremes():
     density = torch.tensor([0.0, 1e-12, 1e6, 0.0], dtype=torch.float64, requires_grad=True)
     starts = torch.arange(4, dtype=torch.float64)
-    light = depth.light_ends(density, starts, starts + 1, offsets=torch.tensor([0, 1, 4]), fractions=(0.5,))
+    light = depth.ray_termination(density, starts, starts + 1, offsets=torch.tensor([0, 1, 4]), fractions=(0.5,))
     total = sum(torch.where(values.isnan(), 0.0, values).sum() for values in light)
     assert isinstance(total, torch.Tensor)
     (gradient,) = torch.autograd.grad(total, density)
@@ -138,9 +138,11 @@ def many_rays(seed, counts, *, low, high):
 def test_the_fast_kernel_agrees_with_the_definition_in_float64(counts, low, high):
     density, starts, ends, offsets = many_rays(3, counts, low=low, high=high)
     fractions = (0.9, 0.05, 0.5)
-    fast = numba_cpu.light_ends(density, starts, ends, offsets=offsets, fractions=fractions)
-    exact = depth.light_ends(density.double(), starts.double(), ends.double(), offsets=offsets, fractions=fractions)
-    for name, value, wanted in zip(LightEnds._fields, fast, exact, strict=True):
+    fast = numba_cpu.ray_termination(density, starts, ends, offsets=offsets, fractions=fractions)
+    exact = depth.ray_termination(
+        density.double(), starts.double(), ends.double(), offsets=offsets, fractions=fractions
+    )
+    for name, value, wanted in zip(RayTermination._fields, fast, exact, strict=True):
         assert value.dtype == torch.float32
         torch.testing.assert_close(
             value.double(), wanted, rtol=TOLERANCE[torch.float32], atol=torch.finfo(torch.float32).tiny, equal_nan=True,
@@ -185,11 +187,11 @@ def test_undefined_depths_are_nan_and_only_those():
     offsets = torch.tensor([0, 0, 1, 2])
     density = torch.tensor([-math.log(0.9), 50.0], dtype=torch.float64)
     starts, ends = torch.tensor([1.0, 1.0], dtype=torch.float64), torch.tensor([2.0, 2.0], dtype=torch.float64)
-    light = depth.light_ends(density, starts, ends, offsets=offsets, fractions=(0.5,))
+    light = depth.ray_termination(density, starts, ends, offsets=offsets, fractions=(0.5,))
 
     def undefined(convention, min_opacity):
         request = DepthRequest(convention, "ray", min_opacity, 7.0)
-        light = depth.light_ends(density, starts, ends, offsets=offsets, fractions=fractions(request))
+        light = depth.ray_termination(density, starts, ends, offsets=offsets, fractions=fractions(request))
         far = torch.full((3,), 7.0, dtype=torch.float64)
         return requested(request, light, background_distance=far).isnan().tolist()
 
@@ -212,5 +214,5 @@ def test_max_weight_takes_the_nearest_of_equals():
     # Weights that are equal to the last bit, in the definition and in the compiled kernel.
     density, starts = torch.tensor([1e-30, 1e-30, 1e-30]), torch.tensor([1.0, 3.0, 5.0])
     for module in (depth, numba_cpu):
-        light = module.light_ends(density, starts, starts + 1, offsets=torch.tensor([0, 3]), fractions=())
-        assert light.heaviest.tolist() == [1.5]
+        light = module.ray_termination(density, starts, starts + 1, offsets=torch.tensor([0, 3]), fractions=())
+        assert light.peak.tolist() == [1.5]

@@ -19,7 +19,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.calibration import Calibration
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.doctor import camera_layout, camera_motion, connectivity, inventory, quality
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.examination import Diagnosis, compare_all, content, estimated_seconds, examine, judged
@@ -379,7 +379,7 @@ def test_focal_lengths_of_a_scene_are_those_of_its_cameras_and_their_pixels_are_
     assert (found.verdict, found.photos) == (LOOK, (("0.jpg", "focal lengths along x and y differ by 20.0 %"),))
 
 
-def ring(count: int, *, span_deg: float, radius: float = 3.0) -> Scene:
+def ring(count: int, *, span_deg: float, radius: float = 3.0) -> Capture:
     camera = Camera.pinhole(640, 480, 600.0)
     up = np.array([0.0, 0.0, 1.0])
     angles = np.radians(np.linspace(0, span_deg, count, endpoint=False))
@@ -389,7 +389,7 @@ def ring(count: int, *, span_deg: float, radius: float = 3.0) -> Scene:
         for i, centre in enumerate(centres)
     )
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
-    return Scene(Path("."), "transforms", frames, frozenset(), points, ("gone.jpg",))
+    return Capture(frames, points, ("gone.jpg",), kind="transforms")
 
 
 @pytest.mark.parametrize(("span_deg", "gap_deg", "verdict"), [(360, 15, GOOD), (300, 72.5, LOOK), (240, 130, BAD)])

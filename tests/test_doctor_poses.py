@@ -16,7 +16,7 @@ from walks import FOCAL_PX, HEIGHT, WIDTH, walk, write
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.doctor import connectivity, examination
 from nerfcli.doctor.brightness import Brightness
 from nerfcli.doctor.compared_pairs import Pair
@@ -358,7 +358,7 @@ def test_the_doctor_of_a_scene_names_the_wrong_pose(tmp_path: Path, monkeypatch:
     sources = tuple(Source(path.name, path) for path in sorted(folder.iterdir()))
     verdicts = []
     for given in (frames, posed(frames, {3: turned(frames[3].world_from_cam, 3.0)})):
-        scene = Scene(tmp_path, "transforms", tuple(given), frozenset(), np.zeros((0, 3)), ())
+        scene = Capture(tuple(given), np.zeros((0, 3)), kind="transforms", root=tmp_path)
         subject = ExaminedCapture(tmp_path, sources, scene)
         diagnosis = examine(subject, threads=2, progress=lambda done, text: None)
         found = next(finding for finding in diagnosis.findings if finding.check == "poses")

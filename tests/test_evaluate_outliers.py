@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.evaluate.outliers import outlier_warnings, outliers
-from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
+from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model, outlier_warnings, outliers
 
 
 def images(*psnrs: float) -> list[dict[str, object]]:

@@ -11,14 +11,13 @@ import pytest
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import look_at
-from nerfcli.evaluate import perceptual
-from nerfcli.evaluate.colour_alignment import colour_aligned
+from nerfcli.evaluate import metrics
 from nerfcli.evaluate.ledger import leak_ledger, summary_line
+from nerfcli.evaluate.metrics import colour_aligned
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.evaluate.requirements import known_numbers, parse_requirements, unmet
-from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.components import Components, Selection
 from nerfcli.training.runs.config import RunConfig
-from nerfcli.training.runs.decisions import Selection
 
 UP = np.array([0.0, -1.0, 0.0])
 
@@ -154,8 +153,8 @@ def test_without_its_libraries_or_weights_lpips_is_left_out_in_one_line(monkeypa
     def missing(name: str) -> ModuleType:
         raise ImportError(f"No module named {name!r}")
 
-    monkeypatch.setattr(perceptual.importlib, "import_module", missing)
-    assert perceptual.find_perceptual(notes.append) is None
+    monkeypatch.setattr(metrics.importlib, "import_module", missing)
+    assert metrics.find_perceptual(notes.append) is None
 
     class Unreachable:
         def __init__(self, **settings: object):
@@ -163,8 +162,8 @@ def test_without_its_libraries_or_weights_lpips_is_left_out_in_one_line(monkeypa
 
     module = ModuleType("lpip")
     module.LearnedPerceptualImagePatchSimilarity = Unreachable  # type: ignore[attr-defined]
-    monkeypatch.setattr(perceptual.importlib, "import_module", lambda name: module)
-    assert perceptual.find_perceptual(notes.append) is None
+    monkeypatch.setattr(metrics.importlib, "import_module", lambda name: module)
+    assert metrics.find_perceptual(notes.append) is None
     assert len(notes) == 2
     assert "nerfcli[lpips]" in notes[0]
     assert notes[1].endswith("weights could not be loaded (<urlopen error [Errno -2] Name or service not known>)")

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats.registry import FORMATS, recognise
-from nerfcli.captures.scene import describe_source, load
+from nerfcli.captures.loading import describe_source, load_scene
 from nerfcli.errors import BAD_INPUT, UserError
 
 CAMERA = Camera.pinhole(64, 48, 70.0)  # the only kind of lens that all formats hold
@@ -38,7 +38,7 @@ def test_every_format_that_is_read_is_tested():
 def test_a_capture_with_photos_is_trained_on(name, tmp_path):
     file = WITH_PHOTOS[name](VIEWS, tmp_path)
     place = file if name == "run" else tmp_path  # a folder of a run is taken for a mistake
-    scene = load(place)
+    scene = load_scene(place)
     kind = name.removesuffix("-text")
     assert (scene.kind, scene.missing, len(scene.frames)) == (kind, (), 3)
     assert len(scene.test_frames) == 1
@@ -51,7 +51,7 @@ def test_a_capture_with_photos_is_trained_on(name, tmp_path):
         assert frame.has_photo
     assert re.fullmatch(rf"{tmp_path}.*: {kind} \(.+\), 3 of 3 photos on disk", describe_source(place, scene))
     if file.is_file() and name not in ("nerfcli", "polycam", "mvsnet", "pose-files"):  # found by a file, not a folder
-        assert load(file).kind == kind
+        assert load_scene(file).kind == kind
 
 
 @pytest.mark.parametrize("name", WITH_PHOTOS)
@@ -60,7 +60,7 @@ def test_a_capture_without_photos_says_how_to_give_them(name, tmp_path):
     for photo in (*tmp_path.rglob("*.jpg"), *tmp_path.rglob("*.png")):
         photo.unlink()
     with pytest.raises(UserError) as caught:
-        load(tmp_path / "cameras.json" if name == "run" else tmp_path)
+        load_scene(tmp_path / "cameras.json" if name == "run" else tmp_path)
     assert caught.value.exit_code == BAD_INPUT
     assert str(tmp_path) in caught.value.message
     assert "--images" in caught.value.hint or name in ("blender", "llff")
@@ -72,4 +72,4 @@ def test_poses_alone_are_no_scene(name, tmp_path):
     (tmp_path / file).write_text(content)
     assert recognise(tmp_path / file)[0].name == name
     with pytest.raises(UserError, match=file):
-        load(tmp_path / file)
+        load_scene(tmp_path / file)

@@ -16,10 +16,10 @@ from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
 from nerfcli.photos.images import read_image
 from nerfcli.render.depth import effective_floor
-from nerfcli.render.files.float_tiff import read_tiff
+from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.render.files.preview import preview
 from nerfcli.render.frames import export_frames
-from nerfcli.render.job import Order, file_names
+from nerfcli.render.job import RenderJob, file_names
 from nerfcli.render.model import Model
 from nerfcli.render.outputs import ExportSettings, VideoSettings
 from nerfcli.render.pictures import DepthRequest, render_picture
@@ -40,9 +40,9 @@ def model() -> Model:
     return fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32, unit="metre")
 
 
-def order(frames: list[Frame], *, outputs: tuple[str, ...] = ("rgb", "depth", "opacity"), **settings: Any) -> Order:
+def order(frames: list[Frame], *, outputs: tuple[str, ...] = ("rgb", "depth", "opacity"), **settings: Any) -> RenderJob:
     wanted: dict[str, Any] = {"depth": DEPTH} | settings
-    return Order(tuple(frames), ExportSettings(outputs=outputs, **wanted), {"run": "a run"})
+    return RenderJob(tuple(frames), ExportSettings(outputs=outputs, **wanted), {"run": "a run"})
 
 
 def export(model: Model, frames: list[Frame], folder: Path, **settings: Any) -> list[Path]:

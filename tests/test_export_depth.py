@@ -20,9 +20,9 @@ from nerfcli.photos.colours import linear_light
 from nerfcli.render.files.depth_files import Levels, map_path, read_map, write_levels, write_maps
 from nerfcli.render.files.depth_pictures import DepthMeta
 from nerfcli.render.files.file_facts import depth_meta_of
-from nerfcli.render.files.float_tiff import write_tiff
+from nerfcli.render.files.float_maps import write_tiff
 from nerfcli.render.frames import export_frames
-from nerfcli.render.job import Order
+from nerfcli.render.job import RenderJob
 from nerfcli.render.model import Model
 from nerfcli.render.outputs import MEASURED, ExportSettings, depth_meta, floor_of
 from nerfcli.render.pictures import DepthRequest, RenderedPicture, render_picture
@@ -45,12 +45,12 @@ def frame(name: str, distance: float = 2.0) -> Frame:
     return Frame(name, CAMERA, look_at(np.array([0.0, 0.0, -distance]), np.zeros(3), np.array([0.0, -1.0, 0.0])))
 
 
-def ordered(frames: list[Frame], **settings: Any) -> Order:
+def ordered(frames: list[Frame], **settings: Any) -> RenderJob:
     wanted: dict[str, Any] = {"outputs": OUTPUTS, "depth": DEPTH} | settings
-    return Order(tuple(frames), ExportSettings(**wanted), {"run": "a run", "field_sha256": "ab"})
+    return RenderJob(tuple(frames), ExportSettings(**wanted), {"run": "a run", "field_sha256": "ab"})
 
 
-def export(model: Model, order: Order, folder: Path) -> list[str]:
+def export(model: Model, order: RenderJob, folder: Path) -> list[str]:
     """Export and return the notes."""
     notes: list[str] = []
     export_frames(model, order, folder, on_rays=lambda rays: None, notify=notes.append)

@@ -12,9 +12,9 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.photos.images import read_image
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.files.float_tiff import read_tiff
+from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.render.frames import export_frames
-from nerfcli.render.job import Order
+from nerfcli.render.job import RenderJob
 from nerfcli.render.outputs import ExportSettings
 from nerfcli.render.tracing import TOLERANCE
 
@@ -29,7 +29,7 @@ def views(tmp_path):
     settings = ExportSettings(("rgb", "depth"), DepthRequest("conditional", "z", 0.1), rgba=True)
     cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     model = fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
-    order = Order((VIEW,), settings, {"run": "a run"})
+    order = RenderJob((VIEW,), settings, {"run": "a run"})
     export_frames(model, order, tmp_path / "views", on_rays=lambda rays: None, notify=lambda text: None)
     return tmp_path / "views"
 

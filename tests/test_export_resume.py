@@ -24,7 +24,7 @@ from nerfcli.photos.images import read_image
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.file_facts import description_of
 from nerfcli.render.frames import export_frames, export_part
-from nerfcli.render.job import Order
+from nerfcli.render.job import RenderJob
 from nerfcli.render.model import Model
 from nerfcli.render.one_frame import render_frame
 from nerfcli.render.outputs import ExportSettings, VideoSettings
@@ -40,16 +40,18 @@ def model() -> Model:
     return fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
 
 
-def order(count: int = 4, *, convention: str = "conditional", video: VideoSettings | None = VIDEO) -> Order:
+def order(count: int = 4, *, convention: str = "conditional", video: VideoSettings | None = VIDEO) -> RenderJob:
     poses = [
         look_at(np.array([0.1 * index, 0.0, -2.0]), np.zeros(3), np.array([0.0, -1.0, 0.0])) for index in range(count)
     ]
     frames = tuple(Frame(f"f{index}/v.png", Camera.pinhole(10, 8, 8.0), pose) for index, pose in enumerate(poses))
     depth = DepthRequest(convention, "z", min_opacity=0.1)
-    return Order(frames, ExportSettings(outputs=("rgb", "depth"), depth=depth, video=video), {"run": "a run"})
+    return RenderJob(frames, ExportSettings(outputs=("rgb", "depth"), depth=depth, video=video), {"run": "a run"})
 
 
-def export(model: Model, ordered: Order, folder: Path, *, on_rays: Callable[[int], None] = lambda rays: None) -> None:
+def export(
+    model: Model, ordered: RenderJob, folder: Path, *, on_rays: Callable[[int], None] = lambda rays: None
+) -> None:
     export_frames(model, ordered, folder, on_rays=on_rays, notify=lambda text: None)
 
 
@@ -320,7 +322,7 @@ def test_what_cannot_become_a_video_is_refused_before_rendering(model, tmp_path,
 
     first, second = order(2).frames
     other = Frame("other.png", Camera.pinhole(12, 8, 8.0), second.world_from_cam)
-    mixed = Order((first, other), order().settings, {})
+    mixed = RenderJob((first, other), order().settings, {})
     with pytest.raises(UserError, match="the views have 2 different sizes \\(10x8, 12x8\\), which cannot be combined"):
         export(model, mixed, tmp_path / "views", on_rays=rendered)
     program = tmp_path / "ffmpeg"

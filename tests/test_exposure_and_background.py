@@ -11,14 +11,14 @@ from PIL import ExifTags, Image
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
 from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
 from nerfcli.field.background import SphereBackground, colours_behind
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.exposure import Exposure, exposed, linear_from_srgb, srgb_from_linear
 from nerfcli.field.hash_field import DETAILED_LOG2_ROWS
-from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
+from nerfcli.photos.exif import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import render_picture
@@ -67,16 +67,16 @@ def save_photo(path: Path, *, seconds: float | None, iso: int | None = 100, f_nu
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Scene:
+def capture(tmp_path: Path) -> Capture:
     """Four photos, each exposed twice as long as the one before; the first is held out."""
     frames = tuple(
         Frame(f"{i}.png", CAMERA, pose(0.2 * i), save_photo(tmp_path / f"{i}.png", seconds=2.0**i / 100))
         for i in range(4)
     )
-    return Scene(tmp_path, "colmap", frames, frozenset({"0.png"}), np.zeros((0, 3)), ())
+    return Capture(frames, np.zeros((0, 3)), kind="colmap", root=tmp_path, test_names=frozenset({"0.png"}))
 
 
-def fit(scene: Scene, run: Path, settings: TrainSettings, *, resume: bool = False, stop_at: int = -1) -> list[float]:
+def fit(scene: Capture, run: Path, settings: TrainSettings, *, resume: bool = False, stop_at: int = -1) -> list[float]:
     """Train and return the loss of every step."""
     losses: list[float] = []
 
@@ -129,19 +129,19 @@ def test_known_exposures_keep_their_differences_while_the_others_are_learned(cap
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
     given = torch.tensor([[0.9, 0.6, 0.3], [-0.9, -0.6, -0.3], [math.nan] * 3])
     training = replace(prepared, log_gains=given).fitting()
-    assert training.parts.exposure is not None
-    assert training.parts.exposure.log_gains()[2].tolist() == [0.0] * 3
+    assert training.appearance.exposure is not None
+    assert training.appearance.exposure.log_gains()[2].tolist() == [0.0] * 3
     for step in range(60):
         training.advance(step / 60)
-    found = training.parts.exposure.log_gains().detach()
+    found = training.appearance.exposure.log_gains().detach()
     assert (found[0] - found[1] - (given[0] - given[1])).abs().max() < 1e-6
     assert (found[2] - found[:2].mean(0)).abs().min() > 0.01
     assert found.mean(0).abs().max() < 1e-6
     # All of it is restored when a training is resumed.
     again = replace(prepared, log_gains=given).fitting()
     again.restore(*training.state())
-    assert again.parts.exposure is not None
-    assert torch.equal(again.parts.exposure.log_gains(), training.parts.exposure.log_gains())
+    assert again.appearance.exposure is not None
+    assert torch.equal(again.appearance.exposure.log_gains(), training.appearance.exposure.log_gains())
 
 
 def test_a_resumed_training_keeps_the_exposures_that_auto_has_fixed(capture, tmp_path, monkeypatch):
@@ -227,7 +227,7 @@ def test_a_background_begins_with_the_colour_of_the_sky():
     colours = torch.tensor([[0.2, 0.4, 0.8], [0.9, 0.1, 0.1]])
     for sky in ([True, False], [False, True]):
         parts, _ = parts_of(replace(LEARNED, exposure="none"), colours, [0.0, 0.0])
-        parts.show_sky(torch.tensor(sky))
+        parts.init_background_from_sky(torch.tensor(sky))
         assert parts.background is not None
         assert parts.background(torch.tensor([[0.0, 0.6, -0.8]]))[0].tolist() == pytest.approx(
             colours[sky.index(True)].tolist(), abs=0.003
@@ -264,8 +264,8 @@ def test_directions_without_pixels_take_the_colours_of_their_neighbours(capture,
     """No direction reads the middle of the grid, so only the roughness penalty lowers an outlying vertex there."""
     prepared = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
     training = prepared.fitting()
-    assert training.parts.background is not None
-    logits = training.parts.background.logits
+    assert training.appearance.background is not None
+    logits = training.appearance.background.logits
     logits.data[:, 16, 16, 16] = 1.0
     for step in range(10):
         training.advance(step / 10)
@@ -275,7 +275,7 @@ def test_directions_without_pixels_take_the_colours_of_their_neighbours(capture,
 
 def test_a_sky_that_no_pixel_shows_changes_nothing():
     parts, drawn = parts_of(replace(LEARNED, exposure="none"), torch.full((2, 3), 0.5), [0.0, 0.0])
-    parts.show_sky(torch.tensor([False, False]))
+    parts.init_background_from_sky(torch.tensor([False, False]))
     assert parts.sky is None
     assert parts.compared(torch.zeros(2, 3), torch.ones(2), drawn, behind=torch.zeros(2, 3))[0].requires_grad
 

@@ -16,14 +16,14 @@ from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity, rotation_from_quaternion
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
-from nerfcli.field.contraction import uncontract
-from nerfcli.field.cost import field_bytes
 from nerfcli.field.fourier_field import fourier_features
 from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.field.kinds import field_bytes
 from nerfcli.kernels import spherical_harmonics
 from nerfcli.render import model as model_file
 from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.render.trained_field import Marching
+from nerfcli.training.open_cells import uncontract
 
 TINY = HashFieldSettings(contraction="none", levels=3, log2_rows=8, coarsest=4, finest=32, width=16)
 

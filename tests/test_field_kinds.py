@@ -13,7 +13,7 @@ from scipy.special import sph_harm_y
 
 from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings, fourier_features
@@ -238,20 +238,22 @@ def test_the_sink_gets_the_gradient_of_the_rows(field):
     optimiser = FieldOptimiser(field)
     before = {name: value.detach().clone() for name, value in field.named_parameters()}
 
-    def rendered(sink: torch.Tensor | None) -> torch.Tensor:
-        return field.backend.render_rays(rays, march, field.medium(), background=background, sink=sink).rgb.sum()
+    def rendered(table_grad: torch.Tensor | None) -> torch.Tensor:
+        return field.backend.render_rays(
+            rays, march, field.medium(), background=background, table_grad=table_grad
+        ).rgb.sum()
 
-    rendered(optimiser.sink).backward()
-    rows, sink = field.rows(), optimiser.sink
+    rendered(optimiser.table_grad).backward()
+    rows, table_grad = field.rows(), optimiser.table_grad
     touched = torch.zeros(0)
-    if rows is not None and sink is not None:
+    if rows is not None and table_grad is not None:
         assert rows.grad is None
         (wanted,) = torch.autograd.grad(rendered(None), rows)
-        torch.testing.assert_close(sink, wanted, rtol=1e-4, atol=1e-4 * float(wanted.abs().max()))
-        touched = (sink != 0).any(-1)
+        torch.testing.assert_close(table_grad, wanted, rtol=1e-4, atol=1e-4 * float(wanted.abs().max()))
+        touched = (table_grad != 0).any(-1)
         assert touched.any()
     optimiser.step(1, 1e-3, decay=field.row_decay)
-    assert sink is None or not sink.any()
+    assert table_grad is None or not table_grad.any()
     for name, value in field.named_parameters():
         changed = value != before[name]
         if value is rows:
@@ -267,10 +269,10 @@ def test_rows_of_the_hash_grid_decay_where_photos_say_little():
     for made, towards_zero in zip(fields, (1, -1), strict=True):
         optimiser, rows = FieldOptimiser(made), made.rows()
         assert rows is not None
-        assert optimiser.sink is not None
+        assert optimiser.table_grad is not None
         rows.data.fill_(0.1)
-        rows_in_a_line, sink = rows.data.view(-1, 4), optimiser.sink.view(-1, 4)
-        sink[3] = -1e-15
+        rows_in_a_line, table_grad = rows.data.view(-1, 4), optimiser.table_grad.view(-1, 4)
+        table_grad[3] = -1e-15
         optimiser.step(1, 1e-3, decay=made.row_decay)
         moved = rows_in_a_line - 0.1
         assert (moved[:3] == 0).all()
@@ -281,7 +283,7 @@ def test_rows_of_the_hash_grid_decay_where_photos_say_little():
 
 
 def training_of_two_photos(
-    scene: Scene, *, has_alpha: bool, log2_rows: int, near: float = 0.1, components: Components = DEFAULTS
+    scene: Capture, *, has_alpha: bool, log2_rows: int, near: float = 0.1, components: Components = DEFAULTS
 ) -> Fitting:
     photos = [
         replace(photo, pixels=photo.pixels[..., : 3 + has_alpha])
@@ -297,7 +299,7 @@ def training_of_two_photos(
 
 @pytest.mark.parametrize("has_alpha", [True, False])
 def test_decay_shrinks_with_the_rays_of_a_step_only_where_photos_have_alpha(
-    has_alpha, spheres: Scene, monkeypatch: pytest.MonkeyPatch
+    has_alpha, spheres: Capture, monkeypatch: pytest.MonkeyPatch
 ):
     """The law of `Fitting.row_decay`, and what the optimiser gets in a step of all rays that there may be."""
     training = training_of_two_photos(spheres, has_alpha=has_alpha, log2_rows=8)
@@ -313,7 +315,7 @@ def test_decay_shrinks_with_the_rays_of_a_step_only_where_photos_have_alpha(
 
 
 @pytest.mark.parametrize(("log2_rows", "most"), [(6, 16), (8, 32)])
-def test_steps_of_large_tables_have_more_rays(log2_rows, most, spheres: Scene, monkeypatch: pytest.MonkeyPatch):
+def test_steps_of_large_tables_have_more_rays(log2_rows, most, spheres: Capture, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(fitting, "MOST_RAYS", 16)
     monkeypatch.setattr(fitting, "ROWS_PER_RAY", 8)
     training = training_of_two_photos(spheres, has_alpha=True, log2_rows=log2_rows)
@@ -322,7 +324,7 @@ def test_steps_of_large_tables_have_more_rays(log2_rows, most, spheres: Scene, m
 
 @pytest.mark.parametrize(("begin", "near", "wanted"), [(0.12, True, 0.4), (0.6, True, 1.0), (0.12, False, None)])
 def test_gradients_are_scaled_up_to_the_nearest_point_or_the_unit_ball(
-    begin, near, wanted, spheres: Scene, monkeypatch: pytest.MonkeyPatch
+    begin, near, wanted, spheres: Capture, monkeypatch: pytest.MonkeyPatch
 ):
     """Rays begin at 0.3 of the distance of the nearest point."""
     components = Components(near=near)
@@ -381,8 +383,8 @@ def test_the_state_of_the_optimiser_comes_back(field):
         density, rgb = radiance_of(field, places(9), looks(9), torch.arange(9))
         (density.sum() + rgb.sum()).backward()
         rows = field.rows()
-        if rows is not None and optimiser.sink is not None and rows.grad is not None:
-            optimiser.sink.add_(rows.grad)
+        if rows is not None and optimiser.table_grad is not None and rows.grad is not None:
+            optimiser.table_grad.add_(rows.grad)
             rows.grad = None
         optimiser.step(number, 1e-3, decay=field.row_decay)
 

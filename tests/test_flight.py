@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.flight import fly
 from nerfcli.cameras.frame import Frame, frames_named
+from nerfcli.cameras.paths import fly
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 

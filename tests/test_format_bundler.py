@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture
-from nerfcli.captures.formats.bundler import parse_bundler
-from nerfcli.captures.formats.finding import find_bundler
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.bundler import find_bundler, parse_bundler
 from nerfcli.errors import BAD_INPUT, UserError
 
 LENSES = [(60.0, 0.1, -0.05), (55.0, 0.02, 0.0), (50.0, 0.0, 0.0)]

@@ -10,7 +10,7 @@ from captures import CAMERAS, assert_same, reprojection_px, ring
 from corruption import assert_refused_or_sound, corrupted_binary, corrupted_text
 
 from nerfcli.cameras import rigid
-from nerfcli.cameras.frame import Capture, Observations
+from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats.colmap import (
     losses_colmap,
     losses_colmap_text,

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture
-from nerfcli.captures.formats.registry import UserInputs, recognise
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.format import UserInputs
+from nerfcli.captures.formats.registry import recognise
 from nerfcli.errors import BAD_INPUT, UserError
 
 SIZE = (64, 48)

@@ -12,7 +12,7 @@ from corruption import corrupted_binary, count_refused
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
-from nerfcli.cameras.frame import Capture, Observations
+from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats.llff import losses_llff, parse_llff, write_llff
 from nerfcli.captures.formats.npy import array_of_npy
 from nerfcli.errors import UserError

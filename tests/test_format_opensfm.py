@@ -10,7 +10,8 @@ from corruption import corrupted_json, count_refused
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats.opensfm import losses_opensfm, parse_opensfm, write_opensfm
 from nerfcli.errors import BAD_INPUT, UserError
 

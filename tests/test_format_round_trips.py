@@ -15,9 +15,10 @@ from readback import READERS, FileLens, assert_holds
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import OPENCV_FROM_OPENGL
-from nerfcli.cameras.frame import Capture
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import blender, colmap_binary, llff, opensfm, trajectories, transforms
-from nerfcli.captures.formats.registry import UserInputs, format_named
+from nerfcli.captures.formats.format import UserInputs
+from nerfcli.captures.formats.registry import format_named
 from nerfcli.captures.formats.transforms_cameras import lost_to_transforms, record_of_camera
 
 TOLERANCE_PX = 1e-6

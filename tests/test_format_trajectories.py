@@ -8,7 +8,8 @@ from corruption import corrupted_text, count_refused
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.trajectories import (
     losses_kitti,
     losses_tum,

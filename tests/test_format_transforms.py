@@ -11,7 +11,7 @@ from captures import CAMERAS, assert_same, photograph, reprojection_px, ring, wi
 from corruption import assert_refused_or_sound, corrupted_binary, corrupted_json
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.blender import losses_blender, parse_blender, write_blender
 from nerfcli.captures.formats.transforms import (
     losses_transforms,
@@ -19,7 +19,7 @@ from nerfcli.captures.formats.transforms import (
     write_transforms,
 )
 from nerfcli.captures.formats.transforms_cameras import lost_to_transforms
-from nerfcli.captures.scene import load
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
 
 LOST = {
@@ -156,7 +156,7 @@ def test_training_gets_the_points_beside_the_file(tmp_path):
     capture = with_photos(ring(CAMERAS["PINHOLE"]), tmp_path / "images")
     photograph(capture.frames)
     write_transforms(capture, tmp_path / "transforms.json")
-    np.testing.assert_array_equal(load(tmp_path).points, capture.points)
+    np.testing.assert_array_equal(load_scene(tmp_path).points, capture.points)
 
 
 def test_images_of_blender_files_in_another_folder(tmp_path):
@@ -177,7 +177,7 @@ def test_a_written_file_serves_for_training_and_as_a_camera_path(tmp_path):
     capture = with_photos(ring(CAMERAS["OPENCV"]), tmp_path)
     write_transforms(capture, tmp_path / "transforms.json")
     photograph(capture.frames[1:])
-    scene = load(tmp_path / "transforms.json")
+    scene = load_scene(tmp_path / "transforms.json")
     assert scene.missing == (capture.frames[0].name,)
     for frame, again in zip(capture.frames[1:], scene.frames, strict=True):
         assert (again.name, again.camera) == (frame.name, frame.camera)

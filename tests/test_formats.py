@@ -18,7 +18,7 @@ from nerfcli.cameras.conventions import (
 )
 from nerfcli.captures.formats.colmap import is_model, read_model
 from nerfcli.captures.formats.transforms import parse_transforms
-from nerfcli.captures.scene import load
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import BAD_INPUT, UserError
 
 # A camera at (1, 2, 3) that looks along -x with +z up. OpenGL axes: right +y, up +z, backward +x, as columns.
@@ -60,7 +60,7 @@ def test_instant_ngp_file_with_shared_intrinsics_and_missing_images(tmp_path):
     put(tmp_path, "images/a b.jpg", "images/ü.jpg", "images/no_suffix.png")
     content = {**SHARED, "k1": 0.1, "k2": -0.05, "p1": 0.001, "p2": 0.002, "aabb_scale": 4, "scale": 0.33}
     path = write_capture(tmp_path, {**content, "frames": [entry(name, sharpness=3.0) for name in names]})
-    capture = load(path)
+    capture = load_scene(path)
     assert capture.kind == "transforms"
     assert [frame.name for frame in capture.frames] == ["images/a b.jpg", "images/ü.jpg", "images/no_suffix.png"]
     assert all(frame.image is not None and frame.image.is_file() for frame in capture.frames)
@@ -76,7 +76,7 @@ def test_nerfstudio_file_with_intrinsics_and_masks_per_frame(tmp_path):
     fisheye = {**SHARED, "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "camera_model": "OPENCV_FISHEYE"}
     frames = [entry("a.png", mask_path="masks/a.png", **fisheye), entry("b.png", **SHARED, k3=0.3)]
     path = write_capture(tmp_path, {"frames": frames, "train_filenames": ["a.png"], "test_filenames": ["./b.png"]})
-    first, second = load(path).frames
+    first, second = load_scene(path).frames
     assert first.camera == Camera("OPENCV_FISHEYE", 64, 48, (50, 51, 33, 23, 0.1, 0.2, 0.3, 0.4))
     assert second.camera == Camera("FULL_OPENCV", 64, 48, (50, 51, 33, 23, 0, 0, 0, 0, 0.3, 0, 0, 0))
     assert (first.mask, second.mask) == (tmp_path / "masks/a.png", None)
@@ -96,7 +96,7 @@ def test_nerfstudio_file_with_intrinsics_and_masks_per_frame(tmp_path):
 def test_focal_length_from_what_the_file_gives(tmp_path, intrinsics, params):
     put(tmp_path, "a.png")
     path = write_capture(tmp_path, {**intrinsics, "frames": [entry("a.png")]})
-    camera = load(path).frames[0].camera
+    camera = load_scene(path).frames[0].camera
     assert (camera.model, camera.width, camera.height) == ("PINHOLE", 64, 48)
     np.testing.assert_allclose(camera.params, params, rtol=1e-14)
 
@@ -105,7 +105,7 @@ def test_rounded_poses_become_exactly_rigid(tmp_path):
     put(tmp_path, "a.png")
     rounded = rigid.look_at(np.array([1.0, 2, 3]), np.zeros(3), np.array([0, 0, 1.0])).round(4)
     path = write_capture(tmp_path, {**SHARED, "frames": [{"file_path": "a", "transform_matrix": rounded[:3].tolist()}]})
-    pose = load(path).frames[0].world_from_cam
+    pose = load_scene(path).frames[0].world_from_cam
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), rtol=0, atol=1e-14)
     np.testing.assert_allclose(opengl_from_opencv_pose(pose), rounded, rtol=0, atol=1e-4)
 
@@ -141,7 +141,7 @@ def test_malformed_transforms_are_refused_with_file_and_field(tmp_path, change, 
     put(tmp_path, "a.png")
     path = write_capture(tmp_path, {**SHARED, "frames": [entry("a.png")], **change})
     with pytest.raises(UserError, match=what) as caught:
-        load(path)
+        load_scene(path)
     assert caught.value.exit_code == BAD_INPUT
     assert str(tmp_path) in caught.value.message
 
@@ -174,7 +174,7 @@ def test_blender_splits_are_kept_and_val_is_left_out(tmp_path):
         tmp_path, {**angle, "frames": [entry("./test/r_0"), entry("./test/r_1")]}, name="transforms_test.json"
     )
     write_capture(tmp_path, {**angle, "frames": [entry("./val/r_0")]}, name="transforms_val.json")
-    capture = load(tmp_path)
+    capture = load_scene(tmp_path)
     assert [(frame.name, frame.split) for frame in capture.frames] == [
         ("train/r_0.png", "train"),
         ("train/r_1.png", "train"),
@@ -211,7 +211,7 @@ def test_llff_by_hand(tmp_path):
     np.save(tmp_path / "poses_bounds.npy", llff_rows(2))
     # images/ has a different number of photos than poses; images_4/ has the right number, at a quarter of the size.
     put(tmp_path, "images/1.jpg", "images_4/b.png", "images_4/a.png")
-    capture = load(tmp_path)
+    capture = load_scene(tmp_path)
     assert [frame.name for frame in capture.frames] == ["images_4/a.png", "images_4/b.png"]
     assert capture.frames[0].camera == Camera("PINHOLE", 64, 48, (50, 50, 32, 24))
     np.testing.assert_allclose(capture.frames[0].world_from_cam, OPENCV_POSE, rtol=0, atol=1e-15)
@@ -219,26 +219,26 @@ def test_llff_by_hand(tmp_path):
     np.testing.assert_array_equal(capture.depth_bounds, [[1.5, 20], [1.5, 21]])
     assert capture.kind == "llff"
     put(tmp_path, "images/2.jpg")
-    assert load(tmp_path).frames[0].name == "images/1.jpg"
+    assert load_scene(tmp_path).frames[0].name == "images/1.jpg"
 
 
 def test_malformed_llff_is_refused(tmp_path):
     path = tmp_path / "poses_bounds.npy"
     np.save(path, llff_rows(3))
     with pytest.raises(UserError, match="none of its 3 photos is on disk, such as image000"):
-        load(tmp_path)
+        load_scene(tmp_path)
     put(tmp_path, "images/1.jpg", "images_8/1.jpg", "images_8/2.jpg")
     with pytest.raises(UserError, match="3 rows, but images/ has 1, images_8/ has 2"):
-        load(tmp_path)
+        load_scene(tmp_path)
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(UserError, match=r"poses_bounds\.npy is not a readable NumPy array"):
-        load(tmp_path)
+        load_scene(tmp_path)
     path.write_bytes(b"")
     with pytest.raises(UserError, match="not a readable NumPy array"):
-        load(tmp_path)
+        load_scene(tmp_path)
     np.save(path, llff_rows(3)[:, :15])
     with pytest.raises(UserError, match=r"array of shape \(3, 15\)"):
-        load(tmp_path)
+        load_scene(tmp_path)
     for column, value, what in (
         (15, 0.0, "depth bounds 0 and 20"),
         (14, -1.0, "row 0: .* -1"),
@@ -248,7 +248,7 @@ def test_malformed_llff_is_refused(tmp_path):
         rows[0, column] = value
         np.save(path, rows)
         with pytest.raises(UserError, match=what):
-            load(tmp_path)
+            load_scene(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -266,16 +266,16 @@ def test_colmap_images_that_are_not_on_disk_are_missing(tmp_path, synthetic):
     synthetic.write_binary(str(tmp_path))
     names = sorted(image.name for image in synthetic.images.values())
     with pytest.raises(UserError, match=r"none of its 10 photos is on disk, such as ring 0/ä 0\.jpg"):
-        load(tmp_path)
+        load_scene(tmp_path)
     put(tmp_path / "images", *names[1:], size=(512, 384))
-    scene = load(tmp_path)
+    scene = load_scene(tmp_path)
     assert scene.missing == (names[0],)
     assert [frame.name for frame in scene.frames] == names[1:]
     assert scene.frames[0].camera.params == (640, 256, 192, 0.05)
     assert scene.kind == "colmap"
     put(tmp_path / "images", names[1], size=(500, 500))
     with pytest.raises(UserError, match="500x500 pixels does not match a camera of 1024x768"):
-        load(tmp_path)
+        load_scene(tmp_path)
 
 
 @pytest.mark.parametrize(

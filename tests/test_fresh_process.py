@@ -12,7 +12,7 @@ CODES = {
     "conversion": "from nerfcli.workflows import convert",
     "adam": """
 import torch
-from nerfcli.training.adam import Adam
+from nerfcli.training.optimiser import Adam
 parameter = torch.ones(3, requires_grad=True)
 adam = Adam([parameter])
 parameter.grad = torch.ones(3)
@@ -30,7 +30,7 @@ assert (torch.get_num_threads(), use_threads()) == (1, 1)
 """,
     "peak memory": """
 import numpy as np
-from nerfcli.bench.machine import PeakMemory
+from nerfcli.bench.measurement import PeakMemory
 memory = PeakMemory("cpu")
 memory.begin()
 before = memory.read()
@@ -70,14 +70,15 @@ def test_a_conversion_imports_no_torch(modules):
 
 
 def test_a_step_of_adam_loads_no_compiler(modules):
-    assert "nerfcli.training.adam" in modules["adam"]
+    assert "nerfcli.training.optimiser" in modules["adam"]
     assert "torch._dynamo" not in modules["adam"]
 
 
 def test_what_comes_after_training_loads_no_trainer(modules):
     loaded = modules["package"] | modules["conversion"] | modules["adam"] | modules["after training"]
     assert "nerfcli.training.runs.run" in loaded
-    assert not [name for name in loaded if name.startswith("nerfcli.train")]
+    trainer = ("loop", "preparation", "evidence", "checkpoints", "waypoints", "sentinel")
+    assert not {f"nerfcli.training.{name}" for name in trainer} & loaded
 
 
 def test_starting_numba_leaves_the_thread_count_alone(modules):

@@ -15,7 +15,7 @@ from commands import nerfcli
 from PIL import ExifTags, Image, ImageOps
 from test_images import exif_with, icc_profile, noise
 
-from nerfcli.captures.scene import load
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
 from nerfcli.photos.exif import read_exif
 from nerfcli.photos.images import image_size, list_images, read_image
@@ -175,7 +175,7 @@ def test_a_capture_of_heic_photos_is_trained_evaluated_and_converted(capture: Pa
         for frame in content["frames"]:
             frame["file_path"] += ".heic"
         path.write_text(json.dumps(content))
-    loaded = load(capture)
+    loaded = load_scene(capture)
     assert {frame.image.suffix for frame in loaded.frames if frame.image} == {".heic"}
     run = tmp_path / "run"
     assert nerfcli("train", capture, "--steps", "3", "--model", "default", "-o", run).exit_code == 0

@@ -10,7 +10,7 @@ from PIL import ExifTags, Image
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.render.held_out_exposure import (
     exif_slope,
     gain_sources,
@@ -143,7 +143,7 @@ def test_training_estimates_exposures_of_held_out_photos_without_opening_them(tm
         pose = np.eye(4)
         pose[:3, 3] = [0.1 * index, 0.0, -2.0]
         frames.append(Frame(f"{index}.png", camera, pose, tmp_path / f"{index}.png"))
-    scene = Scene(tmp_path, "colmap", tuple(frames), frozenset({"7.png"}), np.array([[0.0, 0.0, 0.0]] * 9), ())
+    scene = Capture(tuple(frames), np.zeros((9, 3)), kind="colmap", root=tmp_path, test_names=frozenset({"7.png"}))
     settings = TrainSettings(
         budget_seconds=None,
         steps=150,
@@ -187,7 +187,7 @@ def test_a_run_keeps_the_offset_to_exif_of_held_out_photos(tmp_path: Path, expos
         pose = np.eye(4)
         pose[:3, 3] = [0.1 * index, 0.0, -2.0]
         frames.append(Frame(path.name, camera, pose, path))
-    scene = Scene(tmp_path, "colmap", tuple(frames), frozenset({"9.png"}), np.array([[0.0, 0.0, 0.0]] * 13), ())
+    scene = Capture(tuple(frames), np.zeros((13, 3)), kind="colmap", root=tmp_path, test_names=frozenset({"9.png"}))
     settings = TrainSettings(
         budget_seconds=None,
         steps=150,

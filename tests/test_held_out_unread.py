@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from conftest import SPHERES
 
-from nerfcli.captures import scene as scenes
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.loading import load_scene
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.matching.sky import sky_masks
 from nerfcli.photos.images import read_image, write_png
@@ -74,7 +74,7 @@ def settings(model: str, components: Components) -> TrainSettings:
     )
 
 
-def fit(scene: Scene, run: Path, chosen: TrainSettings) -> list[str]:
+def fit(scene: Capture, run: Path, chosen: TrainSettings) -> list[str]:
     reported: list[str] = []
     train(scene, run, chosen, resume=False, notify=reported.append, on_progress=lambda progress: None)
     return reported
@@ -125,7 +125,7 @@ def test_no_held_out_photo_is_opened_before_the_training_is_over(case, capture, 
     monkeypatch.setattr(evidence, "sky_masks", count_sky)
     if case == "sky":
         fill_background(capture)
-    scene = scenes.load(capture)
+    scene = load_scene(capture)
     opened.clear()
     fit(scene, tmp_path / "run", settings(*CASES[case]))
     # Occluders are searched outside the sky; black behind the objects looks like one.
@@ -141,11 +141,11 @@ def test_the_field_does_not_depend_on_what_is_in_held_out_photos(case, capture, 
     monkeypatch.setattr(preparation, "SEARCH_FRACTION", 1.0)
     # A budget in steps gives trials of equal length; seconds would differ.
     chosen = settings(*CASES[case])
-    fit(scenes.load(capture), tmp_path / "run", chosen)
+    fit(load_scene(capture), tmp_path / "run", chosen)
     noise = np.random.default_rng(0).integers(0, 256, (72, 96, 4), dtype=np.uint8)
     for photo in (capture / HELD_OUT).glob("*.png"):
         write_png(photo, noise)
-    fit(scenes.load(capture), tmp_path / "other", chosen)
+    fit(load_scene(capture), tmp_path / "other", chosen)
     before, after = (load_tensors(tmp_path / name / FIELD, "cpu")[0] for name in ("run", "other"))
     assert {name: tensor.numpy().tobytes() for name, tensor in before.items()} == {
         name: tensor.numpy().tobytes() for name, tensor in after.items()
@@ -156,7 +156,7 @@ def test_the_field_does_not_depend_on_what_is_in_held_out_photos(case, capture, 
 
 
 def test_held_out_photos_that_are_gone_do_not_undo_a_training(capture, tmp_path):
-    loaded = scenes.load(capture)
+    loaded = load_scene(capture)
     for photo in (capture / HELD_OUT).glob("*.png"):
         photo.unlink()
     reported = fit(loaded, tmp_path / "run", replace(settings("default", Components()), steps=4))

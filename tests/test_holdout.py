@@ -4,8 +4,8 @@ from pathlib import PurePosixPath
 
 import pytest
 
-from nerfcli.captures import scene as scenes
 from nerfcli.captures.holdout import DEFAULT_HOLDOUT, check_holdout, default_split, names_held_out
+from nerfcli.captures.loading import fingerprint, load_scene
 from nerfcli.errors import UserError
 
 NAMES = [f"frame_{index}.png" for index in range(1, 21)]
@@ -80,8 +80,8 @@ def test_something_must_be_left_on_both_sides(tmp_path):
 
 
 def test_a_scene_is_split_by_a_rule(spheres):
-    again = scenes.load(spheres.root, holdout="block:0.25")
+    again = load_scene(spheres.root, holdout="block:0.25")
     assert len(again.test_frames) == round(0.25 * len(spheres.frames))
     assert again.holdout == "block:0.25"
     assert {frame.name for frame in again.frames} == {frame.name for frame in spheres.frames}
-    assert scenes.fingerprint(again) != scenes.fingerprint(spheres)
+    assert fingerprint(again) != fingerprint(spheres)

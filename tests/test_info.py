@@ -20,8 +20,8 @@ from nerfcli import cli
 from nerfcli.cli.info import lines_of
 from nerfcli.photos.images import write_png
 from nerfcli.render.files.depth_pictures import KEY
-from nerfcli.render.files.exr import write_exr
 from nerfcli.render.files.file_facts import NOT_STATED, RENDERS, description_of
+from nerfcli.render.files.float_maps import write_exr
 from nerfcli.render.files.levels import write_png16
 from nerfcli.splats.files import write_splats
 from nerfcli.splats.gaussians import Gaussians

@@ -8,7 +8,7 @@ import torch
 from commands import nerfcli
 
 from nerfcli import kernels
-from nerfcli.bench import machine
+from nerfcli.bench import measurement
 from nerfcli.errors import UserError
 from nerfcli.kernels.devices import describe_machine
 from nerfcli.machine import device_name
@@ -53,8 +53,8 @@ def test_a_benchmark_names_the_gpu_and_reads_its_memory(monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"GPU of {device}")
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda device: None)
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: {"cuda:1": 7}[device])
-    assert machine.describe_machine("cuda:1", 2)["device"] == "GPU of cuda:1"
-    memory = machine.PeakMemory("cuda:1")
+    assert measurement.describe_machine("cuda:1", 2)["device"] == "GPU of cuda:1"
+    memory = measurement.PeakMemory("cuda:1")
     memory.begin()
     assert memory.read() == 7
 

@@ -17,7 +17,7 @@ from commands import error_of, listing, nerfcli, started
 from full_disk import files_of_at_most
 
 from nerfcli import atomic, kernels
-from nerfcli.captures import scene
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, TERMINATED
 from nerfcli.exclusive import exclusive
 from nerfcli.interrupts import Terminated, install_handlers
@@ -155,7 +155,7 @@ def test_what_a_killed_evaluation_left_goes_with_the_next(finished):
 def test_a_scene_is_read_while_it_is_trained_on(capture):
     """Commands do not lock a scene, as they only read it."""
     with exclusive(capture.with_name("new") / LOCK, "nerfcli train is working"):
-        assert len(scene.load(capture).frames) == 5
+        assert len(load_scene(capture).frames) == 5
         assert nerfcli("info", capture).exit_code == 0
 
 

@@ -111,15 +111,15 @@ def test_hash_encode_takes_a_sink_and_known_values(generator):
     points = torch.rand(50, 3, generator=generator)
     plain = numba_cpu.hash_encode(points, table, (3, 30), None, None)
     plain.sum().backward()
-    sink = torch.ones_like(table)
-    computed = numba_cpu.hash_encode(points, table, (3, 30), sink, plain.detach())
+    table_grad = torch.ones_like(table)
+    computed = numba_cpu.hash_encode(points, table, (3, 30), table_grad, plain.detach())
     assert torch.equal(computed, plain)
     assert table.grad is not None
     expected = 1 + table.grad
     table.grad = None
     computed.sum().backward()
     assert table.grad is None
-    assert_close(sink, expected, "sink")
+    assert_close(table_grad, expected, "sink")
 
 
 def test_hash_encode_shows_coordinates_gone_bad(generator):
@@ -287,10 +287,12 @@ def test_visible_samples(rays, contraction, contrast, with_cones, least, generat
     grid = HashGrid(table, (4, 5, 6, 7, 9, 11, 13, 16), weights, antialias=with_cones)
     cones = torch.rand(rays, generator=generator) if with_cones else None
     given = (Rays(origins, directions, jitter, cones), March(edges, occupied, contraction, 7.0, least), grid)
-    visits = torch.full((2, 8, 8, 8), -1.0)
-    fast = numba_cpu.visible_samples(*given, visits[0])
-    exact = reference.visible_samples(*given, visits[1])
-    torch.testing.assert_close(visits[0], visits[1], rtol=1e-4, atol=1e-12)  # exponentials of sums of up to 15
+    cell_depths = torch.full((2, 8, 8, 8), -1.0)
+    fast = numba_cpu.visible_samples(*given, cell_depths[0])
+    exact = reference.visible_samples(*given, cell_depths[1])
+    torch.testing.assert_close(
+        cell_depths[0], cell_depths[1], rtol=1e-4, atol=1e-12
+    )  # exponentials of sums of up to 15
     # A midpoint that rounds into the neighbouring cell, or an optical depth that rounds across the limit, could be
     # kept by only one of the two; this does not happen for these seeds.
     assert torch.equal(fast[5], exact[5])
@@ -314,11 +316,11 @@ def test_visible_samples_leave_out_what_absorbs_little_light(least, generator):
     )  # fmt: skip
     march = March(edges, torch.ones(8, 8, 8, dtype=torch.bool), "l2", 7.0)
     given = Rays(origins, directions, torch.rand(rays, generator=generator))
-    visits = torch.full((2, 64, 64, 64), -1.0)
-    every = numba_cpu.visible_samples(given, march, grid, visits[0])
-    kept = numba_cpu.visible_samples(given, march._replace(least_weight=least), grid, visits[1])
+    cell_depths = torch.full((2, 64, 64, 64), -1.0)
+    every = numba_cpu.visible_samples(given, march, grid, cell_depths[0])
+    kept = numba_cpu.visible_samples(given, march._replace(least_weight=least), grid, cell_depths[1])
     # A cell in which all samples are faint is known to be empty, not left open as if it had no samples.
-    assert torch.equal(visits[0], visits[1])
+    assert torch.equal(cell_depths[0], cell_depths[1])
     lengths = (every.ends - every.starts).double()
     weights, _ = reference.interval_weights(every.density.double(), lengths, every.offsets)
     before = reference.optical_depth_before(every.density.double(), lengths, every.offsets)

@@ -13,7 +13,8 @@ from test_stereo import LENS, NORMALS, OFFSETS, PINHOLE, TEXTURE, found, photo, 
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.captures.scene import Scene, load
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
 from nerfcli.matching import occluders
 from nerfcli.matching.occluders import occluder_masks
@@ -215,7 +216,7 @@ def test_the_walls_are_as_far_away_as_their_planes():
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Scene:
+def capture(tmp_path: Path) -> Capture:
     """Six photos of the walls with the disc in front of the second one, and an odd one out that is held out."""
     folder = tmp_path / "walls"
     photos = [photo(x, camera=Camera.pinhole(400, 300, 360.0), contrast=1.5) for x in np.linspace(-0.5, 0.5, 7)]
@@ -230,7 +231,7 @@ def capture(tmp_path: Path) -> Scene:
     split = {"train_filenames": named[:6], "test_filenames": named[6:]}
     lens = {"w": 400, "h": 300, "fl_x": 360.0, "fl_y": 360.0, "cx": 200.0, "cy": 150.0}
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames, **split}))
-    return load(folder)
+    return load_scene(folder)
 
 
 @pytest.mark.parametrize("model", ["default", "auto"])

@@ -1,4 +1,4 @@
-"""nerfcli.render.occupancy: which cells are taken for empty, against a field whose density is known."""
+"""nerfcli.training.open_cells: which cells are taken for empty, against a field whose density is known."""
 
 import math
 from dataclasses import dataclass
@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfcli.field.contraction import training_points
 from nerfcli.kernels import backend_for
-from nerfcli.render.occupancy import DECAY, Occupancy
+from nerfcli.training.open_cells import DECAY, Occupancy, training_points
 
 SIDE = 4
 EVERYTHING = slice(None)

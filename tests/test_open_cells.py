@@ -51,8 +51,8 @@ def refresh(cells: OpenCells, step: int) -> None:
 
 
 def visit(cells: OpenCells, where: tuple[int, int, int], depth: float) -> None:
-    assert cells.visits is not None
-    cells.visits[where] = max(float(cells.visits[where]), depth)
+    assert cells.cell_depths is not None
+    cells.cell_depths[where] = max(float(cells.cell_depths[where]), depth)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
@@ -96,15 +96,15 @@ def test_rendering_notes_the_optical_depths_of_its_samples(wanted):
     origins, directions = torch.zeros(9, 3), torch.nn.functional.normalize(torch.randn(9, 3), dim=-1)
     edges = torch.linspace(0.0, 2.0, 22)  # steps of 2/21
     march = March(edges, torch.ones(4, 4, 4, dtype=torch.bool), "l2", 5.0)
-    visits, shown = torch.full((6, 6, 6), -1.0), dict[str, Tensor]()
+    cell_depths, shown = torch.full((6, 6, 6), -1.0), dict[str, Tensor]()
     field.backend.render_rays(
-        Rays(origins, directions, torch.zeros(9)), march, field.medium(), background=torch.zeros(9, 3), visits=visits,
-        trace=lambda name, values, rays: shown.update({name: values.detach()}),
+        Rays(origins, directions, torch.zeros(9)), march, field.medium(), background=torch.zeros(9, 3),
+        cell_depths=cell_depths, trace=lambda name, values, rays: shown.update({name: values.detach()}),
     )  # fmt: skip
     expected = torch.full((6, 6, 6), -1.0)
     reference.keep_largest(expected, shown["coordinates of samples"], shown["density of samples"] * 2 / 21)
-    torch.testing.assert_close(visits, expected, rtol=1e-4, atol=1e-6)
-    assert 0.1 < (visits < 0).float().mean() < 0.95
+    torch.testing.assert_close(cell_depths, expected, rtol=1e-4, atol=1e-6)
+    assert 0.1 < (cell_depths < 0).float().mean() < 0.95
 
 
 def test_cells_close_where_samples_found_nothing_and_only_there():
@@ -198,7 +198,7 @@ def test_a_field_without_detail_has_the_coarse_cells_alone():
     cells = cells_of(Slab(detailed=False))
     refresh(cells, REFRESH_EVERY)
     assert cells.visited is cells.coarse
-    assert cells.visits is None
+    assert cells.cell_depths is None
     assert cells.at(1) is cells.coarse
     assert set(cells.state()) == {"optical_depth", "occupied"}
 

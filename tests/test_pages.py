@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.errors import UserError
-from nerfcli.pages import embedded_pictures, page, tables
+from nerfcli.pages import page
 
 EVIL = "</script><script>alert(1)</script><b>\u2028&\"'"
 
@@ -38,7 +38,7 @@ def test_a_page_allows_no_loading_and_no_script_that_it_has_not():
 def test_titles_and_cells_are_text():
     assert "<b>" not in simple()
     assert html.escape(EVIL) in simple()
-    made = tables.table(("a", EVIL), ((EVIL, "1"),), numbers={1})
+    made = page.table(("a", EVIL), ((EVIL, "1"),), numbers={1})
     assert "<b>" not in made
     assert made.count(html.escape(EVIL)) == 2
     assert "<td class=number>1</td>" in made
@@ -69,14 +69,12 @@ def test_pictures_read_back_by_another_reader():
     """PNG exactly, channels in order; JPEG within what its quality allows, and no larger than asked for."""
     ramp = np.linspace(0, 255, 64).astype(np.uint8)
     picture = np.stack([np.tile(ramp, (48, 1)), np.full((48, 64), 30, np.uint8), np.zeros((48, 64), np.uint8)], axis=-1)
-    uri = embedded_pictures.data_uri(embedded_pictures.png_bytes(picture), "png")
+    uri = page.data_uri(page.png_bytes(picture), "png")
     data = base64.b64decode(uri.removeprefix("data:image/png;base64,"))
     again = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert again is not None
     np.testing.assert_array_equal(again[..., ::-1], picture)
-    small = cv2.imdecode(
-        np.frombuffer(embedded_pictures.jpeg_bytes(picture, longest_px=32), np.uint8), cv2.IMREAD_COLOR
-    )
+    small = cv2.imdecode(np.frombuffer(page.jpeg_bytes(picture, longest_px=32), np.uint8), cv2.IMREAD_COLOR)
     assert small is not None
     assert small.shape == (24, 32, 3)
     wanted = picture.reshape(24, 2, 32, 2, 3).mean((1, 3))

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from nerfcli.cameras.alignment import align
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.captures import scene as scenes
+from nerfcli.captures.loading import load_scene
 from nerfcli.captures.model_tracks import tracks_of_model
 from nerfcli.doctor.compared_pairs import compare
 from nerfcli.doctor.photo_facts import Source, read_all
@@ -295,7 +295,7 @@ def test_other_photos_stay_as_they_are_among_faces():
 
 
 def test_stereo_measures_distances_all_around(scene):
-    found = scenes.load(scene)
+    found = load_scene(scene)
     photos = load_photos(found.frames[:4], factor=1, threads=2)
     tracks = tracks_of_model(found, photos)
     depths = dense_depths(photos, tracks, longer_side_px=220, threads=2)
@@ -316,7 +316,7 @@ def test_stereo_measures_distances_all_around(scene):
 
 
 def test_poses_of_panoramas_are_the_true_ones(scene):
-    found = scenes.load(scene)
+    found = load_scene(scene)
     numbers = [int(Path(frame.name).stem) for frame in found.frames]
     assert {frame.camera for frame in found.frames} == {Camera(PANORAMA, 768, 384, (768.0, 384.0))}
     poses = np.array([frame.world_from_cam for frame in found.frames])
@@ -360,7 +360,7 @@ def test_panoramas_and_other_photos_share_a_scene(photos, tmp_path):
         Image.fromarray(front[len(front) // 8 : -len(front) // 8]).save(folder / f"photo {number}.png")
     report = poses_in_this_process(folder, tmp_path / "scene", replace(FEW, max_features=2000))
     assert (report.registered, report.total) == (12, 12)
-    frames = scenes.load(tmp_path / "scene").frames
+    frames = load_scene(tmp_path / "scene").frames
     truth = np.array([beside[int(f.name[6])] if f.name[0] == "p" else CENTRES[int(f.name[0])] for f in frames])
     centres = np.array([frame.centre for frame in frames])
     errors = np.linalg.norm(align(centres, truth).apply(centres) - truth, axis=1)

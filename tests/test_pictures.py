@@ -14,7 +14,7 @@ from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.captures.formats.run_cameras import read_cameras
 from nerfcli.field.hash_field import HashField
 from nerfcli.render import pictures
-from nerfcli.render.accuracy import IN_WORDS, measure_error, refined, truncation_bounds
+from nerfcli.render.accuracy import IN_WORDS, measure_error, refine_cuts, truncation_bounds
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model, load_model
 from nerfcli.render.pictures import RenderedPicture, render_picture, straight_rgba
@@ -125,8 +125,8 @@ def test_steps_twice_as_long_are_the_steps_of_such_a_training(trained):
 
 def test_refined_cuts_keep_the_cuts():
     cuts = torch.tensor([0.0, 1.0, 4.0, 5.0], dtype=torch.float64)
-    assert refined(cuts, 1).tolist() == cuts.tolist()
-    assert refined(cuts, 2).tolist() == [0.0, 0.5, 1.0, 2.5, 4.0, 4.5, 5.0]
+    assert refine_cuts(cuts, 1).tolist() == cuts.tolist()
+    assert refine_cuts(cuts, 2).tolist() == [0.0, 0.5, 1.0, 2.5, 4.0, 4.5, 5.0]
 
 
 def test_quadrature_error_shrinks_with_the_step_and_repeats():

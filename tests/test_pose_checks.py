@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from in_this_process import worker_in_this_process
 from synthetic_captures import LONG, WIDE, Noise
 
-from nerfcli.captures import scene as scenes
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.engine import worker
@@ -292,7 +292,7 @@ def test_checks_that_end_the_process_or_never_end_are_left_out(
     assert stages.count("check 0") == 3
     assert not any(stage.startswith(("extract", "match", "map")) for stage in stages)
     assert notes.count("the photos are already mapped: running the checks") == 3
-    assert scenes.load(scene).frames
+    assert load_scene(scene).frames
 
 
 @pytest.mark.usefixtures("same_process")
@@ -313,7 +313,7 @@ def test_a_refused_model_stays_and_can_be_accepted(
     assert kept.num_reg_images() == len(NAMES)
     assert (scene / "refused-model" / "points.ply").read_bytes().startswith(b"ply")
     with pytest.raises(UserError, match="scene"):
-        scenes.load(scene)
+        load_scene(scene)
     stages: list[str] = []
     report, notes = estimate(
         photos,
@@ -325,7 +325,7 @@ def test_a_refused_model_stays_and_can_be_accepted(
     assert not report.verdict["accepted"]
     assert any("because of --accept-refused" in note for note in notes)
     assert not (scene / "refused-model").exists()
-    assert len(scenes.load(scene).frames) == len(NAMES)
+    assert len(load_scene(scene).frames) == len(NAMES)
 
 
 @pytest.mark.usefixtures("same_process")

@@ -22,9 +22,8 @@ from test_pose_stages import model, rows
 from test_poses import similarity
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture
-from nerfcli.captures.calibration import Calibration, Picture, calibrated
-from nerfcli.captures.camera_files import read_calibration
+from nerfcli.captures.calibration import Calibration, Picture, calibrated, read_calibration
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import format_named
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses.input.settings import PoseSettings

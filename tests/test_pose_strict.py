@@ -10,7 +10,7 @@ from corner import CENTRES, NAMES, cam_from_world, write_capture
 from in_this_process import poses_in_this_process
 from test_poses import FAST, similarity
 
-from nerfcli.captures import scene
+from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.ledger import leak_ledger
 from nerfcli.poses.engine.strict import fingerprint, held_out_last, training_part
 from nerfcli.poses.input.job import CameraGroup, Job
@@ -57,10 +57,10 @@ def test_the_scene_records_what_was_held_out_and_how(solved):
     images = {image.name: image for image in report.images}
     assert images["wall.png"].reason == "matches too few points of the training photos (0 inliers of 0)"
     assert (report.registered, report.total) == (7, 9)
-    loaded = scene.load(scene_dir)
+    loaded = load_scene(scene_dir)
     assert loaded.test_names == {NAMES[HELD_OUT]}
-    assert (loaded.history["registered"], loaded.history["total"]) == (7, 9)
-    ledger = {entry.stage: entry.saw_held_out for entry in leak_ledger(RunConfig(history=loaded.history))}
+    assert (loaded.provenance["registered"], loaded.provenance["total"]) == (7, 9)
+    ledger = {entry.stage: entry.saw_held_out for entry in leak_ledger(RunConfig(history=loaded.provenance))}
     assert (ledger["poses"], ledger["intrinsics"], ledger["points"]) == (False, False, False)
     assert is_same_scene(scene_dir, photos, settings)
     assert not is_same_scene(scene_dir, photos, replace(settings, strict=False))

@@ -14,8 +14,8 @@ from in_this_process import poses_in_this_process
 from PIL import Image
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures import scene as scenes
 from nerfcli.captures.calibration import Calibration, Picture, calibrated
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import BAD_INPUT
 from nerfcli.photos.images import list_photos
 from nerfcli.photos.masks import find_mask
@@ -79,7 +79,7 @@ def test_each_subfolder_has_the_camera_that_took_its_photos(scene: Path):
 def test_the_scene_has_the_photos_of_both_and_is_kept_the_second_time(
     rig: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    loaded = scenes.load(scene)
+    loaded = load_scene(scene)
     names = [f"{folder}/{index}.png" for folder in ("left", "right") for index in range(PHOTOS)]
     assert sorted(frame.name for frame in loaded.frames) == names
     for frame in loaded.frames:

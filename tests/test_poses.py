@@ -13,7 +13,7 @@ from corner import CENTRES, FOCAL_PX, NAMES, cam_from_world, wall, write_capture
 from in_this_process import worker_in_this_process
 from PIL import Image
 
-from nerfcli.captures import scene
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import OUT_OF_MEMORY, TOO_FEW_PHOTOS, UserError
 from nerfcli.photos.images import read_image
 from nerfcli.poses.engine import supervise
@@ -158,7 +158,7 @@ def test_progress_goes_through_all_stages(solved: Solved):
 
 
 def test_the_scene_can_be_loaded(solved: Solved):
-    loaded = scene.load(solved.scene)
+    loaded = load_scene(solved.scene)
     assert [frame.name for frame in loaded.frames] == sorted(NAMES)
     assert loaded.unit == "arbitrary"
 

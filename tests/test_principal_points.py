@@ -11,7 +11,7 @@ from corner import NAMES, write_capture
 from in_this_process import poses_in_this_process
 from synthetic_captures import Lens
 
-from nerfcli.captures import scene
+from nerfcli.captures.loading import load_scene
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.lens_observability import uncertainty
@@ -272,4 +272,4 @@ def test_a_scene_of_stabilised_photos_has_their_principal_points(stabilised):
     seen = np.asarray(cameras[0].img_from_cam(np.array([[0.5, 0.0, 1.0]])), dtype=np.float64).ravel()
     straight = cameras[0].principal_point_x + 0.5 * cameras[0].mean_focal_length()
     assert abs(seen[0] - straight) < 5.0
-    assert len({frame.camera for frame in scene.load(scene_dir).frames}) == len(NAMES)
+    assert len({frame.camera for frame in load_scene(scene_dir).frames}) == len(NAMES)

@@ -11,13 +11,13 @@ import torch
 from PIL import Image
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.captures import scene as scenes
+from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats.colmap import write_colmap_binary
 from nerfcli.captures.formats.scene_folder import MODEL_FOLDER, save
+from nerfcli.captures.loading import load_scene
 from nerfcli.captures.model_tracks import tracks_of_model
-from nerfcli.captures.scene import Scene
 from nerfcli.errors import UserError
 from nerfcli.kernels import reference
 from nerfcli.matching.camera_check import CameraCheck
@@ -47,7 +47,7 @@ def camera_at(x: float) -> np.ndarray:
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Scene:
+def capture(tmp_path: Path) -> Capture:
     """Two photos, a model with points, and masks that are black on their left halves."""
     levels = np.random.default_rng(0).integers(0, 256, (2, 8, 12, 3), dtype=np.uint8)
     frames, rows = [], []
@@ -70,15 +70,15 @@ def capture(tmp_path: Path) -> Scene:
     write_colmap_binary(model, tmp_path / MODEL_FOLDER)
     split = {"0.png": "train", "1.png": "train"}
     save(tmp_path, image_folder=tmp_path / "images", provenance={}, masks=tmp_path / "masks", split=split)
-    return scenes.load(tmp_path)
+    return load_scene(tmp_path)
 
 
-def pool_of(scene: Scene, masks: str = "ignore", *, similarity: Similarity) -> PixelPool:
+def pool_of(scene: Capture, masks: str = "ignore", *, similarity: Similarity) -> PixelPool:
     photos = load_photos(scene.train_frames, factor=1, threads=1, masks=masks)
     return PixelPool(photos, similarity, torch.device("cpu"))
 
 
-def tracks_in(scene: Scene) -> Tracks:
+def tracks_in(scene: Capture) -> Tracks:
     return tracks_of_model(scene, load_photos(scene.train_frames, factor=1, threads=1))
 
 
@@ -139,9 +139,9 @@ def test_light_off_its_target_counts_by_how_far_it_is():
     distances = torch.tensor([2.0, 1.0])
     # First: 0.5 at the point, 0.3 half of the way to "elsewhere", 0.2 passes; second: all is elsewhere.
     expected = [0.3 * 0.5 + 0.2, 0.7 + 0.3]
-    off = reference.off_target(weights, left, middles, offsets=offsets, distances=distances)
+    off = reference.depth_loss(weights, left, middles, offsets=offsets, distances=distances)
     assert off.tolist() == pytest.approx(expected)
-    at_targets = reference.off_target(
+    at_targets = reference.depth_loss(
         torch.tensor([0.0, 1.0, 0.0, 1.0]), torch.zeros(3), torch.tensor([5.0, 2.0, 3.0, 1.0]),
         offsets=offsets, distances=distances,
     )  # fmt: skip
@@ -157,7 +157,7 @@ def test_the_gradient_of_light_off_its_target_is_right():
 
     def off(density: torch.Tensor) -> torch.Tensor:
         weights, transmittance = reference.interval_weights(density, lengths, offsets)
-        return reference.off_target(weights, transmittance, middles, offsets=offsets, distances=distances)
+        return reference.depth_loss(weights, transmittance, middles, offsets=offsets, distances=distances)
 
     assert torch.autograd.gradcheck(off, (density,))
 
@@ -176,21 +176,21 @@ def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
     assert len(PointRays([of_points], pool).added_to(pool.draw(3, generator), generator).distances) == 1
 
 
-def likelihood(off_target: torch.Tensor) -> torch.Tensor:
-    return distance_losses(off_target, fraction=0.0)
+def likelihood(depth_loss: torch.Tensor) -> torch.Tensor:
+    return distance_losses(depth_loss, fraction=0.0)
 
 
 def test_the_loss_of_distances_is_a_log_likelihood_with_a_bounded_slope():
-    off_target = torch.tensor([0.0, 1e-9, 0.3, 0.999, 1.0], dtype=torch.float64, requires_grad=True)
-    losses = distance_losses(off_target, fraction=0.1)
-    for off, loss in zip(off_target.tolist(), losses.tolist(), strict=True):
+    depth_loss = torch.tensor([0.0, 1e-9, 0.3, 0.999, 1.0], dtype=torch.float64, requires_grad=True)
+    losses = distance_losses(depth_loss, fraction=0.1)
+    for off, loss in zip(depth_loss.tolist(), losses.tolist(), strict=True):
         with mpmath.workdps(40):
             expected = mpmath.mpf("1.1") * mpmath.log(mpmath.mpf("1.1") / (mpmath.mpf("1.1") - mpmath.mpf(off)))
         assert loss == pytest.approx(float(expected), rel=1e-12)
     losses.sum().backward()
-    assert off_target.grad is not None
-    assert off_target.grad[[0, -1]].tolist() == pytest.approx([1.0, 11.0])
-    assert torch.autograd.gradcheck(likelihood, (off_target[1:4].detach().requires_grad_(),))
+    assert depth_loss.grad is not None
+    assert depth_loss.grad[[0, -1]].tolist() == pytest.approx([1.0, 11.0])
+    assert torch.autograd.gradcheck(likelihood, (depth_loss[1:4].detach().requires_grad_(),))
 
 
 def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
@@ -200,7 +200,7 @@ def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
         offsets, lengths = torch.tensor([0, 3]), torch.full((3,), 0.1, dtype=torch.float64)
         weights, transmittance = reference.interval_weights(log_density.exp(), lengths, offsets)
         middles, distances = torch.tensor([0.5, 1.0, 1.5]).double(), torch.tensor([1.0]).double()
-        off = reference.off_target(weights, transmittance, middles, offsets=offsets, distances=distances)
+        off = reference.depth_loss(weights, transmittance, middles, offsets=offsets, distances=distances)
         loss(off).sum().backward()
         assert log_density.grad is not None
         gradients.append(log_density.grad[1].item())
@@ -208,17 +208,17 @@ def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
 
 
 def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(capture, tmp_path, monkeypatch):
-    off_target = torch.tensor([0.25, 1.0])
-    assert torch.equal(distance_losses(off_target, fraction=0.29), likelihood(off_target))
-    assert torch.equal(distance_losses(off_target, fraction=0.3), off_target)
+    depth_loss = torch.tensor([0.25, 1.0])
+    assert torch.equal(distance_losses(depth_loss, fraction=0.29), likelihood(depth_loss))
+    assert torch.equal(distance_losses(depth_loss, fraction=0.3), depth_loss)
     # A training passes on its fraction of the budget.
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
     fitting, fractions = prepared.fitting(), []
 
-    def recorded(off_target: torch.Tensor, *, fraction: float) -> torch.Tensor:
+    def recorded(depth_loss: torch.Tensor, *, fraction: float) -> torch.Tensor:
         fractions.append(fraction)
-        return distance_losses(off_target, fraction=fraction)
+        return distance_losses(depth_loss, fraction=fraction)
 
     monkeypatch.setattr("nerfcli.training.fitting.distance_losses", recorded)
     for fraction in (0.0, 0.29, 0.31, 0.9):
@@ -235,7 +235,7 @@ def test_points_fade_out():
 
 @pytest.mark.parametrize(("parallax", "weight"), [(1.0, 0.5), (0.5, 0.125)])
 def test_points_of_a_narrow_baseline_fade_with_the_steps_of_a_training(
-    parallax: float, weight: float, capture: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    parallax: float, weight: float, capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Half of the budget and four times 800 steps: a loss of 4 for each distance adds 4 times its weight."""
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
@@ -315,7 +315,7 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
     learns = cameras in ("focal", "all")
     assert prepared.log_focal == (check.log_focal if learns else 0.0)
     assert any("suggest a focal length 1.88 %" in line for line in reported) == learns
-    refined = prepared.fitting().parts.cameras
+    refined = prepared.fitting().appearance.cameras
     if learns:
         assert refined is not None
         assert refined.lenses is not None

@@ -61,9 +61,9 @@ def test_steps_begin_eight_times_as_long_as_those_of_the_capture_and_end_with_a_
 def test_pictures_of_detailed_fields_have_at_most_half_of_the_steps_of_the_capture():
     for settings, part in ((grid(4096), 1 / 4), (grid(1024), 1 / 2), (grid(800), 1 / 2), (grid(4096, log2_rows=16), 1)):
         steps = RaySteps(BALL, settings, parallax=1.0, device=torch.device("cpu"))
-        assert steps.of_pictures(1.0, DETAILED_STEPS) == BALL.stretched(part)
+        assert steps.render_steps(1.0, DETAILED_STEPS) == BALL.stretched(part)
         # A training that ends before it gets to the shortest steps has not learned what they would show.
-        assert steps.of_pictures(1.0, DETAILED_STEPS // 2) == BALL.stretched(max(part, 1 / 2))
+        assert steps.render_steps(1.0, DETAILED_STEPS // 2) == BALL.stretched(max(part, 1 / 2))
 
 
 def test_a_training_sees_the_parallax_of_its_capture(spheres, tmp_path):

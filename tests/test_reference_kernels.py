@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from oracles import march_through_slabs, trilinear_hash
 
 from nerfcli import kernels
-from nerfcli.field.contraction import training_points, uncontract
 from nerfcli.kernels import March, Rays, reference
 from nerfcli.kernels.contraction import cube_widths
+from nerfcli.training.open_cells import training_points, uncontract
 
 
 def random_rays(seed, counts, dtype=torch.float64):

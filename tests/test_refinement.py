@@ -23,22 +23,28 @@ from nerfcli.cameras.rigid import (
     transform_from_twist,
     vector_from_rotation,
 )
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import find_run, parse_run, read_cameras, read_given_cameras
-from nerfcli.captures.scene import Scene
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.photos.loading import load_photos
+from nerfcli.training.camera_optimiser import (
+    BETAS,
+    EPS,
+    NewtonSteps,
+    WhitenedAdam,
+    mean_similarity,
+    whitening,
+    without_mean,
+)
 from nerfcli.training.extent import Extent
 from nerfcli.training.fitting import Fitting
-from nerfcli.training.gauge import mean_similarity, without_mean
 from nerfcli.training.loop import train
-from nerfcli.training.newton import NewtonSteps
 from nerfcli.training.pool import PixelPool
 from nerfcli.training.refinement import LAST_FRACTION, LENS_RATE, PoseRefinement, Refinement, rate_at
-from nerfcli.training.runs.camera_moves import camera_moves
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.files import STATE
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.training.whitening import BETAS, EPS, WhitenedAdam, whitening
+from nerfcli.workflows.describe_run import camera_moves
 
 seeds = st.integers(0, 2**32 - 1)
 FEW = TrainSettings(
@@ -52,7 +58,7 @@ def random_poses(rng: np.random.Generator, count: int) -> np.ndarray:
     )
 
 
-def turned(scene: Scene, degrees: float) -> Scene:
+def turned(scene: Capture, degrees: float) -> Capture:
     """The scene with its training photos turned about random axes."""
     rng = np.random.default_rng(7)
 
@@ -69,20 +75,20 @@ def turned(scene: Scene, degrees: float) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def small(spheres: Scene) -> Scene:
+def small(spheres: Capture) -> Capture:
     """Four photos, the last one held out."""
     frames = spheres.frames[:4]
     return replace(spheres, frames=frames, test_names=frozenset({frames[3].name}))
 
 
-def pool_of(scene: Scene) -> PixelPool:
+def pool_of(scene: Capture) -> PixelPool:
     photos = load_photos(scene.train_frames, factor=1, threads=1)
     return PixelPool(photos, Similarity.identity(), torch.device("cpu"))
 
 
 def linear_loss(pool: PixelPool, refinement: Refinement, numbers: torch.Tensor, slopes: torch.Tensor) -> float:
     """Return a loss that is linear in the rays, so that `slopes` are exactly its gradients by them."""
-    drawn = refinement.refined(pool.rays_of(numbers))
+    drawn = refinement.refine_cameras(pool.rays_of(numbers))
     return float((torch.stack([drawn.origins, drawn.directions]).double() * slopes).sum())
 
 
@@ -97,7 +103,7 @@ def test_pose_gradient_is_the_difference_of_a_loss(small):
     twists = 0.1 * torch.randn(3, 6, generator=generator, dtype=torch.float64)
     start = torch.from_numpy(transform_from_twist(twists.numpy()))
     poses.motions.copy_(start)
-    drawn = refinement.refined(pool.rays_of(numbers))
+    drawn = refinement.refine_cameras(pool.rays_of(numbers))
     of_rays = poses.gradients(
         drawn.directions.double(), pool.photo_of(numbers), by_origin=slopes[0], by_direction=slopes[1]
     )
@@ -115,7 +121,7 @@ def test_pose_gradient_is_the_difference_of_a_loss(small):
             assert found[photo, axis].item() == pytest.approx(wanted, abs=1e-4 * found.abs().max().item() + 1e-3)
 
 
-def with_lens(small: Scene, shifts: tuple[float, ...]) -> Scene:
+def with_lens(small: Capture, shifts: tuple[float, ...]) -> Capture:
     """Return the scene with photos of one lens, whose principal points a stabiliser has moved by `shifts`."""
     lens = Camera("RADIAL", 96, 72, (100.0, 48.0, 36.0, 0.05, -0.02))
     cameras = [lens.with_principal_point(48.0 + shift, 36.0 - shift) for shift in shifts]
@@ -438,7 +444,7 @@ def test_a_step_of_all_hands_each_part_what_it_needs(small, monkeypatch):
         lambda slopes, losses, photos, fraction, *, rate: given.update(slopes=slopes, rate=rate),
     )
     numbers = torch.arange(50)
-    drawn = refinement.refined(pool.rays_of(numbers))
+    drawn = refinement.refine_cameras(pool.rays_of(numbers))
     drawn = drawn._replace(origins=drawn.origins.requires_grad_(), directions=drawn.directions.requires_grad_())
     losses = (drawn.origins + drawn.directions).square().sum(-1)
     losses.mean().backward()
@@ -462,7 +468,7 @@ def test_rates_rise_from_nothing_and_end_at_nothing():
 def test_cameras_that_have_not_moved_give_the_same_rays(small):
     pool = pool_of(small)
     drawn = pool.draw(100, torch.Generator().manual_seed(0))
-    refined = Refinement("poses", pool).refined(drawn)
+    refined = Refinement("poses", pool).refine_cameras(drawn)
     assert torch.equal(refined.origins, drawn.origins)
     torch.testing.assert_close(refined.directions, drawn.directions, atol=2e-7, rtol=0)
 
@@ -487,7 +493,7 @@ def test_moves_are_reported_in_degrees_and_percent(small):
 def test_lenses_that_have_not_changed_give_the_same_rays(small):
     pool = pool_of(small)
     drawn = pool.draw(100, torch.Generator().manual_seed(0))
-    refined = Refinement("focal", pool).refined(drawn)
+    refined = Refinement("focal", pool).refine_cameras(drawn)
     torch.testing.assert_close(refined.directions, drawn.directions, atol=2e-7, rtol=0)
 
 
@@ -518,9 +524,9 @@ def test_displaced_cameras_return_to_their_places_in_a_trained_field(spheres, sp
         components=Components(cameras="poses"), learning_rate=1e-30, final_learning_rate=1e-30,
     )  # fmt: skip
     fitting = Fitting(pool, extent.marching, contraction=extent.contraction, settings=settings)
-    cameras = fitting.parts.cameras
+    cameras = fitting.appearance.cameras
     assert cameras is not None
-    tensors |= {f"parts.{name}": value.clone() for name, value in fitting.parts.state_dict().items()}
+    tensors |= {f"parts.{name}": value.clone() for name, value in fitting.appearance.state_dict().items()}
     fitting.restore(tensors, description)
     truth = extent.training_from_scene.apply_pose(np.array([f.world_from_cam for f in spheres.train_frames]))
     points = np.random.default_rng(0).normal(size=(50, 3)) * 0.2
@@ -542,7 +548,7 @@ def test_displaced_cameras_return_to_their_places_in_a_trained_field(spheres, sp
     assert error_px() < before / 2
 
 
-def fit(scene: Scene, run: Path, settings: TrainSettings, *, resume: bool = False) -> None:
+def fit(scene: Capture, run: Path, settings: TrainSettings, *, resume: bool = False) -> None:
     train(scene, run, settings, resume=resume, notify=lambda text: None, on_progress=lambda progress: None)
 
 

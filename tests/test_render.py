@@ -146,7 +146,7 @@ def test_z_of_a_plane_is_constant_and_its_ray_depth_is_not():
     np.testing.assert_allclose(ray[pixels] * cosines()[pixels], middle, rtol=0.01)
 
 
-def test_depth_is_undefined_where_too_little_light_ends():
+def test_depth_is_undefined_where_too_little_ray_termination():
     # Opacity of the slab is 1 - exp(-0.5 / cos) = 0.39 to 0.44: below one half, above one tenth.
     for convention, floor in (("conditional", 0.5), ("max-weight", 0.5), ("median", 0.0)):
         depth = picture_of(fog(SLAB, SIMILARITY), towards_slab(), DepthRequest(convention, "z", floor)).depth

@@ -10,7 +10,7 @@ from commands import error_of, nerfcli
 from PIL import Image
 
 from nerfcli.errors import BAD_INPUT
-from nerfcli.render.files.float_tiff import read_tiff
+from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.workflows.views import file_fps
 
 USAGE = 2

@@ -33,9 +33,8 @@ from nerfcli.photos.colours import levels_of
 from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.outputs import depth_meta
-from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.components import Components, Decision, Selection
 from nerfcli.training.runs.config import RunConfig
-from nerfcli.training.runs.decisions import Decision, Selection
 from nerfcli.training.runs.log import LogEntry
 from nerfcli.training.runs.settings import TrainSettings
 

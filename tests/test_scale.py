@@ -19,15 +19,23 @@ from scipy.stats import norm
 from nerfcli.cameras import rigid
 from nerfcli.cameras.alignment import align, align_robustly
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import write_colmap_binary
-from nerfcli.captures.scale.boards import CharucoBoard, refined_corners, scale_from_charuco, scale_from_markers
-from nerfcli.captures.scale.corners import Side, nearest_in_pixels, scale_from_corners
+from nerfcli.captures.loading import load_scene
+from nerfcli.captures.scale.boards import (
+    CharucoBoard,
+    Side,
+    nearest_in_pixels,
+    refine_corners,
+    scale_from_charuco,
+    scale_from_corners,
+    scale_from_markers,
+)
 from nerfcli.captures.scale.distances import KnownDistance, known_distance, scale_from_distances
 from nerfcli.captures.scale.estimate import ScaleEstimate
 from nerfcli.captures.scale.gps import gps_positions, scale_from_gps
-from nerfcli.captures.scene import load
 from nerfcli.captures.world import transformed
 from nerfcli.errors import UserError
 from nerfcli.photos.geodesy import Position, east_north_up, ecef
@@ -465,14 +473,14 @@ def test_corners_of_a_blurred_square_are_where_its_edges_meet(seed, blur, turn):
     inside = (norm.cdf((half - across) / blur) - norm.cdf((-half - across) / blur)).prod(axis=-1)
     grey = np.rint(230 - 200 * inside).astype(np.uint8)
     noisy = np.rint(230 - 200 * inside + 2 * rng.normal(size=inside.shape)).clip(0, 255).astype(np.uint8)
-    found = refined_corners(noisy, truth + rng.uniform(-1, 1, (4, 2)))
+    found = refine_corners(noisy, truth + rng.uniform(-1, 1, (4, 2)))
     assert found is not None
     np.testing.assert_allclose(found, truth, rtol=0, atol=0.1)
-    clean = refined_corners(grey, truth + rng.uniform(-1, 1, (4, 2)))
+    clean = refine_corners(grey, truth + rng.uniform(-1, 1, (4, 2)))
     assert clean is not None
     np.testing.assert_allclose(clean, truth, rtol=0, atol=0.05)
-    assert refined_corners(np.full_like(grey, 128), truth) is None
-    assert refined_corners(grey, np.full((4, 2), 60.0)) is None
+    assert refine_corners(np.full_like(grey, 128), truth) is None
+    assert refine_corners(grey, np.full((4, 2), 60.0)) is None
 
 
 def test_markers_that_give_no_scale_are_reported(tmp_path):
@@ -579,7 +587,7 @@ def test_positions_in_exif_give_the_scale(tmp_path):
     done = nerfcli("convert", tmp_path / "in", tmp_path / "out", "--to", "nerfcli", "--scale", "gps", "--json")
     assert done.exit_code == 0, done.stderr
     assert json.loads(done.stdout)["scale"]["metres_per_unit"] == pytest.approx(10.0, rel=2e-3)
-    written = load(tmp_path / "out")
+    written = load_scene(tmp_path / "out")
     assert written.unit == "metre"
     assert (written.unit_source or "").startswith("GPS of 8 photos (EXIF)")
     assert np.linalg.norm(written.frames[7].centre - written.frames[0].centre) == pytest.approx(22 * 2**0.5, rel=2e-3)

@@ -12,11 +12,11 @@ from PIL import Image
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures import scene as scenes
 from nerfcli.captures.formats.colmap import write_colmap_binary
 from nerfcli.captures.formats.scene_folder import save
 from nerfcli.captures.formats.transforms import parse_transforms
 from nerfcli.captures.holdout import default_split
+from nerfcli.captures.loading import fingerprint, load_scene
 from nerfcli.errors import BAD_INPUT, UserError
 
 NAMES = [f"photo {index:02d}.jpg" for index in range(10)]
@@ -82,13 +82,13 @@ def test_splits_that_nerfstudio_lists_are_kept(tmp_path):
     path = tmp_path / "transforms.json"
     content = json.loads(path.read_text())
     path.write_text(json.dumps({**content, "train_filenames": ["a.png", "b.png"], "val_filenames": ["c.png"]}))
-    assert scenes.load(tmp_path).test_names == {"c.png"}  # held out for want of a test split; d is not used
-    assert [frame.name for frame in scenes.load(tmp_path).frames] == ["a.png", "b.png", "c.png"]
+    assert load_scene(tmp_path).test_names == {"c.png"}  # held out for want of a test split; d is not used
+    assert [frame.name for frame in load_scene(tmp_path).frames] == ["a.png", "b.png", "c.png"]
     path.write_text(
         json.dumps({**content, "train_filenames": ["a.png"], "val_filenames": ["c.png"], "test_filenames": ["d.png"]})
     )
-    assert [frame.name for frame in scenes.load(tmp_path).frames] == ["a.png", "d.png"]
-    assert scenes.load(tmp_path).test_names == {"d.png"}
+    assert [frame.name for frame in load_scene(tmp_path).frames] == ["a.png", "d.png"]
+    assert load_scene(tmp_path).test_names == {"d.png"}
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
@@ -97,15 +97,15 @@ def test_colmap_project_wherever_its_model_stands(tmp_path, model, place):
     with pytest.raises(
         UserError, match=r"colmap \(a COLMAP model\), none of its 10 photos is on disk, such as photo 00"
     ):
-        scenes.load(tmp_path)
+        load_scene(tmp_path)
     for name in NAMES[1:]:
         write_image(tmp_path / "images" / name)
-    scene = scenes.load(tmp_path)
+    scene = load_scene(tmp_path)
     assert scene.kind == "colmap"
     assert scene.missing == (NAMES[0],)
     assert scene.points.shape == (30, 3)
     assert scene.test_names == {NAMES[1], NAMES[9]}
-    assert scenes.load(tmp_path / place).frames[0].image == scene.frames[0].image or place != "."
+    assert load_scene(tmp_path / place).frames[0].image == scene.frames[0].image or place != "."
 
 
 def test_a_converted_model_whose_names_begin_with_the_folder_of_the_photos(tmp_path):
@@ -113,7 +113,7 @@ def test_a_converted_model_whose_names_begin_with_the_folder_of_the_photos(tmp_p
         write_image(tmp_path / "images" / name)
     write_transforms(tmp_path, [f"images/{name}" for name in NAMES])
     write_colmap_binary(parse_transforms(tmp_path / "transforms.json"), tmp_path / "sparse/0")
-    scene = scenes.load(tmp_path)
+    scene = load_scene(tmp_path)
     assert (scene.kind, scene.missing) == ("colmap", ())
     assert scene.frames[0].image == tmp_path / "images" / NAMES[0]
 
@@ -123,11 +123,11 @@ def test_a_colmap_model_of_photos_stored_lying_is_turned_upright(tmp_path, model
     shutil.copytree(model, tmp_path / "sparse/0")
     for name in NAMES:
         write_image(tmp_path / "images" / name, orientation=6 if name == NAMES[0] else 1)
-    turned, plain = scenes.load(tmp_path).frames[:2]
+    turned, plain = load_scene(tmp_path).frames[:2]
     assert (turned.camera.width, turned.camera.height) == (48, 64)
     assert (plain.camera.width, plain.camera.height) == (64, 48)
     write_image(tmp_path / "images" / NAMES[0])
-    stored = scenes.load(tmp_path).frames[0]
+    stored = load_scene(tmp_path).frames[0]
     # The stored picture's right edge is the upright one's bottom edge.
     right, _ = stored.camera.bearings(np.array([[64.0, 10.0]]))
     bottom, _ = turned.camera.bearings(np.array([[48.0 - 10.0, 64.0]]))
@@ -140,27 +140,27 @@ def test_own_scene_is_read_back(own, tmp_path):
     assert content["image_folder"] == "../photos"
     assert content["split"] == {"test": [NAMES[0], NAMES[8]]}
     assert content["provenance"] == {"command": "poses"}
-    scene = scenes.load(own)
+    scene = load_scene(own)
     assert (scene.kind, scene.unit, scene.missing) == ("nerfcli", "arbitrary", ())
     assert scene.frames[3].image == tmp_path / "photos" / NAMES[3]
     assert scene.test_names == {NAMES[0], NAMES[8]}
     np.testing.assert_array_equal(scene.points.min(axis=0), content["bounds"]["points_min"])
-    assert scenes.load(own / "scene.json").test_names == scene.test_names
+    assert load_scene(own / "scene.json").test_names == scene.test_names
     # The scene and its photos can move together, and the split stays when a photo goes.
     (tmp_path / "elsewhere").mkdir()
     for folder in ("photos", "photos-scene"):
         (tmp_path / folder).rename(tmp_path / "elsewhere" / folder)
     (tmp_path / "elsewhere/photos" / NAMES[0]).unlink()
-    moved = scenes.load(tmp_path / "elsewhere/photos-scene")
+    moved = load_scene(tmp_path / "elsewhere/photos-scene")
     assert moved.missing == (NAMES[0],)
     assert moved.test_names == {NAMES[8]}
 
 
 def test_cameras_of_an_own_scene_refer_to_upright_photos(own, tmp_path):
     """`nerfcli poses` shows pycolmap upright photos: nothing is turned a second time."""
-    before = scenes.load(own).frames[0]
+    before = load_scene(own).frames[0]
     write_image(tmp_path / "photos" / NAMES[0], orientation=3)
-    after = scenes.load(own).frames[0]
+    after = load_scene(own).frames[0]
     assert after.camera == before.camera
     np.testing.assert_array_equal(after.world_from_cam, before.world_from_cam)
 
@@ -171,7 +171,7 @@ def test_masks_are_found_by_the_photos_name(own, tmp_path):
     write_image(masks / "photo 01.png")
     write_image(masks / NAMES[2])
     save(own, image_folder=tmp_path / "photos", provenance={}, masks=masks, unit="metre", unit_source="a ruler")
-    scene = scenes.load(own)
+    scene = load_scene(own)
     assert [frame.mask for frame in scene.frames[:4]] == [
         masks / f"{NAMES[0]}.png",
         masks / "photo 01.png",
@@ -197,7 +197,7 @@ def test_masks_are_found_by_the_photos_name(own, tmp_path):
 def test_malformed_scene_json_is_refused(own, changes, what):
     edit(own, **changes)
     with pytest.raises(UserError, match=what) as caught:
-        scenes.load(own)
+        load_scene(own)
     assert caught.value.exit_code == BAD_INPUT
 
 
@@ -208,27 +208,27 @@ def test_save_refuses_an_unknown_unit(own, tmp_path):
 
 def test_what_is_no_scene_says_what_was_looked_for(tmp_path):
     with pytest.raises(UserError, match=r"nowhere does not exist"):
-        scenes.load(tmp_path / "nowhere")
+        load_scene(tmp_path / "nowhere")
     with pytest.raises(UserError, match="contains no capture in a supported format") as caught:
-        scenes.load(tmp_path)
+        load_scene(tmp_path)
     assert caught.value.exit_code == BAD_INPUT
     assert caught.value.hint.startswith("looked for scene.json, sparse/0/cameras.bin or .txt, transforms.json")
     write_image(tmp_path / "images/a.JPG")
     with pytest.raises(UserError, match=r"images has 1 photo but no cameras") as caught:
-        scenes.load(tmp_path)
+        load_scene(tmp_path)
     assert caught.value.hint == f"estimate them with: nerfcli poses {tmp_path / 'images'}"
     with pytest.raises(UserError, match="contains no capture in a supported format"):
-        scenes.load(tmp_path / "images/a.JPG")
+        load_scene(tmp_path / "images/a.JPG")
 
 
 def test_the_fingerprint_depends_on_names_cameras_poses_and_split_and_nothing_else(own):
-    scene = scenes.load(own)
-    original = scenes.fingerprint(scene)
+    scene = load_scene(own)
+    original = fingerprint(scene)
     assert len(original) == 64
     first, *rest = scene.frames
 
     def with_first(**changes) -> str:
-        return scenes.fingerprint(replace(scene, frames=(replace(first, **changes), *rest)))
+        return fingerprint(replace(scene, frames=(replace(first, **changes), *rest)))
 
     nudged = first.world_from_cam.copy()
     nudged[0, 3] += 1e-6
@@ -238,8 +238,8 @@ def test_the_fingerprint_depends_on_names_cameras_poses_and_split_and_nothing_el
         with_first(camera=Camera(first.camera.model, 64, 48, (*first.camera.params[:-1], 0.0501))),
         with_first(world_from_cam=nudged),
         with_first(world_from_cam=turned),
-        scenes.fingerprint(replace(scene, test_names=frozenset([NAMES[1]]))),
-        scenes.fingerprint(replace(scene, frames=tuple(rest))),
+        fingerprint(replace(scene, test_names=frozenset([NAMES[1]]))),
+        fingerprint(replace(scene, frames=tuple(rest))),
     }
     assert original not in different
     assert len(different) == 6
@@ -250,6 +250,6 @@ def test_the_fingerprint_depends_on_names_cameras_poses_and_split_and_nothing_el
     same = {
         with_first(world_from_cam=last_bits),
         with_first(image=None),
-        scenes.fingerprint(replace(scene, frames=scene.frames[::-1], root=Path("/elsewhere"), points=np.zeros((0, 3)))),
+        fingerprint(replace(scene, frames=scene.frames[::-1], root=Path("/elsewhere"), points=np.zeros((0, 3)))),
     }
     assert same == {original}

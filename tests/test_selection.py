@@ -11,21 +11,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.matching.camera_check import CameraCheck
-from nerfcli.training.runs.components import Components
-from nerfcli.training.runs.decisions import Decision, Selection
+from nerfcli.training.runs.components import Components, Decision, Selection
 from nerfcli.training.selection.diagnostics import Diagnostics
-from nerfcli.training.selection.judgement import (
+from nerfcli.training.selection.race import (
     CLEAR_ERRORS,
+    COSTS_MORE,
     FLOOR,
     LEAST_GAIN_DB,
     MOST_LOSS_DB,
+    NO_TIME,
+    ONCE,
+    REMOVAL_FRACTION,
     SEED_DB,
+    SearchBudget,
     judge_evidence,
     judge_one,
     judge_removal,
     judge_supported,
 )
-from nerfcli.training.selection.race import COSTS_MORE, NO_TIME, ONCE, REMOVAL_FRACTION, SearchBudget
 from nerfcli.training.selection.selection import (
     MOST_START_STEPS,
     Facts,

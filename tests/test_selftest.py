@@ -50,7 +50,13 @@ def test_the_command_tries_what_the_strict_suite_tries_and_is_about_as_strict(al
     """The same kernel operations; bounds of compiled ones are at most four times as loose."""
     for name in ("float32", "bfloat16", "compiled"):
         tried = {row.operation for row in all_rows if row.precision == name}
-        cameras = {"frame_rays", "uncontract", "Occupancy.above", "visible_samples, composite, light_ends", "radiance"}
+        cameras = {
+            "frame_rays",
+            "uncontract",
+            "Occupancy.above",
+            "visible_samples, composite, ray_termination",
+            "radiance",
+        }
         assert {row.operation for row in own_rows if row.precision == name} >= tried - cameras - {"hash_encode"}
     loosest = {row.operation: row.bounds.value for row in all_rows if row.precision == "compiled"}
     for row in own_rows:
@@ -69,7 +75,7 @@ def test_every_textbook_formula_breaks_a_bound_somewhere(all_rows, own_rows):
 
 def test_every_kernel_has_rows_in_every_arithmetic_that_it_is_made_for(all_rows):
     tried = {(row.operation, row.precision) for row in all_rows}
-    depths = ("light_ends", "optical_depth_before")
+    depths = ("ray_termination", "optical_depth_before")
     for operation in ("composite", "distortion", "hash_encode", "pixel_rays", "project", "visible_samples", *depths):
         assert {(operation, name) for name in ("float64", "float32", "compiled")} <= tried
     assert {("hash_encode", "float16"), ("composite", "bfloat16")} <= tried
@@ -78,7 +84,7 @@ def test_every_kernel_has_rows_in_every_arithmetic_that_it_is_made_for(all_rows)
 
 def test_a_depth_has_a_gradient_or_says_why_not(all_rows):
     for row in all_rows:
-        if row.operation in ("light_ends", "optical_depth_before"):
+        if row.operation in ("ray_termination", "optical_depth_before"):
             assert (row.errors.gradient is None) == bool(row.no_gradient), row
 
 
@@ -111,7 +117,7 @@ def test_depth_at_midpoints_and_distortion_by_differences_are_caught(monkeypatch
         lambda weights, starts, ends, offsets: textbook.distortion(weights, starts, ends, offsets)[None],
     )
     assert failed(light.rows((SINGLE,))) == {"distortion"}
-    assert failed(depths.rows((SINGLE,))) == {"light_ends"}
+    assert failed(depths.rows((SINGLE,))) == {"ray_termination"}
 
 
 def test_the_spread_of_a_far_thin_surface_was_once_the_rounding_of_its_distance(monkeypatch):
@@ -127,12 +133,12 @@ def test_the_spread_of_a_far_thin_surface_was_once_the_rounding_of_its_distance(
 def test_the_gradients_of_depths_are_difference_quotients_in_sixty_digits():
     """Independent of the closed forms: (depth(density + h) - depth(density - h)) / 2 h, of the exact values."""
     ray = Ray("slabs", [0.7, 1e-9, 2.5, 1.25], [1.0, 1.5, 2.0, 2.25], [1.5, 1.75, 2.25, 3.25])
-    answer, h = exact_depths.light_ends(ray).depths, 2.0**-16
+    answer, h = exact_depths.ray_termination(ray).depths, 2.0**-16
     for k, sigma in enumerate(ray.density):
         if sigma < h:
             continue
         up, down = (
-            exact_depths.light_ends(replace(ray, density=[*ray.density[:k], sigma + s * h, *ray.density[k + 1 :]]))
+            exact_depths.ray_termination(replace(ray, density=[*ray.density[:k], sigma + s * h, *ray.density[k + 1 :]]))
             for s in (1, -1)
         )
         for name, found in answer.items():
@@ -147,7 +153,7 @@ def test_optical_depth_by_subtraction_and_half_precision_are_caught(monkeypatch)
         monkeypatch.setattr(
             module, "optical_depth_before", lambda *given: textbook.optical_depth_before(*given[:2], offsets=given[2])
         )
-    assert failed(depths.rows((SINGLE,))) == {"optical_depth_before", "light_ends"}
+    assert failed(depths.rows((SINGLE,))) == {"optical_depth_before", "ray_termination"}
     interpolated, pixel_rays = reference.hash_encode, reference.pixel_rays
 
     def in_half(points, table, resolutions, widths=None):

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.kernels import numba_cpu
@@ -31,11 +31,11 @@ FEW = TrainSettings(
 
 
 @pytest.fixture(scope="module")
-def views(spheres: Scene) -> Scene:
+def views(spheres: Capture) -> Capture:
     return replace(spheres, frames=spheres.frames[:3], test_names=frozenset())
 
 
-def fit(scene: Scene, run: Path, settings: TrainSettings = FEW, *, resume: bool = False) -> list[str]:
+def fit(scene: Capture, run: Path, settings: TrainSettings = FEW, *, resume: bool = False) -> list[str]:
     """Train, and return the messages for the user."""
     reported: list[str] = []
     train(scene, run, settings, resume=resume, notify=reported.append, on_progress=lambda progress: None)

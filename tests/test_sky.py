@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from nerfcli.field.background import SphereBackground
-from nerfcli.training.adam import Adam
 from nerfcli.training.fitting import ROUGHNESS_WEIGHT
 from nerfcli.training.losses import colour_losses
-from nerfcli.training.selection.sky import explained_by_direction, paint
+from nerfcli.training.optimiser import Adam
+from nerfcli.training.selection.diagnostics import explained_by_direction, paint
 
 PHOTOS = 12
 PIXELS = 150

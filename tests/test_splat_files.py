@@ -115,6 +115,17 @@ def test_foreign_ply_in_any_order_with_more_in_it(tmp_path):
     np.testing.assert_array_equal(found.quaternions[:, 3], column["rot_3"])
 
 
+@pytest.mark.parametrize(("form", "order"), [("ascii", ""), ("binary_big_endian", ">")])
+def test_other_encodings_of_ply(tmp_path, form, order):
+    row = np.arange(1.0, 24.0)
+    body = " ".join(map(str, row)).encode() + b"\n" if form == "ascii" else struct.pack(f"{order}23f", *row)
+    (tmp_path / "a.ply").write_bytes(ply(*NEEDED, body=body, form=form))
+    found = read_splats(tmp_path / "a.ply", silent)[0]
+    column = dict(zip([name for name in NAMES if name[0] != "n"], row, strict=True))
+    np.testing.assert_array_equal(found.means, [[column[name] for name in "xyz"]])
+    np.testing.assert_array_equal(found.quaternions, [[column[f"rot_{index}"] for index in range(4)]])
+
+
 def test_spz_of_the_reference_implementation(tmp_path):
     """Version 3 has the same bytes, but for harmonics with 7 bits instead of 5 and 4; version 2 the same Gaussians."""
     ours, kept = packed(waves())[0], len(OFFICIAL_3) - waves().harmonics[:, 1:].size
@@ -191,13 +202,13 @@ REFUSED = {
     ),
     "mesh.ply": (ply(*FACES, body=bytes(25)), "holds a mesh, not splats"),
     "compressed.ply": (ply(*CHUNKS), "is a compressed .ply of PlayCanvas"),
-    "text.ply": (ply(*NEEDED, form="ascii"), "is a text or big-endian .ply"),
-    "short.ply": (ply(*NEEDED, body=bytes(91)), "is cut short: 1 splats take"),
+    "text.ply": (ply(*NEEDED, form="ascii", body=b"1 2 3\n"), "a vertex has fewer than 23 numbers"),
+    "short.ply": (ply(*NEEDED, body=bytes(91)), "is cut short: its header announces 1 vertices, but 91 bytes"),
     "enormous.ply": (ply(f"element vertex {10**15}", *NEEDED[1:], body=bytes(100)), "is cut short"),
     "empty.ply": (ply("element vertex 0", *NEEDED[1:]), "holds no splats"),
     "degree.ply": (ply(*NEEDED, *floats(["f_rest_9"]), body=bytes(96)), "has 10 properties f_rest_"),
-    "lists.ply": (ply(*NEEDED, "property list uchar int ids"), "has vertices that cannot be read"),
-    "twice.ply": (ply(*NEEDED, "property float x"), "has vertices that cannot be read"),
+    "lists.ply": (ply(*NEEDED, "property list uchar int ids"), "its vertices contain lists"),
+    "twice.ply": (ply(*NEEDED, "property float x"), "its header has the line 'property float x'"),
     "zeros.ply": (ply(*NEEDED, body=bytes(92)), "none of its 1 splat"),
     "other.ply": (b"solid cube", "is no PLY file"),
     "splats.sog": (b"", "is no file of splats that nerfcli knows"),

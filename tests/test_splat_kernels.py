@@ -101,7 +101,7 @@ def definition(rows: np.ndarray, view: SplatView, camera: Camera) -> tuple[Tenso
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     pixels = torch.from_numpy(np.stack([x, y], axis=-1).reshape(-1, 2))
     colour, transmittance, ends = composite_splats(footprints, pixels, torch.from_numpy(BACKGROUND))
-    depths = torch.stack([ends.mean, ends.quantiles[:, 0], ends.spread, ends.heaviest])
+    depths = torch.stack([ends.mean, ends.quantiles[:, 0], ends.spread, ends.peak])
     shape = (HEIGHT, WIDTH)
     return colour.reshape(*shape, 3), transmittance.reshape(shape), depths.reshape(4, *shape), leaves
 
@@ -116,7 +116,7 @@ def test_compiled_kernels_agree_with_the_definition(camera: Camera, count: int, 
     np.testing.assert_allclose(picture.image, colour.detach(), atol=CLOSE)
     np.testing.assert_allclose(picture.transmittance, transmittance.detach(), atol=CLOSE)
     ends = splat_depths(picture, (0.5,))
-    for found, truth in zip((ends.mean, ends.quantiles[:, 0], ends.spread, ends.heaviest), depths, strict=True):
+    for found, truth in zip((ends.mean, ends.quantiles[:, 0], ends.spread, ends.peak), depths, strict=True):
         np.testing.assert_allclose(found.reshape(HEIGHT, WIDTH), truth.detach(), rtol=1e-3, atol=1e-5)
     rng = np.random.default_rng(1)
     by_image, by_light = rng.normal(size=(HEIGHT, WIDTH, 3)), rng.normal(size=(HEIGHT, WIDTH))

@@ -23,10 +23,9 @@ from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.outputs import ExportSettings
 from nerfcli.splats import refine as refinement
-from nerfcli.splats.gaussians import Gaussians
+from nerfcli.splats.gaussians import Gaussians, gaussians_of, rows_of
 from nerfcli.splats.refine import Refinement, refine, splat_photos
 from nerfcli.splats.render import SplatScene
-from nerfcli.splats.rows import gaussians_of, rows_of
 from nerfcli.splats.state import load_splat_state
 from nerfcli.training.runs.files import SPLATS
 from nerfcli.workflows.evaluate import evaluate_splats

@@ -19,7 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 pytest.importorskip("triton", reason="Triton is for Linux")
 
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.kernels.triton_cuda import launch
 from nerfcli.kernels.triton_cuda.backend import TritonBackend
 from nerfcli.photos.loading import load_photos
@@ -140,7 +140,7 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
     ids=lambda value: "-".join(f"{k}={v}" for k, v in vars(value).items() if v != getattr(Components(), k)) or "default"
     if isinstance(value, Components) else None,
 )  # fmt: skip
-def test_a_step_waits_once_for_the_device(components, most, waits, spheres: Scene):
+def test_a_step_waits_once_for_the_device(components, most, waits, spheres: Capture):
     photos = load_photos(spheres.train_frames[:3], factor=4, threads=1)
     opaque = [photo.__class__(photo.frame, photo.pixels[..., :3].copy(), photo.used) for photo in photos]
     pool = PixelPool(opaque, Similarity(1.0, np.eye(3), np.zeros(3)), GPU)

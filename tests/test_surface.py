@@ -17,15 +17,14 @@ from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
 from nerfcli.errors import UserError
 from nerfcli.export import extent
-from nerfcli.export.colours import point_colours, surface_colours
-from nerfcli.export.depth_views import DepthView, normals_of, plane_rays
-from nerfcli.export.extent import Grid, scene_box
+from nerfcli.export.depth_views import DepthView, normals_of, plane_rays, point_colours, surface_colours
+from nerfcli.export.extent import Grid, SurfaceSettings, scene_box
 from nerfcli.export.fusion import FusedVolume, fuse
 from nerfcli.export.marching import mesh_of, simplified, surface_of, without_small_pieces
-from nerfcli.export.mesh_files import read_glb_json, read_ply_header, read_ply_mesh, write_glb, write_ply
+from nerfcli.export.mesh_files import read_glb_json, write_glb
 from nerfcli.export.points import agreed_points
-from nerfcli.export.settings import SurfaceSettings
-from nerfcli.photos.undistorted import pinhole_of, undistorted
+from nerfcli.photos.loading import pinhole_of, undistorted
+from nerfcli.ply import read_ply_header, read_ply_mesh, read_ply_vertices, write_ply
 from nerfcli.render.model import Model, save_model
 from nerfcli.training.runs.files import FIELD
 from nerfcli.training.runs.run import Run
@@ -263,7 +262,7 @@ def test_a_ply_comes_back_and_says_what_it_is(tmp_path):
     again, triangles = read_ply_mesh(tmp_path / "a.ply")
     np.testing.assert_array_equal(again, vertices)
     np.testing.assert_array_equal(triangles, faces)
-    _, _, comments, _ = read_ply_header(tmp_path / "a.ply")
+    comments = read_ply_header(tmp_path / "a.ply").comments
     assert r"unit metre (2 known distances (H\xfcgel.txt), +- 0.3 %)" in comments
     assert json.loads(comments[-1].partition(" ")[2])["unit_source"] == source
     assert "frame of the scene" in comments
@@ -383,9 +382,8 @@ def test_a_mesh_is_written_in_the_frame_of_the_scene(blocked, tmp_path):
 
 
 def vertices_of(path: Path) -> tuple[np.ndarray, int]:
-    elements, properties, _, start = read_ply_header(path)
-    table = np.frombuffer(path.read_bytes(), np.dtype(list(properties.items())), elements["vertex"], start)
-    return np.stack([table[axis] for axis in "xyz"], -1), elements.get("face", 0)
+    table = read_ply_vertices(path)
+    return np.stack([table[axis] for axis in "xyz"], -1), read_ply_header(path).count("face")
 
 
 def test_points_are_written(blocked, tmp_path):

@@ -20,20 +20,21 @@ from conftest import SPHERES
 from nerfcli import kernels
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, apply, rotation_from_quaternion
-from nerfcli.captures import scene as scenes
-from nerfcli.captures.formats.registry import UserInputs, recognise
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.format import UserInputs
+from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.formats.run_cameras import read_cameras, write_cameras
 from nerfcli.captures.holdout import default_split
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.loading import fingerprint
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model, over_white
 from nerfcli.field import hash_field
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.loading import load_photos
-from nerfcli.render.files.float_tiff import read_tiff
+from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import DepthRequest, render_picture
 from nerfcli.training import loop, sentinel
@@ -56,13 +57,13 @@ ADAPTIVE = replace(FEW, first_samples_per_step=2**15, samples_per_step=2**15)
 
 
 @pytest.fixture(scope="module")
-def views(spheres: Scene) -> Scene:
+def views(spheres: Capture) -> Capture:
     """Some of the views, none held out: checks on held-out pixels take longer than steps."""
     return replace(spheres, frames=spheres.frames[:4], test_names=frozenset())
 
 
 def fit(
-    scene: Scene, run: Path, settings: TrainSettings, *,
+    scene: Capture, run: Path, settings: TrainSettings, *,
     resume: bool = False, on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> list[Progress]:  # fmt: skip
     """Train, and return the progress of every step."""
@@ -77,7 +78,7 @@ def fit(
 
 
 @pytest.fixture(scope="module")
-def straight(views: Scene, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Progress]]:
+def straight(views: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Progress]]:
     """A training with `ADAPTIVE` that nothing interrupts, and the progress of its steps. Do not write into its run."""
     run = tmp_path_factory.mktemp("straight") / "run"
     return run, fit(views, run, ADAPTIVE)
@@ -89,7 +90,7 @@ def weights(run: Path) -> dict[str, bytes]:
     return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
 
 
-def held_out_photos(scene: Scene) -> list[HeldOutPhoto]:
+def held_out_photos(scene: Capture) -> list[HeldOutPhoto]:
     photos = load_photos(scene.test_frames, factor=1, threads=1)
     return [HeldOutPhoto(photo.frame, photo.pixels, photo.used) for photo in photos]
 
@@ -129,7 +130,7 @@ def test_photos_of_a_desk_are_learned_too(with_points, tmp_path):
         points.append(apply(frame.world_from_cam, in_camera))
     # Points show how near to the cameras the scene begins.
     cloud = np.concatenate(points) if with_points else np.zeros((0, 3))
-    scene = Scene(desk, "transforms", frames, names, cloud, ())
+    scene = Capture(frames, cloud, kind="transforms", root=desk, test_names=names)
     settings = TrainSettings(budget_seconds=None, steps=400, downscale=8, samples_per_step=2**14, threads=2)
     fit(scene, tmp_path / "run", settings)
     photos = load_photos(scene.test_frames, factor=8, threads=1)
@@ -573,7 +574,7 @@ def test_what_counts_as_the_same_run(views, tmp_path):
     assert not Run(tmp_path / "run").is_trained_from(replace(views, frames=frames), settings)
     config = read_config(tmp_path / "run")
     assert config.settings.downscale == 4
-    assert config.scene_fingerprint == scenes.fingerprint(views)
+    assert config.scene_fingerprint == fingerprint(views)
     assert set(config.versions) >= {"nerfcli", "python", "torch", "numpy"}
 
 

@@ -8,7 +8,7 @@ import pytest
 from conftest import SPHERES
 from typer.testing import CliRunner
 
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.cli import app
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.training.loop import train
@@ -18,7 +18,7 @@ from nerfcli.workflows.train_plan import plan_training
 STEPS = TrainSettings(budget_seconds=None, steps=250)
 
 
-def test_disk_space_covers_a_run_and_the_state_that_is_replaced(spheres: Scene, tmp_path: Path) -> None:
+def test_disk_space_covers_a_run_and_the_state_that_is_replaced(spheres: Capture, tmp_path: Path) -> None:
     settings = replace(STEPS, steps=1, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
     run = tmp_path / "run"
     train(spheres, run, settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)

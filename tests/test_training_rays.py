@@ -13,7 +13,7 @@ from frame_rays import frame_rays
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_quaternion
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.memory import default_memory_limit, resident_bytes
 from nerfcli.photos.images import downscale, write_png
@@ -50,8 +50,8 @@ def ring(count: int = 12, radius: float = 3.0, moved: Similarity | None = None) 
     return frames
 
 
-def scene_of(frames: list[Frame], points: np.ndarray | None = None) -> Scene:
-    return Scene(
+def scene_of(frames: list[Frame], points: np.ndarray | None = None) -> Capture:
+    return Capture(
         root=Path("."),
         kind="transforms",
         frames=tuple(frames),
@@ -61,7 +61,7 @@ def scene_of(frames: list[Frame], points: np.ndarray | None = None) -> Scene:
     )
 
 
-def training_centres(scene: Scene, similarity: Similarity) -> np.ndarray:
+def training_centres(scene: Capture, similarity: Similarity) -> np.ndarray:
     return np.array([similarity.apply(frame.centre) for frame in scene.frames])
 
 

@@ -141,9 +141,9 @@ def test_cameras_learn_from_the_fork_on(trials, start):
     """A step at the fork, after 0.6 of the budget, does not move the cameras; a later one does."""
     fitting = trials._fitting(Components(view=0, cameras="poses"), seed=0, log_gains=None, cameras_from=0.6)
     trials._take_up(fitting, start)
-    assert fitting.parts.cameras is not None
-    assert fitting.parts.cameras.poses is not None
-    motions = fitting.parts.cameras.poses.motions
+    assert fitting.appearance.cameras is not None
+    assert fitting.appearance.cameras.poses is not None
+    motions = fitting.appearance.cameras.poses.motions
     given = motions.clone()
     fitting.advance(0.6)
     assert torch.equal(motions, given)
@@ -168,7 +168,12 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
             return torch.full_like(coordinates[:, 0], sigma)
 
         def radiance(
-            self, coordinates: torch.Tensor, directions: torch.Tensor, rays: torch.Tensor, *, sink: torch.Tensor | None
+            self,
+            coordinates: torch.Tensor,
+            directions: torch.Tensor,
+            rays: torch.Tensor,
+            *,
+            table_grad: torch.Tensor | None,
         ) -> tuple[torch.Tensor, torch.Tensor]:
             return self.density(coordinates), torch.zeros_like(coordinates)
 
@@ -191,7 +196,9 @@ def test_trials_use_the_lens_found_before(spheres):
         across = directions / (directions @ axis)[:, None]
         return float((across[1] - across[0]).norm())
 
-    assert width(fitting.parts.refined(drawn).directions) == pytest.approx(width(drawn.directions) / 1.05, rel=1e-5)
+    assert width(fitting.appearance.refine_cameras(drawn).directions) == pytest.approx(
+        width(drawn.directions) / 1.05, rel=1e-5
+    )
 
 
 def test_blocks_that_judge_are_not_learned_from(trials):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.matching.correspondences import chosen_pairs, match
 from nerfcli.matching.features import Matches
 from nerfcli.matching.tracks import Tracks, indices_by_value, tracks_of_matches
@@ -46,9 +46,9 @@ def wall_photo(x: float, turned: float, *, used: np.ndarray | None = None) -> Lo
     return LoadedPhoto(Frame(name, CAMERA, pose), np.repeat(shown[..., None], 3, axis=2), used)
 
 
-def scene_of(photos: list[LoadedPhoto]) -> Scene:
+def scene_of(photos: list[LoadedPhoto]) -> Capture:
     frames = tuple(photo.frame for photo in photos)
-    return Scene(Path("walls"), "transforms", frames, frozenset(), np.zeros((0, 3)), ())
+    return Capture(frames, np.zeros((0, 3)), kind="transforms", root=Path("walls"))
 
 
 def found_in(photos: list[LoadedPhoto], *, threads: int = 1) -> np.ndarray:

@@ -15,7 +15,7 @@ from synthetic_captures import WIDE, Scene, View
 from turntable_capture import Turntable, turntable, write
 
 from nerfcli.cameras.alignment import align
-from nerfcli.captures import scene as scenes
+from nerfcli.captures.loading import load_scene
 from nerfcli.doctor.examination import Diagnosis, examine
 from nerfcli.doctor.photo_list import find_subject
 from nerfcli.errors import UserError
@@ -217,7 +217,7 @@ def solved(photos: Path, scene_dir: Path, **options: Any) -> tuple[dict, list[st
 
 def errors(capture: Turntable, scene_dir: Path) -> tuple[float, float]:
     """Return the largest position error (fraction of the radius) and rotation error (degrees) after alignment."""
-    frames = scenes.load(scene_dir).frames
+    frames = load_scene(scene_dir).frames
     truth = np.array([capture.object_from_cam[int(frame.name[5:8])] for frame in frames])
     found = np.array([frame.world_from_cam for frame in frames])
     moved = align(found[:, :3, 3], truth[:, :3, 3])
@@ -256,7 +256,7 @@ class TestPoses:
         assert found["background_matches_in_black"] > 0.95
 
     def test_scene_has_masks_for_training(self, capture: Turntable, made: tuple[Path, dict, list[str]]) -> None:
-        for frame in scenes.load(made[0] / "scene").frames:
+        for frame in load_scene(made[0] / "scene").frames:
             assert frame.mask is not None
             mask = np.asarray(Image.open(frame.mask).convert("L")) > 127
             truth = capture.masks[int(frame.name[5:8])]
@@ -284,7 +284,7 @@ class TestPoses:
         assert report["moving_foreground"] is None
         assert not (tmp_path / "scene" / "masks").exists()
         assert not any("turns" in note for note in notes)
-        assert all(frame.mask is None for frame in scenes.load(tmp_path / "scene").frames)
+        assert all(frame.mask is None for frame in load_scene(tmp_path / "scene").frames)
 
 
 class TestDoctor:

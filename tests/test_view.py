@@ -25,7 +25,7 @@ from fog import foggy_cells
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.captures import scene
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import INTERRUPTED
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.render.depth import DepthRequest
@@ -360,7 +360,7 @@ def test_ctrl_c_ends_the_server(finished):
 
 def fit(run: Path, *, on_step: Any = lambda progress: None) -> None:
     loop.train(
-        scene.load(run.with_name("spheres")), run, FEW, resume=False, notify=lambda text: None, on_progress=on_step
+        load_scene(run.with_name("spheres")), run, FEW, resume=False, notify=lambda text: None, on_progress=on_step
     )
 
 

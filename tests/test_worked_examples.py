@@ -7,7 +7,7 @@ import torch
 from kernel_parts import parts_for
 
 from nerfcli.field.fourier_field import fourier_features
-from nerfcli.kernels import LightEnds
+from nerfcli.kernels import RayTermination
 from nerfcli.kernels.reference import depth
 from nerfcli.render.depth import DepthRequest, requested
 
@@ -59,10 +59,10 @@ def test_depths_of_slabs_at_points(slabs, dtype):
     close(weights.sum(), 15 / 16, dtype)
     mean = depth.conditional(weights, places, OFFSETS)
     close(mean, [5 / 3], dtype)
-    heaviest = depth.max_weight(weights, places, OFFSETS)
-    close(heaviest, [1.0], dtype)
+    peak = depth.max_weight(weights, places, OFFSETS)
+    close(peak, [1.0], dtype)
     none = mean.new_empty(1, 0)
-    ends = LightEnds(1 - transmittance, transmittance, mean, mean, heaviest, weights.max()[None], none)
+    ends = RayTermination(1 - transmittance, transmittance, mean, mean, peak, weights.max()[None], none)
     for far in (4.0, 100.0):
         request = DepthRequest("background", "ray", background_distance=far)
         close(requested(request, ends, background_distance=mean.new_tensor([far])), [25 / 16 + far / 16], dtype)

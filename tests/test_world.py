@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.world import WORLD_AXES, moved_to_origin, smallest_rotation, transformed, up_aligned
 from nerfcli.errors import UserError
 

@@ -161,9 +161,9 @@ def test_hash_encode(samples, faded, generator):
     assert_close(encoded, reference.hash_encode(points, table, resolutions, widths), "encoded")
     for name, a, b in zip(("points", "table"), fast, exact, strict=True):
         assert_close(a.grad, b.grad, name)
-    sink = torch.ones_like(fast[1].detach())
-    hash_grid.hash_encode(fast[0].detach(), fast[1], resolutions, sink, given).backward(gradient.to(DEVICE))
-    assert_close(sink - 1, exact[1].grad, "sink")
+    table_grad = torch.ones_like(fast[1].detach())
+    hash_grid.hash_encode(fast[0].detach(), fast[1], resolutions, table_grad, given).backward(gradient.to(DEVICE))
+    assert_close(table_grad - 1, exact[1].grad, "sink")
     half = hash_grid.encode(fast[0].detach(), fast[1].detach().half(), resolutions, widths=given, dtype=torch.float16)
     assert_close(half.float(), encoded, "float16", relative=1e-3)
 
@@ -304,19 +304,19 @@ def test_faint_samples_are_left_out_but_counted_for_visits_and_never_all(least, 
     march = march._replace(max_optical_depth=3.0, least_weight=least)
     grid = HashGrid(table, (4, 5, 6, 7, 8, 9, 10, 11), layers)
     doubled = grid._replace(table=table.double(), layers=tuple(x.double() for x in layers))
-    expected_visits, visits = torch.zeros(8, 8, 8, dtype=torch.float64), torch.zeros(8, 8, 8, device=DEVICE)
+    expected_visits, cell_depths = torch.zeros(8, 8, 8, dtype=torch.float64), torch.zeros(8, 8, 8, device=DEVICE)
     exact = reference.visible_samples(*exactly(rays, march), doubled, expected_visits)
     fast = marching.visible_samples(
         rays, march, grid._replace(layers=on_device(*layers)), table=table.half().to(DEVICE),
-        capacity=marching.Capacity(), visits=visits,
+        capacity=marching.Capacity(), cell_depths=cell_depths,
     )  # fmt: skip
     every = reference.visible_samples(*exactly(rays, march._replace(least_weight=0.0)), doubled)
     assert len(exact.starts) <= fraction * len(every.starts)
     assert torch.equal(fast.offsets.cpu(), exact.offsets)  # for this seed both keep the same samples
     assert_close(fast.starts, exact.starts, "starts")
     assert_close(fast.density, exact.density, "density", relative=HALF)
-    assert_close(visits, expected_visits, "visits", relative=HALF)
-    assert least != 0.08 or ((visits > 0) & (visits < least)).any()  # cells in which all samples are left out
+    assert_close(cell_depths, expected_visits, "visits", relative=HALF)
+    assert least != 0.08 or ((cell_depths > 0) & (cell_depths < least)).any()  # cells in which all samples are left out
 
 
 @pytest.mark.parametrize("samples", SIZES)
@@ -413,13 +413,18 @@ def test_visits_leave_out_densities_that_are_not_a_number(generator):
     table = 0.7 * torch.randn(8, 64, 4, generator=generator)
     table[0, ::16] = torch.nan
     grid = HashGrid(table, (4, 5, 6, 7, 8, 9, 10, 11), on_device(*layers_of(32, generator)))
-    visits = torch.full((8, 8, 8), -1.0, device=DEVICE)
+    cell_depths = torch.full((8, 8, 8), -1.0, device=DEVICE)
     seen = marching.visible_samples(
-        rays, march, grid, table=table.half().to(DEVICE), capacity=marching.Capacity(), visits=visits
+        rays,
+        march,
+        grid,
+        table=table.half().to(DEVICE),
+        capacity=marching.Capacity(),
+        cell_depths=cell_depths,
     )
     assert seen.density.isnan().any()
-    assert not visits.isnan().any()
-    assert (visits >= 0).any()
+    assert not cell_depths.isnan().any()
+    assert (cell_depths >= 0).any()
 
 
 @pytest.mark.parametrize("samples", SIZES)
@@ -436,12 +441,14 @@ def test_contracted_distances(samples, generator):
 @pytest.mark.parametrize("samples", SIZES)
 @pytest.mark.parametrize("magnitude", [0.01, 3.0, 100.0])
 @pytest.mark.parametrize("fractions", [(), (0.9, 0.1, 0.5)])
-def test_light_ends(samples, magnitude, fractions, generator):
+def test_ray_termination(samples, magnitude, fractions, generator):
     density, _, starts, ends, offsets = samples_along(samples, magnitude, generator)
     if samples == 123:
         density[60:90] = 0.0
-    exact = reference.light_ends(*(x.double() for x in (density, starts, ends)), offsets=offsets, fractions=fractions)
-    fast = depth.light_ends(*on_device(density, starts, ends), offsets=offsets.to(DEVICE), fractions=fractions)
+    exact = reference.ray_termination(
+        *(x.double() for x in (density, starts, ends)), offsets=offsets, fractions=fractions
+    )
+    fast = depth.ray_termination(*on_device(density, starts, ends), offsets=offsets.to(DEVICE), fractions=fractions)
     for name in exact._fields:
         torch.testing.assert_close(
             getattr(fast, name).cpu().double(), getattr(exact, name), rtol=2e-5, atol=1e-7, equal_nan=True,
@@ -501,16 +508,21 @@ def whole(
     resolutions = tuple(round(4 * 1.22**level) for level in range(8))
     background = torch.rand(count, 3, generator=g).to(device, dtype)
     targets = targets._replace(distances=(0.7 + torch.rand(count // 2, generator=g)).to(device, dtype))
-    sink = torch.zeros_like(table, requires_grad=False) if with_sink else None
+    table_grad = torch.zeros_like(table, requires_grad=False) if with_sink else None
     seen = backend.render_rays(
-        rays, march, HashGrid(table, resolutions, layers, 3, with_sink), targets, background=background, sink=sink
+        rays,
+        march,
+        HashGrid(table, resolutions, layers, 3, with_sink),
+        targets,
+        background=background,
+        table_grad=table_grad,
     )
     total = sum((x * torch.randn(x.shape, generator=g).to(device, dtype)).sum() for x in seen[:4])
     assert isinstance(total, Tensor)
     total.backward()
     gradients = {"by origins": rays.origins.grad, "by directions": rays.directions.grad}
     gradients |= {f"by layer {i}": layer.grad for i, layer in enumerate(layers)}
-    gradients["by table"] = table.grad if sink is None else sink
+    gradients["by table"] = table.grad if table_grad is None else table_grad
     assert (table.grad is None) == with_sink
     return {**seen._asdict(), **{name: value for name, value in gradients.items() if value is not None}}
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture, Observations
 
 PINHOLE = Camera("PINHOLE", 640, 480, (500.0, 505.0, 321.25, 238.5))
 SQUARE = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))

@@ -1,7 +1,7 @@
-"""Data of a capture: frames (camera, pose, picture), which are found by name, points and other content of its file."""
+"""Frames: a camera, its pose and its picture; found by name."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -20,7 +20,8 @@ class Frame:
 
     Args:
         name: unique in its capture, with forward slashes; the image's path as its capture lists it.
-        camera: refers to the upright picture, EXIF orientation applied; see `Capture.pixels` for the exception.
+        camera: refers to the upright picture, EXIF orientation applied; see `captures.capture.Capture` for the
+            exception.
         world_from_cam: (4, 4) rigid, OpenCV axes, float64.
         image: the picture's file; None for the frames of a camera path.
         mask: the mask's file: black where the picture is not to be used.
@@ -43,54 +44,6 @@ class Frame:
     def centre(self) -> np.ndarray:
         """The camera's centre in the world, (3,)."""
         return self.world_from_cam[:3, 3]
-
-
-@dataclass(frozen=True)
-class Observations:
-    """Observations of points: one row per 2D feature of a frame.
-
-    Args:
-        frame_index: (M,) int64, of the frame.
-        point_index: (M,) int64, of the point; -1 for a feature without one.
-        pixels: (M, 2) float64 positions in the frame's picture, pixel centres at 0.5.
-    """
-
-    frame_index: np.ndarray
-    point_index: np.ndarray
-    pixels: np.ndarray
-
-
-@dataclass(frozen=True)
-class Capture:
-    """A capture as a file describes it.
-
-    Args:
-        frames: the views, in the order of the file; readers of scenes return only those whose picture is on disk.
-        points: (N, 3) points of the surface in the world; N is 0 where the format has none.
-        missing: names of images that the file lists and that are not on disk.
-        depth_bounds: (frames, 2) nearest and farthest z of each view in scene units, or None.
-        kind: the format: "colmap", "transforms", "blender", "llff", ...
-        colours: (N, 3) uint8 sRGB of the points, or None.
-        observations: where the points were seen, or None.
-        unit: of length: "arbitrary" or "metre".
-        unit_source: how the metric scale was found, as text for people; None if unknown.
-        pixels: which pixels of a photo with an EXIF orientation its camera refers to: "stored", as nearly all programs
-            read them, or "upright", as the photo is displayed.
-        rescaled: number of photos whose intrinsics were given for another size, by (that size, the photo's size),
-            each (width, height).
-    """
-
-    frames: tuple[Frame, ...]
-    points: np.ndarray
-    missing: tuple[str, ...]
-    depth_bounds: np.ndarray | None
-    kind: str
-    colours: np.ndarray | None = None
-    observations: Observations | None = None
-    unit: str = "arbitrary"
-    unit_source: str | None = None
-    pixels: str = "stored"
-    rescaled: Mapping[tuple[Size, Size], int] = field(default_factory=dict)
 
 
 def frames_named(frames: Sequence[Frame], names: Sequence[str]) -> tuple[Frame, ...]:

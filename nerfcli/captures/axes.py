@@ -13,7 +13,7 @@ import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
 
 # Sources: docs.opencv.org calib3d; docs.nerf.studio "Data conventions"; Fyusion/LLFF README;

@@ -11,8 +11,8 @@ from functools import partial
 
 import numpy as np
 
-from nerfcli.cameras.frame import Capture
 from nerfcli.captures.axes import Convention, all_axes, opencv_from_axes, poses_of, reinterpreted_poses
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.evidence import FrustumEvidence, MatchEvidence, ObservationEvidence, match_neighbours
 from nerfcli.errors import UserError
 

@@ -12,8 +12,9 @@ import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
 from nerfcli.captures.axes import Convention, for_picture, shifted
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
 from nerfcli.matching.epipolar import fundamental_matrix, sampson_angles
 from nerfcli.matching.features import Features, Matches, find_features, mutual_matches

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerfcli.captures.formats.colmap import parse_colmap
-from nerfcli.captures.formats.finding import find_model
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.colmap import find_model, parse_colmap
 from nerfcli.matching.tracks import Tracks, indices_by_value, world_rays
 from nerfcli.photos.loading import LoadedPhoto
 
 
-def tracks_of_model(scene: Scene, photos: Sequence[LoadedPhoto]) -> Tracks:
+def tracks_of_model(scene: Capture, photos: Sequence[LoadedPhoto]) -> Tracks:
     """Return the observations of these photos in the scene's COLMAP model; empty without such a model."""
     folder = find_model(scene.root)
     capture = parse_colmap(folder) if folder is not None else None

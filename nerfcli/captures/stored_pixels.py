@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame, Observations, Size
+from nerfcli.cameras.frame import Frame, Size
+from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.orientation import (
     Measure,
     counted,

@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_direction
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
 
 WORLD_AXES = {f"{sign}{'xyz'[i]}": float(f"{sign}1") * np.eye(3)[i] for sign in ("", "-") for i in range(3)}

@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.scale.boards import CharucoBoard, scale_from_charuco, scale_from_markers
 from nerfcli.captures.scale.distances import known_distance, scale_from_distances
 from nerfcli.captures.scale.estimate import ScaleEstimate

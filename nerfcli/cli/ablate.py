@@ -62,7 +62,7 @@ def ablate(
       nerfcli ablate photos-scene --only view,exposure --budget 30s
       nerfcli ablate photos-scene --seeds 5 -o paper/ablation
     """
-    from nerfcli.bench.ablation_results import COLUMNS, ResultRow, table_of
+    from nerfcli.bench.ablation import COLUMNS, ResultRow, table_of
     from nerfcli.cli.scans import refuse_scan
     from nerfcli.memory import default_memory_limit
     from nerfcli.training.runs.components import CHOICES

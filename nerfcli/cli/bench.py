@@ -72,8 +72,7 @@ def bench_one(path: Path, folder: Path, how: dict[str, Any], *, overwrite: bool,
         UserError: the input cannot be measured, or `folder` holds something else.
     """
     from nerfcli import kernels
-    from nerfcli.bench.machine import describe_machine, is_busy, load_average
-    from nerfcli.bench.measurement import measure_renderings, measure_trainings
+    from nerfcli.bench.measurement import describe_machine, is_busy, load_average, measure_renderings, measure_trainings
     from nerfcli.bench.results import BENCH, COLUMNS, Point, table_of, write_results
     from nerfcli.training.runs.run import Run
 

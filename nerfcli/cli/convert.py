@@ -173,9 +173,10 @@ def convert(
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
     """
     values = dict(locals())
-    from nerfcli.captures.camera_files import read_intrinsics
+    from nerfcli.captures.calibration import read_intrinsics
     from nerfcli.captures.conversion import ConventionOverrides, TargetOptions
-    from nerfcli.captures.formats.registry import UserInputs, format_named
+    from nerfcli.captures.formats.format import UserInputs
+    from nerfcli.captures.formats.registry import format_named
     from nerfcli.captures.world_frame import WorldFrame
     from nerfcli.ct.result import is_reconstruction
     from nerfcli.workflows.convert import convert_capture, detect_convention, detection_record

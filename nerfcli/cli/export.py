@@ -100,7 +100,7 @@ def export(
     """
     values = dict(locals())
     from nerfcli.ct.result import is_reconstruction
-    from nerfcli.export.settings import FACES, SurfaceSettings
+    from nerfcli.export.extent import FACES, SurfaceSettings
     from nerfcli.training.runs.run import load_run
     from nerfcli.workflows.export import TARGETS, default_target, export_run
     from nerfcli.workflows.splats import SplatSettings

@@ -72,10 +72,10 @@ class HashVolume:
         growth = math.log(max(self.finest, COARSEST) / COARSEST) / (LEVELS - 1)
         return tuple(round(COARSEST * math.exp(growth * level)) for level in range(LEVELS))
 
-    def attenuation(self, points: Tensor, *, sink: Tensor | None = None) -> Tensor:
+    def attenuation(self, points: Tensor, *, table_grad: Tensor | None = None) -> Tensor:
         """Return the attenuation (N,) at points (N, 3); gradients of the table are added to the sink."""
         places = ((points - torch.tensor(self.low)) / self.side).float()
-        code = self.backend.hash_encode(places, self.table, self.resolutions, sink=sink)
+        code = self.backend.hash_encode(places, self.table, self.resolutions, table_grad=table_grad)
         hidden = torch.relu(code @ self.layers[0].t())
         return self.start * density_from_log((hidden @ self.layers[1].t())[:, 0])
 
@@ -110,7 +110,12 @@ def hash_volume(grid: VoxelGrid, start: float, arrays: Mapping[str, np.ndarray],
 
 
 def line_integrals(
-    volume: HashVolume, rays: tuple[Tensor, Tensor], grid: VoxelGrid, *, jitter: Tensor, sink: Tensor | None = None
+    volume: HashVolume,
+    rays: tuple[Tensor, Tensor],
+    grid: VoxelGrid,
+    *,
+    jitter: Tensor,
+    table_grad: Tensor | None = None,
 ) -> Tensor:
     """Return line integrals (R,) of rays inside the grid's box, as sums over samples; 0 for rays that miss the box.
 
@@ -119,7 +124,7 @@ def line_integrals(
         rays: (R, 3) origins and unit directions, float64.
         grid: its box bounds the rays, and `STEP_VOXELS` refers to its voxels.
         jitter: offsets of samples within their intervals, in [0, 1), repeated along the samples.
-        sink: see `HashVolume.attenuation`.
+        table_grad: see `HashVolume.attenuation`.
     """
     origins, directions = rays
     low = torch.tensor(grid.first, dtype=torch.float64) - grid.size / 2
@@ -135,14 +140,14 @@ def line_integrals(
     number = torch.arange(len(index)) - offsets[index]
     place = near[index] + (number + jitter.repeat(-(-len(index) // len(jitter)))[: len(index)]) * length[index]
     points = origins[index] + place[:, None] * directions[index]
-    sampled = volume.attenuation(points, sink=sink)
+    sampled = volume.attenuation(points, table_grad=table_grad)
     return kernels.sum_along_rays(sampled, offsets) * length.float()
 
 
-def total_variation(volume: HashVolume, points: Tensor, size: float, *, sink: Tensor | None = None) -> Tensor:
+def total_variation(volume: HashVolume, points: Tensor, size: float, *, table_grad: Tensor | None = None) -> Tensor:
     """Return the mean over points (N, 3) of the norm of the differences to neighbours `size` away along x, y and z."""
     steps = torch.cat([torch.zeros(1, 3), size * torch.eye(3)])
-    values = volume.attenuation((points[:, None] + steps).view(-1, 3), sink=sink).view(-1, 4)
+    values = volume.attenuation((points[:, None] + steps).view(-1, 3), table_grad=table_grad).view(-1, 4)
     return ((values[:, 1:] - values[:, :1]).square().sum(1) + 1e-12 * volume.start**2).sqrt().mean()
 
 
@@ -173,7 +178,7 @@ def fit_hash(
     samples_of_ray = max(grid.shape) / STEP_VOXELS
     rays_of_step = math.ceil(min(SAMPLES / samples_of_ray, count / MIN_STEPS_PER_PASS))
     smoothed = math.ceil(SMOOTHED * rays_of_step * samples_of_ray)
-    sink = torch.zeros_like(volume.table)
+    table_grad = torch.zeros_like(volume.table)
     first, second = torch.zeros_like(volume.table), torch.zeros_like(volume.table)
     optimiser = torch.optim.Adam(volume.layers, lr=RATE, betas=BETAS, eps=EPS)
     extent = grid.size * torch.tensor(grid.shape[::-1])
@@ -190,12 +195,12 @@ def fit_hash(
             origins, directions = geometry.rays_of_pixels(chosen.numpy())
             rays = torch.from_numpy(origins), torch.from_numpy(directions)
             jitter = torch.rand(997, generator=generator, dtype=torch.float64)
-            integrals = line_integrals(volume, rays, grid, jitter=jitter, sink=sink)
+            integrals = line_integrals(volume, rays, grid, jitter=jitter, table_grad=table_grad)
             slope = likelihood.slope(integrals.detach()[:, None], chosen)[:, 0] * (count / len(chosen))
             outputs, gradients = [integrals], [slope]
             if strength > 0:
                 points = corner + extent * torch.rand(smoothed, 3, generator=generator)
-                outputs.append(total_variation(volume, points, grid.size, sink=sink))
+                outputs.append(total_variation(volume, points, grid.size, table_grad=table_grad))
                 gradients.append(torch.tensor(beta * grid.voxels))
             optimiser.zero_grad()
             torch.autograd.backward(outputs, gradients)
@@ -205,7 +210,7 @@ def fit_hash(
                 group["lr"] = rate
             optimiser.step()
             with torch.no_grad():
-                volume.backend.adam_rows(volume.table, sink, first, second, step=AdamStep(step, rate, BETAS, EPS))
+                volume.backend.adam_rows(volume.table, table_grad, first, second, step=AdamStep(step, rate, BETAS, EPS))
             done += len(chosen) / count
             volume.passes += len(chosen) / count
             if progress is not None:

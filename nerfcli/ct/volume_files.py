@@ -18,7 +18,7 @@ import tifffile
 from nerfcli.atomic import atomic_path
 from nerfcli.ct.grid import VoxelGrid
 from nerfcli.errors import UserError
-from nerfcli.export.mesh_files import KEY
+from nerfcli.ply import KEY
 
 _NIFTI_HEADER = 352
 _NIFTI_UNITS = {"m": 1, "mm": 2, "um": 3}

@@ -7,9 +7,8 @@ import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_direction, views_of
-from nerfcli.captures.formats.colmap import read_model
-from nerfcli.captures.formats.finding import find_model
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.colmap import find_model, read_model
 from nerfcli.doctor.geometry import BASELINE_BAD, BASELINE_LOOK
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
@@ -28,7 +27,7 @@ _ASPECT_LOOK = 0.02
 _GPS_WIDE = 100.0
 
 
-def spread(scene: Scene) -> Finding:
+def spread(scene: Capture) -> Finding:
     """Check the spread of the cameras relative to scene depth, and find cameras far from the rest."""
     centres = centres_of(scene.frames)
     depths = _depths(scene)
@@ -58,7 +57,7 @@ def spread(scene: Scene) -> Finding:
     )
 
 
-def directions(scene: Scene) -> Finding:
+def directions(scene: Capture) -> Finding:
     """Check from which directions the cameras see the scene."""
     up = up_direction(scene.frames)
     east, north = horizontal_axes(up)
@@ -95,7 +94,7 @@ def directions(scene: Scene) -> Finding:
     )
 
 
-def focal_lengths(scene: Scene) -> Finding:
+def focal_lengths(scene: Capture) -> Finding:
     """Check whether the focal lengths of a scene's cameras along x and y agree, as pixels of nearly all cameras are
     square."""
     apart = sorted(((abs(frame.camera.pixel_aspect - 1.0), frame.name) for frame in scene.frames), reverse=True)
@@ -120,7 +119,7 @@ def focal_lengths(scene: Scene) -> Finding:
     )
 
 
-def points(scene: Scene) -> Finding | None:
+def points(scene: Capture) -> Finding | None:
     """Check the number of 3D points per photo; None if the format does not provide it."""
     model = find_model(scene.root)
     if scene.kind not in ("nerfcli", "colmap") or model is None:
@@ -139,7 +138,7 @@ def points(scene: Scene) -> Finding | None:
     )
 
 
-def intrinsics(scene: Scene) -> Finding | None:
+def intrinsics(scene: Capture) -> Finding | None:
     """Check how well the photos determined the intrinsics, from the report of `nerfcli poses`; None without one."""
     path = scene.root / "poses_report.json"
     if scene.kind != "nerfcli" or not path.is_file():
@@ -164,7 +163,7 @@ def intrinsics(scene: Scene) -> Finding | None:
     )
 
 
-def check_scene_files(scene: Scene) -> list[Finding]:
+def check_scene_files(scene: Capture) -> list[Finding]:
     """Check for listed photos that are missing and for incomplete masks, and report the unit of length."""
     missing = scene.missing
     total = len(missing) + len(scene.frames)
@@ -222,7 +221,7 @@ def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
     )
 
 
-def _depths(scene: Scene) -> np.ndarray:
+def _depths(scene: Capture) -> np.ndarray:
     """Return the median depth along the optical axis that each camera sees, (frames,)."""
     frames = scene.frames
     if scene.depth_bounds is not None:

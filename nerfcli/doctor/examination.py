@@ -8,7 +8,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.calibration import Calibration, Picture, calibrated
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.doctor import camera_layout, connectivity, geometry, inventory, pose_agreement, quality
 from nerfcli.doctor.compared_pairs import Pair, compare, focal_px
 from nerfcli.doctor.misplaced_groups import misplaced_groups, nearest_pairs
@@ -211,7 +211,7 @@ def _focal_length(subject: ExaminedCapture, photos: Sequence[PhotoFacts]) -> Fin
     return inventory.focal_length(photos) if subject.scene is None else camera_layout.focal_lengths(subject.scene)
 
 
-def _frames(scene: Scene, photos: Sequence[PhotoFacts]) -> list[Frame]:
+def _frames(scene: Capture, photos: Sequence[PhotoFacts]) -> list[Frame]:
     """Return the frames of the readable photos, in their order."""
     by_name = {frame.name: frame for frame in scene.frames}
     return [by_name[photo.name] for photo in photos]

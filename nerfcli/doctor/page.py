@@ -13,8 +13,8 @@ from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.doctor.quality import BLURRED, STOPS_LOOK
 from nerfcli.errors import several
 from nerfcli.pages import page
-from nerfcli.pages.embedded_pictures import data_uri, picture_rule, png_bytes
 from nerfcli.pages.findings import BAD, GOOD, LOOK, VERDICTS, Finding, worst
+from nerfcli.pages.page import data_uri, picture_rule, png_bytes
 
 _WORDS = {GOOD: "good", LOOK: "worth a look", BAD: "fix this first"}
 

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerfcli.captures import scene as scenes
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import recognised
+from nerfcli.captures.loading import load_scene
 from nerfcli.doctor.photo_facts import Source
 from nerfcli.errors import UserError, in_shell
 from nerfcli.photos.images import list_photos, list_unreadable, name_in, where_photos_may_be
@@ -16,7 +17,7 @@ class ExaminedCapture:
 
     path: Path
     sources: tuple[Source, ...]
-    scene: scenes.Scene | None
+    scene: Capture | None
 
     @property
     def kind(self) -> str:
@@ -38,7 +39,7 @@ def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
     if recognised(path) is not None:
         if subfolders:
             raise UserError(f"{path}: --subfolders is for photos, and this is a scene", "leave --subfolders out")
-        scene = scenes.load(path)
+        scene = load_scene(path)
         sources = tuple(Source(f.name, f.image, f.mask) for f in scene.frames if f.image is not None)
         return ExaminedCapture(path, sources, scene)
     if path.is_file():

@@ -4,7 +4,13 @@ Colours are sRGB in [0, 1], as float or rounded to 8 bits. Pixels that do not co
 left out entirely: from PSNR pixel by pixel, from SSIM with every window that contains one.
 """
 
+import importlib
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
 import numpy as np
+import torch
 from scipy.ndimage import minimum_filter
 from skimage.metrics import structural_similarity
 
@@ -77,3 +83,104 @@ def ssim(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float |
 def _window(shape: tuple[int, ...]) -> int:
     smallest = min(shape[:2])
     return WINDOW if smallest >= WINDOW else smallest - 1 + smallest % 2
+
+
+# Returns the distance of (picture, photo), both (H, W, 3) float in [0, 1].
+Perceptual = Callable[[np.ndarray, np.ndarray], float]
+
+NAME = "LPIPS AlexNet v0.1"
+INSTALL = "pip install 'nerfcli[lpips]'"
+# AlexNet halves a picture so often that nothing is left of a smaller one.
+SMALLEST = 32
+
+
+def find_perceptual(notify: Callable[[str], None]) -> Perceptual | None:
+    """Load the perceptual distance; None, with one line for the user, if it is not available.
+
+    Source: Zhang et al. 2018, The unreasonable effectiveness of deep features as a perceptual metric,
+    arXiv:1801.03924; computed by torchmetrics.
+    """
+    try:
+        importlib.import_module("torchvision")
+        metric = importlib.import_module("torchmetrics.image.lpip").LearnedPerceptualImagePatchSimilarity
+    # A torchvision that was built for another torch fails with a RuntimeError or OSError.
+    except (ImportError, RuntimeError, OSError) as error:
+        notify(f"LPIPS is not available ({_first_line(error)}); install it with {INSTALL}")
+        return None
+    try:
+        with _socket_timeout():
+            network = metric(net_type="alex", normalize=True)
+    except (RuntimeError, OSError) as error:  # no network (URLError is an OSError), or a truncated file
+        notify(f"LPIPS is not available: its weights could not be loaded ({_first_line(error)})")
+        return None
+
+    def measure(picture: np.ndarray, photo: np.ndarray) -> float:
+        pair = [torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)) for p in (picture, photo)]
+        with torch.no_grad():
+            return float(network(*(values.permute(2, 0, 1)[None] for values in pair)))
+
+    return measure
+
+
+@contextmanager
+def _socket_timeout() -> Iterator[None]:
+    """Limit the wait for servers that do not answer, for which torch waits forever."""
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(20.0)
+    try:
+        yield
+    finally:
+        socket.setdefaulttimeout(before)
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+# Values within half a grey level of 0 and 1 are saturated: they do not determine the true colour.
+EDGE = 0.5 / 255
+
+
+def colour_aligned(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np.ndarray:
+    """Return the picture with its colours fitted to the photo's, by least squares over the pixels that count.
+
+    Each channel becomes a quadratic polynomial of all three: products of two, the channels, and a constant, ten
+    coefficients. A pixel is excluded for a channel if it is saturated there in the picture, in its latest correction,
+    or in the photo. The fit is applied five times, each time clipped to [0, 1].
+
+    Args:
+        picture, photo: (H, W, 3) float in [0, 1].
+        used: (H, W) bool.
+
+    Returns:
+        (H, W, 3) float64 in [0, 1]. A channel with fewer than ten pixels to fit is unchanged.
+
+    Source: color_correct in multinerf, internal/image.py (Barron et al. 2022, Mip-NeRF 360; the "cc" metrics of
+    Zip-NeRF), here without masked pixels.
+    """
+    wanted = photo.reshape(-1, 3).astype(np.float64)
+    current = picture.reshape(-1, 3).astype(np.float64)
+    counted = _unsaturated(current) & used.reshape(-1, 1)
+    # The correction changes which pixels are saturated, so it is fitted several times.
+    for _ in range(5):
+        terms = _quadratic(current)
+        fitted = counted & _unsaturated(current) & _unsaturated(wanted)
+        corrected = current.copy()
+        for channel in range(3):
+            rows = fitted[:, channel]
+            if rows.sum() < terms.shape[1]:
+                continue
+            weights = np.linalg.lstsq(terms[rows], wanted[rows, channel], rcond=None)[0]
+            corrected[:, channel] = terms @ weights
+        current = np.clip(corrected, 0.0, 1.0)
+    return current.reshape(picture.shape)
+
+
+def _quadratic(colours: np.ndarray) -> np.ndarray:
+    """Return the terms (N, 10): products of two channels, the channels, 1."""
+    products = [colours[:, i : i + 1] * colours[:, i:] for i in range(3)]
+    return np.concatenate([*products, colours, np.ones_like(colours[:, :1])], axis=1)
+
+
+def _unsaturated(colours: np.ndarray) -> np.ndarray:
+    return (colours >= EDGE) & (colours <= 1.0 - EDGE)

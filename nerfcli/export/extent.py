@@ -11,6 +11,29 @@ from nerfcli.errors import UserError
 from nerfcli.export.depth_views import DepthView, depth_views, spread_frames
 from nerfcli.render.model import Model
 
+# Longer side in pixels of the pictures whose depths are fused, and most photos to render.
+MAX_SIZE, MOST_VIEWS = 480, 150
+FACES = 300_000
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """Settings for extracting geometry from a field.
+
+    Args:
+        box: low and high corner x0, y0, z0, x1, y1, z1 in the scene's frame and unit; None for the photos'
+            subject.
+        voxel_size: scene units; None for the resolution of the photos.
+        faces: most triangles.
+        max_size: longer side of the pictures whose depths are fused, pixels.
+    """
+
+    box: tuple[float, ...] | None = None
+    voxel_size: float | None = None
+    faces: int = FACES
+    max_size: int = MAX_SIZE
+
+
 # Most voxels along a side; beyond, not even the index of the blocks fits into memory.
 MOST_CELLS = 2048
 # Cameras look out of the ball if it contains less than this fraction of the seen points.

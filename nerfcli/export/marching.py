@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
 from nerfcli.export.fusion import SIDE, FusedVolume
-from nerfcli.export.mesh_files import read_ply_mesh, write_ply
+from nerfcli.ply import read_ply_mesh, write_ply
 
 # Voxels along a side of a brick, the unit of marching.
 _BRICK = 8 * SIDE

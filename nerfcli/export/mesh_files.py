@@ -1,4 +1,4 @@
-"""Meshes and points as PLY, GLB and OBJ files, each with a description of its values.
+"""Meshes as GLB and OBJ files, each with a description of its values; as PLY: `nerfcli.ply`.
 
 The description consists of plain values, the same for all formats: a comment `nerfcli` with JSON in PLY and OBJ,
 `asset.extras` in GLB. Further comments name the unit and the coordinate frame.
@@ -6,7 +6,7 @@ The description consists of plain values, the same for all formats: a comment `n
 
 import json
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,144 +15,13 @@ import numpy as np
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 from nerfcli.photos.colours import linear_light
+from nerfcli.ply import comments_of
 
-KEY = "nerfcli"
-_WORDS = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int", "u2": "ushort"}
-_CODES = {
-    word: code
-    for code, words in {
-        "f4": ("float", "float32"),
-        "f8": ("double", "float64"),
-        "u1": ("uchar", "uint8"),
-        "i1": ("char", "int8"),
-        "u2": ("ushort", "uint16"),
-        "i2": ("short", "int16"),
-        "i4": ("int", "int32"),
-        "u4": ("uint", "uint32"),
-    }.items()
-    for word in words
-}
 # Component types and chunk types of glTF 2.0.
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 # Float positions are stored relative to their mean if it is at least this many times their extent from the origin.
 _FAR = 1000.0
-
-
-def comments_of(description: Mapping[str, Any]) -> list[str]:
-    """Return the comment lines that describe a file, first for people, then for programs; in ASCII, as PLY wants it."""
-    unit, source = description.get("unit"), description.get("unit_source")
-    stated = {"metre": "metre", "arbitrary": "arbitrary, the scale of the scene is not known"}.get(str(unit), str(unit))
-    lines = [
-        "written by nerfcli",
-        f"unit {stated}{f' ({source})' if source else ''}",
-        f"frame {description.get('frame')}",
-        f"{KEY} {json.dumps(dict(description), ensure_ascii=True, allow_nan=False)}",
-    ]
-    return [line.replace("±", "+-").encode("ascii", "backslashreplace").decode() for line in lines]
-
-
-def description_in(comments: Iterable[str]) -> dict[str, Any]:
-    """Return the description that `comments_of` wrote; empty if there is none."""
-    for comment in comments:
-        if comment.startswith(f"{KEY} {{"):
-            try:
-                return json.loads(comment.partition(" ")[2])
-            except ValueError:
-                break
-    return {}
-
-
-def write_ply(
-    path: Path,
-    columns: Mapping[str, np.ndarray],
-    *,
-    faces: np.ndarray | None = None,
-    description: Mapping[str, Any] | None = None,
-) -> None:
-    """Write vertices, and triangles if there are any, as a binary PLY, atomically.
-
-    Args:
-        columns: vertex properties by name, (N,) float32, float64, int32, uint16 or uint8.
-        faces: (F, 3).
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    with atomic_path(path) as partial:
-        partial.write_bytes(ply_bytes(columns, faces=faces, description=description))
-
-
-def ply_bytes(
-    columns: Mapping[str, np.ndarray],
-    *,
-    faces: np.ndarray | None = None,
-    description: Mapping[str, Any] | None = None,
-) -> bytes:
-    """Return what `write_ply` writes."""
-    table = np.zeros(len(next(iter(columns.values()))), [(name, values.dtype) for name, values in columns.items()])
-    for name, values in columns.items():
-        table[name] = values
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [f"comment {line}" for line in (comments_of(description) if description else ())]
-    lines += [f"element vertex {len(table)}"]
-    lines += [f"property {_WORDS[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
-    if faces is not None:
-        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-    head = "\n".join([*lines, "end_header", ""]).encode("ascii")
-    return b"".join([head, table.view(np.uint8).data, b"" if faces is None else _triangles(faces).tobytes()])
-
-
-def read_ply_header(path: Path) -> tuple[dict[str, int], dict[str, str], list[str], int]:
-    """Read the header of a PLY file.
-
-    Returns:
-        The elements and their counts; the properties of a vertex and their NumPy types; the comments; the offset of the
-        body, 0 if it is not binary little-endian.
-
-    Raises:
-        UserError: it is not a PLY file, or its vertices hold lists, unknown types or a property twice.
-    """
-    with path.open("rb") as file:
-        head = file.read(2**20)
-    end = head.find(b"end_header")
-    stop = head.find(b"\n", end)
-    if head[:3] != b"ply" or end < 0 or stop < 0:
-        raise UserError(f"{path} is no PLY file: its header has no beginning or no end", "copy or export it once more")
-    elements: dict[str, int] = {}
-    properties: dict[str, str] = {}
-    comments, binary = [], False
-    for line in head[:end].decode("utf-8", errors="replace").splitlines():
-        match line.split():
-            case ["comment", *_]:
-                comments.append(line.partition(" ")[2])
-            case ["format", form, _]:
-                binary = form == "binary_little_endian"
-            case ["element", name, count] if count.isdecimal() and len(count) < 20:
-                elements[name] = int(count)
-            case ["property", kind, name] if list(elements) == ["vertex"] and kind in _CODES and name not in properties:
-                properties[name] = f"<{_CODES[kind]}"
-            case ["property", *_] if list(elements) == ["vertex"]:
-                raise UserError(f"{path} has vertices that cannot be read: {line.strip()[:80]}", "export it once more")
-    return elements, properties, comments, stop + 1 if binary else 0
-
-
-def read_ply_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the vertices (N, 3) and triangles (F, 3), int64, of a binary PLY whose faces hold only three indices.
-
-    Raises:
-        UserError: the file is of another kind, or truncated.
-    """
-    elements, properties, _, start = read_ply_header(path)
-    dtype = np.dtype(list(properties.items()))
-    faces = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
-    count, triangles = elements.get("vertex", 0), elements.get("face", 0)
-    data = path.read_bytes()
-    if not start or len(data) < start + count * dtype.itemsize + triangles * faces.itemsize:
-        raise UserError(f"{path} is no binary PLY file of triangles, or cut short", "export it once more")
-    table = np.frombuffer(data, dtype, count, start)
-    listed = np.frombuffer(data, faces, triangles, start + count * dtype.itemsize)
-    return np.stack([table[axis] for axis in "xyz"], axis=-1), listed["vertices"].astype(np.int64)
 
 
 def write_obj(
@@ -268,9 +137,3 @@ def read_glb_json(path: Path) -> dict[str, Any]:
     except (struct.error, ValueError) as error:
         raise UserError(f"{path} is no GLB file, or cut short: {error}", "export it once more") from error
     return content
-
-
-def _triangles(faces: np.ndarray) -> np.ndarray:
-    table = np.zeros(len(faces), [("count", "u1"), ("vertices", "<i4", 3)])
-    table["count"], table["vertices"] = 3, faces
-    return table

@@ -1,10 +1,12 @@
 """Describe files of meshes and points as plain values."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from nerfcli.errors import UserError
-from nerfcli.export.mesh_files import description_in, read_glb_json, read_ply_header
+from nerfcli.export.mesh_files import read_glb_json
+from nerfcli.ply import description_in, read_ply_header
 
 # Note for files without a description.
 NOT_STATED = "unit and frame"
@@ -18,7 +20,9 @@ def is_splat_file(path: Path) -> bool:
         UserError: the header of a .ply is damaged.
     """
     suffix = path.suffix.lower()
-    return path.is_file() and (suffix == ".spz" or (suffix == ".ply" and "f_dc_0" in read_ply_header(path)[1]))
+    if not path.is_file() or suffix not in (".spz", ".ply"):
+        return False
+    return suffix == ".spz" or "f_dc_0" in read_ply_header(path).vertex_properties
 
 
 def model_facts(path: Path) -> dict[str, Any]:
@@ -31,9 +35,9 @@ def model_facts(path: Path) -> dict[str, Any]:
         raise UserError(f"there is no {path}", "give a file that exists")
     match path.suffix.lower():
         case ".ply":
-            elements, properties, comments, _ = read_ply_header(path)
-            vertices, faces = elements.get("vertex", 0), elements.get("face")
-            return {**_described(comments), **_counts("PLY", vertices, faces), "properties": " ".join(properties)}
+            header = read_ply_header(path)
+            counts = _counts("PLY", header.count("vertex"), header.count("face") or None)
+            return {**_described(header.comments), **counts, "properties": " ".join(header.vertex_properties)}
         case ".glb":
             return _glb_facts(path)
         case _:
@@ -75,5 +79,5 @@ def _counts(form: str, vertices: int, faces: int | None) -> dict[str, Any]:
     return {"kind": "mesh" if faces else "points", "format": form, "vertices": vertices, "faces": faces}
 
 
-def _described(comments: list[str]) -> dict[str, Any]:
+def _described(comments: Sequence[str]) -> dict[str, Any]:
     return description_in(comments) or {"not_stated": NOT_STATED}

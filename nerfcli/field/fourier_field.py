@@ -66,7 +66,7 @@ class FourierField(Field):
         return density_from_log(self.log_density(self._hidden(coordinates))[:, 0])
 
     def radiance(
-        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
+        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, table_grad: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """See `kernels.Medium`; there is no table, and the sink is not used."""
         hidden = self._hidden(coordinates)

@@ -99,11 +99,11 @@ class HashField(Field):
         return self.backend.density(coordinates, self.medium())
 
     def radiance(
-        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
+        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, table_grad: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """See `kernels.Medium`. Backends render the `HashGrid` itself faster."""
         grid = self.medium()
-        encoded = self.backend.hash_encode(coordinates, grid.table, grid.resolutions, sink=sink)
+        encoded = self.backend.hash_encode(coordinates, grid.table, grid.resolutions, table_grad=table_grad)
         return reference.radiance(encoded, spherical_harmonics(directions, grid.view_degree), rays, grid.layers)
 
     @torch.no_grad()

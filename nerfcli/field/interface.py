@@ -100,6 +100,6 @@ class Field(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def radiance(
-        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
+        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, table_grad: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return density and colour of points; see `kernels.Medium`."""

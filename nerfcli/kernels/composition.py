@@ -27,7 +27,7 @@ from nerfcli.kernels.interface import (
     Targets,
     Trace,
 )
-from nerfcli.kernels.reference.compositing import contracted_distance, off_target, scale_gradients, sum_along_rays
+from nerfcli.kernels.reference.compositing import contracted_distance, depth_loss, scale_gradients, sum_along_rays
 
 
 class Backend(abc.ABC):
@@ -40,11 +40,11 @@ class Backend(abc.ABC):
 
     name: str
     deterministic: bool
-    parts: ClassVar[ModuleType]
+    operations: ClassVar[ModuleType]
 
     def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
         """Return origins (N, 3), directions (N, 3) and colours (N, C) in [0, 1] of chosen pixels (N,) int64."""
-        return self.parts.pixel_rays(chosen, pixels)
+        return self.operations.pixel_rays(chosen, pixels)
 
     def render_rays(
         self,
@@ -54,46 +54,46 @@ class Backend(abc.ABC):
         targets: Targets = Targets(),
         *,
         background: Tensor,
-        sink: Tensor | None = None,
-        visits: Tensor | None = None,
+        table_grad: Tensor | None = None,
+        cell_depths: Tensor | None = None,
         trace: Trace | None = None,
     ) -> RaySums:
         """Render rays for training, with gradients.
 
         Args:
             background: (R, 3) sRGB, without gradient.
-            sink: of the table's shape; the gradient with respect to the table is added to it instead of being passed to
-                autograd, which saves making, filling and adding a buffer of megabytes at every step.
-            visits: (C, C, C) over the unit cube; raised to the optical depth of the samples, including those left out
-                for their weight, see `keep_largest`.
+            table_grad: of the table's shape; the gradient with respect to the table is added to it instead of being
+                passed to autograd, which saves making, filling and adding a buffer of megabytes at every step.
+            cell_depths: (C, C, C) over the unit cube; raised to the optical depth of the samples, including those
+                left out for their weight, see `keep_largest`.
             trace: called with intermediate tensors.
 
         Differentiable in origins, directions, the table and the layers.
         """
-        samples = self._visible(rays.detached(), march, medium, visits)
+        samples = self._visible(rays.detached(), march, medium, cell_depths)
         starts, ends, offsets = samples.starts, samples.ends, samples.offsets
-        index = self.parts.ray_indices(offsets) if samples.rays is None else samples.rays
+        index = self.operations.ray_indices(offsets) if samples.rays is None else samples.rays
         if torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad):
             samples = samples._replace(coordinates=self._coordinates(rays, samples, march.contraction))
         if isinstance(medium, HashGrid):
             widths = None
             if medium.antialias and rays.cones is not None:
                 widths = sample_widths(rays.detached(), starts, ends, index=index, contraction=march.contraction)
-            density, rgb = self._radiance(samples, rays.directions, index, medium, widths=widths, sink=sink)
+            density, rgb = self._radiance(samples, rays.directions, index, medium, widths=widths, table_grad=table_grad)
         else:
-            density, rgb = medium.radiance(samples.coordinates, rays.directions, index, sink=sink)
+            density, rgb = medium.radiance(samples.coordinates, rays.directions, index, table_grad=table_grad)
         if targets.near is not None and density.requires_grad:
             scale_gradients(density, rgb, distance=starts, near=targets.near)
-        colour, transmittance, weights = self.parts.composite(
+        colour, transmittance, weights = self.operations.composite(
             density, rgb, ends - starts, offsets=offsets, background=background
         )
         apart = off = transmittance[:0]
         if targets.distortion:
             near, far = self._contracted(starts, ends)
-            apart = self.parts.distortion(weights, near, far, offsets)
+            apart = self.operations.distortion(weights, near, far, offsets)
         if targets.distances is not None and len(targets.distances):
             middles = (starts + ends) / 2
-            off = self._off_target(
+            off = self._depth_loss(
                 weights, transmittance, middles, offsets=offsets, rays=index, distances=targets.distances
             )
         if trace is not None:
@@ -128,8 +128,8 @@ class Backend(abc.ABC):
         samples = self._visible(rays.detached(), march, medium, None)
         starts, ends, density, offsets = samples.starts, samples.ends, samples.density, samples.offsets
         lengths = ends - starts
-        weights, _ = self.parts.interval_weights(density, lengths, offsets)
-        index = self.parts.ray_indices(offsets) if samples.rays is None else samples.rays
+        weights, _ = self.operations.interval_weights(density, lengths, offsets)
+        index = self.operations.ray_indices(offsets) if samples.rays is None else samples.rays
         unseen = weights <= (negligible / offsets.diff().clamp_min(1).to(weights))[index]
         seen = (~unseen).nonzero()[:, 0]
         rgb = torch.full((len(density), 3), UNSEEN, dtype=density.dtype, device=density.device)
@@ -138,10 +138,10 @@ class Backend(abc.ABC):
             rgb[seen] = self._networks(samples.encoded[seen], rays.directions, index[seen], medium)[1]
         else:
             rgb[seen] = medium.radiance(samples.coordinates[seen], rays.directions, index[seen])[1]
-        colour, transmittance, _ = self.parts.composite(
+        colour, transmittance, _ = self.operations.composite(
             density, rgb, lengths, offsets=offsets, background=background.expand(len(rays.origins), 3)
         )
-        light = self.parts.light_ends(density, starts, ends, offsets=offsets, fractions=fractions)
+        light = self.operations.ray_termination(density, starts, ends, offsets=offsets, fractions=fractions)
         stopped = transmittance <= math.exp(-march.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
         behind = torch.maximum(background, 1.0 - background).amax(-1)  # largest difference from the background's colour
         left_out = UNSEEN * self._sum_along_rays(torch.where(unseen, weights, 0.0), offsets)
@@ -157,7 +157,7 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def hash_encode(
-        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
+        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, table_grad: Tensor | None = None
     ) -> Tensor:
         """Interpolate tables at points (N, 3) of the unit cube, giving (N, L * F), for media made of tables.
 
@@ -200,7 +200,7 @@ class Backend(abc.ABC):
         """
 
     @abc.abstractmethod
-    def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, visits: Tensor | None) -> Samples:
+    def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, cell_depths: Tensor | None) -> Samples:
         """See `reference.visible_samples`."""
 
     @abc.abstractmethod
@@ -208,7 +208,7 @@ class Backend(abc.ABC):
         """Return the coordinates of samples again, differentiable in their rays."""
 
     @abc.abstractmethod
-    def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, sink: Tensor | None) -> Tensor:
+    def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, table_grad: Tensor | None) -> Tensor:
         """Return the encoded features of samples again, with gradients."""
 
     @abc.abstractmethod
@@ -223,7 +223,7 @@ class Backend(abc.ABC):
         """Return `reference.contracted_distance` of the ends of intervals."""
         return contracted_distance(starts), contracted_distance(ends)
 
-    def _off_target(
+    def _depth_loss(
         self,
         weights: Tensor,
         transmittance: Tensor,
@@ -233,8 +233,8 @@ class Backend(abc.ABC):
         rays: Tensor,
         distances: Tensor,
     ) -> Tensor:
-        """See `reference.off_target`; `rays` (N,) are the rays of the samples."""
-        return off_target(weights, transmittance, middles, offsets=offsets, distances=distances)
+        """See `reference.depth_loss`; `rays` (N,) are the rays of the samples."""
+        return depth_loss(weights, transmittance, middles, offsets=offsets, distances=distances)
 
     def _sum_along_rays(self, values: Tensor, offsets: Tensor) -> Tensor:
         """See `reference.sum_along_rays`; for scalars (N,), without gradients."""
@@ -248,20 +248,20 @@ class Backend(abc.ABC):
         grid: HashGrid,
         *,
         widths: Tensor | None,
-        sink: Tensor | None,
+        table_grad: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         """Return densities and colours of samples along directions (R, 3) of rays `index` (N,), with gradients."""
-        encoded = self._encoded(samples, grid, widths=widths, sink=sink)
+        encoded = self._encoded(samples, grid, widths=widths, table_grad=table_grad)
         return self._networks(encoded, directions, index, grid)
 
-    def _visible(self, rays: Rays, march: March, medium: HashGrid | Medium, visits: Tensor | None) -> Samples:
+    def _visible(self, rays: Rays, march: March, medium: HashGrid | Medium, cell_depths: Tensor | None) -> Samples:
         if isinstance(medium, HashGrid):
-            return self._visible_in_grid(rays, march, medium, visits)
+            return self._visible_in_grid(rays, march, medium, cell_depths)
         with torch.no_grad():  # samples behind surfaces are computed, then left out
-            starts, ends, coordinates, offsets = self.parts.occupied_samples(rays, march)
+            starts, ends, coordinates, offsets = self.operations.occupied_samples(rays, march)
             density = torch.cat([medium.density(chunk) for chunk in coordinates.split(2**16)])
-            reached = self.parts.optical_depth_before(density, ends - starts, offsets) < march.max_optical_depth
+            reached = self.operations.optical_depth_before(density, ends - starts, offsets) < march.max_optical_depth
             kept = torch.nn.functional.pad(reached.cumsum(0), (1, 0))[offsets]
-            if visits is not None:
-                self.parts.keep_largest(visits, coordinates[reached], (density * (ends - starts))[reached])
+            if cell_depths is not None:
+                self.operations.keep_largest(cell_depths, coordinates[reached], (density * (ends - starts))[reached])
             return Samples(starts[reached], ends[reached], density[reached], None, coordinates[reached], kept)

@@ -86,12 +86,12 @@ class Medium(Protocol):
         ...
 
     def radiance(
-        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
+        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, table_grad: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return density (N,) and sRGB colour (N, 3) at coordinates (N, 3) along `directions` (R, 3) of `rays` (N,).
 
         Args:
-            sink: buffer to which the gradient of the field's table is added, instead of passing it to autograd.
+            table_grad: buffer to which the gradient of the field's table is added, instead of passing it to autograd.
         """
         ...
 
@@ -117,14 +117,14 @@ class RaySums(NamedTuple):
         rgb: (R, 3) sRGB on the background.
         transmittance: (R,) fraction of the light that passes all samples.
         distortion: (R,) in contracted distance, see `contracted_distance`; (0,) if it is not a target.
-        off_target: (K,) in [0, 1], see `off_target`; (0,) without such targets.
+        depth_loss: (K,) in [0, 1], see `depth_loss`; (0,) without such targets.
         samples: () int64, total number of samples of the rays.
     """
 
     rgb: Tensor
     transmittance: Tensor
     distortion: Tensor
-    off_target: Tensor
+    depth_loss: Tensor
     samples: Tensor
 
 
@@ -144,15 +144,15 @@ class AdamStep(NamedTuple):
     decay: float = 0.0
 
 
-class LightEnds(NamedTuple):
-    """Distribution of absorption along each of R rays; see `light_ends`."""
+class RayTermination(NamedTuple):
+    """Distribution of absorption along each of R rays; see `ray_termination`."""
 
     opacity: Tensor
     transmittance: Tensor
     mean: Tensor
     spread: Tensor
-    heaviest: Tensor
-    largest: Tensor
+    peak: Tensor
+    peak_weight: Tensor
     quantiles: Tensor
 
 
@@ -176,7 +176,7 @@ class RaysSeen(NamedTuple):
     """
 
     rgb: Tensor
-    ends: LightEnds
+    ends: RayTermination
     truncation_error: Tensor
     intervals: Intervals
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.matching.tracks import Tracks
-from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.photos.undistorted import WIDEST_DEG
+from nerfcli.photos.loading import WIDEST_DEG, LoadedPhoto
 
 # Rotations panorama_from_face: front, right, back, left, up, down.
 _TURNS = np.array(

@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.photos.undistorted import pinhole_of, undistorted
+from nerfcli.photos.loading import LoadedPhoto, pinhole_of, undistorted
 
 # The fewest points that determine the range of disparities of a pair.
 FEWEST_SHARED = 12

@@ -1,13 +1,18 @@
 """HTML page around the content of a command: head, common style, origin; and writing the page."""
 
+import base64
 import hashlib
 import json
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
 from html import escape
 from pathlib import Path
 from string import Template
 from typing import Any
+
+import cv2
+import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
@@ -142,3 +147,69 @@ $body
 </main>
 $script</body></html>
 """)
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Collection[int] = ()) -> str:
+    """Return a table that scrolls sideways where the window is too narrow; all cells are plain text.
+
+    Args:
+        rows: each with as many cells.
+        numbers: indices of the columns that are aligned to the right.
+    """
+
+    def line(tag: str, cells: Sequence[str]) -> str:
+        return "".join(
+            f"<{tag}{' class=number' if index in numbers else ''}>{escape(cell)}</{tag}>"
+            for index, cell in enumerate(cells)
+        )
+
+    head = f"<thead><tr>{line('th', columns)}</tr></thead>"
+    body = "\n".join(f"<tr>{line('td', row)}</tr>" for row in rows)
+    return f'<div class="wide"><table>{head}<tbody>{body}</tbody></table></div>'
+
+
+JPEG_QUALITY = 85
+
+
+def data_uri(data: bytes, kind: str) -> str:
+    """Return an encoded picture as a data URI.
+
+    Args:
+        kind: jpeg or png.
+    """
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def jpeg_bytes(picture: np.ndarray, *, longest_px: int | None = None, quality: int = JPEG_QUALITY) -> bytes:
+    """Encode a photo or a rendering as JPEG.
+
+    Args:
+        picture: (H, W, 3) uint8 sRGB.
+        longest_px: limit of its longer side; smaller pictures are not scaled. None for no limit.
+    """
+    return _encoded(fitted(picture, longest_px), ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def png_bytes(picture: np.ndarray) -> bytes:
+    """Encode a drawing (H, W, 3) uint8 sRGB as PNG, without loss."""
+    return _encoded(picture, ".png", [])
+
+
+def fitted(picture: np.ndarray, longest_px: int | None) -> np.ndarray:
+    """Reduce a picture if its longer side exceeds the limit."""
+    scale = 1.0 if longest_px is None else longest_px / max(picture.shape[:2])
+    if scale >= 1.0:
+        return picture
+    size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
+def picture_rule(name: str, uri: str) -> str:
+    """Return a CSS rule that shows a picture in all elements of a class, so that it is stored only once."""
+    return f".{name}{{background-image:url({uri})}}"
+
+
+def _encoded(picture: np.ndarray, suffix: str, options: list[int]) -> bytes:
+    encoded, data = cv2.imencode(suffix, picture[..., ::-1], options)
+    assert encoded
+    return data.tobytes()

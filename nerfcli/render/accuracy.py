@@ -109,7 +109,7 @@ def measure_error(
     )
 
 
-def refined(cuts: Tensor, parts: int) -> Tensor:
+def refine_cuts(cuts: Tensor, parts: int) -> Tensor:
     """Return the distances (S * parts + 1,) that cut each interval of `cuts` (S + 1,) into equal parts."""
     fraction = torch.arange(parts, dtype=cuts.dtype, device=cuts.device) / parts
     inner = cuts[:-1, None] + cuts.diff()[:, None] * fraction
@@ -129,7 +129,7 @@ def _renderings(
             model,
             rays.origin.expand_as(directions),
             directions,
-            cuts=refined(cuts, parts).to(directions),
+            cuts=refine_cuts(cuts, parts).to(directions),
             background=background,
             fractions=fractions(depth) if depth is not None else (),
             tolerance=wanted,

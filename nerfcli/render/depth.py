@@ -20,12 +20,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nerfcli.kernels import LightEnds
+from nerfcli.kernels import RayTermination
 
 CONVENTIONS = ("conditional", "moment", "background", "max-weight", "median")
 AXES = ("ray", "z")
 QUANTILE = "quantile:"
-# `LightEnds.quantiles` of a picture: the median for the disagreement, then the requested one.
+# `RayTermination.quantiles` of a picture: the median for the disagreement, then the requested one.
 MEDIAN = 0.5
 
 
@@ -89,7 +89,7 @@ def fractions(request: DepthRequest) -> tuple[float, ...]:
     return (MEDIAN,) if request.fraction is None or request.fraction == MEDIAN else (MEDIAN, request.fraction)
 
 
-def requested(request: DepthRequest, ends: LightEnds, *, background_distance: Tensor) -> Tensor:
+def requested(request: DepthRequest, ends: RayTermination, *, background_distance: Tensor) -> Tensor:
     """Select the requested depth (R,).
 
     Args:
@@ -105,23 +105,23 @@ def requested(request: DepthRequest, ends: LightEnds, *, background_distance: Te
         case "conditional":
             depth = ends.mean
         case "max-weight":
-            depth = ends.heaviest
+            depth = ends.peak
         case _:
             depth = ends.quantiles[:, -1]
     # Quantiles are NaN by themselves where the opacity does not reach them.
     return torch.where(ends.opacity >= request.min_opacity, depth, torch.nan)
 
 
-def spread(request: DepthRequest, ends: LightEnds) -> Tensor:
+def spread(request: DepthRequest, ends: RayTermination) -> Tensor:
     """Return the standard deviation (R,) of where light ends, given that it ends; NaN below `min_opacity`."""
     return torch.where(ends.opacity >= request.min_opacity, ends.spread, torch.nan)
 
 
-def disagreement(request: DepthRequest, ends: LightEnds) -> Tensor:
+def disagreement(request: DepthRequest, ends: RayTermination) -> Tensor:
     """Return |median - conditional| (R,); NaN where the opacity is below 1/2 or below the request's `min_opacity`."""
     return (median(request, ends) - ends.mean).abs()
 
 
-def median(request: DepthRequest, ends: LightEnds) -> Tensor:
+def median(request: DepthRequest, ends: RayTermination) -> Tensor:
     """Return the distance (R,) at which half of all light has ended; NaN below an opacity of 1/2 or `min_opacity`."""
     return torch.where(ends.opacity >= request.min_opacity, ends.quantiles[:, 0], torch.nan)

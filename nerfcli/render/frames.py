@@ -1,4 +1,4 @@
-"""Export of all frames of an order: render the missing ones, then write the outputs that need all of them."""
+"""Export of all frames of a job: render the missing ones, then write the outputs that need all of them."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -14,7 +14,7 @@ from nerfcli.exclusive import exclusive
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.files.depth_files import write_levels
 from nerfcli.render.files.levels import scale_in_words
-from nerfcli.render.job import DESCRIPTION, Order
+from nerfcli.render.job import DESCRIPTION, RenderJob
 from nerfcli.render.one_frame import removed_in_words, render_frame
 from nerfcli.render.outputs import depth_meta
 from nerfcli.render.presentation import write_previews, write_videos
@@ -24,7 +24,7 @@ from nerfcli.render.unfinished import UnfinishedFrames, take_over, unfinished_of
 
 def export_frames(
     model: Renderable,
-    order: Order,
+    job: RenderJob,
     folder: Path,
     *,
     on_rays: Callable[[int], None],
@@ -36,7 +36,7 @@ def export_frames(
     Layout: rgb/NAME.png, depth/NAME.tiff with depth/NAME.png to look at, opacity/NAME.png; exr/NAME.exr,
     depth16/NAME.png; rgb.mp4, depth.mp4, opacity.mp4; render.json. The colours of all depth previews share one range,
     so that a video does not flicker. Until the folder is complete, its files are in a hidden folder beside it, which
-    stays if the command ends early: the same order then renders only the missing frames. The frames of a finished
+    stays if the command ends early: the same job then renders only the missing frames. The frames of a finished
     folder that differs only in previews and videos are reused. Memory does not grow with the number of frames.
 
     Args:
@@ -45,38 +45,36 @@ def export_frames(
         threads: number of threads; the files do not depend on it.
 
     Returns:
-        The paths to show, see `Order.results`.
+        The paths to show, see `RenderJob.results`.
 
     Raises:
         UserError: the folder cannot be written, or a video cannot be made.
     """
-    order.check()
-    unfinished = unfinished_of(order, folder)
+    job.check()
+    unfinished = unfinished_of(job, folder)
     with exclusive(unfinished.lock, f"nerfcli render is working on {folder}"):
-        if order.shares_pictures_with(folder):
-            take_over(unfinished, order, folder)
-        everything = range(len(order.frames))
-        _render_missing(
-            model, order, everything, unfinished=unfinished, on_rays=on_rays, notify=notify, threads=threads
-        )
-        meta = depth_meta(model, order.settings.depth)
-        ranges = write_previews(unfinished.folder, order, meta, threads=threads)
+        if job.shares_pictures_with(folder):
+            take_over(unfinished, job, folder)
+        everything = range(len(job.frames))
+        _render_missing(model, job, everything, unfinished=unfinished, on_rays=on_rays, notify=notify, threads=threads)
+        meta = depth_meta(model, job.settings.depth)
+        ranges = write_previews(unfinished.folder, job, meta, threads=threads)
         levels = {}
-        if order.settings.in_levels:
-            written = write_levels(unfinished.folder, order.names, meaning=meta)
+        if job.settings.in_levels:
+            written = write_levels(unfinished.folder, job.names, meaning=meta)
             levels = {"depth16": asdict(written)}
             notify(f"16-bit files: {scale_in_words(replace(meta, units_per_level=written.units_per_level))}")
             if written.pixels_beyond:
                 notify(f"{written.pixels_beyond} pixels are too distant for 16-bit files and have no depth there")
-        write_videos(unfinished.folder, order, meta, ranges=ranges, notify=notify)
-        notes = {name: unfinished.noted(name) for name in order.names}
+        write_videos(unfinished.folder, job, meta, ranges=ranges, notify=notify)
+        notes = {name: unfinished.noted(name) for name in job.names}
         facts = {name: note["facts"] for name, note in notes.items()}
-        if words := removed_in_words(order.settings.depth, list(facts.values())):
+        if words := removed_in_words(job.settings.depth, list(facts.values())):
             notify(words)
         description = {
-            **order.of_pictures(),
-            **order.settings.of_presentation(),
-            **({"depth_meaning": meta.to_json()} if order.settings.measured else {}),
+            **job.key(),
+            **job.settings.of_presentation(),
+            **({"depth_meaning": meta.to_json()} if job.settings.measured else {}),
             **levels,
             "ranges": ranges,
             "error_meaning": ERROR_IN_WORDS,
@@ -85,12 +83,12 @@ def export_frames(
         }
         write_json(unfinished.folder / DESCRIPTION, description)
         unfinished.finish(folder)
-        return order.results(folder)
+        return job.results(folder)
 
 
 def export_part(
     model: Renderable,
-    order: Order,
+    job: RenderJob,
     folder: Path,
     part: range,
     *,
@@ -98,7 +96,7 @@ def export_part(
     notify: Callable[[str], None],
     threads: int = 1,
 ) -> Path:
-    """Render some frames of an order, which `export_frames` then finds; the other arguments are the same.
+    """Render some frames of a job, which `export_frames` then finds; the other arguments are the same.
 
     Args:
         part: indices of frames; several machines that share a disk may render different ones at the same time.
@@ -106,17 +104,17 @@ def export_part(
     Returns:
         The unfinished folder.
     """
-    order.check()
-    unfinished = unfinished_of(order, folder)
-    _render_missing(model, order, part, unfinished=unfinished, on_rays=on_rays, notify=notify, threads=threads)
-    there = sum(map(unfinished.has, order.names))
-    notify(f"{there} of {len(order.names)} frames are complete; the same command without --frames renders the others")
+    job.check()
+    unfinished = unfinished_of(job, folder)
+    _render_missing(model, job, part, unfinished=unfinished, on_rays=on_rays, notify=notify, threads=threads)
+    there = sum(map(unfinished.has, job.names))
+    notify(f"{there} of {len(job.names)} frames are complete; the same command without --frames renders the others")
     return unfinished.folder
 
 
 def _render_missing(
     model: Renderable,
-    order: Order,
+    job: RenderJob,
     part: range,
     *,
     unfinished: UnfinishedFrames,
@@ -124,12 +122,12 @@ def _render_missing(
     notify: Callable[[str], None],
     threads: int,
 ) -> None:
-    held = {index for index in part if unfinished.has(order.names[index])}
+    held = {index for index in part if unfinished.has(job.names[index])}
     missing = [index for index in part if index not in held]
     if held:
         notify(f"resuming: {len(held)} of {len(part)} frames are already in {unfinished.folder}")
-        on_rays(sum(map(order.rays, held)))
-    render_one = partial(render_frame, model, order, unfinished=unfinished)
+        on_rays(sum(map(job.rays, held)))
+    render_one = partial(render_frame, model, job, unfinished=unfinished)
     # Some steps of a picture use one thread, so several are in progress; more would wait for Python's lock.
     at_a_time = min(threads, 4, len(missing))
     if at_a_time > 1 and model.thread_safe:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.photos.exif_exposure import log_exposures
+from nerfcli.photos.exif import log_exposures
 from nerfcli.render.model import Model
 
 # Sources of a held-out photo's gains: none, as the model has no exposures; EXIF; EXIF and an offset interpolated from

@@ -1,4 +1,4 @@
-"""An order: which views of which field to render; and whether a folder already holds the result."""
+"""A job: which views of which field to render; and whether a folder already holds the result."""
 
 import hashlib
 import json
@@ -48,7 +48,7 @@ def with_suffix(stem: Path, suffix: str) -> Path:
 
 
 @dataclass(frozen=True)
-class Order:
+class RenderJob:
     """Views, settings and provenance of a rendering job.
 
     Args:
@@ -75,11 +75,11 @@ class Order:
         camera = self.frames[index].camera
         return camera.width * camera.height
 
-    def of_pictures(self) -> dict[str, Any]:
+    def key(self) -> dict[str, Any]:
         """Return everything that determines the rendered numbers, as plain values."""
         return {
             "nerfcli": __version__,
-            "settings": self.settings.of_pictures(),
+            "settings": self.settings.pixel_settings(),
             "frames": describe_frames(self.frames),
             **self.provenance,
         }
@@ -87,7 +87,7 @@ class Order:
     @cached_property
     def digest(self) -> str:
         """Twelve hexadecimal digits that differ where the rendered numbers may differ."""
-        text = json.dumps(self.of_pictures(), sort_keys=True)
+        text = json.dumps(self.key(), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     def results(self, folder: Path) -> list[Path]:
@@ -98,7 +98,7 @@ class Order:
         return [folder / f"{output}.{form}" for form in video.formats for output in self.settings.outputs]
 
     def check(self) -> None:
-        """Refuse an order that would fail only after the last picture is rendered.
+        """Refuse a job that would fail only after the last picture is rendered.
 
         Raises:
             UserError: an encoder is missing, or a video would have pictures of different sizes.
@@ -115,17 +115,17 @@ class Order:
             )
 
     def is_held_by(self, folder: Path) -> bool:
-        """Return whether the finished folder already holds this order, pictures and presentation.
+        """Return whether the finished folder already holds this job, pictures and presentation.
 
         It is also False if the folder holds the same pictures and nothing would be replaced, as when videos are added.
 
         Raises:
-            UserError: it holds another order.
+            UserError: it holds another job.
         """
         made = _made(folder)
         if made is None:
             return False
-        wanted = self.of_pictures()
+        wanted = self.key()
         del wanted["nerfcli"]
         depth, there = wanted["settings"]["depth"], made.get("settings", {}).get("depth")
         if self.settings.measured and depth != there and isinstance(there, dict):
@@ -157,7 +157,7 @@ class Order:
         if made is None or "files" not in made:
             return False
         presentation = self.settings.of_presentation()
-        return all(made.get(key) == value for key, value in self.of_pictures().items()) and any(
+        return all(made.get(key) == value for key, value in self.key().items()) and any(
             made.get(key) != value for key, value in presentation.items()
         )
 

@@ -1,4 +1,4 @@
-"""Render one frame of an order with all that is asked for, write its files, and note it as complete."""
+"""Render one frame of a job with all that is asked for, write its files, and note it as complete."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -18,7 +18,7 @@ from nerfcli.render.depth import DepthRequest
 from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.files.depth_files import frame_meta, write_maps
 from nerfcli.render.files.depth_pictures import DepthMeta, limits_in_words
-from nerfcli.render.job import Order, with_suffix
+from nerfcli.render.job import RenderJob, with_suffix
 from nerfcli.render.outputs import BLACK, ExportSettings, depth_meta
 from nerfcli.render.pictures import RenderedPicture, straight_rgba
 from nerfcli.render.renderable import Renderable
@@ -117,16 +117,16 @@ def _to_bytes(values: np.ndarray) -> np.ndarray:
 
 
 def render_frame(
-    model: Renderable, order: Order, index: int, *, unfinished: UnfinishedFrames, on_rays: Callable[[int], None]
+    model: Renderable, job: RenderJob, index: int, *, unfinished: UnfinishedFrames, on_rays: Callable[[int], None]
 ) -> None:
     """Render a frame and write its files to the unfinished folder.
 
-    The files depend only on the model and the order, not on other frames or on threads.
+    The files depend only on the model and the job, not on other frames or on threads.
 
     Raises:
         UserError: a file cannot be written.
     """
-    frame, name, settings = order.frames[index], order.names[index], order.settings
+    frame, name, settings = job.frames[index], job.names[index], job.settings
     wanted = settings.depth if settings.measured else None
     background = BLACK if settings.rgba else model.background
     picture = model.render(frame, background=background, depth=wanted, on_tile=on_rays)
@@ -134,12 +134,12 @@ def render_frame(
         picture = replace(picture, rgb=straight_rgba(picture))
     removed = {}
     if settings.needs_visibility:
-        picture = with_coverage(picture, frame, axis=settings.depth.axis, photo_depths=order.photo_depths)
-        if order.depth_errors is not None:
-            picture = with_measured_errors(picture, order.depth_errors)
+        picture = with_coverage(picture, frame, axis=settings.depth.axis, photo_depths=job.photo_depths)
+        if job.depth_errors is not None:
+            picture = with_measured_errors(picture, job.depth_errors)
         picture, removed = without_unseen_depth(picture, settings.depth)
     facts = truncation_bounds(picture, TOLERANCE) | model.measured_error(frame, depth=wanted)
     bounds = {**facts, "meaning": ERROR_IN_WORDS}
-    meta = frame_meta(depth_meta(model, settings.depth), frame, provenance=order.provenance, error_bounds=bounds)
+    meta = frame_meta(depth_meta(model, settings.depth), frame, provenance=job.provenance, error_bounds=bounds)
     files = _write_outputs(picture, unfinished.folder, name, settings=settings, meta=meta, background=model.background)
     unfinished.note(name, files, facts=facts | removed)

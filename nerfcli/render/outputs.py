@@ -83,7 +83,7 @@ class ExportSettings:
         """True if depth is also written as 16-bit levels."""
         return "png16" in self.formats and "depth" in self.outputs
 
-    def of_pictures(self) -> dict[str, Any]:
+    def pixel_settings(self) -> dict[str, Any]:
         """Return the settings that determine the rendered numbers and their files, as plain values."""
         settings = asdict(self)
         del settings["video"]

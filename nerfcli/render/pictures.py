@@ -10,7 +10,7 @@ from torch import Tensor
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.background import Background, colours_behind
-from nerfcli.kernels import LightEnds
+from nerfcli.kernels import RayTermination
 from nerfcli.render.depth import DepthRequest, disagreement, fractions, median, requested, spread
 from nerfcli.render.rays import PictureRays, successive_rays
 from nerfcli.render.tracing import TOLERANCE, render_rays
@@ -178,7 +178,13 @@ def _render_tile(
 
 
 def depth_maps_of(
-    depth: DepthRequest, ends: LightEnds, *, cosines: Tensor, unit: float, valid: Tensor, background_distance: float
+    depth: DepthRequest,
+    ends: RayTermination,
+    *,
+    cosines: Tensor,
+    unit: float,
+    valid: Tensor,
+    background_distance: float,
 ) -> tuple[Tensor, ...]:
     """Return the requested depth, spread, disagreement and median (R,), NaN where undefined.
 
@@ -197,7 +203,7 @@ def depth_maps_of(
     ends = ends._replace(
         mean=ends.mean * factor,
         spread=ends.spread * factor,
-        heaviest=ends.heaviest * factor,
+        peak=ends.peak * factor,
         quantiles=ends.quantiles * factor[:, None],
     )
     distances = requested(depth, ends, background_distance=background_distance * factor)

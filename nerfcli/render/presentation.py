@@ -1,4 +1,4 @@
-"""Outputs that need all frames of an order: previews with a common range of colours, and videos."""
+"""Outputs that need all frames of a job: previews with a common range of colours, and videos."""
 
 import json
 from collections.abc import Callable, Iterable, Iterator
@@ -14,13 +14,14 @@ from nerfcli.photos.images import read_image, write_png
 from nerfcli.render.files.depth_files import read_map
 from nerfcli.render.files.depth_pictures import KEY, DepthMeta
 from nerfcli.render.files.film import write_video
-from nerfcli.render.files.preview import COLOURS, preview
-from nerfcli.render.files.quantiles import quantiles
-from nerfcli.render.job import Order
+from nerfcli.render.files.preview import COLOURS, preview, quantiles
+from nerfcli.render.job import RenderJob
 from nerfcli.render.outputs import MEASURED, meaning_of
 
 
-def write_previews(folder: Path, order: Order, meta: DepthMeta, *, threads: int = 1) -> dict[str, tuple[float, float]]:
+def write_previews(
+    folder: Path, job: RenderJob, meta: DepthMeta, *, threads: int = 1
+) -> dict[str, tuple[float, float]]:
     """Write a false-colour PNG beside each measured file, with one range per output.
 
     Args:
@@ -34,14 +35,14 @@ def write_previews(folder: Path, order: Order, meta: DepthMeta, *, threads: int 
         UserError: a file cannot be read or written.
     """
     ranges = {}
-    for output in order.settings.measured:
-        meaning = meaning_of(meta, order.settings.depth, output)
-        ranges[output] = _write_previews_of(output, folder, order, meaning, threads=threads)
+    for output in job.settings.measured:
+        meaning = meaning_of(meta, job.settings.depth, output)
+        ranges[output] = _write_previews_of(output, folder, job, meaning, threads=threads)
     return ranges
 
 
 def _write_previews_of(
-    output: str, folder: Path, order: Order, meaning: DepthMeta, *, threads: int
+    output: str, folder: Path, job: RenderJob, meaning: DepthMeta, *, threads: int
 ) -> tuple[float, float]:
     """Write the previews of one output, and return its range."""
     kept: dict[str, np.ndarray] = {}
@@ -55,7 +56,7 @@ def _write_previews_of(
             kept[name] = values
         return values
 
-    lo, hi = value_range(lambda: map(read, order.names), output)
+    lo, hi = value_range(lambda: map(read, job.names), output)
     metadata = _texts(meaning) | {"range": f"{lo} {hi}", "colour map": COLOURS}
 
     def write(name: str) -> None:
@@ -63,13 +64,13 @@ def _write_previews_of(
         write_png(_picture(folder, output, name), picture, metadata=metadata)
 
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(write, order.names))
+        list(pool.map(write, job.names))
     return lo, hi
 
 
 def write_videos(
     folder: Path,
-    order: Order,
+    job: RenderJob,
     meta: DepthMeta,
     *,
     ranges: dict[str, tuple[float, float]],
@@ -79,25 +80,25 @@ def write_videos(
 
     Args:
         folder: holds every picture and preview.
-        order: the rendering job; `order.check` has passed.
+        job: the rendering job; `job.check` has passed.
         ranges: colour ranges from `write_previews`, for the videos' comments.
 
     Raises:
         UserError: a video cannot be written.
     """
-    settings = order.settings.video
+    settings = job.settings.video
     if settings is None:
         return
     for form in settings.formats:
-        for output in order.settings.outputs:
+        for output in job.settings.outputs:
 
             def pictures(output: str = output) -> Iterator[np.ndarray]:
-                for name in order.names:
+                for name in job.names:
                     yield read_image(_picture(folder, output, name))[..., :3]
 
             path = folder / f"{output}.{form}"
-            notify(f"encoding {path.name}, {len(order.names)} frames")
-            comment = json.dumps(_comment(order, meta, output, ranges), ensure_ascii=False)
+            notify(f"encoding {path.name}, {len(job.names)} frames")
+            comment = json.dumps(_comment(job, meta, output, ranges), ensure_ascii=False)
             write_video(path, pictures, fps=settings.fps, comment=comment)
 
 
@@ -114,9 +115,9 @@ def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> tuple[
     return (lo if output in ("depth", "lower", "upper") else 0.0), hi
 
 
-def _comment(order: Order, meta: DepthMeta, output: str, ranges: dict[str, tuple[float, float]]) -> dict[str, Any]:
+def _comment(job: RenderJob, meta: DepthMeta, output: str, ranges: dict[str, tuple[float, float]]) -> dict[str, Any]:
     """Return the description of a video for its container's comment."""
-    description: dict[str, Any] = {"nerfcli": __version__, "outputs": [output], **order.provenance}
+    description: dict[str, Any] = {"nerfcli": __version__, "outputs": [output], **job.provenance}
     if output in MEASURED:
         description |= meta.to_json()
         description |= {"ranges": {output: ranges[output]}, "colour_map": COLOURS}

@@ -70,7 +70,7 @@ class TrainedField:
         unit: unit of length of the scene's frame, "arbitrary" or "metre".
         unit_source: how the metre is known; None where unknown.
         log_exposure: mean log exposure of the training photos by EXIF, if the model has gains of photos; see
-            `photos.exif_exposure`.
+            `photos.exif`.
         exif_slope: factor by which gains follow the exposures in EXIF, see `held_out_exposure.exif_slope`.
         exposures: log gains (3,) of held-out photos by name, estimated from the training photos where EXIF does not
             give them; see `render.held_out_exposure`.

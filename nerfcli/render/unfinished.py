@@ -1,8 +1,8 @@
-"""Folder of an incomplete order: it stays when the command ends early, and the next one continues it.
+"""Folder of an incomplete job: it stays when the command ends early, and the next one continues it.
 
     .NAME.unfinished-DIGEST/           beside the folder NAME that it will become; DIGEST tells orders apart
         rgb/...  depth/...             files, each atomic
-        .frames/order.json             what was ordered, for people
+        .frames/order.json             what is to be rendered, for people
         .frames/done/NAME.json         one for each complete frame, written last: digests of its files, facts
         .frames/lock                   held by the one command that makes the folder complete
 
@@ -20,14 +20,14 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.atomic import atomic_path, cannot_write, replace_folder, write_json
-from nerfcli.render.job import DESCRIPTION, Order
+from nerfcli.render.job import DESCRIPTION, RenderJob
 
 _NOTES = ".frames"
 
 
 @dataclass(frozen=True)
 class UnfinishedFrames:
-    """The folder that collects the frames of an order."""
+    """The folder that collects the frames of a job."""
 
     folder: Path
 
@@ -82,8 +82,8 @@ def _digest_of_note(files: dict[str, str], facts: dict[str, Any]) -> str:
     return _digest(json.dumps([files, facts], sort_keys=True).encode())
 
 
-def take_over(unfinished: UnfinishedFrames, order: Order, finished: Path) -> None:
-    """Link the frames of a finished folder, for which `Order.shares_pictures_with` is True, into an unfinished one.
+def take_over(unfinished: UnfinishedFrames, job: RenderJob, finished: Path) -> None:
+    """Link the frames of a finished folder, for which `RenderJob.shares_pictures_with` is True, into an unfinished one.
 
     Frames with a missing or changed file are left out, as are previews and videos. Files are hard-linked, or copied if
     the file system has no links, so that the finished folder always stays intact.
@@ -92,7 +92,7 @@ def take_over(unfinished: UnfinishedFrames, order: Order, finished: Path) -> Non
         UserError: the files cannot be linked or copied.
     """
     made = json.loads((finished / DESCRIPTION).read_text(encoding="utf-8"))
-    for name in order.names:
+    for name in job.names:
         digests: dict[str, str] = made["files"][name]
         if unfinished.has(name) or not all(_has_digest(finished / file, digest) for file, digest in digests.items()):
             continue
@@ -110,16 +110,16 @@ def _has_digest(path: Path, digest: str) -> bool:
     return path.is_file() and _digest(path.read_bytes()) == digest
 
 
-def unfinished_of(order: Order, folder: Path) -> UnfinishedFrames:
-    """Return the unfinished folder of an order that will become `folder`; it is created if needed.
+def unfinished_of(job: RenderJob, folder: Path) -> UnfinishedFrames:
+    """Return the unfinished folder of a job that will become `folder`; it is created if needed.
 
     Raises:
         UserError: it cannot be created.
     """
-    unfinished = folder.with_name(f".{folder.name}.unfinished-{order.digest}")
+    unfinished = folder.with_name(f".{folder.name}.unfinished-{job.digest}")
     try:
         (unfinished / _NOTES).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise cannot_write(folder, error) from error
-    write_json(unfinished / _NOTES / "order.json", order.of_pictures())
+    write_json(unfinished / _NOTES / "order.json", job.key())
     return UnfinishedFrames(unfinished)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from nerfcli.errors import UserError
-from nerfcli.export.mesh_files import description_in, read_ply_header
 from nerfcli.export.model_facts import NOT_STATED
+from nerfcli.ply import description_in, read_ply_header
 from nerfcli.splats.gaussians import Gaussians
 from nerfcli.splats.ply import read_splat_ply, write_splat_ply
 from nerfcli.splats.spz import read_spz, write_spz
@@ -32,7 +32,7 @@ def read_splats(path: Path, notify: Callable[[str], None]) -> tuple[Gaussians, d
         raise UserError(f"there is no {path}", "give a .ply or .spz of splats")
     if _suffix(path) == ".spz":
         return read_spz(path, notify)
-    return read_splat_ply(path, notify), description_in(read_ply_header(path)[2])
+    return read_splat_ply(path, notify), description_in(read_ply_header(path).comments)
 
 
 def write_splats(

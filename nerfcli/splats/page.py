@@ -14,8 +14,8 @@ from string import Template
 
 import numpy as np
 
-from nerfcli.export.mesh_files import ply_bytes
 from nerfcli.pages.page import write_page
+from nerfcli.ply import ply_bytes
 from nerfcli.splats.gaussians import Gaussians
 from nerfcli.splats.ply import splat_columns
 from nerfcli.splats.spz import packed, unpacked

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from nerfcli.errors import UserError, listed, several
-from nerfcli.export.mesh_files import read_ply_header, write_ply
+from nerfcli.ply import read_ply_header, read_ply_vertices, write_ply
 from nerfcli.splats.gaussians import Gaussians
 
 # Logit that stands for an infinite one, in files in which an opacity of exactly 1 or 0 was converted: 1 - 2e-9.
@@ -49,18 +49,18 @@ def splat_columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
 def read_splat_ply(path: Path, notify: Callable[[str], None]) -> Gaussians:
     """Read Gaussians that any program wrote: properties in any order, further ones and further elements ignored.
 
-    The file is mapped, not loaded. Infinite logits become +-20; Gaussians with other numbers that are not finite, or
-    with a quaternion of norm 0, are left out, and `notify` is called with their number.
+    A binary file is mapped, not loaded. Infinite logits become +-20; Gaussians with other numbers that are not finite,
+    or with a quaternion of norm 0, are left out, and `notify` is called with their number.
 
     Raises:
         UserError: it is no such file, or truncated, or none of its Gaussians is finite.
     """
-    elements, properties, _, start = read_ply_header(path)
-    count = elements.get("vertex", 0)
-    if "packed_position" in properties or "chunk" in elements:
+    header = read_ply_header(path)
+    properties = header.vertex_properties
+    if "packed_position" in properties or header.count("chunk"):
         raise UserError(f"{path} is a compressed .ply of PlayCanvas, which nerfcli does not read", _ELSEWHERE)
     if missing := [name for name in _names(0) if name not in properties]:
-        what = "a mesh" if elements.get("face") else "points" if "x" in properties else "something else"
+        what = "a mesh" if header.count("face") else "points" if "x" in properties else "something else"
         hint = "expected the .ply of 3D Gaussian splatting, whose vertices have x, f_dc_0, opacity, scale_0, rot_0, ..."
         raise UserError(f"{path} holds {what}, not splats: {listed(missing)} missing", hint)
     rest = sum(name.startswith("f_rest_") for name in properties)
@@ -70,19 +70,9 @@ def read_splat_ply(path: Path, notify: Callable[[str], None]) -> Gaussians:
             f"{path} has {rest} properties f_rest_, expected f_rest_0 to f_rest_8, f_rest_23 or f_rest_44, or none",
             f"nerfcli reads harmonics of degrees 0 to 3; {_ELSEWHERE}",
         )
-    if not start:
-        raise UserError(
-            f"{path} is a text or big-endian .ply; splats are read from binary little-endian ones", _ELSEWHERE
-        )
-    if not count:
+    table = read_ply_vertices(path)
+    if not len(table):
         raise UserError(f"{path} holds no splats", "export it once more")
-    row, size = np.dtype(list(properties.items())), path.stat().st_size
-    if size < start + count * row.itemsize:
-        raise UserError(
-            f"{path} is cut short: {count} splats take {start + count * row.itemsize} bytes, it has {size}",
-            "copy or export it once more",
-        )
-    table = np.memmap(path, row, mode="r", offset=start, shape=(count,))
     return _from_table(path, table, _names(degree), notify=notify)
 
 

@@ -16,8 +16,7 @@ from nerfcli.kernels.numba_cpu.splat_compositing import OPAQUE
 from nerfcli.kernels.numba_cpu.splats import render_splats, splat_depths
 from nerfcli.render.depth import DepthRequest, fractions
 from nerfcli.render.pictures import RenderedPicture, depth_maps_of
-from nerfcli.splats.gaussians import Gaussians
-from nerfcli.splats.rows import rows_of
+from nerfcli.splats.gaussians import Gaussians, rows_of
 from nerfcli.splats.views import splat_view
 
 # Gaussians nearer to a camera than this fraction of the scene's extent are left out, as by the near plane of viewers.

@@ -22,7 +22,7 @@ from scipy.special import expit
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError, listed
-from nerfcli.export.mesh_files import comments_of, description_in
+from nerfcli.ply import comments_of, description_in
 from nerfcli.splats.gaussians import Gaussians
 
 _MAGIC, _HEADER = b"NGSP", struct.Struct("<4sIIBBBB")

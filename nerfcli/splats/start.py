@@ -13,10 +13,9 @@ import torch
 from nerfcli.field.background import Colour, SphereBackground, colours_behind
 from nerfcli.field.exposure import exposed, linear_from_srgb
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera
-from nerfcli.render.coverage import DepthMap, small_frame
+from nerfcli.render.coverage import DepthMap, normals_of_points, small_frame
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
-from nerfcli.render.normals import normals_of_points
 from nerfcli.render.pictures import render_picture
 from nerfcli.splats.gaussians import Gaussians
 

@@ -10,9 +10,8 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.kernels.numba_cpu.splats import SplatAdam
-from nerfcli.splats.gaussians import Gaussians
+from nerfcli.splats.gaussians import Gaussians, gaussians_of
 from nerfcli.splats.refine import Refinement
-from nerfcli.splats.rows import gaussians_of
 
 FORMAT = "nerfcli splats 1"
 

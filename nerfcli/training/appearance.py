@@ -61,7 +61,7 @@ class Appearance(nn.Module):
         self.sky: Tensor | None = None
 
     @torch.no_grad()
-    def show_sky(self, sky: Tensor) -> None:
+    def init_background_from_sky(self, sky: Tensor) -> None:
         """Initialise a learned background with the median colour of the sky, which unseen directions keep.
 
         Args:
@@ -91,13 +91,13 @@ class Appearance(nn.Module):
         """Return by name the gradients of the parameters that have one."""
         return {name: tensor.grad for name, tensor in self.named_parameters() if tensor.grad is not None}
 
-    def refined(self, drawn: PixelBatch) -> PixelBatch:
+    def refine_cameras(self, drawn: PixelBatch) -> PixelBatch:
         """Return the same pixels, with the rays of the current cameras."""
-        return drawn if self.cameras is None else self.cameras.refined(drawn)
+        return drawn if self.cameras is None else self.cameras.refine_cameras(drawn)
 
     def with_learning_rays(self, drawn: PixelBatch, fraction: float) -> PixelBatch:
         """Return the same as `refined`, with rays that collect gradients while cameras learn."""
-        refined = self.refined(drawn)
+        refined = self.refine_cameras(drawn)
         if self.cameras is None or rate_at(fraction) == 0.0:
             return refined
         return refined._replace(

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from nerfcli import distributed
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import write_cameras
-from nerfcli.captures.scene import Scene
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import refuse_non_finite, save_tensors
 from nerfcli.field.kinds import settings_from_json
-from nerfcli.photos.exif_exposure import log_exposures
+from nerfcli.photos.exif import log_exposures
 from nerfcli.render.held_out_exposure import exif_slope, gains_between, gains_beyond_exif
 from nerfcli.render.model import Model, save_model
 from nerfcli.training.extent import Extent
@@ -51,7 +51,7 @@ class Checkpoints:
         scene: gives the unit of length.
     """
 
-    def __init__(self, run: Path, fitting: Fitting, totals: Totals, *, prepared: Prepared, scene: Scene):
+    def __init__(self, run: Path, fitting: Fitting, totals: Totals, *, prepared: Prepared, scene: Capture):
         self._run, self._fitting, self._totals = run, fitting, totals
         self._prepared, self._scene = prepared, scene
 
@@ -65,9 +65,9 @@ class Checkpoints:
         alone = ALPHA_BACKGROUND if prepared.pool.has_alpha else OPAQUE_BACKGROUND
         return Model(
             fitting.field,
-            cells.coarse if fitting.parts.sky is None else cells.visited,
-            fitting.ray_steps.of_pictures(fitting.largest_fraction, fitting.step),
-            fitting.parts.background or alone,
+            cells.coarse if fitting.appearance.sky is None else cells.visited,
+            fitting.ray_steps.render_steps(fitting.largest_fraction, fitting.step),
+            fitting.appearance.background or alone,
             prepared.extent.training_from_scene,
             self._scene.unit,
             self._scene.unit_source,
@@ -77,7 +77,7 @@ class Checkpoints:
 
     def _held_out_exposures(self) -> dict[str, Any]:
         """Return the exposures of held-out photos for `Model`, from training photos; none with exposure=exif."""
-        exposure, test = self._fitting.parts.exposure, self._scene.test_frames
+        exposure, test = self._fitting.appearance.exposure, self._scene.test_frames
         if exposure is None or self._fitting.components.exposure == "exif":
             return {}
         place = {frame.name: index for index, frame in enumerate(self._scene.frames)}
@@ -102,14 +102,14 @@ class Checkpoints:
     def frames(self) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
         """Return the training frames and the held-out frames with their current cameras."""
         given = (self._scene.train_frames, self._scene.test_frames)
-        refinement = self._fitting.parts.cameras
+        refinement = self._fitting.appearance.cameras
         if refinement is None:
             return given
         return refinement.frames(*given, scale=self._prepared.extent.training_from_scene.scale)
 
     def write_cameras(self) -> None:
         """Write RUN/cameras.json."""
-        refined = self._fitting.parts.cameras is not None
+        refined = self._fitting.appearance.cameras is not None
         given = {frame.name: frame for frame in self._scene.frames} if refined else None
         write_cameras(self._run, *self.frames(), given=given)
 
@@ -131,7 +131,7 @@ class Checkpoints:
 
     def _write_field(self) -> None:
         save_model(self._run / FIELD, self.model())
-        if self._fitting.parts.cameras is not None:
+        if self._fitting.appearance.cameras is not None:
             self.write_cameras()
 
 
@@ -164,7 +164,7 @@ def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description
             f"{run} was trained with another field ({description['field']})",
             "train into a new folder with -o, or again with --overwrite",
         )
-    if missing := [name for name in fitting.parts.state_dict() if f"parts.{name}" not in tensors]:
+    if missing := [name for name in fitting.appearance.state_dict() if f"parts.{name}" not in tensors]:
         raise UserError(
             f"{run} was trained without a component that --with now enables ({missing[0]})",
             "train into a new folder with -o, or again with --overwrite",

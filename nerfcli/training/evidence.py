@@ -14,7 +14,7 @@ from nerfcli.matching.exposures import matched_log_gains
 from nerfcli.matching.occluders import occluder_masks
 from nerfcli.matching.sky import PointsBefore, points_before, sky_masks
 from nerfcli.matching.stereo import LEAST_SIDE_PX, DenseDepth, affordable_side_px, dense_depths
-from nerfcli.photos.exif_exposure import log_exposures
+from nerfcli.photos.exif import log_exposures
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.held_out_exposure import exif_slope
 from nerfcli.training.extent import Extent
@@ -58,7 +58,7 @@ class Evidence:
         self.side_px = affordable_side_px(album.photos, seconds=seconds, threads=threads)
 
     @cached_property
-    def of_tracks(self) -> PointDepths:
+    def track_depths(self) -> PointDepths:
         """Depths of points from structure from motion, or of matched features."""
         return point_depths(self.shared.tracks, self.pool, self.extent.training_from_scene)
 
@@ -99,7 +99,7 @@ class Evidence:
             return np.full_like(found, np.nan)
         return found
 
-    def gains_or(self, others: Tensor) -> Tensor:
+    def matched_gains_or(self, others: Tensor) -> Tensor:
         """Return `log_gains` (photos, 3), with the values of `others` where unknown."""
         measured = torch.from_numpy(self.log_gains).to(others)
         return torch.where(measured.isfinite(), measured, others)
@@ -160,7 +160,7 @@ class Evidence:
         ]
 
     @cached_property
-    def of_stereo(self) -> PointDepths:
+    def stereo_depths(self) -> PointDepths:
         """Depths from stereo matching."""
         found = stereo_depths(self._dense, self.pool, self.extent.training_from_scene)
         self.notify(
@@ -169,7 +169,7 @@ class Evidence:
         )
         return found
 
-    def sets(self, components: Components) -> list[PointDepths]:
+    def depths_for(self, components: Components) -> list[PointDepths]:
         """Return the sets of depths that a model with points uses."""
-        found = [self.of_tracks, self.of_stereo] if components.stereo else [self.of_tracks]
+        found = [self.track_depths, self.stereo_depths] if components.stereo else [self.track_depths]
         return [depths.among(self.pool) for depths in found]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.normalisation import (
     NARROW_SPREAD,
@@ -77,7 +77,7 @@ class Extent:
         return replace(self, marching=replace(self.marching, far=min(self.marching.far, self.reach)))
 
 
-def lacks_depth(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> bool:
+def lacks_depth(scene: Capture, settings: TrainSettings, *, fills_frame: bool) -> bool:
     """Return whether the settings need a depth that the scene lacks, so that points must be triangulated first.
 
     Args:
@@ -89,7 +89,7 @@ def lacks_depth(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> 
     return not is_object and len(scene.points) == 0 and (scene.depth_bounds is None or contraction == "none")
 
 
-def choose_extent(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> Extent:
+def choose_extent(scene: Capture, settings: TrainSettings, *, fills_frame: bool) -> Extent:
     """Choose the extent for the settings.
 
     Args:

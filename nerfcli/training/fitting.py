@@ -10,8 +10,7 @@ from torch import Tensor
 from nerfcli import distributed
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
-from nerfcli.field.kinds import fresh_field
-from nerfcli.field.sizes import chosen_size
+from nerfcli.field.kinds import chosen_size, fresh_field
 from nerfcli.kernels import March, Rays, Targets
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.appearance import Appearance
@@ -107,18 +106,18 @@ class Fitting:
         self.field = fresh_field(size).to(device)
         gains = torch.full((len(pool.first_pixel), 3), torch.nan) if log_gains is None else log_gains
         self.points = points
-        self.parts = Appearance(self.components, pool, log_gains=gains, log_focal=log_focal)
+        self.appearance = Appearance(self.components, pool, log_gains=gains, log_focal=log_focal)
         self._cameras_from = cameras_from
         self.cells = OpenCells(self.field, device)
         if sky is not None:
-            self.parts.show_sky(sky)
+            self.appearance.init_background_from_sky(sky)
         self.ray_steps = RaySteps(marching, self.field.settings, parallax=parallax, device=device)
         rows = self.field.rows()
         most_rays = MOST_RAYS if rows is None else max(MOST_RAYS, rows.shape[-2] // ROWS_PER_RAY)
         self._most_rays = most_rays if device.type == "cpu" else max(most_rays, settings.samples_per_step // 4)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
         self.optimiser = FieldOptimiser(self.field)
-        self.parts_optimiser = PartsOptimiser(self.parts.groups())
+        self.parts_optimiser = PartsOptimiser(self.appearance.groups())
         self.samples_per_ray = float(self.ray_steps.most)
         self.rate_factor, self.rollbacks = 1.0, 0
         self.in_step = False
@@ -140,7 +139,7 @@ class Fitting:
         watch.state(self.state)
         self.largest_fraction = max(self.largest_fraction, fraction)
         of_cameras = max(0.0, fraction - self._cameras_from) / (1.0 - self._cameras_from)
-        drawn = self.parts.with_learning_rays(self.draw(fraction), of_cameras)
+        drawn = self.appearance.with_learning_rays(self.draw(fraction), of_cameras)
         rays = len(drawn.origins)
         edges = self.ray_steps.edges(fraction, self.step)
         loss, losses, samples = self._loss(drawn, edges=edges, fraction=fraction, watch=watch)
@@ -155,8 +154,8 @@ class Fitting:
         self.step += 1
         self.optimiser.step(self.step, rate, decay=self.row_decay(rays))
         self.parts_optimiser.step(rate)
-        if self.parts.cameras is not None:
-            self.parts.cameras.step(drawn, losses, of_cameras, factor=self.rate_factor)
+        if self.appearance.cameras is not None:
+            self.appearance.cameras.step(drawn, losses, of_cameras, factor=self.rate_factor)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         watch.state(self.state)
         self.in_step = False
@@ -207,31 +206,31 @@ class Fitting:
         count, components, device = len(whole.origins), self.components, whole.origins.device
         drawn = PixelBatch(*(distributed.own(rows, count) for rows in whole))
         jitter = distributed.own(torch.rand(count, generator=self.generator, device=device), count)
-        background = distributed.own(self.parts.behind(count, self.generator), count)
+        background = distributed.own(self.appearance.behind(count, self.generator), count)
         seen = self.field.backend.render_rays(
             Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
             self._march(edges, self.cells.at(self.step))._replace(least_weight=LEAST_WEIGHT),
             self.field.medium(self._detail),
             Targets(self.ray_steps.nearest if components.near else None, bool(components.distortion), drawn.distances),
             background=background,
-            sink=self.optimiser.sink,
-            visits=self.cells.visits,
+            table_grad=self.optimiser.table_grad,
+            cell_depths=self.cells.cell_depths,
             trace=watch.rows,
         )
-        rendered, measured = self.parts.compared(seen.rgb, seen.transmittance, drawn, behind=background)
+        rendered, measured = self.appearance.compared(seen.rgb, seen.transmittance, drawn, behind=background)
         losses = colour_losses(rendered, measured)
         loss = losses.sum() / count
         if components.distortion:
             loss = loss + components.distortion * (seen.distortion.sum() / count)
         if len(whole.distances):
-            losses_of_distances = drawn.trust * distance_losses(seen.off_target, fraction=fraction)
+            losses_of_distances = drawn.trust * distance_losses(seen.depth_loss, fraction=fraction)
             weight = components.points * fading(fraction, step=self.step, parallax=self.parallax)
             loss = loss + weight * (losses_of_distances.sum() / len(whole.distances))
-        if self.parts.sky is not None:
-            opacity = (1.0 - seen.transmittance) * self.parts.sky[drawn.numbers]
+        if self.appearance.sky is not None:
+            opacity = (1.0 - seen.transmittance) * self.appearance.sky[drawn.numbers]
             loss = loss + SKY_WEIGHT * opacity.sum() / count
-        if self.parts.background is not None:
-            loss = loss + ROUGHNESS_WEIGHT * self.parts.background.roughness() / distributed.count()
+        if self.appearance.background is not None:
+            loss = loss + ROUGHNESS_WEIGHT * self.appearance.background.roughness() / distributed.count()
         if watch is not UNWATCHED:
             watch.rows("rendered colour", seen.rgb, torch.arange(len(drawn.origins), device=device))
         watch.values("loss", loss)
@@ -240,16 +239,16 @@ class Fitting:
     @torch.no_grad()
     def compare(self, drawn: PixelBatch) -> tuple[Tensor, Tensor]:
         """Return the model's and the photos' colours of pixels, both (N, 3) sRGB, alpha on white."""
-        drawn = self.parts.refined(drawn)
+        drawn = self.appearance.refine_cameras(drawn)
         behind = torch.full_like(drawn.origins, 1.0 if self.pool.has_alpha else 0.0)
         edges = self.ray_steps.edges(self.largest_fraction, self.step)
         rendered, transmittance = self._seen(drawn, edges=edges, behind=behind)
-        return self.parts.compared(rendered, transmittance, drawn, behind=behind)
+        return self.appearance.compared(rendered, transmittance, drawn, behind=behind)
 
     @torch.no_grad()
     def light_from_beyond(self, drawn: PixelBatch, *, distance: float) -> Tensor:
         """Return the fraction of each pixel's light, (N,), that comes from beyond a distance in the current field."""
-        drawn = self.parts.refined(drawn)
+        drawn = self.appearance.refine_cameras(drawn)
         edges = self.ray_steps.edges(self.largest_fraction, self.step)
         near = edges[: max(2, int(torch.searchsorted(edges, distance, right=True)))]
         return self._seen(drawn, edges=near, behind=torch.zeros_like(drawn.origins))[1]
@@ -270,9 +269,9 @@ class Fitting:
         """Fraction of the budget whose detail the field has; cameras that learn late do not delay it."""
         if self._cameras_from > 0.0:
             return self.largest_fraction
-        if self.parts.cameras is None and self.field.settings.detailed:
+        if self.appearance.cameras is None and self.field.settings.detailed:
             return min(1.0, max(self.largest_fraction, self.step / LARGE_TABLE_STEPS))
-        return self.parts.fraction_of_detail(self.largest_fraction)
+        return self.appearance.fraction_of_detail(self.largest_fraction)
 
     def _march(self, edges: Tensor, occupied: Tensor) -> March:
         return March(edges, occupied, self.field.settings.contraction, DEEPEST)
@@ -286,9 +285,9 @@ class Fitting:
         samples = distributed.total(samples)
         if samples > 0:
             rays = (drawn.origins, drawn.directions)
-            distributed.add_up_gradients((*self.optimiser.weights(), *self.parts.parameters(), *rays))
-            if self.optimiser.sink is not None:
-                distributed.add_up(self.optimiser.sink)
+            distributed.add_up_gradients((*self.optimiser.weights(), *self.appearance.parameters(), *rays))
+            if self.optimiser.table_grad is not None:
+                distributed.add_up(self.optimiser.table_grad)
         return samples
 
     def settle(self) -> None:
@@ -310,13 +309,13 @@ class Fitting:
         """Return the loss if it and all gradients are finite; on a GPU usually that of the previous step."""
         rays = {"origins of rays": drawn.origins.grad, "directions of rays": drawn.directions.grad}
         of_rays = {name: gradient for name, gradient in rays.items() if gradient is not None}
-        gradients = {**self.optimiser.gradients(), **self.parts.gradients(), **of_rays}
+        gradients = {**self.optimiser.gradients(), **self.appearance.gradients(), **of_rays}
         for name, gradient in gradients.items():
             watch.values(f"gradient of {name}", gradient)
         # Non-finite if any term is. One sum of all is faster on a GPU than many small ones.
         total = torch.cat([loss.detach().view(1), *(gradient.flatten() for gradient in gradients.values())]).sum()
-        if self.optimiser.sink is not None:
-            watch.values("gradient of rows", self.optimiser.sink)
+        if self.optimiser.table_grad is not None:
+            watch.values("gradient of rows", self.optimiser.table_grad)
         numbers = torch.stack([loss.detach(), total])
         distributed.add_up(numbers)
         self._take_loss(self._losses.exchange(numbers))
@@ -333,7 +332,7 @@ class Fitting:
             **self.cells.state(),
             **self.optimiser.state(),
         }
-        tensors.update({f"parts.{name}": value for name, value in self.parts.state_dict().items()})
+        tensors.update({f"parts.{name}": value for name, value in self.appearance.state_dict().items()})
         tensors.update(self.parts_optimiser.state())
         return tensors, {
             "field": self.field.settings.to_json(),
@@ -347,15 +346,15 @@ class Fitting:
     def restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
         """Restore what `state` returned."""
         self._losses.forget()
-        if self.parts.cameras is not None:
-            self.parts.cameras.sent.forget()
+        if self.appearance.cameras is not None:
+            self.appearance.cameras.sent.forget()
         self.field.load_state_dict(
             {name.removeprefix("field."): value for name, value in tensors.items() if name.startswith("field.")}
         )
         self.generator.set_state(tensors["generator"].cpu())
         self.cells.restore(tensors)
         self.optimiser.restore(tensors)
-        self.parts.load_state_dict({name: tensors[f"parts.{name}"] for name in self.parts.state_dict()})
+        self.appearance.load_state_dict({name: tensors[f"parts.{name}"] for name in self.appearance.state_dict()})
         self.parts_optimiser.restore(tensors)
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]

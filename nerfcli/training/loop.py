@@ -1,32 +1,70 @@
 """The training of a scene from photos to checkpoint, within a budget of time or steps."""
 
 import resource
+import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from nerfcli import distributed, kernels
 from nerfcli.atomic import cannot_write
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import LOST_RANK, UserError
 from nerfcli.field.checkpoint import load_tensors
-from nerfcli.field.cost import field_bytes
+from nerfcli.field.kinds import field_bytes
 from nerfcli.interrupts import deferred_interrupts
+from nerfcli.photos.masks import write_masks
 from nerfcli.training.checkpoints import Checkpoints, Totals, decisions_of, restore
 from nerfcli.training.fitting import Fitting
-from nerfcli.training.left_out import remove_left_out, write_left_out
 from nerfcli.training.preparation import Prepared, prepare
+from nerfcli.training.runs.components import Selection
 from nerfcli.training.runs.config import RunConfig, write_config
-from nerfcli.training.runs.decisions import Selection
 from nerfcli.training.runs.files import FIELD, LOG, STATE
 from nerfcli.training.runs.log import LogEntry, append_log, cut_log
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.sentinel import FAILURES, Sentinel
 from nerfcli.training.waypoints import FRACTIONS, forget_waypoints, keep_waypoint, measure_waypoints
+
+# Folder of a run, named like the component that leaves pixels out.
+OCCLUDERS = "occluders"
+
+
+def remove_left_out(run: Path) -> None:
+    """Remove the masks of an earlier training from a run folder."""
+    if (run / OCCLUDERS).is_dir():
+        shutil.rmtree(run / OCCLUDERS)
+
+
+def write_left_out(run: Path, masks: Mapping[str, np.ndarray], *, notify: Callable[[str], None]) -> None:
+    """Write RUN/occluders/PHOTO.png, black where pixels are left out, for each photo with such pixels; report how many.
+
+    Args:
+        run: its folder; masks of an earlier training are replaced.
+        masks: (height, width) bool by the name of the photo, True where pixels are used.
+
+    Raises:
+        UserError: the masks cannot be written.
+    """
+    folder = run / OCCLUDERS
+    left_out = {name: 100.0 * float(1.0 - mask.mean()) for name, mask in masks.items()}
+    most = sorted((name for name in left_out if left_out[name]), key=lambda name: -left_out[name])
+    shutil.rmtree(folder, ignore_errors=True)
+    write_masks(folder, {name: masks[name] for name in most})
+    if not most:
+        notify("occluders: none found")
+        return
+    named = ", ".join(f"{name} {left_out[name]:.0f} %" for name in most[:3])
+    mean = np.mean(list(left_out.values()))
+    notify(
+        f"occluders: {mean:.1f} % of the pixels left out, in {len(most)} of {len(masks)} photos, most in {named}; "
+        f"masks in {folder}"
+    )
+
 
 CHECKPOINT_SECONDS = 30.0
 
@@ -43,7 +81,7 @@ class Progress:
 
 
 def train(
-    scene: Scene,
+    scene: Capture,
     run: Path,
     settings: TrainSettings,
     *,
@@ -137,7 +175,7 @@ def _clear(run: Path) -> None:
 
 
 def _describe(
-    scene: Scene, run: Path, requested: TrainSettings, prepared: Prepared, *, selection: Selection | None
+    scene: Capture, run: Path, requested: TrainSettings, prepared: Prepared, *, selection: Selection | None
 ) -> None:
     """Write RUN/config.json."""
     described = RunConfig.describing(

@@ -24,8 +24,8 @@ def colour_losses(rendered: Tensor, measured: Tensor) -> Tensor:
     return losses.mean(-1) / HUBER_DELTA
 
 
-def distance_losses(off_target: Tensor, *, fraction: float) -> Tensor:
-    """Return the negative log likelihood of known distances, or from 30 % of the budget on, `off_target` itself.
+def distance_losses(depth_loss: Tensor, *, fraction: float) -> Tensor:
+    """Return the negative log likelihood of known distances, or from 30 % of the budget on, `depth_loss` itself.
 
     (1 + c) log((1 + c) / (1 + c - off target)),  c = 0.1
 
@@ -33,7 +33,7 @@ def distance_losses(off_target: Tensor, *, fraction: float) -> Tensor:
     this light, down to c, so that thin surfaces come back that the free space around them has nearly erased.
 
     Args:
-        off_target: (K,) in [0, 1], see `kernels.RaySums`.
+        depth_loss: (K,) in [0, 1], see `kernels.RaySums`.
         fraction: of the budget that is used.
 
     Returns:
@@ -41,9 +41,9 @@ def distance_losses(off_target: Tensor, *, fraction: float) -> Tensor:
         (1 + c) log(1 + 1 / c), with a slope of 1 + 1 / c, where none is. Differentiable.
     """
     if fraction >= EMERGING_FRACTION:
-        return off_target
+        return depth_loss
     most = 1.0 + FAINT
-    return -most * torch.log1p(-off_target / most)
+    return -most * torch.log1p(-depth_loss / most)
 
 
 def over_background(colours: Tensor, background: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.paths import focus_point
 from nerfcli.cameras.rigid import Similarity, apply, inverse
-from nerfcli.captures.scene import Scene
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
 from nerfcli.render.trained_field import Marching
 
@@ -37,7 +37,7 @@ NARROW_BACKGROUND = 2.5
 LEAST_POINTS = 50
 
 
-def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
+def contracted_frame(scene: Capture) -> tuple[Similarity, Marching]:
     """Return the similarity to the training frame and the steps along rays, for contracted space beyond the unit ball.
 
     The unit ball is centred where the cameras look. Its radius is the distance of the median camera, or three quarters
@@ -45,7 +45,7 @@ def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
     show would be in contracted space, with steps that grow as the square of the distance.
 
     Raises:
-        UserError: no camera (see `Scene`).
+        UserError: no camera (see `Capture`).
     """
     depths = _typical_depths(scene)
     centre = _focus(scene, depths)
@@ -58,7 +58,7 @@ def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
     return similarity, Marching(near=near, far=FARTHEST, shortest_step=1 / 256, growth=1 / 128)
 
 
-def has_narrow_baseline(scene: Scene) -> bool:
+def has_narrow_baseline(scene: Capture) -> bool:
     """Return whether the cameras are close together relative to the nearest depth: see `narrow_frame`.
 
     False if the scene has no depths, or if its nearest depth is 0.
@@ -68,7 +68,7 @@ def has_narrow_baseline(scene: Scene) -> bool:
     return nearest > 0.0 and float(_distances(scene, _middle(scene)).max()) <= NARROW_SPREAD * nearest
 
 
-def narrow_frame(scene: Scene) -> tuple[Similarity, Marching, float]:
+def narrow_frame(scene: Capture) -> tuple[Similarity, Marching, float]:
     """Return similarity and steps for forward-facing captures and panoramas, and the distance of the background.
 
     The unit ball is centred between the cameras and reaches to the nearest depth. Everything visible is in contracted
@@ -87,13 +87,13 @@ def narrow_frame(scene: Scene) -> tuple[Similarity, Marching, float]:
     return similarity, Marching(near=_near_part(scene), far=FARTHEST, shortest_step=1 / 256, growth=1 / 128), background
 
 
-def object_frame(scene: Scene) -> tuple[Similarity, Marching]:
+def object_frame(scene: Capture) -> tuple[Similarity, Marching]:
     """Return similarity and steps for photos with alpha: an object in the middle, and nothing else.
 
     The unit ball is the smallest that fills every camera's view, and the cube around it is the whole field.
 
     Raises:
-        UserError: no camera (see `Scene`).
+        UserError: no camera (see `Capture`).
     """
     centre = _focus(scene, _typical_depths(scene))
     distances = _distances(scene, centre)
@@ -105,7 +105,7 @@ def object_frame(scene: Scene) -> tuple[Similarity, Marching]:
     return similarity, Marching(near=near, far=far, shortest_step=2 * reach / 512, growth=0.0)
 
 
-def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
+def box_frame(scene: Capture) -> tuple[Similarity, Marching]:
     """Return similarity and steps for a bounded scene without alpha: [-1, 1]^3 is the smallest cube around its points.
 
     Raises:
@@ -127,22 +127,22 @@ def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
     return similarity, Marching(near=near, far=far, shortest_step=2 * reach / 512, growth=0.0)
 
 
-def _near_part(scene: Scene) -> float:
+def _near_part(scene: Capture) -> float:
     """Return the fraction of the nearest depth at which rays begin."""
     return NEAR_PER_POINT if scene.depth_bounds is None else NEAR_PER_BOUND
 
 
-def _middle(scene: Scene) -> np.ndarray:
+def _middle(scene: Capture) -> np.ndarray:
     """Return the mean of the camera centres."""
     return np.mean([frame.centre for frame in scene.frames], axis=0)
 
 
-def _focus(scene: Scene, depths: np.ndarray | None) -> np.ndarray:
+def _focus(scene: Capture, depths: np.ndarray | None) -> np.ndarray:
     """Return the point that the cameras look at; `depths` as from `_typical_depths`."""
     return focus_point(scene.frames, depth_hint=None if depths is None else float(np.median(depths[:, 1])))
 
 
-def _distances(scene: Scene, centre: np.ndarray) -> np.ndarray:
+def _distances(scene: Capture, centre: np.ndarray) -> np.ndarray:
     """Return the distances of the cameras from a point."""
     return np.array([np.linalg.norm(frame.centre - centre) for frame in scene.frames])
 
@@ -152,7 +152,7 @@ def _half_fov(frame: Frame) -> float:
     return math.radians(min(max(frame.camera.fov_deg) / 2, 70.0))
 
 
-def _typical_depths(scene: Scene) -> np.ndarray | None:
+def _typical_depths(scene: Capture) -> np.ndarray | None:
     """Return the nearest and median depth that each camera sees, (n, 2), from the capture's own bounds or SfM points.
 
     The nearest depth is the first percentile, as a few wrong points are always closer. None if the scene has neither.

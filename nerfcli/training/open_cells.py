@@ -6,8 +6,105 @@ from torch.nn.functional import max_pool3d
 
 from nerfcli import distributed
 from nerfcli.field.interface import Field
-from nerfcli.render.occupancy import DECAY, Occupancy
 from nerfcli.render.trained_field import Marching
+
+# Contracted radius 2 is infinity; cells at the grid's corners, beyond it, are mapped to this radius.
+LARGEST_RADIUS = 1e6
+
+
+def uncontract(points: Tensor) -> Tensor:
+    """Return the inverse of `kernels.contract`.
+
+    x = y for |y| <= 1, else y / |y| / (2 - |y|)
+
+    Args:
+        points: (..., 3); a norm of 2 or more is infinitely far and becomes 1e6.
+
+    Returns:
+        (..., 3). Relative error grows as radius * 1e-7 in float32: the far field is coarse by design.
+    """
+    norm = points.square().sum(-1, keepdim=True).clamp_min(1.0).sqrt()
+    radius = 1.0 / (2.0 - norm).clamp_min(1.0 / LARGEST_RADIUS)
+    return points / norm * radius
+
+
+def training_points(coordinates: Tensor, contraction: str) -> Tensor:
+    """Return the inverse of `kernels.grid_coordinates`: unit cube to training frame."""
+    if contraction == "none":
+        return (coordinates - 0.5) * 2.0
+    return uncontract((coordinates - 0.5) * 4.0)
+
+
+DECAY = 0.8
+
+
+class Occupancy:
+    """Content of each cell: a decaying maximum of the optical depth of one ray step.
+
+    It is updated by evaluating the field at random points. Space behind surfaces is not removed, at no cost: rays stop
+    before they reach it.
+    Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, appendix C, with a faster decay for short trainings.
+    """
+
+    def __init__(self, side: int, device: torch.device):
+        self.optical_depth = torch.full((side, side, side), torch.inf, device=device)
+
+    def above(self, optical_depth: float) -> Tensor:
+        """Return the cells, (side, side, side) bool indexed [z, y, x], above `least` or never evaluated.
+
+        A cell with NaN counts as above, so that rays sample it and the loss detects the NaN.
+        """
+        return ~(self.optical_depth <= self.least(optical_depth))
+
+    def least(self, optical_depth: float) -> Tensor:
+        """Return the threshold, (): this optical depth, or the mean over all cells if that is less.
+
+        In a short training, all of space may still be fog below any fixed threshold; cells that rays skip would not
+        learn any more.
+        """
+        return self.optical_depth.nanmean().clamp_max(optical_depth)
+
+    @torch.no_grad()
+    def refresh(
+        self,
+        field: Field,
+        *,
+        detail: float,
+        cells: slice,
+        shortest_step: float,
+        growth: float,
+        generator: torch.Generator,
+    ) -> None:
+        """Evaluate the field at one random point in each of the chosen cells.
+
+        Args:
+            detail: level of detail of the field, see `Field.medium`.
+            cells: slice of the cells, numbered (z * side + y) * side + x; in this order their features are close in
+                memory.
+            shortest_step, growth: the step schedule of `Marching`; distances are from the origin of the
+                training frame, near which the cameras are.
+            generator: source of the random points, on the grid's device.
+        """
+        side, device = self.optical_depth.shape[0], self.optical_depth.device
+        numbers = torch.arange(side**3, device=device)[cells]
+        place = torch.stack([numbers % side, numbers // side % side, numbers // side**2], dim=-1)
+        inside = torch.rand(len(numbers), 3, generator=generator, device=device)
+        coordinates = (place + inside) / side
+        medium = field.medium(detail)
+        density = torch.cat([field.backend.density(chunk, medium) for chunk in coordinates.split(2**16)])
+        radius = training_points(coordinates, field.settings.contraction).norm(dim=-1)
+        step = (growth * radius * radius.clamp_min(1.0)).clamp_min(shortest_step)  # as in `Marching.edges`
+        chosen = self.optical_depth.view(-1)[cells]
+        chosen.copy_(torch.maximum(torch.where(chosen.isinf(), 0.0, chosen * DECAY), density * step))
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the state for `restore`."""
+        return {"optical_depth": self.optical_depth}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Restore the state that `state` returned."""
+        self.optical_depth = tensors["optical_depth"]
+
 
 OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8
@@ -35,15 +132,15 @@ class OpenCells:
         self._field = field
         self._occupancy = Occupancy(OCCUPANCY_SIDE, device)
         # Fine cells: the largest optical depth of the samples since the last refresh, and the value up to then.
-        self.visits: Tensor | None = None
+        self.cell_depths: Tensor | None = None
         if field.settings.detailed:
-            self.visits = torch.full((FINE_SIDE, FINE_SIDE, FINE_SIDE), UNVISITED, device=device)
-            self._depths = torch.full_like(self.visits, torch.inf)
+            self.cell_depths = torch.full((FINE_SIDE, FINE_SIDE, FINE_SIDE), UNVISITED, device=device)
+            self._depths = torch.full_like(self.cell_depths, torch.inf)
         self._open(FIRST_THRESHOLD)
 
     def at(self, step: int) -> Tensor:
         """Return the open cells (G, G, G) for one step: those of the fine grid, if there is one, in most steps."""
-        return self.coarse if self.visits is None or step % REFRESH_EVERY == 0 else self._fine
+        return self.coarse if self.cell_depths is None or step % REFRESH_EVERY == 0 else self._fine
 
     @property
     def visited(self) -> Tensor:
@@ -52,10 +149,10 @@ class OpenCells:
         The others still hold the initial fog, behind surfaces or beside all photos. Without a fine grid these are all
         open cells.
         """
-        if self.visits is None:
+        if self.cell_depths is None:
             return self.coarse
         parts = FINE_SIDE // OCCUPANCY_SIDE
-        fine = self._depths.isfinite() | (self.visits >= 0)
+        fine = self._depths.isfinite() | (self.cell_depths >= 0)
         blocks = fine.view(OCCUPANCY_SIDE, parts, OCCUPANCY_SIDE, parts, OCCUPANCY_SIDE, parts)
         return self.coarse & blocks.any(5).any(3).any(1)
 
@@ -87,21 +184,21 @@ class OpenCells:
             growth=marching.growth,
             generator=generator,
         )
-        if self.visits is not None:
-            distributed.keep_largest(self.visits)
+        if self.cell_depths is not None:
+            distributed.keep_largest(self.cell_depths)
             # The host waits for a GPU to count these; computing all cells instead takes a CPU 1.6 times as long.
-            visits, depths = self.visits.view(-1), self._depths.view(-1)
-            visited = (visits >= 0).nonzero()[:, 0]
+            cell_depths, depths = self.cell_depths.view(-1), self._depths.view(-1)
+            visited = (cell_depths >= 0).nonzero()[:, 0]
             before = depths[visited]
-            depths[visited] = torch.where(before.isinf(), 0.0, before * DECAY).maximum(visits[visited])
-            visits[visited] = UNVISITED
+            depths[visited] = torch.where(before.isinf(), 0.0, before * DECAY).maximum(cell_depths[visited])
+            cell_depths[visited] = UNVISITED
         closed = min(1.0, max(step / self._field.closing_steps, fraction / CLOSING_FRACTION))
         self._open(FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed)
 
     def _open(self, threshold: float) -> None:
         self.coarse, least = self._occupancy.above(threshold), self._occupancy.least(threshold)
         parts = FINE_SIDE // OCCUPANCY_SIDE
-        if self.visits is not None:
+        if self.cell_depths is not None:
             # Random points often miss a surface that takes a small part of its cell, such as the tip of a stem, until
             # the cell closes for good. The samples of the training hit it.
             found = torch.where(self._depths.isinf(), UNVISITED, self._depths)
@@ -116,8 +213,8 @@ class OpenCells:
     def state(self) -> dict[str, Tensor]:
         """Return the state for `restore`."""
         tensors = {**self._occupancy.state(), "occupied": self.coarse}
-        if self.visits is not None:
-            tensors |= {"fine_depth": self._depths, "fine_visits": self.visits, "fine_occupied": self._fine}
+        if self.cell_depths is not None:
+            tensors |= {"fine_depth": self._depths, "fine_visits": self.cell_depths, "fine_occupied": self._fine}
         return tensors
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
@@ -125,6 +222,6 @@ class OpenCells:
         self._occupancy.restore(tensors)
         # Not recomputed: the threshold changes between two refreshes, the open cells do not.
         self.coarse = tensors["occupied"]
-        if self.visits is not None and "fine_depth" in tensors:  # earlier checkpoints have no fine cells
-            self._depths, self.visits = tensors["fine_depth"], tensors["fine_visits"]
+        if self.cell_depths is not None and "fine_depth" in tensors:  # earlier checkpoints have no fine cells
+            self._depths, self.cell_depths = tensors["fine_depth"], tensors["fine_visits"]
             self._fine = tensors["fine_occupied"]

@@ -13,21 +13,21 @@ import torch
 from torch import Tensor
 
 from nerfcli import distributed
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.loading import refuse_without_training_photos
 from nerfcli.captures.model_tracks import tracks_of_model
-from nerfcli.captures.scene import Scene, refuse_without_training_photos
 from nerfcli.errors import UserError, reason_of
 from nerfcli.matching.camera_check import CameraCheck, check_cameras
 from nerfcli.matching.correspondences import SharedFeatures
 from nerfcli.matching.triangulation import triangulate
 from nerfcli.memory import default_memory_limit
-from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
+from nerfcli.photos.exif import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.training.evidence import Evidence
 from nerfcli.training.extent import Extent, choose_extent, lacks_depth
 from nerfcli.training.fitting import Fitting
 from nerfcli.training.point_depth import PointDepths, PointRays
 from nerfcli.training.pool import Album, PixelPool, load_album
-from nerfcli.training.runs.components import Components
-from nerfcli.training.runs.decisions import Selection
+from nerfcli.training.runs.components import Components, Selection
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.selection.selection import (
     LEARN_FOCAL,
@@ -106,7 +106,7 @@ class Prepared:
 
 
 def load_training_photos(
-    scene: Scene,
+    scene: Capture,
     settings: TrainSettings,
     *,
     run: Path,
@@ -133,7 +133,7 @@ def load_training_photos(
 
 
 def prepare(
-    scene: Scene,
+    scene: Capture,
     settings: TrainSettings,
     *,
     run: Path,
@@ -188,7 +188,7 @@ def prepare(
         others = "" if known == len(gains) else "; the others are learned"
         notify(f"matched pixels give the exposure of {known} of {len(gains)} photos{others}")
     elif settings.components.exposure == "learned" and settings.components.stereo:
-        gains = distributed.from_first(lambda: evidence.gains_or(gains))
+        gains = distributed.from_first(lambda: evidence.matched_gains_or(gains))
     occluders, points = None, None
     if settings.components.occluders:
         occluders = distributed.from_first(lambda: evidence.occluders)
@@ -214,7 +214,7 @@ def prepare(
 
 
 def _extent(
-    scene: Scene, settings: TrainSettings, album: Album, shared: SharedFeatures, *, notify: Callable[[str], None]
+    scene: Capture, settings: TrainSettings, album: Album, shared: SharedFeatures, *, notify: Callable[[str], None]
 ) -> Extent:
     """Return the extent of the field; without 3D points, from triangulated ones if it needs any."""
     if lacks_depth(scene, settings, fills_frame=album.fills_frame):
@@ -224,7 +224,7 @@ def _extent(
     return choose_extent(scene, settings, fills_frame=album.fills_frame)
 
 
-def _log_focal(scene: Scene, evidence: Evidence) -> float:
+def _log_focal(scene: Capture, evidence: Evidence) -> float:
     """Return the logarithm of the initial factor of focal lengths, and report how it was found."""
     _, log_focal, decisions = with_known_cameras(evidence.settings.components, _facts(scene, evidence))
     for decision in decisions:
@@ -232,16 +232,16 @@ def _log_focal(scene: Scene, evidence: Evidence) -> float:
     return log_focal
 
 
-def _depths(scene: Scene, settings: TrainSettings, evidence: Evidence) -> list[PointDepths]:
+def _depths(scene: Capture, settings: TrainSettings, evidence: Evidence) -> list[PointDepths]:
     """Return the sets of pixels at known distances that are drawn from in each step."""
-    sets = evidence.sets(settings.components)
+    sets = evidence.depths_for(settings.components)
     if not any(len(depths.numbers) for depths in sets):
         raise UserError(
             f"--with points: no 3D point could be triangulated from the photos of {scene.root}",
             "use a scene written by nerfcli poses or a COLMAP model, or remove --with points",
         )
     if settings.model != "auto" or "points" in settings.fixed:  # else the decision on points reports it
-        evidence.notify(f"points: {len(evidence.of_tracks.numbers):,} pixels see a 3D point at a known distance")
+        evidence.notify(f"points: {len(evidence.track_depths.numbers):,} pixels see a 3D point at a known distance")
     return sets
 
 
@@ -249,7 +249,7 @@ def _threads(count: int) -> str:
     return f"{count} {'thread' if count == 1 else 'threads'}"
 
 
-def _facts(scene: Scene, evidence: Evidence) -> Facts:
+def _facts(scene: Capture, evidence: Evidence) -> Facts:
     """Collect facts about the scene before training."""
     album, shared, settings = evidence.album, evidence.shared, evidence.settings
     lacks_points = album.fills_frame and len(scene.points) == 0
@@ -269,9 +269,9 @@ def _facts(scene: Scene, evidence: Evidence) -> Facts:
     if not facts.has_alpha and "background" not in facts.fixed:
         facts = replace(facts, sky_fraction=evidence.sky_fraction, sky_confirmed=evidence.sky_confirmed)
     if may_use_points(settings.components, facts) and (shared.of_model.count or has_time or settings.components.points):
-        facts = replace(facts, points=len(evidence.of_tracks.numbers))
+        facts = replace(facts, points=len(evidence.track_depths.numbers))
         if may_use_stereo(settings.components, facts, has_time=bool(evidence.side_px)):
-            stereo = len(evidence.of_stereo.numbers)
+            stereo = len(evidence.stereo_depths.numbers)
             facts = replace(
                 facts,
                 stereo=stereo,
@@ -290,7 +290,7 @@ def _camera_check(evidence: Evidence) -> CameraCheck | None:
         return None
 
 
-def _search(scene: Scene, evidence: Evidence, *, storage: PhotoStorage, began: float) -> Selection:
+def _search(scene: Capture, evidence: Evidence, *, storage: PhotoStorage, began: float) -> Selection:
     """Select components for the scene and report each decision."""
     facts = _facts(scene, evidence)
     album, settings, notify = evidence.album, evidence.settings, evidence.notify
@@ -310,7 +310,7 @@ def _search(scene: Scene, evidence: Evidence, *, storage: PhotoStorage, began: f
         settings=settings,
         exif=_exif(scene),
         log_focal=log_focal,
-        depths=evidence.sets(model) if facts.points else [],
+        depths=evidence.depths_for(model) if facts.points else [],
         log_gains=torch.from_numpy(evidence.log_gains) if uses_matched else None,
         sky=None if facts.has_alpha else evidence.sky,
         colours=album.colours,
@@ -336,19 +336,19 @@ def _search(scene: Scene, evidence: Evidence, *, storage: PhotoStorage, began: f
     return replace(selection, decisions=decisions, seconds=selection.seconds + took, log_focal=log_focal)
 
 
-def _exif(scene: Scene) -> np.ndarray:
+def _exif(scene: Capture) -> np.ndarray:
     """Return the (photos,) logarithms of EXIF exposures relative to their mean."""
     return relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
 
 
-def _known(scene: Scene) -> str | None:
+def _known(scene: Capture) -> str | None:
     """Return the reason to trust the cameras, shown to the user; None if they may be wrong."""
     if scene.kind == "blender":
         return "these cameras are exact: the pictures were rendered with them"
     return "structure from motion has already optimized the cameras" if len(scene.points) else None
 
 
-def _exposures(scene: Scene, components: Components, *, notify: Callable[[str], None]) -> tuple[float | None, Tensor]:
+def _exposures(scene: Capture, components: Components, *, notify: Callable[[str], None]) -> tuple[float | None, Tensor]:
     """Return the mean log exposure of the training photos by EXIF, and theirs relative to it, (photos, 3)."""
     frames = scene.train_frames
     reference = None if components.exposure == "none" else mean_log_exposure(frames)

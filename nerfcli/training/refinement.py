@@ -15,11 +15,9 @@ from nerfcli.cameras.camera import Camera, by_lens
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.lens_change import FOCAL, bearings_by_change, changeable, changed, pixels_by_change
 from nerfcli.cameras.rigid import from_parts, inverse, transform_from_twist, vector_from_rotation
+from nerfcli.training.camera_optimiser import NewtonSteps, WhitenedAdam, whitening, without_mean
 from nerfcli.training.delayed import Delayed, on_device_of
-from nerfcli.training.gauge import without_mean
-from nerfcli.training.newton import NewtonSteps
 from nerfcli.training.pool import PixelBatch, Pool
-from nerfcli.training.whitening import WhitenedAdam, whitening
 
 # Least distance of a camera from the origin of the training frame, about which its points are.
 _LEAST_DISTANCE = 0.2
@@ -249,7 +247,7 @@ class Refinement(nn.Module):
         self.sent = Delayed()
 
     @torch.no_grad()
-    def refined(self, drawn: PixelBatch) -> PixelBatch:
+    def refine_cameras(self, drawn: PixelBatch) -> PixelBatch:
         """Return the same pixels, with the rays of the current cameras."""
         photos = self._pool.photo_of(drawn.numbers)
         origins, directions = drawn.origins, drawn.directions

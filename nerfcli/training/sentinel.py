@@ -64,7 +64,7 @@ class Sentinel:
                 self._take_snapshot(fraction)
             return self._fitting.advance(fraction)
         except NonFiniteError:
-            return self._answer()
+            return self._recover()
 
     def settle(self) -> None:
         """Make sure that the last step was finite, too, which `advance` does not know yet on a GPU.
@@ -75,7 +75,7 @@ class Sentinel:
         try:
             self._fitting.settle()
         except NonFiniteError:
-            self._answer()
+            self._recover()
 
     def _take_snapshot(self, fraction: float) -> None:
         self._fitting.settle()
@@ -95,7 +95,7 @@ class Sentinel:
     def _go_back(self) -> None:
         self._fitting.restore(*_copied(self._tensors, self._description))
 
-    def _answer(self) -> StepResult:
+    def _recover(self) -> StepResult:
         """Find the failure by repeating the steps since the copy; then continue from the copy with smaller steps."""
         fitting = self._fitting
         self._go_back()

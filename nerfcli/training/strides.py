@@ -5,7 +5,7 @@ from torch import Tensor
 
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
-from nerfcli.field.sizes import cube_side
+from nerfcli.field.kinds import cube_side
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.normalisation import NEAR_PER_POINT
 
@@ -47,7 +47,7 @@ class RaySteps:
         """Return the edges of the steps, see `Marching.edges`, at a fraction of the budget and at step `step`."""
         return self._edges[:: self._stride(fraction, step)].contiguous()
 
-    def of_pictures(self, fraction: float, step: int) -> Marching:
+    def render_steps(self, fraction: float, step: int) -> Marching:
         """Return the steps of pictures of the field: those of the training so far, at most those of the capture.
 
         Pictures of detailed fields have at most half of the capture's, with which the training had more rays.

@@ -119,7 +119,7 @@ def render_tile(model: Model, view: View, tile: Tile) -> np.ndarray:
     values = torch.cat(
         [
             *(seen.rgb.clamp(0.0, 1.0), ends.opacity[:, None], ends.mean[:, None], ends.spread[:, None]),
-            *(quantiles[:, :1], ends.heaviest[:, None], quantiles[:, 1:], torch.zeros_like(ends.mean)[:, None]),
+            *(quantiles[:, :1], ends.peak[:, None], quantiles[:, 1:], torch.zeros_like(ends.mean)[:, None]),
         ],
         dim=1,
     )

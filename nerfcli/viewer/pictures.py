@@ -10,9 +10,8 @@ from scipy.spatial import KDTree
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of
-from nerfcli.pages.embedded_pictures import data_uri, jpeg_bytes
-from nerfcli.photos.loading import load_photo
-from nerfcli.photos.undistorted import pinhole_of, undistorted
+from nerfcli.pages.page import data_uri, jpeg_bytes
+from nerfcli.photos.loading import load_photo, pinhole_of, undistorted
 from nerfcli.render.held_out_exposure import log_gains_of
 from nerfcli.render.model import Model
 

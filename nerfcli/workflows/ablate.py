@@ -6,17 +6,26 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.bench.ablation_results import RUNS, MeasuredTraining, refuse_foreign, rows_of, write_results
-from nerfcli.bench.ablation_variants import AUTO, CHOSEN, CaptureTraits, Variant, variants
-from nerfcli.captures import scene as scenes
-from nerfcli.captures.formats.colmap import parse_colmap
-from nerfcli.captures.formats.finding import find_model
-from nerfcli.captures.scene import Scene
+from nerfcli.bench.ablation import (
+    AUTO,
+    CHOSEN,
+    RUNS,
+    CaptureTraits,
+    MeasuredTraining,
+    Variant,
+    refuse_foreign,
+    rows_of,
+    variants,
+    write_results,
+)
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.colmap import find_model, parse_colmap
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
 from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
-from nerfcli.photos.exif_exposure import mean_log_exposure, relative_log_exposures
+from nerfcli.photos.exif import mean_log_exposure, relative_log_exposures
 from nerfcli.photos.images import read_image
 from nerfcli.training.runs.files import STATE
 from nerfcli.training.runs.run import Run
@@ -54,7 +63,7 @@ def ablate_scene(
     Raises:
         UserError: see `nerfcli.training.loop.train`; or no photos are held out, or the folder holds something else.
     """
-    scene = scenes.load(path)
+    scene = load_scene(path)
     if not scene.test_frames:
         raise UserError(f"{path} has no held-out photos", "by default every 8th photo is held out; check its split")
     refuse_foreign(folder)
@@ -104,7 +113,7 @@ def ablate_scene(
     return {"rows": [vars(row) for row in rows], **about}
 
 
-def _capture(scene: Scene) -> CaptureTraits:
+def _capture(scene: Capture) -> CaptureTraits:
     """Return the traits of a scene that decide which components can be varied."""
     first, sparse = scene.train_frames[0].image, find_model(scene.root)
     seen = parse_colmap(sparse).observations if sparse is not None else None

@@ -4,11 +4,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from nerfcli.cameras.frame import Capture
 from nerfcli.captures import detect
-from nerfcli.captures.check import TOLERANCE_PX
-from nerfcli.captures.conversion import ConventionOverrides, Conversion, TargetOptions, convert, load
-from nerfcli.captures.formats.registry import Format, UserInputs, recording
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.conversion import TOLERANCE_PX, ConventionOverrides, Conversion, TargetOptions, convert, load
+from nerfcli.captures.formats.format import Format, UserInputs
+from nerfcli.captures.formats.registry import recording
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.captures.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.captures.world_frame import WorldFrame, in_world_frame

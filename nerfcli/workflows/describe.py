@@ -9,9 +9,10 @@ from typing import Any
 
 from nerfcli.cameras.camera import by_lens
 from nerfcli.cameras.frame import Frame
-from nerfcli.captures import scene as scenes
-from nerfcli.captures.formats.registry import UserInputs, recognise, recognised
+from nerfcli.captures.formats.format import UserInputs
+from nerfcli.captures.formats.registry import recognise, recognised
 from nerfcli.captures.formats.run_cameras import CAMERAS
+from nerfcli.captures.loading import describe_unused_masks, fingerprint, with_photos_on_disk
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.ct.result import is_reconstruction, load_reconstruction
 from nerfcli.ct.volume_files import is_volume_file, volume_facts
@@ -130,18 +131,18 @@ def _describe_capture(path: Path) -> dict[str, Any]:
             "unit": capture.unit,
             "unit_source": capture.unit_source,
         }
-    scene = scenes.scene_of(path, form, found, capture)
+    scene = with_photos_on_disk(path, form, found, capture)
     return {
         "kind": scene.kind,
         "photos": len(scene.frames),
         "held_out": len(scene.test_frames),
         "missing": len(scene.missing),
         "masks": sum(frame.mask is not None for frame in scene.frames) or None,
-        "unused_masks": scenes.describe_unused_masks(scene),
+        "unused_masks": describe_unused_masks(scene),
         **_camera_facts(scene.frames),
         "rescaled": describe_rescaling(scene.rescaled),
         "points": len(scene.points),
         "unit": scene.unit,
         "unit_source": scene.unit_source,
-        "fingerprint": scenes.fingerprint(scene),
+        "fingerprint": fingerprint(scene),
     }

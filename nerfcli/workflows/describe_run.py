@@ -1,12 +1,16 @@
 """Describe a run or a file of tensors as plain values: settings, decisions, metrics."""
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import vector_from_rotation
 from nerfcli.field.checkpoint import load_tensors
-from nerfcli.field.cost import field_bytes
-from nerfcli.training.runs.camera_moves import camera_moves
+from nerfcli.field.kinds import field_bytes
 from nerfcli.training.runs.run import Run
 from nerfcli.training.sentinel import FAILURE_FORMAT, replay
 
@@ -58,3 +62,28 @@ def describe_tensors(path: Path) -> dict[str, Any]:
     _, bad = replay(path)
     again = None if bad is None else f"{bad.name}: {bad.count} of {bad.total} numbers"
     return {**facts, "failure": description["message"], "pixels": description["pixels"], "repeated_now": again}
+
+
+def camera_moves(before: Sequence[Frame], after: Sequence[Frame], *, radius: float) -> dict[str, Any]:
+    """Return the median and the largest change of the cameras of photos.
+
+    Args:
+        before, after: the same photos in the same order, at least one.
+        radius: radius of the scene, in its units.
+
+    Returns:
+        "rotation_deg", "translation_percent" (of the radius) and "focal_percent", each with "median" and "max".
+    """
+    given, refined = (np.array([frame.world_from_cam for frame in frames]) for frames in (before, after))
+    turns = np.linalg.norm(vector_from_rotation(np.swapaxes(given[:, :3, :3], 1, 2) @ refined[:, :3, :3]), axis=1)
+    moves = np.linalg.norm(refined[:, :3, 3] - given[:, :3, 3], axis=1)
+    focal = [abs(b.camera.focal_px / a.camera.focal_px - 1) for a, b in zip(before, after, strict=True)]
+    columns = {
+        "rotation_deg": np.degrees(turns),
+        "translation_percent": 100 * moves / radius,
+        "focal_percent": 100 * np.array(focal),
+    }
+    return {
+        name: {"median": round(float(np.median(values)), 4), "max": round(float(values.max()), 4)}
+        for name, values in columns.items()
+    }

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 
 from nerfcli.atomic import refuse_read_only
-from nerfcli.captures.camera_files import read_calibration
+from nerfcli.captures.calibration import read_calibration
 from nerfcli.doctor.examination import Diagnosis, estimated_seconds, examine
 from nerfcli.doctor.page import refuse_foreign, write_page
 from nerfcli.doctor.photo_list import find_subject

@@ -13,7 +13,7 @@ from nerfcli.atomic import atomic_folder, clear_leftovers, read_json, refuse_rea
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import GATE_NOT_MET, UserError
 from nerfcli.evaluate.ledger import leak_ledger
-from nerfcli.evaluate.perceptual import find_perceptual
+from nerfcli.evaluate.metrics import find_perceptual
 from nerfcli.evaluate.predictions import INFO, PREDICTIONS, predictions_are_there, save_compared
 from nerfcli.evaluate.protocol import PROTOCOL, ComparedImages, Extras, evaluate_model
 from nerfcli.evaluate.requirements import WHY_ABSENT, Requirement, known_numbers, unmet

@@ -6,12 +6,11 @@ import torch
 
 from nerfcli.atomic import cannot_write, refuse_read_only
 from nerfcli.errors import UserError
-from nerfcli.export.extent import check_box, scene_box
-from nerfcli.export.settings import SurfaceSettings
+from nerfcli.export.extent import SurfaceSettings, check_box, scene_box
 from nerfcli.machine import device_name, thread_count
 from nerfcli.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.pages.page import write_page
-from nerfcli.photos.undistorted import pinhole_frame
+from nerfcli.photos.loading import pinhole_frame
 from nerfcli.render.model import Model
 from nerfcli.training.runs.run import Run
 from nerfcli.viewer.packing import pack_model

@@ -11,15 +11,14 @@ from nerfcli import __version__
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import look_at
 from nerfcli.errors import UserError
-from nerfcli.export.colours import surface_colours
-from nerfcli.export.depth_views import DepthView, depth_views, spread_frames
-from nerfcli.export.extent import Grid, automatic_voxel, scene_box
+from nerfcli.export.depth_views import DepthView, depth_views, spread_frames, surface_colours
+from nerfcli.export.extent import MOST_VIEWS, Grid, SurfaceSettings, automatic_voxel, scene_box
 from nerfcli.export.fusion import fuse
 from nerfcli.export.marching import Mesh, simplified, surface_of, without_small_pieces
-from nerfcli.export.mesh_files import write_glb, write_obj, write_ply
+from nerfcli.export.mesh_files import write_glb, write_obj
 from nerfcli.export.points import agreed_points
-from nerfcli.export.settings import MOST_VIEWS, SurfaceSettings
 from nerfcli.notices import Notify, Progress, part_of
+from nerfcli.ply import write_ply
 from nerfcli.render.coverage import coverage_and_parallax
 from nerfcli.render.model import Model
 from nerfcli.training.runs.run import Run

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from nerfcli.captures.calibration import Calibration
-from nerfcli.captures.camera_files import read_calibration
+from nerfcli.captures.calibration import Calibration, read_calibration
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.errors import UserError, duration
 from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python

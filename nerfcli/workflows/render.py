@@ -10,7 +10,7 @@ from nerfcli.errors import UserError
 from nerfcli.machine import device_name, thread_count
 from nerfcli.notices import Notify, Progress, no_progress, part_of, silent
 from nerfcli.render.frames import export_frames, export_part
-from nerfcli.render.job import Order, refuse_foreign
+from nerfcli.render.job import RenderJob, refuse_foreign
 from nerfcli.render.outputs import OUTPUTS, ExportSettings
 from nerfcli.render.renderable import Renderable
 from nerfcli.training.runs.run import Run, load_run
@@ -109,10 +109,8 @@ def render_run(
     frames = chosen_frames(trained, views, depth_hint=1.0 / model.training_from_scene.scale)
     if "depth" in settings.outputs and settings.depth.axis == "z":
         refuse_z_depth_for_equirectangular(frames, notify=notify)
-    order = Order(tuple(frames), settings, provenance, seen, errors)
-    return _export(
-        shown, order, folder, part=part, threads=cores, overwrite=overwrite, notify=notify, progress=progress
-    )
+    job = RenderJob(tuple(frames), settings, provenance, seen, errors)
+    return _export(shown, job, folder, part=part, threads=cores, overwrite=overwrite, notify=notify, progress=progress)
 
 
 def render_splats(
@@ -156,15 +154,13 @@ def render_splats(
         refuse_z_depth_for_equirectangular(frames, notify=notify)
     provenance = {"cameras": views.cameras, "splats": path.name, "splats_sha256": file_digest(path)}
     folder = path.with_name(f"{path.stem}-{RENDERS}") / folder_name(views, settings) if target is None else Path(target)
-    order = Order(tuple(frames), settings, provenance)
-    return _export(
-        splats, order, folder, part=part, threads=cores, overwrite=overwrite, notify=notify, progress=progress
-    )
+    job = RenderJob(tuple(frames), settings, provenance)
+    return _export(splats, job, folder, part=part, threads=cores, overwrite=overwrite, notify=notify, progress=progress)
 
 
 def _export(
     shown: Renderable,
-    order: Order,
+    job: RenderJob,
     folder: Path,
     *,
     part: slice | None,
@@ -173,17 +169,17 @@ def _export(
     notify: Notify,
     progress: Progress,
 ) -> list[Path]:
-    """Render an order, or keep a complete folder."""
-    frames = order.frames
+    """Render an job, or keep a complete folder."""
+    frames = job.frames
     chosen = range(len(frames))[part] if part is not None else range(len(frames))
     if not chosen:
         raise UserError(f"--frames: there are only {len(frames)} views", "views are counted from 0", exit_code=2)
     refuse_foreign(folder)
-    if not overwrite and order.is_held_by(folder):
+    if not overwrite and job.is_held_by(folder):
         notify(f"{folder} is kept: it is complete and has these settings; add --overwrite to render again")
-        return order.results(folder)
+        return job.results(folder)
 
-    total = sum(map(order.rays, chosen))
+    total = sum(map(job.rays, chosen))
     done = 0
 
     def on_rays(rays: int) -> None:
@@ -193,5 +189,5 @@ def _export(
 
     progress(0.0, "")
     if part is not None:
-        return [export_part(shown, order, folder, chosen, on_rays=on_rays, notify=notify, threads=threads)]
-    return export_frames(shown, order, folder, on_rays=on_rays, notify=notify, threads=threads)
+        return [export_part(shown, job, folder, chosen, on_rays=on_rays, notify=notify, threads=threads)]
+    return export_frames(shown, job, folder, on_rays=on_rays, notify=notify, threads=threads)

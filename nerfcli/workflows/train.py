@@ -7,15 +7,15 @@ from tempfile import TemporaryDirectory
 
 from nerfcli import distributed
 from nerfcli.atomic import clear_leftovers
-from nerfcli.captures import scene as scenes
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.loading import describe_source, describe_unused_masks, fingerprint, load_scene
 from nerfcli.captures.orientation import describe_rescaling
-from nerfcli.captures.scene import Scene, describe_unused_masks
 from nerfcli.errors import UserError, listed, several
 from nerfcli.exclusive import exclusive
 from nerfcli.machine import is_one_of_several
 from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.training import loop
-from nerfcli.training.left_out import OCCLUDERS
+from nerfcli.training.loop import OCCLUDERS
 from nerfcli.training.runs.config import split_hash
 from nerfcli.training.runs.files import CONFIG, LOCK, METRICS, STATE
 from nerfcli.training.runs.run import Run
@@ -97,8 +97,8 @@ def _trained(
     progress: Progress,
 ) -> Run:
     """See `train_scene`."""
-    loaded = scenes.load(folder, holdout=holdout)
-    notify(scenes.describe_source(folder, loaded))
+    loaded = load_scene(folder, holdout=holdout)
+    notify(describe_source(folder, loaded))
     if loaded.missing:
         names = listed(loaded.missing)
         warn(f"{several(len(loaded.missing), 'missing photo')} of {folder} skipped: {names}")
@@ -171,11 +171,11 @@ def was_interrupted(scene: Path, run: Path, settings: TrainSettings, *, holdout:
     trained = Run(run)
     if not trained.is_trained:
         return False
-    loaded = scenes.load(scene, holdout=holdout)
+    loaded = load_scene(scene, holdout=holdout)
     return trained.is_trained_from(loaded, settings) and not trained.is_complete(settings)
 
 
-def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:
+def _keeps(path: Path, scene: Capture, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:
     """Return whether the run at `path` is complete with these settings; raise if it may not be replaced otherwise."""
     run = Run(path)
     masks = {frame.mask.parent: frame.mask for frame in scene.frames if frame.mask is not None}  # one of each folder
@@ -191,7 +191,7 @@ def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, o
             f"{path} was trained with other held-out photos ({before or 'the split of the scene'})",
             f"give --holdout {before}" if before else "remove --holdout, or choose another folder with -o",
         )
-    if resume and run.config.scene_fingerprint != scenes.fingerprint(scene):
+    if resume and run.config.scene_fingerprint != fingerprint(scene):
         raise UserError(f"{path} was trained on a different scene than {scene.root}", "choose another folder with -o")
     if resume and run.is_complete(settings):  # decided before stereo matching is repeated needlessly
         before = run.config.settings

@@ -4,7 +4,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerfcli.captures import scene as scenes
+from nerfcli.captures.loading import load_scene, refuse_without_training_photos
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.storage import InFiles, field_bytes, needs_of, storage_for
 
@@ -58,8 +58,8 @@ def plan_training(
     Raises:
         UserError: the scene cannot be read, has no training photo, or does not fit into memory.
     """
-    loaded = scenes.load(Path(scene), holdout=holdout)
-    scenes.refuse_without_training_photos(loaded)
+    loaded = load_scene(Path(scene), holdout=holdout)
+    refuse_without_training_photos(loaded)
     first = loaded.train_frames[0].camera
     factor = settings.downscale or automatic_downscale(first)
     needs = needs_of((*loaded.train_frames, *loaded.test_frames), factor, settings=settings)

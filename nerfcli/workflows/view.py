@@ -17,7 +17,7 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.export.extent import scene_box
-from nerfcli.photos.undistorted import pinhole_frame
+from nerfcli.photos.loading import pinhole_frame
 from nerfcli.render.model import Model, load_model
 from nerfcli.training.runs.config import no_run
 from nerfcli.training.runs.files import CONFIG, FIELD

@@ -10,13 +10,14 @@ import numpy as np
 from nerfcli.atomic import cannot_write
 from nerfcli.cameras import paths
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame, frames_named
+from nerfcli.cameras.frame import Frame, frames_named
 from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
-from nerfcli.captures import scene as scenes
-from nerfcli.captures.formats.camera_path import losses_camera_path, read_path, write_camera_path
-from nerfcli.captures.formats.finding import find_camera_path
-from nerfcli.captures.formats.registry import UserInputs, recognise
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.camera_path import find_camera_path, losses_camera_path, read_path, write_camera_path
+from nerfcli.captures.formats.format import UserInputs
+from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.formats.transforms import write_transforms
+from nerfcli.captures.loading import with_photos_on_disk
 from nerfcli.errors import UserError
 from nerfcli.notices import Notify, warn_python
 from nerfcli.photos.loading import downscaled_camera
@@ -221,7 +222,7 @@ def _frames_of(path: Path) -> tuple[Frame, ...]:
     form, found = recognise(path)
     capture = form.parse(found, UserInputs())
     if path.is_dir() and form.name != "run" and any(frame.has_photo for frame in capture.frames):
-        return scenes.scene_of(path, form, found, capture).frames
+        return with_photos_on_disk(path, form, found, capture).frames
     return capture.frames
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hard_cases import exact, exact_depths
 from hard_cases.exact_depths import FRACTIONS, quantile_name
-from nerfcli.kernels import LightEnds
+from nerfcli.kernels import RayTermination
 from nerfcli.kernels.selftest import textbook
 from nerfcli.kernels.selftest.cases import (
     MEANINGLESS,
@@ -64,12 +64,12 @@ def _depth_rows(rays: list[Ray], precision: Precision, *, cut: str) -> Iterator[
         rays = [ray for ray in rays if _bound(ray, precision) <= MEANINGLESS]
     if not rays:
         return
-    wanted = [exact_depths.light_ends(ray) for ray in rays]
+    wanted = [exact_depths.ray_termination(ray) for ray in rays]
     density, starts, ends, offsets = _packed(rays, precision)
     density.requires_grad_(not precision.compiled)
     module = precision.parts
     start = time.perf_counter()
-    seen = _columns(module.light_ends(density, starts, ends, offsets=offsets, fractions=FRACTIONS))
+    seen = _columns(module.ray_termination(density, starts, ends, offsets=offsets, fractions=FRACTIONS))
     slopes = _gradients(seen, density)
     seconds = time.perf_counter() - start
     plain = textbook.depth(density, starts, ends, offsets=offsets)
@@ -87,7 +87,7 @@ def _depth_rows(rays: list[Ray], precision: Precision, *, cut: str) -> Iterator[
         ours = nearest(seen, slopes)
         yield Row(
             case=f"{name}; {cut} intervals",
-            operation="light_ends",
+            operation="ray_termination",
             precision=precision.name,
             errors=ours.errors,
             bounds=ours.bounds,
@@ -105,7 +105,7 @@ def _depth_rows(rays: list[Ray], precision: Precision, *, cut: str) -> Iterator[
 
 def _nearest(
     rays: list[Ray],
-    wanted: list[exact_depths.LightEnds],
+    wanted: list[exact_depths.RayTermination],
     *,
     columns: list[str],
     values: dict[str, Tensor],
@@ -167,9 +167,9 @@ def _bound(ray: Ray, precision: Precision) -> float:
     return precision.unit * (16 + (samples + 2) * (1 + depth))
 
 
-def _columns(seen: LightEnds) -> dict[str, Tensor]:
+def _columns(seen: RayTermination) -> dict[str, Tensor]:
     named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
-    named |= {"conditional": seen.mean, "max-weight": seen.heaviest}
+    named |= {"conditional": seen.mean, "max-weight": seen.peak}
     return named | {quantile_name(fraction): seen.quantiles[:, i] for i, fraction in enumerate(FRACTIONS)}
 
 

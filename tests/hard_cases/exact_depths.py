@@ -37,7 +37,7 @@ class Depth:
 
 
 @dataclass(frozen=True)
-class LightEnds:
+class RayTermination:
     """All depths of a ray by name, and the start of its heaviest interval.
 
     Args:
@@ -65,9 +65,9 @@ class _Interval:
         return self.sigma * self.length
 
 
-def light_ends(ray: Ray) -> LightEnds:
+def ray_termination(ray: Ray) -> RayTermination:
     """Return every depth of a ray and its gradient; the ray's numbers are not rounded."""
-    return _light_ends(_Numbers(ray))
+    return _ray_termination(_Numbers(ray))
 
 
 class _Numbers:
@@ -84,7 +84,7 @@ class _Numbers:
 
 
 @functools.cache
-def _light_ends(numbers: _Numbers) -> LightEnds:
+def _ray_termination(numbers: _Numbers) -> RayTermination:
     ray = numbers.ray
     with localcontext() as context:
         context.prec = DIGITS
@@ -95,9 +95,9 @@ def _light_ends(numbers: _Numbers) -> LightEnds:
         depths = {"opacity": _depth(1 - left, slopes, slopes)}
         depths["transmittance"] = _depth(left, [-x for x in slopes], slopes)
         mass = sum((one.weight for one in intervals), Decimal(0))
-        heaviest = max((one.weight for one in intervals), default=Decimal(0))
+        peak = max((one.weight for one in intervals), default=Decimal(0))
         # Weights this close are equal but for rounding; the nearest of them counts as the heaviest.
-        near = [k for k, one in enumerate(intervals) if one.weight > 0 and one.weight >= heaviest * (1 - _THIN)]
+        near = [k for k, one in enumerate(intervals) if one.weight > 0 and one.weight >= peak * (1 - _THIN)]
         if mass:
             depths |= _moments(intervals, mass, intervals[near[0]].mean)
             one = intervals[near[0]]
@@ -107,7 +107,7 @@ def _light_ends(numbers: _Numbers) -> LightEnds:
         else:
             depths |= dict.fromkeys(("conditional", "spread", "max-weight"), _undefined(ray))
         depths |= {quantile_name(fraction): _quantile(ray, intervals, _target(fraction)) for fraction in FRACTIONS}
-        return LightEnds(depths, float(intervals[near[0]].start) if near else float("nan"))
+        return RayTermination(depths, float(intervals[near[0]].start) if near else float("nan"))
 
 
 def quantile_name(fraction: float) -> str:

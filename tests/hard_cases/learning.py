@@ -11,7 +11,7 @@ from nerfcli.kernels import AdamStep
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT, density_from_log
 from nerfcli.kernels.selftest.cases import GRADIENTS, LOGARITHMS
 from nerfcli.kernels.selftest.measure import Errors, Precision, Row, largest_error
-from nerfcli.render.occupancy import Occupancy
+from nerfcli.training.open_cells import Occupancy
 
 RATE, BETAS, EPS = 0.01, (0.9, 0.99), 1e-15
 

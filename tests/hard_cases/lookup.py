@@ -158,10 +158,10 @@ def _half_row(half: torch.dtype, device: str) -> Row:
     wanted = _exact(CROWD, grids, times=CROWD_SIZE)
     points = single.tensor(CROWD).repeat(CROWD_SIZE, 1)
     table = single.tensor(hash_table(2)).to(half).requires_grad_()
-    sink = torch.zeros_like(table, dtype=torch.float32)
+    table_grad = torch.zeros_like(table, dtype=torch.float32)
     start = time.perf_counter()
     backend = kernels.backend_for(table.device, half)
-    encoded = backend.hash_encode(points, table, grids.resolutions, sink=sink)
+    encoded = backend.hash_encode(points, table, grids.resolutions, table_grad=table_grad)
     (encoded.view(len(points), -1, FEATURES) * single.tensor(GAINS)).sum().backward()
     seconds = time.perf_counter() - start
     plain = _in_half(points, table, grids.resolutions, half=half)
@@ -169,7 +169,7 @@ def _half_row(half: torch.dtype, device: str) -> Row:
         case=f"table in half precision, {len(points)} gradients of 1 to 1e-8 in a cell",
         operation="hash_encode",
         precision=str(half).removeprefix("torch."),
-        errors=_errors(encoded, sink, wanted, tiny=single.tiny, times=CROWD_SIZE),
+        errors=_errors(encoded, table_grad, wanted, tiny=single.tiny, times=CROWD_SIZE),
         bounds=Errors(16 * single.unit, (16 + len(points)) * single.unit),
         reason="16 u of float32, of a gradient 16 + n: the table alone is of half precision, sums are not",
         formula="places, table and sums in half precision",

@@ -13,11 +13,11 @@ from nerfcli import kernels
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
-from nerfcli.field.contraction import uncontract
 from nerfcli.kernels import HashGrid, March, Rays, reference
 from nerfcli.kernels.selftest import textbook
 from nerfcli.kernels.selftest.cases import CONTRACTED, DIRECTIONS
 from nerfcli.kernels.selftest.measure import Errors, Precision, Row, largest_error
+from nerfcli.training.open_cells import uncontract
 
 GIVEN = (1.0, 0.5, 0.25)
 WORLD = 1e6
@@ -129,13 +129,13 @@ def _empty_row(precision: Precision) -> Row:
     density, background = torch.zeros_like(starts), precision.tensor([[0.25, 0.5, 1.0]] * 3)
     rgb = starts.new_zeros(len(starts), 3)
     colour, passing, _ = module.composite(density, rgb, ends - starts, offsets=offsets, background=background)
-    light = module.light_ends(density, starts, ends, offsets=offsets, fractions=(0.5,))
+    light = module.ray_termination(density, starts, ends, offsets=offsets, fractions=(0.5,))
     seconds = time.perf_counter() - begin
     got = torch.cat([colour.flatten(), passing, light.opacity, light.mean, light.quantiles.flatten()])
     wanted = [0.25, 0.5, 1.0] * 3 + [1.0] * 3 + [0.0] * 3 + [math.nan] * 6
     return Row(
         case="empty occupancy: every ray without samples",
-        operation="visible_samples, composite, light_ends",
+        operation="visible_samples, composite, ray_termination",
         precision=precision.name,
         errors=Errors(largest_error(got, wanted, tiny=precision.tiny)),
         bounds=Errors(0.0),

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import (
     check_unique_names,
@@ -30,6 +31,7 @@ from nerfcli.captures.formats.fields import (
     shown,
     size_of,
 )
+from nerfcli.captures.formats.format import Format, by_suffix, has_keys
 from nerfcli.captures.formats.limits import rigid_pose
 
 FILES = ("cameras.sfm", "sfm.sfm", "sfm.json")
@@ -172,3 +174,20 @@ def _points(value: Any, where: str) -> tuple[np.ndarray, np.ndarray | None]:
     points = [_numbers(record.get("X"), 3, f"{where}[{index}]: X") for index, record in enumerate(records)]
     colours = [_numbers(record.get("color"), 3, f"{where}[{index}]: color") for index, record in enumerate(records)]
     return np.array(points), np.clip(np.rint(colours), 0, 255).astype(np.uint8)
+
+
+def find_alicevision(path: Path) -> Path | None:
+    """Find a file .sfm, or a .json that is a reconstruction of AliceVision."""
+    found = by_suffix(".sfm", *FILES)(path)
+    if found is None and path.is_file() and path.suffix.lower() == ".json":
+        return path if has_keys(path, b'"featuresFolders"', is_alicevision) else None
+    return found
+
+
+FORMAT = Format(
+    "alicevision",
+    "AliceVision, Meshroom",
+    ".sfm",
+    find_alicevision,
+    lambda path, given: parse_alicevision(path, images=given.images),
+)

@@ -16,8 +16,10 @@ import numpy as np
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opengl_from_opencv_pose
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import read_json_object
+from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.transforms import (
     SPLITS,
     check_unique_names,
@@ -26,6 +28,7 @@ from nerfcli.captures.formats.transforms import (
 )
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.captures.orientation import Measure
+from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError
 
 
@@ -135,3 +138,25 @@ def _angle(frame: Frame) -> float:
 
 def _shared_angle(frames: list[Frame]) -> float:
     return Counter(map(_angle, frames)).most_common(1)[0][0]
+
+
+def find_blender(path: Path) -> Path | None:
+    """Find a folder with a file of the Blender scenes."""
+    return path if any((path / f"transforms_{split}.json").is_file() for split in ("train", "test", "val")) else None
+
+
+FORMAT = Format(
+    "blender",
+    "NeRF's synthetic scenes",
+    "transforms_train.json",
+    find_blender,
+    lambda path, given: parse_blender(path, measure, images=given.images, camera=given.camera),
+    axes="opengl",
+    open_axes=True,
+    files=("transforms_train.json", "transforms_val.json", "transforms_test.json"),
+    lacks=("points",),
+    unused_splits=("val",),  # views for choosing settings
+    listed_by=lambda frame: SPLITS.index(frame.split or "train"),
+    write=write_blender,
+    losses=losses_blender,
+)

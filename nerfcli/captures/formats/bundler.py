@@ -15,12 +15,15 @@ import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
-from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, name_of, numbers, read_text
+from nerfcli.captures.formats.format import Format, by_suffix, only_file
 from nerfcli.captures.formats.limits import rigid_pose
 from nerfcli.captures.formats.photo_names import measured_sizes
 from nerfcli.captures.orientation import Measure
+from nerfcli.captures.stored_pixels import measure
 
 BEGINS = "# Bundle file"
 _HEADER = f"{BEGINS} v0.3"
@@ -175,3 +178,18 @@ def _observations(views: np.ndarray, index_of_camera: np.ndarray, middles: np.nd
     frame_index, views = frame_index[kept], views[kept]
     pixels = middles[frame_index] + views[:, 2:] * (1.0, -1.0)
     return Observations(frame_index, views[:, 1].astype(np.int64), pixels)
+
+
+def find_bundler(path: Path) -> Path | None:
+    """Find a file .out, Bundler's own in a folder, or the only one in it that begins as a file of Bundler does."""
+    return by_suffix(".out", "bundle.out", "bundle/bundle.out")(path) or only_file(path, "*.out", BEGINS)
+
+
+FORMAT = Format(
+    "bundler",
+    "Bundler",
+    "bundle.out",
+    find_bundler,
+    lambda path, given: parse_bundler(path, measure, images=given.images),
+    axes="opengl",
+)

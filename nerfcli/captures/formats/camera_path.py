@@ -26,8 +26,10 @@ import numpy as np
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import read_json_object
+from nerfcli.captures.formats.format import Format, find_json, has_keys
 from nerfcli.captures.formats.limits import rigid_pose
 from nerfcli.captures.formats.unsupported import distortion, projection
 from nerfcli.errors import UserError
@@ -229,3 +231,23 @@ def _common_cameras(frames: Sequence[Frame]) -> tuple[Camera, ...]:
 
 def _kind(camera: Camera) -> str:
     return "equirectangular" if camera.is_spherical else projection(camera)
+
+
+def find_camera_path(path: Path) -> Path | None:
+    """Find a JSON file that has the key camera_path and no frames, or the file camera_path.json of a folder."""
+    found = find_json(path, opening="{", name="camera_path.json")
+    if found is None or path.is_dir():
+        return found
+    return found if has_keys(found, b'"camera_path"', is_camera_path) else None
+
+
+FORMAT = Format(
+    "camera-path",
+    "a camera path of nerfstudio's viewer",
+    "camera_path.json",
+    find_camera_path,
+    lambda path, given: parse_camera_path(path),
+    axes="opengl",
+    open_axes=True,
+    lacks=("cameras", "points"),
+)

@@ -16,9 +16,10 @@ from typing import TypeVar
 
 from nerfcli.atomic import atomic_folder
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import colmap_binary, colmap_text
 from nerfcli.captures.formats.colmap_model import ColmapImage, ColmapModel, capture_of, model_of
+from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.photo_names import IMAGE_FOLDERS
 from nerfcli.captures.formats.unsupported import lost_parts
 from nerfcli.errors import UserError
@@ -202,3 +203,39 @@ def _write(capture: Capture, path: Path, suffix: str, *, wrong: list[str]) -> No
         (partial / f"cameras{suffix}").write_bytes(encoding.cameras_to_bytes(model))
         (partial / f"images{suffix}").write_bytes(encoding.images_to_bytes(model))
         (partial / f"points3D{suffix}").write_bytes(encoding.points_to_bytes(model))
+
+
+_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+
+
+def find_model(path: Path) -> Path | None:
+    """Find the folder of a COLMAP model, or the one that a file of it is in."""
+    if path.is_file():
+        return path.parent if path.name in MODEL_FILES and is_model(path.parent) else None
+    return next((path / name for name in _FOLDERS if is_model(path / name)), None)
+
+
+BINARY = Format(
+    "colmap",
+    "a COLMAP model",
+    "sparse/0/cameras.bin or .txt",
+    find_model,
+    lambda path, given: parse_model(path, images=given.images),
+    files=MODEL_FILES,
+    is_unordered=True,  # ids of a model are in no particular order
+    write=write_colmap_binary,
+    losses=losses_colmap,
+)
+
+
+TEXT = Format(
+    "colmap-text",
+    "a COLMAP model as text",
+    "sparse/0/cameras.bin or .txt",
+    find_model,
+    lambda path, given: parse_model(path, images=given.images),
+    files=MODEL_FILES,
+    is_unordered=True,  # ids of a model are in no particular order
+    write=write_colmap_text,
+    losses=losses_colmap_text,
+)

@@ -8,7 +8,8 @@ import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats.limits import plausible
 
 # Point id of a feature without a point: in the file, the largest unsigned 64-bit number, which is -1 if signed.

@@ -15,12 +15,15 @@ from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.format import Format, folder_of
 from nerfcli.captures.formats.limits import checked_camera, plausible, rigid_poses
 from nerfcli.captures.formats.npy import DAMAGED, array_of_npy
 from nerfcli.captures.formats.photo_names import IMAGE_FOLDERS, ListImages
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.errors import UserError
+from nerfcli.photos.images import list_images
 
 FILE = "poses_bounds.npy"
 
@@ -174,3 +177,19 @@ def _points_seen(capture: Capture) -> list[np.ndarray]:
         np.flatnonzero(frame.camera.shows(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points)))
         for frame in capture.frames
     ]
+
+
+FORMAT = Format(
+    "llff",
+    "poses_bounds.npy",
+    "poses_bounds.npy",
+    folder_of(FILE),
+    lambda path, given: parse_llff(path, list_images),
+    axes="llff",
+    open_axes=True,
+    files=("poses_bounds.npy",),
+    lacks=("points",),
+    listed_by=lambda frame: Path(frame.name).name,
+    write=write_llff,
+    losses=losses_llff,
+)

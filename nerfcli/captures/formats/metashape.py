@@ -21,10 +21,13 @@ import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, shown, size_of
+from nerfcli.captures.formats.format import Format, by_suffix
 from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.photo_names import IMAGE_FOLDERS, with_photos
 
 Element = ElementTree.Element
 
@@ -193,3 +196,14 @@ def _number(record: Element, key: str, where: str, *, default: float | None = No
 
 def _words(record: Element, key: str) -> list[str]:
     return (record.findtext(key) or "").split()
+
+
+FORMAT = Format(
+    "metashape",
+    "Agisoft Metashape",
+    ".xml",
+    by_suffix(".xml", "cameras.xml"),
+    lambda path, given: with_photos(
+        parse_metashape(path), *(path.parent / name for name in IMAGE_FOLDERS), path.parent
+    ),
+)

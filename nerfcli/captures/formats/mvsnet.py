@@ -16,12 +16,16 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras import rigid
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, malformed, numbers, read_text
+from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.lenses import camera_of_matrix
 from nerfcli.captures.formats.limits import rigid_pose
 from nerfcli.captures.formats.photo_names import ListImages, PhotoOfStem
 from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.stored_pixels import measure
+from nerfcli.photos.images import list_images
 
 CAMERA_FOLDER = "cams"
 CAMERA_FILES = "*_cam.txt"
@@ -70,3 +74,17 @@ def _bounds(depths: list[float]) -> tuple[float, float] | None:
         return None
     near, far = depths[0], depths[3] if len(depths) == 4 else depths[0] + depths[1] * depths[2]
     return (near, far) if 0 < near < far else None
+
+
+def find_mvsnet(path: Path) -> Path | None:
+    """Find the folder that holds cams/ of MVSNet."""
+    return path if any((path / CAMERA_FOLDER).glob(CAMERA_FILES)) else None
+
+
+FORMAT = Format(
+    "mvsnet",
+    "cams/ of MVSNet, BlendedMVS",
+    "cams/",
+    find_mvsnet,
+    lambda path, given: parse_mvsnet(path, measure, list_images, images=given.images),
+)

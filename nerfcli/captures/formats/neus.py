@@ -7,20 +7,25 @@ The numbers belong to the photos of image/ in the order of their names, and to t
 Source: Totoro97/NeuS models/dataset.py, load_K_Rt_from_P; lioryariv/idr DATA_CONVENTION.md.
 """
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
 from scipy.linalg import rq
 
 from nerfcli.cameras import rigid
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed
+from nerfcli.captures.formats.format import Format, named
 from nerfcli.captures.formats.lenses import camera_of_matrix
 from nerfcli.captures.formats.limits import plausible
 from nerfcli.captures.formats.npy import DAMAGED, array_of_npy, members_of_npz
 from nerfcli.captures.formats.photo_names import GIVE_PHOTOS, ListImages
 from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError
+from nerfcli.photos.images import list_images
 
 FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 FIRST = "world_mat_0"
@@ -104,3 +109,21 @@ def _decomposed(projection: np.ndarray, where: str) -> tuple[np.ndarray, np.ndar
     upper, rotation = upper * signs, signs[:, None] * rotation
     translation = np.linalg.solve(upper, signed[:, 3])
     return upper / upper[2, 2], rigid.inverse(rigid.from_parts(rotation, translation))
+
+
+def find_neus(path: Path) -> Path | None:
+    """Find a file .npz with the projections of IDR and NeuS, or a folder's file with one of their names."""
+    found = named(*FILES)(path) if path.is_dir() else path
+    if found is None or found.suffix.lower() != ".npz" or not zipfile.is_zipfile(found):
+        return None
+    with zipfile.ZipFile(found) as archive:
+        return found if f"{FIRST}.npy" in archive.namelist() else None
+
+
+FORMAT = Format(
+    "neus",
+    "projections of IDR, NeuS",
+    ".npz",
+    find_neus,
+    lambda path, given: parse_neus(path, measure, list_images, images=given.images),
+)

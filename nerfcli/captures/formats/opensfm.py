@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import (
     check_unique_names,
@@ -31,6 +32,7 @@ from nerfcli.captures.formats.fields import (
     size_of,
     vector,
 )
+from nerfcli.captures.formats.format import Format, find_json
 from nerfcli.captures.formats.limits import checked_camera, plausible
 from nerfcli.captures.formats.unsupported import distortion, lost_of_cameras, lost_parts, projection
 from nerfcli.errors import UserError
@@ -253,3 +255,16 @@ def _is_on_earth(content: dict[str, Any], path: Path) -> bool:
         return False
     place = [number(record_of(reference, where), key, where) for key in ("latitude", "longitude")]
     return any(place)
+
+
+FORMAT = Format(
+    "opensfm",
+    "OpenSfM, OpenDroneMap",
+    "reconstruction.json",
+    lambda path: find_json(path, opening="[", name="reconstruction.json"),
+    lambda path, given: parse_opensfm(path),
+    default_name="reconstruction.json",
+    files=("*.json",),
+    write=write_opensfm,
+    losses=losses_opensfm,
+)

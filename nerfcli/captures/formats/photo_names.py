@@ -2,10 +2,13 @@
 
 import os
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, shown
 from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.photos.images import list_images
 
 # Folders of photos beside a file of cameras, in the order of preference; the numbers are factors of reduction.
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
@@ -90,3 +93,16 @@ def measured_sizes(
             f"the photos are needed, as the file does not give their sizes; {GIVE_PHOTOS}",
         )
     return sizes, tuple(missing)
+
+
+def with_photos(capture: Capture, *folders: Path) -> Capture:
+    """Return the capture with its photos looked up in folders, by their names, file names alone, or without suffix."""
+    stems = [{photo.stem: photo for photo in reversed(list_images(folder))} for folder in folders if folder.is_dir()]
+    frames = []
+    for frame in capture.frames:
+        name = Path(frame.name).name
+        paths = [*(folder / frame.name for folder in folders), *(folder / name for folder in folders)]
+        named = next((path for path in paths if path.is_file()), None)
+        image = named or next((photos[name] for photos in stems if name in photos), frame.image)
+        frames.append(replace(frame, image=image))
+    return replace(capture, frames=tuple(frames))

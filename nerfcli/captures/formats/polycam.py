@@ -12,10 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, number, read_json_object, size_of
+from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.limits import checked_camera, rigid_pose
 from nerfcli.captures.formats.photo_names import ListImages, PhotoOfStem
+from nerfcli.photos.images import list_images
 
 FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 KEYFRAMES = "keyframes"
@@ -55,3 +58,19 @@ def parse_polycam(folder: Path, list_images: ListImages, *, images: Path | None 
     return Capture(
         tuple(frames), np.zeros((0, 3)), missing, None, "polycam", unit="metre", unit_source="LiDAR (Polycam)"
     )
+
+
+def find_polycam(path: Path) -> Path | None:
+    """Find the folder that holds the keyframes of Polycam, or the one that they are in."""
+    folder = path.parent if path.name == KEYFRAMES else path
+    return folder if polycam_folders(folder) is not None else None
+
+
+FORMAT = Format(
+    "polycam",
+    "raw data of Polycam",
+    "keyframes/",
+    find_polycam,
+    lambda path, given: parse_polycam(path, list_images, images=given.images),
+    axes="opengl",
+)

@@ -18,13 +18,17 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, size_of
+from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.lenses import camera_of_matrix
 from nerfcli.captures.formats.limits import checked_camera, rigid_pose
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, ListImages, PhotoOfStem
 from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError
+from nerfcli.photos.images import list_images
 
 POSE_FOLDERS = ("pose", "poses")
 IMAGE_FOLDERS = ("color", "rgb", "images", "image")
@@ -137,3 +141,19 @@ def _cameras(folder: Path, camera: Camera | None) -> Callable[[tuple[int, int]],
     size = size_of(width, height, str(path))
     calibrated = checked_camera("PINHOLE", *size, (focal, focal, x, y), where=str(path))
     return lambda size: calibrated.resized(*size)
+
+
+def find_pose_files(path: Path) -> Path | None:
+    """Find a folder with a text file for each pose, or the one that the folder of these files is in."""
+    folder = path.parent if path.name in POSE_FOLDERS else path
+    files = pose_files(folder) if folder.is_dir() else []
+    return folder if files and is_pose(files[0]) else None
+
+
+FORMAT = Format(
+    "pose-files",
+    "a matrix per photo, as in ScanNet, 7-Scenes, NSVF",
+    "pose/*.txt",
+    find_pose_files,
+    lambda path, given: parse_pose_files(path, measure, list_images, camera=given.camera, images=given.images),
+)

@@ -21,11 +21,14 @@ from scipy.spatial.transform import Rotation
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, read_text, shown
+from nerfcli.captures.formats.format import Format, by_suffix, only_file
 from nerfcli.captures.formats.photo_names import measured_sizes
 from nerfcli.captures.orientation import Measure
+from nerfcli.captures.stored_pixels import measure
 
 _EXPECTED = 'expected a file of RealityScan\'s export "Internal/External camera parameters"'
 
@@ -118,3 +121,17 @@ def _camera(value: dict[str, float], size: tuple[int, int], where: str) -> Camer
         )
     radial, tangential = (value["k1"], value["k2"], value["k3"]), (value["t2"], value["t1"])
     return lenses.brown_camera(size, focal, centre, radial=radial, tangential=tangential, where=where)
+
+
+def find_reality_capture(path: Path) -> Path | None:
+    """Find a file .csv, or the only one in a folder that begins with the header of such a table."""
+    return by_suffix(".csv")(path) or only_file(path, "*.csv", "#name,")
+
+
+FORMAT = Format(
+    "reality-capture",
+    "RealityScan, RealityCapture",
+    ".csv",
+    find_reality_capture,
+    lambda path, given: parse_reality_capture(path, measure, images=given.images),
+)

@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, number, read_json_object, shown, size_of, vector
+from nerfcli.captures.formats.format import Format, has_keys, named
 from nerfcli.captures.formats.limits import checked_camera, quaternion_pose
 from nerfcli.captures.formats.photo_names import ListImages, PhotoOfStem
+from nerfcli.photos.images import list_images
 
 FILES = ("metadata.json", "metadata")
 IMAGE_FOLDERS = ("rgb", "rgbd", "images")
@@ -68,3 +71,19 @@ def _intrinsics(content: dict[str, Any], count: int, where: str) -> np.ndarray:
     if not isinstance(rows, list) or len(rows) != count:
         raise malformed(where, f"{_INTRINSICS} is {shown(rows)}", f"expected a list of {count}, one for each pose")
     return np.array([vector({"row": row}, "row", 4, f"{where}: {_INTRINSICS}[{i}]") for i, row in enumerate(rows)])
+
+
+def find_record3d(path: Path) -> Path | None:
+    """Find the file metadata.json, or metadata, of a capture by Record3D."""
+    found = path if path.is_file() and path.name in FILES else named(*FILES)(path)
+    return found if found is not None and has_keys(found, b'"poses"', is_record3d) else None
+
+
+FORMAT = Format(
+    "record3d",
+    "Record3D",
+    "metadata.json",
+    find_record3d,
+    lambda path, given: parse_record3d(path, list_images, images=given.images),
+    axes="opengl",
+)

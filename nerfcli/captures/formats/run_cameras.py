@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.format import Format
 from nerfcli.errors import UserError
 from nerfcli.sealed import SEAL, read_sealed, write_sealed
 
@@ -134,3 +136,12 @@ def _found(file: str, run: Path, written_at: Path) -> Path:
     """Return a file's path from the run, or if only that exists, its path from where the run was written."""
     here, there = run / file, Path(os.path.normpath(written_at / file))
     return there if there.exists() and not here.exists() else here
+
+
+FORMAT = Format(
+    "run",
+    "cameras refined by training",
+    "cameras.json of a run",
+    find_run,
+    lambda path, given: parse_run(path),
+)

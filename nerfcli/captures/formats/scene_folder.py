@@ -14,9 +14,11 @@ import numpy as np
 
 from nerfcli import __version__
 from nerfcli.atomic import write_json
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import parse_colmap, read_model, write_colmap_binary
 from nerfcli.captures.formats.fields import read_json_object
+from nerfcli.captures.formats.format import Format, folder_of
 from nerfcli.captures.formats.photo_names import seen_from
 from nerfcli.captures.holdout import default_split
 from nerfcli.captures.stored_pixels import UPRIGHT
@@ -38,7 +40,7 @@ class Description:
     Args:
         image_folder: folder of the photos, which the names of the model's images are relative to; need not exist.
         model_dir: the COLMAP model, whose cameras refer to upright photos.
-        unit, unit_source: as in `Scene`.
+        unit, unit_source: as in `Capture`.
         listed: names of frames by their use: "test", "val", or "unused" for those that the split leaves out.
         masks: the folder of the masks, or the mask of each photo that has one.
         depth_bounds: nearest and farthest z by the name of the frame, in scene units; empty where they are not known.
@@ -235,6 +237,7 @@ def parse_scene(path: Path, *, images: Path | None = None) -> Capture:
         unit_source=described.unit_source,
         depth_bounds=described.bounds_of(frames),
         pixels=UPRIGHT,
+        provenance=described.provenance,
     )
 
 
@@ -308,3 +311,17 @@ def _named(capture: Capture) -> tuple[Path, list[str]]:
     except ValueError as error:  # on several drives
         raise UserError("the photos are on several drives", "put them into one folder") from error
     return root, [Path(image).relative_to(root).as_posix() for image in images]
+
+
+FORMAT = Format(
+    "nerfcli",
+    "a scene folder",
+    SCENE_FILE,
+    folder_of(SCENE_FILE),
+    lambda path, given: parse_scene(path, images=given.images),
+    files=SCENE_FILES,
+    is_unordered=True,
+    has_split=True,
+    write=write_scene,
+    losses=losses_scene,
+)

@@ -14,8 +14,10 @@ import numpy as np
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, shown
+from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.limits import quaternion_pose, rigid_pose
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
@@ -143,3 +145,45 @@ def _losses(capture: Capture, *, named: bool) -> tuple[str, ...]:
 def _write(lines: list[str], path: Path) -> None:
     with atomic_path(path) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def find_lines(path: Path, *, columns: int) -> Path | None:
+    """Find a text file whose first line that is neither empty nor a comment has `columns` words."""
+    if not path.is_file() or path.suffix.lower() != ".txt":
+        return None
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        for _ in range(1000):
+            line = stream.readline(10_000)
+            if line.strip() and not line.lstrip().startswith("#"):
+                return path if len(line.split()) == columns else None
+    return None
+
+
+TUM = Format(
+    "tum",
+    "a trajectory of the TUM RGB-D benchmark",
+    ".txt with 8 or 12 numbers a line",
+    lambda path: find_lines(path, columns=8),
+    lambda path, given: parse_tum(path, given.camera),
+    open_axes=True,
+    default_name="trajectory.txt",
+    files=("*.txt",),
+    lacks=("cameras", "points"),
+    write=write_tum,
+    losses=losses_tum,
+)
+
+
+KITTI = Format(
+    "kitti",
+    "a trajectory of the KITTI odometry benchmark",
+    ".txt with 8 or 12 numbers a line",
+    lambda path: find_lines(path, columns=12),
+    lambda path, given: parse_kitti(path, given.camera),
+    open_axes=True,
+    default_name="poses.txt",
+    files=("*.txt",),
+    lacks=("cameras", "points"),
+    write=write_kitti,
+    losses=losses_kitti,
+)

@@ -15,11 +15,17 @@ import numpy as np
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
-from nerfcli.cameras.frame import Capture, Frame, Size
+from nerfcli.cameras.frame import Frame, Size
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.alicevision import find_alicevision
+from nerfcli.captures.formats.camera_path import find_camera_path
 from nerfcli.captures.formats.fields import malformed, read_json_object
+from nerfcli.captures.formats.format import Format, find_json
 from nerfcli.captures.formats.limits import rigid_poses
 from nerfcli.captures.formats.photo_names import seen_from
-from nerfcli.captures.formats.ply import read_ply_points, write_ply
+from nerfcli.captures.formats.ply import read_points, write_points
+from nerfcli.captures.formats.record3d import find_record3d
+from nerfcli.captures.formats.run_cameras import find_run
 from nerfcli.captures.formats.transforms_cameras import (
     camera_of_record,
     given_size,
@@ -28,6 +34,7 @@ from nerfcli.captures.formats.transforms_cameras import (
 )
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError
 
 SPLITS = ("train", "val", "test")
@@ -98,7 +105,7 @@ def write_transforms(capture: Capture, path: Path) -> None:
     with ExitStack() as undo:
         if len(capture.points):
             existed = cloud.exists()
-            write_ply(capture, cloud)
+            write_points(capture, cloud)
             undo.callback(lambda: None if existed else cloud.unlink(missing_ok=True))
         write_json(path, {**content, "frames": records})
         undo.pop_all()
@@ -259,7 +266,7 @@ def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.
     if not isinstance(cloud, str) or not cloud:
         raise malformed(str(path), f"ply_file_path is {cloud!r:.80}", "expected the path of a PLY file as text")
     try:
-        return read_ply_points(path.parent / cloud.replace("\\", "/"))
+        return read_points(path.parent / cloud.replace("\\", "/"))
     except UserError as error:
         raise malformed(f"{path}: ply_file_path", error.message, error.hint) from error
 
@@ -275,3 +282,27 @@ def _listed_splits(path: Path, content: dict[str, Any]) -> dict[str, str]:
             )
         splits.update({_name_of(item, f"{path}: {split}_filenames"): split for item in listed})
     return splits
+
+
+def find_transforms(path: Path) -> Path | None:
+    """Find transforms.json in a folder, or a JSON file of an object that is none of another format."""
+    others = (find_run, find_camera_path, find_alicevision, find_record3d)
+    if path.is_file() and any(find(path) is not None for find in others):
+        return None
+    return find_json(path, opening="{", name="transforms.json")
+
+
+FORMAT = Format(
+    "transforms",
+    "nerfstudio, instant-ngp",
+    "transforms.json",
+    find_transforms,
+    lambda path, given: parse_transforms(path, measure),
+    axes="opengl",
+    open_axes=True,
+    open_centre=True,
+    default_name="transforms.json",
+    files=("*.json", "*_points.ply"),
+    write=write_transforms,
+    losses=losses_transforms,
+)

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Capture
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError, several
 
 # Parameters that every format of perspective pictures has a place for.

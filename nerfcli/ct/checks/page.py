@@ -8,8 +8,8 @@ import numpy as np
 
 from nerfcli.ct.checks.examine import ScanDiagnosis
 from nerfcli.pages import page
-from nerfcli.pages.embedded_pictures import data_uri, jpeg_bytes
 from nerfcli.pages.findings import VERDICTS, Finding
+from nerfcli.pages.page import data_uri, jpeg_bytes
 
 _LONGEST_PX = 640
 

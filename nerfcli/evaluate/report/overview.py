@@ -8,7 +8,7 @@ import numpy as np
 from nerfcli.evaluate.report.run_facts import RunFacts, warnings_of
 from nerfcli.evaluate.report.tables import last_logged, metric, registered, render_time
 from nerfcli.evaluate.report.views import HeldOutRenderings
-from nerfcli.pages.embedded_pictures import data_uri, fitted, jpeg_bytes
+from nerfcli.pages.page import data_uri, fitted, jpeg_bytes
 
 _COLUMNS = (
     ("photos", lambda run: str(len(run.frames.train) + len(run.frames.test))),

@@ -30,7 +30,7 @@ from nerfcli.evaluate.report.views import (
     depth_range,
 )
 from nerfcli.pages import page
-from nerfcli.pages.embedded_pictures import data_uri, jpeg_bytes
+from nerfcli.pages.page import data_uri, jpeg_bytes
 from nerfcli.photos.colours import levels_of
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.depth_pictures import DepthMeta

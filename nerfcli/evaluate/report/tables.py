@@ -5,7 +5,7 @@ from html import escape
 from typing import Any
 
 from nerfcli.evaluate.report.run_facts import RunFacts, captures_of
-from nerfcli.pages.tables import table
+from nerfcli.pages.page import table
 
 _MEGA = 1e6
 

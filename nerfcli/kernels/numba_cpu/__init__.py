@@ -4,7 +4,7 @@ from nerfcli.kernels.numba_cpu import machine_code
 from nerfcli.kernels.numba_cpu.compile_all import warm_up
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.coordinates import sample_coordinates
-from nerfcli.kernels.numba_cpu.depth import light_ends
+from nerfcli.kernels.numba_cpu.depth import ray_termination
 from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
 from nerfcli.kernels.numba_cpu.marching import keep_largest, occupied_samples
 from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
@@ -30,13 +30,13 @@ __all__ = [
     "interval_weights",
     "is_compiled",
     "keep_largest",
-    "light_ends",
     "occupied_samples",
     "optical_depth_before",
     "pixel_rays",
     "project",
     "radiance",
     "ray_indices",
+    "ray_termination",
     "sample_coordinates",
     "thread_safe",
     "trace_rays",

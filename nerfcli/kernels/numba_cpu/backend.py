@@ -18,7 +18,7 @@ class NumbaBackend(Backend):
     """Backend composed of `numba_cpu`. The same seed and number of threads give the same bits."""
 
     name = "numba_cpu"
-    parts = numba_cpu
+    operations = numba_cpu
     deterministic = True
     project = staticmethod(numba_cpu.project)
     back_project = staticmethod(numba_cpu.back_project)
@@ -51,17 +51,17 @@ class NumbaBackend(Backend):
         )
 
     def hash_encode(
-        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
+        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, table_grad: Tensor | None = None
     ) -> Tensor:
-        return _encode(points, table, resolutions, computed=None, widths=None, sink=sink)
+        return _encode(points, table, resolutions, computed=None, widths=None, table_grad=table_grad)
 
     def adam_rows(self, table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, step: AdamStep) -> None:
         module = numba_cpu if table.shape[-1] == FEATURES else reference
         module.adam_rows(table, gradient, first, second, step=step)
 
-    def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, visits: Tensor | None) -> Samples:
+    def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, cell_depths: Tensor | None) -> Samples:
         module = numba_cpu if _fits(grid, grid.layers[:2]) else reference
-        return module.visible_samples(rays, along, grid, visits)
+        return module.visible_samples(rays, along, grid, cell_depths)
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         return numba_cpu.sample_coordinates(
@@ -74,9 +74,14 @@ class NumbaBackend(Backend):
             computed=samples.coordinates,
         )
 
-    def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, sink: Tensor | None) -> Tensor:
+    def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, table_grad: Tensor | None) -> Tensor:
         return _encode(
-            samples.coordinates, grid.table, grid.resolutions, computed=samples.encoded, widths=widths, sink=sink
+            samples.coordinates,
+            grid.table,
+            grid.resolutions,
+            computed=samples.encoded,
+            widths=widths,
+            table_grad=table_grad,
         )
 
     def _density_of(self, encoded: Tensor, grid: HashGrid) -> Tensor:
@@ -95,11 +100,11 @@ def _encode(
     *,
     computed: Tensor | None,
     widths: Tensor | None,
-    sink: Tensor | None,
+    table_grad: Tensor | None,
 ) -> Tensor:
     if numba_cpu.can_hash_encode(points, table, resolutions):
-        return numba_cpu.hash_encode(points, table, resolutions, sink, computed, widths)
-    return encode_into(points, table, resolutions, widths=widths, sink=sink)
+        return numba_cpu.hash_encode(points, table, resolutions, table_grad, computed, widths)
+    return encode_into(points, table, resolutions, widths=widths, table_grad=table_grad)
 
 
 def _fits(grid: HashGrid, layers: tuple[Tensor, ...]) -> bool:

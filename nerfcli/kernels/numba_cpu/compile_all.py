@@ -14,7 +14,7 @@ from nerfcli.kernels.interface import AdamStep, HashGrid, March, PixelTable, Ray
 from nerfcli.kernels.numba_cpu import machine_code
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.coordinates import sample_coordinates
-from nerfcli.kernels.numba_cpu.depth import light_ends
+from nerfcli.kernels.numba_cpu.depth import ray_termination
 from nerfcli.kernels.numba_cpu.hash_grid import hash_encode
 from nerfcli.kernels.numba_cpu.marching import keep_largest, occupied_samples
 from nerfcli.kernels.numba_cpu.networks import density, radiance
@@ -72,7 +72,7 @@ def run_training() -> None:
     optical_depth_before(density(encoded.detach(), weights), lengths, offsets)
     thickness, rgb = radiance(encoded, torch.zeros(1, 16, requires_grad=True), ray_indices(offsets), weights)
     interval_weights(thickness, lengths, offsets)
-    light_ends(thickness, *spans, offsets=offsets, fractions=(0.5,))
+    ray_termination(thickness, *spans, offsets=offsets, fractions=(0.5,))
     colour, _, spread = composite(thickness, rgb, lengths, offsets=offsets, background=torch.zeros(3))
     (colour.sum() + distortion(spread, *spans, offsets).sum()).backward()
     gradient, first, second = (torch.zeros(8, 16, 4) for _ in range(3))

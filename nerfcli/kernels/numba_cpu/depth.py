@@ -1,6 +1,6 @@
 """Depth of rays on CPU threads, one ray at a time: mean, spread, heaviest interval and quantiles in one pass.
 
-Same operation as `depth.light_ends`, for float32; everything is computed in float64. Mean and variance are updated
+Same operation as `depth.ray_termination`, for float32; everything is computed in float64. Mean and variance are updated
 sample by sample around the mean so far, which avoids cancellation.
 Source: West 1979, Updating mean and variance estimates, CACM 22(9).
 """
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.kernels.interface import LightEnds
+from nerfcli.kernels.interface import RayTermination
 from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.reference.depth import SERIES_BELOW, VARIANCE_SERIES, VARIANCE_SERIES_BELOW
 
@@ -74,22 +74,24 @@ def add_interval(sums: Any, ray: Any, start: Any, length: Any, density: Any, tar
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _light_ends(density: Any, starts: Any, ends: Any, offsets: Any, targets: Any, sums: Any, quantiles: Any) -> None:
+def _ray_termination(
+    density: Any, starts: Any, ends: Any, offsets: Any, targets: Any, sums: Any, quantiles: Any
+) -> None:
     for ray in numba.prange(offsets.shape[0] - 1):
         for i in range(offsets[ray], offsets[ray + 1]):
             start, length = np.float64(starts[i]), np.float64(ends[i]) - np.float64(starts[i])
             add_interval(sums, ray, start, length, np.float64(density[i]), targets, quantiles)
 
 
-def light_ends(
+def ray_termination(
     density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fractions: tuple[float, ...]
-) -> LightEnds:
-    """See `depth.light_ends`; float32 on the CPU, without gradients."""
+) -> RayTermination:
+    """See `depth.ray_termination`; float32 on the CPU, without gradients."""
     use_threads()
     sums, quantiles, targets = new_sums(len(offsets) - 1, fractions)
     arrays = [x.detach().contiguous().numpy() for x in (density, starts, ends, offsets)]
-    _light_ends(arrays[0], arrays[1], arrays[2], arrays[3], targets, sums, quantiles)
-    return light_ends_of(sums, quantiles, fractions)
+    _ray_termination(arrays[0], arrays[1], arrays[2], arrays[3], targets, sums, quantiles)
+    return ray_termination_of(sums, quantiles, fractions)
 
 
 def new_sums(rays: int, fractions: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -98,18 +100,18 @@ def new_sums(rays: int, fractions: tuple[float, ...]) -> tuple[np.ndarray, np.nd
     return np.zeros((rays, PASSED + 1)), np.full((rays, len(fractions)), np.nan, np.float32), targets
 
 
-def light_ends_of(sums: np.ndarray, quantiles: np.ndarray, fractions: tuple[float, ...]) -> LightEnds:
+def ray_termination_of(sums: np.ndarray, quantiles: np.ndarray, fractions: tuple[float, ...]) -> RayTermination:
     """Return the results of rays from their sums, after all their intervals have been added."""
-    depth, mass, mean, squares, heaviest, largest, _ = torch.from_numpy(sums).unbind(1)
+    depth, mass, mean, squares, peak, largest, _ = torch.from_numpy(sums).unbind(1)
     seen = mass > 0.0
     spread = torch.sqrt(squares / torch.where(seen, mass, 1.0))
     back = np.argsort(np.argsort(fractions, kind="stable"), kind="stable")
-    return LightEnds(
+    return RayTermination(
         opacity=-torch.expm1(-depth).float(),
         transmittance=torch.exp(-depth).float(),
         mean=torch.where(seen, mean, torch.nan).float(),
         spread=torch.where(seen, spread, torch.nan).float(),
-        heaviest=torch.where(largest > 0.0, heaviest, torch.nan).float(),
-        largest=largest.float(),
+        peak=torch.where(largest > 0.0, peak, torch.nan).float(),
+        peak_weight=largest.float(),
         quantiles=torch.from_numpy(quantiles[:, back]),
     )

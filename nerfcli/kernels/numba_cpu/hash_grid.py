@@ -185,7 +185,7 @@ class _HashEncode(torch.autograd.Function):
         points: Tensor,
         table: Tensor,
         resolutions: tuple[int, ...],
-        sink: Tensor | None,
+        table_grad: Tensor | None,
         computed: Tensor | None,
         widths: Tensor | None,
     ) -> Tensor:
@@ -202,7 +202,7 @@ class _HashEncode(torch.autograd.Function):
         else:
             out = computed.view_as(computed)
         ctx.save_for_backward(points, widths, table if ctx.needs_input_grad[0] else table[:0])
-        ctx.table_shape, ctx.sides, ctx.sink = table.shape, sides, sink
+        ctx.table_shape, ctx.sides, ctx.table_grad = table.shape, sides, table_grad
         return out
 
     @staticmethod
@@ -217,10 +217,10 @@ class _HashEncode(torch.autograd.Function):
                 laid_out, widths.numpy(), flat, rows, ctx.sides, gradient, of_points.numpy(), use_threads()
             )
         if ctx.needs_input_grad[1]:
-            of_table = torch.zeros(ctx.table_shape) if ctx.sink is None else ctx.sink
+            of_table = torch.zeros(ctx.table_shape) if ctx.table_grad is None else ctx.table_grad
             flat = of_table.view(-1).numpy()
             _encode_backward(laid_out, widths.numpy(), gradient, rows, ctx.sides, flat, use_threads())
-        return of_points, of_table if ctx.sink is None else None, None, None, None, None
+        return of_points, of_table if ctx.table_grad is None else None, None, None, None, None
 
 
 def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> bool:
@@ -239,14 +239,14 @@ def hash_encode(
     points: Tensor,
     table: Tensor,
     resolutions: tuple[int, ...],
-    sink: Tensor | None = None,
+    table_grad: Tensor | None = None,
     computed: Tensor | None = None,
     widths: Tensor | None = None,
 ) -> Tensor:
     """See `reference.hash_encode`; float32 on the CPU, rows of 4 features, differentiable in points and table.
 
     Args:
-        sink: see `Backend.hash_encode`.
+        table_grad: see `Backend.hash_encode`.
         computed: (N, L * F), the result, if it has already been computed without gradients.
     """
-    return _HashEncode.apply(points, table, resolutions, sink, computed, widths)
+    return _HashEncode.apply(points, table, resolutions, table_grad, computed, widths)

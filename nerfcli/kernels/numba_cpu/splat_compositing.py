@@ -238,7 +238,7 @@ def depths(
                     row = out[y * width + x]
                     for k in range(len(fractions)):
                         row[6 + k] = np.nan
-                    t, total, square, heaviest, largest, origin = 1.0, 0.0, 0.0, np.nan, 0.0, 0.0
+                    t, total, square, peak, largest, origin = 1.0, 0.0, 0.0, np.nan, 0.0, 0.0
                     for entry in range(starts[tile], starts[tile + 1]):
                         i = entries[entry]
                         f = footprints[i]
@@ -255,14 +255,14 @@ def depths(
                         total += weight * away
                         square += weight * away * away
                         if weight > largest:
-                            heaviest, largest = f[9], weight
+                            peak, largest = f[9], weight
                         t -= weight
                         for k in range(len(fractions)):
                             if t <= 1.0 - fractions[k] and np.isnan(row[6 + k]):
                                 row[6 + k] = f[9]
                         if t <= OPAQUE:
                             break
-                    row[0], row[1], row[4], row[5] = 1.0 - t, t, heaviest, largest
+                    row[0], row[1], row[4], row[5] = 1.0 - t, t, peak, largest
                     row[2], row[3] = np.nan, np.nan
                     if t < 1.0:
                         mean = total / (1.0 - t)

@@ -7,7 +7,7 @@ import numba
 import numpy as np
 import torch
 
-from nerfcli.kernels.interface import LightEnds, SplatView
+from nerfcli.kernels.interface import RayTermination, SplatView
 from nerfcli.kernels.numba_cpu import machine_code, splat_compositing
 from nerfcli.kernels.numba_cpu.splat_gradient import BUFFER, gather_lane, gradient_of_lane, gradients_of_lanes
 from nerfcli.kernels.numba_cpu.splat_projection import (
@@ -86,8 +86,8 @@ def render_splats(rows: np.ndarray, view: SplatView, background: np.ndarray) -> 
     )
 
 
-def splat_depths(picture: SplatPicture, fractions: tuple[float, ...]) -> LightEnds:
-    """Return where the light of each pixel ends, row by row, each Gaussian at its own distance; see `light_ends`."""
+def splat_depths(picture: SplatPicture, fractions: tuple[float, ...]) -> RayTermination:
+    """Return where the light of each pixel ends, row by row, each Gaussian at its distance; see `ray_termination`."""
     height, width = picture.transmittance.shape
     columns = np.empty((height * width, 6 + len(fractions)), np.float32)
     splat_compositing.depths(
@@ -95,8 +95,8 @@ def splat_depths(picture: SplatPicture, fractions: tuple[float, ...]) -> LightEn
         use_threads(),
     )  # fmt: skip
     values = torch.from_numpy(columns)
-    opacity, transmittance, mean, spread, heaviest, largest = values[:, :6].unbind(-1)
-    return LightEnds(opacity, transmittance, mean, spread, heaviest, largest, values[:, 6:])
+    opacity, transmittance, mean, spread, peak, largest = values[:, :6].unbind(-1)
+    return RayTermination(opacity, transmittance, mean, spread, peak, largest, values[:, 6:])
 
 
 def splat_gradients(picture: SplatPicture, by_image: np.ndarray, by_transmittance: np.ndarray) -> np.ndarray:

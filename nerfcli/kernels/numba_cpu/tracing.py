@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import UNSEEN, HashGrid, Intervals, March, Rays, RaysSeen
-from nerfcli.kernels.numba_cpu.depth import add_interval, light_ends_of, new_sums
+from nerfcli.kernels.numba_cpu.depth import add_interval, new_sums, ray_termination_of
 from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
 from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, colour_range, density_tile
 from nerfcli.kernels.numba_cpu.rays import CHUNK
@@ -166,7 +166,7 @@ def trace_rays(
     if keep_intervals:
         _sort(borders, offsets, owner, record, found, spans.numpy())
     starts, ends, density = spans
-    light, left = light_ends_of(sums, quantiles, fractions), torch.from_numpy(np.exp(-sums[:, 0]))
+    light, left = ray_termination_of(sums, quantiles, fractions), torch.from_numpy(np.exp(-sums[:, 0]))
     seen = torch.from_numpy(colours + UNSEEN * unseen[:, None]) + left[:, None] * background
     stopped = left <= math.exp(-along.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
     behind = torch.maximum(background, 1.0 - background).amax(-1)  # largest difference from the background's colour

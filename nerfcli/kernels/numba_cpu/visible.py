@@ -281,7 +281,7 @@ def flat_arguments(rays: Rays, along: March, grid: HashGrid, layers: tuple[torch
     )  # fmt: skip
 
 
-def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: torch.Tensor | None = None) -> Samples:
+def visible_samples(rays: Rays, along: March, grid: HashGrid, cell_depths: torch.Tensor | None = None) -> Samples:
     """See `reference.visible_samples`; float32 on the CPU."""
     threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
     cones = rays.cones if grid.antialias and rays.cones is not None else rays.origins.new_empty(0)
@@ -299,12 +299,12 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: torch.Tens
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     samples = int(offsets[-1])
     if samples == 0 and along.least_weight > 0.0:  # all are faint
-        return visible_samples(rays, along._replace(least_weight=0.0), grid, visits)
+        return visible_samples(rays, along._replace(least_weight=0.0), grid, cell_depths)
     spans, coordinates, encoded = torch.empty(3, samples), torch.empty(samples, 3), torch.empty(samples, WIDTH)
     _sort(borders, offsets, owner, record, code, found, spans.numpy(), coordinates.numpy(), encoded.numpy())
     starts, ends, density = spans
-    if visits is not None:
-        keep_largest(visits, coordinates, density * (ends - starts))
+    if cell_depths is not None:
+        keep_largest(cell_depths, coordinates, density * (ends - starts))
         for faint, number in zip(torch.from_numpy(left), missing.tolist(), strict=True):
-            keep_largest(visits, faint[:number, :3], faint[:number, 3])
+            keep_largest(cell_depths, faint[:number, :3], faint[:number, 3])
     return Samples(starts, ends, density, encoded, coordinates, torch.from_numpy(offsets))

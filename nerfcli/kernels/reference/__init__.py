@@ -7,15 +7,15 @@ gradient. `backend` composes them.
 from nerfcli.kernels.reference.compositing import (
     composite,
     contracted_distance,
+    depth_loss,
     distortion,
     interval_weights,
-    off_target,
     optical_depth_before,
     ray_indices,
     scale_gradients,
     sum_along_rays,
 )
-from nerfcli.kernels.reference.depth import light_ends
+from nerfcli.kernels.reference.depth import ray_termination
 from nerfcli.kernels.reference.encoding import corner_rows, hash_encode
 from nerfcli.kernels.reference.marching import (
     keep_largest,
@@ -38,20 +38,20 @@ __all__ = [
     "corner_rows",
     "denoise_total_variation",
     "density",
+    "depth_loss",
     "distortion",
     "geometry",
     "hash_encode",
     "interval_weights",
     "keep_largest",
-    "light_ends",
     "march",
     "occupied_samples",
-    "off_target",
     "optical_depth_before",
     "pixel_rays",
     "project",
     "radiance",
     "ray_indices",
+    "ray_termination",
     "sample_coordinates",
     "scale_gradients",
     "sum_along_rays",

@@ -17,7 +17,7 @@ class ReferenceBackend(Backend):
     """
 
     name = "reference"
-    parts = reference
+    operations = reference
     adam_rows = staticmethod(reference.adam_rows)
     project = staticmethod(reference.project)
     back_project = staticmethod(reference.back_project)
@@ -28,9 +28,9 @@ class ReferenceBackend(Backend):
         self.deterministic = device.type == "cpu"
 
     def hash_encode(
-        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
+        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, table_grad: Tensor | None = None
     ) -> Tensor:
-        return encode_into(points, table, resolutions, widths=None, sink=sink)
+        return encode_into(points, table, resolutions, widths=None, table_grad=table_grad)
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         return reference.sample_coordinates(
@@ -42,8 +42,8 @@ class ReferenceBackend(Backend):
             contraction=contraction,
         )
 
-    def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, sink: Tensor | None) -> Tensor:
-        return encode_into(samples.coordinates, grid.table, grid.resolutions, widths=widths, sink=sink)
+    def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, table_grad: Tensor | None) -> Tensor:
+        return encode_into(samples.coordinates, grid.table, grid.resolutions, widths=widths, table_grad=table_grad)
 
     def _density_of(self, encoded: Tensor, grid: HashGrid) -> Tensor:
         return reference.density(encoded, grid.layers)
@@ -53,16 +53,16 @@ class ReferenceBackend(Backend):
 
 
 def encode_into(
-    points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, widths: Tensor | None, sink: Tensor | None
+    points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, widths: Tensor | None, table_grad: Tensor | None
 ) -> Tensor:
     """Return `reference.hash_encode`; the gradient with respect to the table goes into the sink, if there is one."""
-    if sink is None or not (table.requires_grad and torch.is_grad_enabled()):
+    if table_grad is None or not (table.requires_grad and torch.is_grad_enabled()):
         return reference.hash_encode(points, table, resolutions, widths)
-    leaf = table.detach().to(sink.dtype).requires_grad_()  # gradients of a half-precision table are not rounded
+    leaf = table.detach().to(table_grad.dtype).requires_grad_()  # gradients of a half-precision table are not rounded
 
     def add_to_sink(given: Tensor) -> None:
         if given.grad is not None:
-            sink.add_(given.grad)
+            table_grad.add_(given.grad)
 
     leaf.register_post_accumulate_grad_hook(add_to_sink)
     return reference.hash_encode(points, leaf, resolutions, widths)

@@ -121,7 +121,7 @@ def contracted_distance(distance: Tensor) -> Tensor:
     return torch.where(distance <= 1.0, distance, 2.0 - 1.0 / distance.clamp_min(1.0)) / 2.0
 
 
-def off_target(
+def depth_loss(
     weights: Tensor, transmittance: Tensor, middles: Tensor, *, offsets: Tensor, distances: Tensor
 ) -> Tensor:
     """Compute how far from known distances the light of the last K rays is absorbed.

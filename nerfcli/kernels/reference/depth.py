@@ -2,7 +2,7 @@
 
 A ray has density sigma(t), transmittance T(t) and the density of absorption p(t) = T(t) sigma(t), whose integral is the
 opacity. Density is constant inside an interval, and everything here is exact for that: no midpoints. Packed samples as
-in `interface`; any dtype, differentiable. Only `light_ends` has fast versions.
+in `interface`; any dtype, differentiable. Only `ray_termination` has fast versions.
 """
 
 import math
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels.activations import opacity
-from nerfcli.kernels.interface import LightEnds
+from nerfcli.kernels.interface import RayTermination
 from nerfcli.kernels.reference.compositing import (
     interval_weights,
     optical_depth_before,
@@ -171,9 +171,9 @@ def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, 
     return result.masked_scatter(found, places)
 
 
-def light_ends(
+def ray_termination(
     density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fractions: tuple[float, ...]
-) -> LightEnds:
+) -> RayTermination:
     """Compute all statistics of where the light of rays is absorbed.
 
     Args:
@@ -184,7 +184,7 @@ def light_ends(
 
     Returns:
         opacity (R,), transmittance (R,); mean (R,) distance of the absorbed light, and its standard deviation `spread`
-        (R,); heaviest (R,): `max_weight`, and largest (R,): that weight, 0 without samples; quantiles
+        (R,); peak (R,): `max_weight`, and peak_weight (R,): that weight, 0 without samples; quantiles
         (R, len(fractions)). Undefined values are NaN, and no others.
 
     Differentiable in density, starts and ends. Opacity and transmittance keep full precision where they are small.
@@ -196,8 +196,8 @@ def light_ends(
     total = opacity(sum_along_rays(density * lengths, offsets))
     columns = [quantile(density, starts, ends, offsets=offsets, fraction=fraction) for fraction in fractions]
     quantiles = torch.stack(columns, dim=-1) if columns else density.new_empty(len(offsets) - 1, 0)
-    heaviest, largest = max_weight(weights, means, offsets), _largest(weights, offsets)
-    return LightEnds(total, transmittance, mean, width, heaviest, largest, quantiles)
+    peak, largest = max_weight(weights, means, offsets), _largest(weights, offsets)
+    return RayTermination(total, transmittance, mean, width, peak, largest, quantiles)
 
 
 def _largest(weights: Tensor, offsets: Tensor) -> Tensor:

@@ -71,14 +71,14 @@ def keep_largest(cells: Tensor, coordinates: Tensor, values: Tensor) -> None:
 
 
 @torch.no_grad()
-def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: Tensor | None = None) -> Samples:
+def visible_samples(rays: Rays, along: March, grid: HashGrid, cell_depths: Tensor | None = None) -> Samples:
     """Return the samples of `march` in front of which the optical depth is below a limit, with their encoding.
 
     A sample of optical depth d behind an optical depth D is left out if d exp(-D) < least_weight: it absorbs less than
     this fraction of its ray's light. Everything behind the limit absorbs at most exp(-max_optical_depth). Samples whose
     density is NaN are kept. If all samples of all rays are that faint, none is left out, so that a field that has
-    become transparent can learn again. `visits` (C, C, C) is raised to the optical depths of all samples before the
-    limit, including those left out for their weight, see `keep_largest`. Without gradients.
+    become transparent can learn again. `cell_depths` (C, C, C) is raised to the optical depths of all samples
+    before the limit, including those left out for their weight, see `keep_largest`. Without gradients.
     """
     starts, ends, coordinates, offsets = occupied_samples(rays, along)
     widths = None
@@ -89,8 +89,8 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: Tensor | N
     lengths = ends - starts
     before = optical_depth_before(thickness, lengths, offsets)
     reached = before < along.max_optical_depth
-    if visits is not None:
-        keep_largest(visits, coordinates[reached], (thickness * lengths)[reached])
+    if cell_depths is not None:
+        keep_largest(cell_depths, coordinates[reached], (thickness * lengths)[reached])
     faint = thickness * lengths * torch.exp(-before) < along.least_weight
     faint &= ~faint.all()
     seen = reached & ~faint

@@ -10,9 +10,17 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from nerfcli.kernels.harmonics import splat_harmonics
-from nerfcli.kernels.interface import BEYOND, LARGEST_ALPHA, LOW_PASS, SMALLEST_ALPHA, Footprints, LightEnds, Splats
+from nerfcli.kernels.interface import (
+    BEYOND,
+    LARGEST_ALPHA,
+    LOW_PASS,
+    SMALLEST_ALPHA,
+    Footprints,
+    RayTermination,
+    Splats,
+)
 from nerfcli.kernels.reference.compositing import composite
-from nerfcli.kernels.reference.depth import light_ends
+from nerfcli.kernels.reference.depth import ray_termination
 
 # Extent of a Gaussian along a ray, as a fraction of its distance: all of its light ends at its mean.
 THICKNESS = 1e-9
@@ -89,7 +97,9 @@ def alphas(footprints: Footprints, pixels: Tensor) -> Tensor:
     return torch.where(alpha < SMALLEST_ALPHA, 0.0, alpha.clamp_max(LARGEST_ALPHA))
 
 
-def composite_splats(footprints: Footprints, pixels: Tensor, background: Tensor) -> tuple[Tensor, Tensor, LightEnds]:
+def composite_splats(
+    footprints: Footprints, pixels: Tensor, background: Tensor
+) -> tuple[Tensor, Tensor, RayTermination]:
     """Composite Gaussians at pixels (P, 2) from front to back, in the order of their distances.
 
     Args:
@@ -107,5 +117,5 @@ def composite_splats(footprints: Footprints, pixels: Tensor, background: Tensor)
     density = -torch.log1p(-alphas(footprints, pixels)[:, order]).reshape(-1) / lengths
     rgb = footprints.colours[order].repeat(count, 1)
     colour, transmittance, _ = composite(density, rgb, lengths, offsets=offsets, background=background)
-    ends = light_ends(density.detach(), starts, starts + lengths, offsets=offsets, fractions=(0.5,))
+    ends = ray_termination(density.detach(), starts, starts + lengths, offsets=offsets, fractions=(0.5,))
     return colour, transmittance, ends

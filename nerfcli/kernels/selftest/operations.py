@@ -179,7 +179,9 @@ def depth_inputs(rays: Sequence[Ray], precision: Precision) -> Inputs:
     off = min(0.5, depth_bound(rays, 1, precision).value)
     near = [1 - (1 - fraction) ** (1 + x) for x in (-off, off) for fraction in FRACTIONS]
     spans = map(exact, (density, starts, ends))
-    low, high = reference.light_ends(*spans, offsets=offsets.cpu(), fractions=tuple(near)).quantiles.split(3, dim=1)
+    low, high = reference.ray_termination(*spans, offsets=offsets.cpu(), fractions=tuple(near)).quantiles.split(
+        3, dim=1
+    )
     settled = (low.isnan() & high.isnan()) | ((high - low).abs() <= 8 * off * low)
     return {"density": density, "starts": starts, "ends": ends, "offsets": offsets, "settled": settled}
 
@@ -200,12 +202,14 @@ def depth_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Err
     return Errors(bound, 16 * bound)
 
 
-def light_ends(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> Outcome:
+def ray_termination(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> Outcome:
     """Compute the depths of rays that `columns` names."""
     density = _density_for(module, given)
-    seen = module.light_ends(density, given["starts"], given["ends"], offsets=given["offsets"], fractions=FRACTIONS)
+    seen = module.ray_termination(
+        density, given["starts"], given["ends"], offsets=given["offsets"], fractions=FRACTIONS
+    )
     named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
-    named |= {"conditional": seen.mean, "max-weight": seen.heaviest}
+    named |= {"conditional": seen.mean, "max-weight": seen.peak}
     named |= dict(zip(("median", "0.05", "0.95"), seen.quantiles.unbind(1), strict=True))
     return _depths([named[column] for column in columns], columns, given, density)
 

@@ -16,7 +16,7 @@ from nerfcli.kernels.selftest.measure import Errors, Precision, Row
 SINGLE, HALF, COMPILED, OF_GPU = "float32", "bfloat16", "compiled", "GPU kernels"
 # Operations that the GPU kernels compute in float32 themselves, without the reference.
 OPERATIONS_OF_GPU = (
-    *("composite", "optical_depth_before", "distortion", "light_ends"),
+    *("composite", "optical_depth_before", "distortion", "ray_termination"),
     *("hash_encode", "pixel_rays", "adam_rows", "visible_samples"),
 )
 VALUE_ONLY = "value only: where a gradient is wanted, plain torch gives both"
@@ -129,9 +129,9 @@ def checks() -> Iterator[Check]:
         ):
             yield Check(
                 f"{name}; {cut} rays",
-                "light_ends",
+                "ray_termination",
                 lambda precision, rays=rays: operations.depth_inputs(operations.meaningful(rays, precision), precision),
-                functools.partial(operations.light_ends, columns),
+                functools.partial(operations.ray_termination, columns),
                 lambda precision, rays=rays, factor=4 if columns == ("spread",) else 1: operations.depth_bound(
                     operations.meaningful(rays, precision), factor, precision
                 ),

@@ -38,7 +38,7 @@ class TritonBackend(ReferenceBackend):
     """Backend composed of `triton_cuda`. Sums are atomic: results of the same seed differ in their last digits."""
 
     name = "triton_cuda"
-    parts = operations
+    operations = operations
 
     def __init__(self, device: torch.device):
         super().__init__(device)
@@ -47,11 +47,11 @@ class TritonBackend(ReferenceBackend):
         self._capacity = marching.Capacity()
 
     def hash_encode(
-        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
+        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, table_grad: Tensor | None = None
     ) -> Tensor:
         if hash_grid.can_hash_encode(table, resolutions):
-            return hash_grid.hash_encode(points, table, resolutions, sink)
-        return super().hash_encode(points, table, resolutions, sink=sink)
+            return hash_grid.hash_encode(points, table, resolutions, table_grad)
+        return super().hash_encode(points, table, resolutions, table_grad=table_grad)
 
     def adam_rows(self, table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, step: AdamStep) -> None:
         if table.shape[-1] == FEATURES:
@@ -67,12 +67,14 @@ class TritonBackend(ReferenceBackend):
         code = hash_grid.encode(coordinates.contiguous(), table, medium.resolutions, widths=None, dtype=torch.float16)
         return networks.density(code, medium.layers)
 
-    def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, visits: Tensor | None = None) -> Samples:
+    def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, cell_depths: Tensor | None = None) -> Samples:
         if not _fits(grid):
-            return reference.visible_samples(rays, along, grid, visits)
+            return reference.visible_samples(rays, along, grid, cell_depths)
         with torch.no_grad():
             table = self._half.of(grid.table)
-            return marching.visible_samples(rays, along, grid, table=table, capacity=self._capacity, visits=visits)
+            return marching.visible_samples(
+                rays, along, grid, table=table, capacity=self._capacity, cell_depths=cell_depths
+            )
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         return sample_coordinates(
@@ -93,20 +95,20 @@ class TritonBackend(ReferenceBackend):
         grid: HashGrid,
         *,
         widths: Tensor | None,
-        sink: Tensor | None,
+        table_grad: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         if not _fits(grid):
-            return super()._radiance(samples, directions, index, grid, widths=widths, sink=sink)
+            return super()._radiance(samples, directions, index, grid, widths=widths, table_grad=table_grad)
         assert samples.encoded is not None
         return _Radiance.apply(
-            samples.coordinates, directions, grid.table, self._half.of(grid.table), sink, samples.encoded, index,
+            samples.coordinates, directions, grid.table, self._half.of(grid.table), table_grad, samples.encoded, index,
             samples.offsets, grid.resolutions, grid.view_degree, widths, *grid.layers,
         )  # fmt: skip
 
     def _contracted(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
         return compositing.contracted_distances(starts, ends)
 
-    def _off_target(
+    def _depth_loss(
         self,
         weights: Tensor,
         transmittance: Tensor,
@@ -116,7 +118,7 @@ class TritonBackend(ReferenceBackend):
         rays: Tensor,
         distances: Tensor,
     ) -> Tensor:
-        return compositing.off_target(weights, transmittance, middles, rays=rays, distances=distances)
+        return compositing.depth_loss(weights, transmittance, middles, rays=rays, distances=distances)
 
     def _sum_along_rays(self, values: Tensor, offsets: Tensor) -> Tensor:
         return rays.sum_along_rays(values[:, None], offsets)[:, 0]
@@ -132,14 +134,14 @@ class _Radiance(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, points: Tensor, directions: Tensor, table: Tensor, half: Tensor, sink: Tensor | None, code: Tensor,
-        index: Tensor, offsets: Tensor, resolutions: tuple[int, ...], degree: int, widths: Tensor | None,
+        ctx: Any, points: Tensor, directions: Tensor, table: Tensor, half: Tensor, table_grad: Tensor | None,
+        code: Tensor, index: Tensor, offsets: Tensor, resolutions: tuple[int, ...], degree: int, widths: Tensor | None,
         *layers: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         directions = directions.detach().contiguous()
         density, rgb = networks.radiance(code, directions, index, layers, degree=degree)
         ctx.save_for_backward(points, directions, code, index, offsets, density, *layers)
-        ctx.table_shape, ctx.half, ctx.sink, ctx.widths = table.shape, half, sink, widths
+        ctx.table_shape, ctx.half, ctx.table_grad, ctx.widths = table.shape, half, table_grad, widths
         ctx.resolutions, ctx.degree = resolutions, degree
         return density, rgb
 
@@ -158,10 +160,10 @@ class _Radiance(torch.autograd.Function):
                 points, ctx.half, by_code, ctx.resolutions, scale=scale, widths=ctx.widths
             )
         if ctx.needs_input_grad[2]:
-            of_table = torch.zeros(ctx.table_shape, device=points.device) if ctx.sink is None else ctx.sink
+            of_table = torch.zeros(ctx.table_shape, device=points.device) if ctx.table_grad is None else ctx.table_grad
             hash_grid.add_table_gradient(of_table, points, by_code, ctx.resolutions, scale=scale, widths=ctx.widths)
         of_directions = rays.sum_along_rays(by_direction, offsets) if rays_learn else None
-        of_table = of_table if ctx.sink is None else None
+        of_table = of_table if ctx.table_grad is None else None
         return of_points, of_directions, of_table, *(None,) * 8, *of_layers
 
 

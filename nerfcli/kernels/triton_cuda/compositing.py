@@ -286,8 +286,8 @@ def contracted_distances(starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     return near, far
 
 
-def off_target(weights: Tensor, transmittance: Tensor, middles: Tensor, *, rays: Tensor, distances: Tensor) -> Tensor:
-    """See `reference.off_target`; with the `rays` (N,) of samples, the host need not know where the last K begin."""
+def depth_loss(weights: Tensor, transmittance: Tensor, middles: Tensor, *, rays: Tensor, distances: Tensor) -> Tensor:
+    """See `reference.depth_loss`; with the `rays` (N,) of samples, the host need not know where the last K begin."""
     first = len(transmittance) - len(distances)
     distance = torch.nn.functional.pad(distances, (first, 0), value=1.0)[rays]
     deviation = ((middles - distance).abs() / (MOST_DEVIATION * distance)).clamp_max(1.0)

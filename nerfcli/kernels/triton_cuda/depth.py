@@ -1,6 +1,6 @@
 """Where the light of rays is absorbed, on a GPU: mean, spread, heaviest interval and quantiles, in float32.
 
-Same operation as `reference.light_ends`. For mean and spread, positions are relative to the heaviest interval: a
+Same operation as `reference.ray_termination`. For mean and spread, positions are relative to the heaviest interval: a
 distant, thin surface is narrower than its distance's last digit. Three passes go along each ray, as sums of squares
 would cancel; one more for each quantile.
 """
@@ -11,7 +11,7 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from nerfcli.kernels.interface import LightEnds
+from nerfcli.kernels.interface import RayTermination
 from nerfcli.kernels.reference.depth import SERIES_BELOW, VARIANCE_SERIES, VARIANCE_SERIES_BELOW
 from nerfcli.kernels.triton_cuda.compositing import absorbed
 from nerfcli.kernels.triton_cuda.hash_grid import device_floats
@@ -46,9 +46,9 @@ def _variance_fraction(x, alpha):
 
 
 @jit
-def _light_ends(
+def _ray_termination(
     density, starts, ends, offsets, targets, weights, opacity, transmittance,
-    mean, spread, heaviest, largest, quantiles, rays, FRACTIONS: tl.constexpr,
+    mean, spread, at_peak, largest, quantiles, rays, FRACTIONS: tl.constexpr,
     RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
     ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
@@ -108,7 +108,7 @@ def _light_ends(
     tl.store(transmittance + ray, tl.exp(-total), mask=there)
     tl.store(mean + ray, tl.where(ended, start + inside + middle, undefined), mask=there)
     tl.store(spread + ray, tl.where(ended, tl.sqrt(squares / mass), undefined), mask=there)
-    tl.store(heaviest + ray, tl.where(ended, start + inside, undefined), mask=there)
+    tl.store(at_peak + ray, tl.where(ended, start + inside, undefined), mask=there)
     tl.store(largest + ray, most, mask=there)
     for fraction in range(FRACTIONS):
         target = tl.load(targets + fraction)
@@ -137,17 +137,17 @@ def _light_ends(
         tl.store(quantiles + ray * FRACTIONS + fraction, tl.where(found < NOWHERE, crossing, undefined), mask=there)
 
 
-def light_ends(
+def ray_termination(
     density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fractions: tuple[float, ...]
-) -> LightEnds:
-    """See `reference.light_ends`; float32, without gradients."""
+) -> RayTermination:
+    """See `reference.ray_termination`; float32, without gradients."""
     density, starts, ends = (x.detach().contiguous() for x in (density, starts, ends))
     rays, device = len(offsets) - 1, density.device
     targets = device_floats(tuple(-math.log1p(-fraction) for fraction in fractions) or (0.0,), device)
     columns = [torch.empty(rays, device=device) for _ in range(6)]
     quantiles = torch.empty(rays, len(fractions), device=device)
     launch(
-        _light_ends, blocks_of(rays), density, starts, ends, offsets, targets, torch.empty_like(density), *columns,
+        _ray_termination, blocks_of(rays), density, starts, ends, offsets, targets, torch.empty_like(density), *columns,
         quantiles, rays, FRACTIONS=len(fractions), RAYS=RAYS, STEPS=STEPS,
     )  # fmt: skip
-    return LightEnds(*columns, quantiles=quantiles)
+    return RayTermination(*columns, quantiles=quantiles)

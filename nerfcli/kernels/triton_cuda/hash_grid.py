@@ -86,7 +86,7 @@ def _encode(
 
 @jit
 def _encode_backward(
-    points, widths, gradient, scale, resolutions, sink, count, rows,
+    points, widths, gradient, scale, resolutions, table_grad, count, rows,
     COLUMNS: tl.constexpr, FADES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     level = tl.program_id(1)
@@ -103,7 +103,7 @@ def _encode_backward(
         cy, fy = _cell(points, i, valid, 1, resolution)
         cz, fz = _cell(points, i, valid, 2, resolution)
         fade = _fade(widths, i, valid, resolution, FADES)
-        base = sink + level.to(tl.int64) * rows * 4
+        base = table_grad + level.to(tl.int64) * rows * 4
         for corner in tl.static_range(8):
             row = _row(cx, cy, cz, corner, resolution, rows)
             weight = _weight(fx, fy, fz, corner) * fade
@@ -181,7 +181,7 @@ def encode(
 
 
 def add_table_gradient(
-    sink: Tensor,
+    table_grad: Tensor,
     points: Tensor,
     gradient: Tensor,
     resolutions: tuple[int, ...],
@@ -190,10 +190,10 @@ def add_table_gradient(
     widths: Tensor | None,
 ) -> None:
     """Add the table's gradient to the sink (L, T, 4); the codes' gradient (N, L * 4) is multiplied by `scale` (1,)."""
-    levels, rows, _ = sink.shape
+    levels, rows, _ = table_grad.shape
     launch(
         _encode_backward, (blocks(len(points), BLOCK), levels), points, points if widths is None else widths,
-        gradient, scale, device_integers(resolutions, points.device), sink, len(points), rows,
+        gradient, scale, device_integers(resolutions, points.device), table_grad, len(points), rows,
         COLUMNS=levels * FEATURES, FADES=widths is not None, BLOCK=BLOCK,
     )  # fmt: skip
 
@@ -237,12 +237,12 @@ class _HashEncode(torch.autograd.Function):
         points: Tensor,
         table: Tensor,
         resolutions: tuple[int, ...],
-        sink: Tensor | None,
+        table_grad: Tensor | None,
         widths: Tensor | None,
     ) -> Tensor:
         points, table = points.detach().contiguous(), table.detach().contiguous()
         ctx.save_for_backward(points, table, *(() if widths is None else (widths,)))
-        ctx.resolutions, ctx.sink = resolutions, sink
+        ctx.resolutions, ctx.table_grad = resolutions, table_grad
         return encode(points, table, resolutions, widths=widths)
 
     @staticmethod
@@ -254,17 +254,17 @@ class _HashEncode(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             of_points = points_gradient(points, table, gradient, ctx.resolutions, **named)
         if ctx.needs_input_grad[1]:
-            of_table = torch.zeros_like(table) if ctx.sink is None else ctx.sink
+            of_table = torch.zeros_like(table) if ctx.table_grad is None else ctx.table_grad
             add_table_gradient(of_table, points, gradient, ctx.resolutions, **named)
-        return of_points, of_table if ctx.sink is None else None, None, None, None
+        return of_points, of_table if ctx.table_grad is None else None, None, None, None
 
 
 def hash_encode(
     points: Tensor,
     table: Tensor,
     resolutions: tuple[int, ...],
-    sink: Tensor | None = None,
+    table_grad: Tensor | None = None,
     widths: Tensor | None = None,
 ) -> Tensor:
     """See `reference.hash_encode`; float32, rows of 4 features, differentiable in points and table."""
-    return _HashEncode.apply(points, table, resolutions, sink, widths)
+    return _HashEncode.apply(points, table, resolutions, table_grad, widths)

@@ -83,13 +83,13 @@ def _march(
 
 @jit
 def _visible(
-    density, starts, ends, offsets, counts, sources, coordinates, visits, side, deepest, least, room, rays,
+    density, starts, ends, offsets, counts, sources, coordinates, cell_depths, side, deepest, least, room, rays,
     WRITES: tl.constexpr, VISITS: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
     """Count the samples of each ray that are not faint, and in front of which the optical depth is below a limit.
 
     With WRITES, `counts` are the offsets of these samples, and their places are written to `sources`. With VISITS, the
-    cells of `visits` are raised to the optical depths of the samples in front of the limit.
+    cells of `cell_depths` are raised to the optical depths of the samples in front of the limit.
     """
     ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
     there = ray < rays
@@ -119,7 +119,10 @@ def _visible(
             layer = tl.minimum(layer.to(tl.int32), side - 1)
             # A NaN is left out; it differs from itself.
             tl.atomic_max(
-                visits + (layer * side + row) * side + column, own, mask=reached & (own == own), sem="relaxed"
+                cell_depths + (layer * side + row) * side + column,
+                own,
+                mask=reached & (own == own),
+                sem="relaxed",
             )
         faint = own * tl.exp(-before) < least
         number = tl.where(reached & (faint == 0), 1, 0)
@@ -158,7 +161,13 @@ def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, 
 
 
 def visible_samples(
-    rays: Rays, along: March, grid: HashGrid, *, table: Tensor, capacity: Capacity, visits: Tensor | None = None
+    rays: Rays,
+    along: March,
+    grid: HashGrid,
+    *,
+    table: Tensor,
+    capacity: Capacity,
+    cell_depths: Tensor | None = None,
 ) -> Samples:
     """See `reference.visible_samples`; codes are float16.
 
@@ -182,11 +191,11 @@ def visible_samples(
         density = networks.density(code, grid.layers, count=limit)
         spans = density, starts, ends, offsets
         counts = torch.empty(count, dtype=torch.int64, device=offsets.device)
-        cells, side = (density, 0) if visits is None else (visits, len(visits))
+        cells, side = (density, 0) if cell_depths is None else (cell_depths, len(cell_depths))
         ends_at = float(along.max_optical_depth)
         launch(
             _visible, blocks_of(count), *spans, counts, counts, coordinates, cells, side, ends_at, least, room, count,
-            WRITES=False, VISITS=visits is not None, RAYS=RAYS, STEPS=STEPS,
+            WRITES=False, VISITS=cell_depths is not None, RAYS=RAYS, STEPS=STEPS,
         )  # fmt: skip
         kept = _offsets(counts)
         candidates, samples = torch.stack([needed, kept[-1]]).tolist()  # the host waits

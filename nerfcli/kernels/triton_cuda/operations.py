@@ -6,7 +6,7 @@ from nerfcli.kernels.interface import AdamStep, HashGrid, March, Rays, Samples
 from nerfcli.kernels.reference import keep_largest
 from nerfcli.kernels.triton_cuda import marching, row_adam
 from nerfcli.kernels.triton_cuda.compositing import composite, distortion, interval_weights, optical_depth_before
-from nerfcli.kernels.triton_cuda.depth import light_ends
+from nerfcli.kernels.triton_cuda.depth import ray_termination
 from nerfcli.kernels.triton_cuda.hash_grid import hash_encode
 from nerfcli.kernels.triton_cuda.marching import occupied_samples
 from nerfcli.kernels.triton_cuda.pixels import pixel_rays
@@ -19,11 +19,11 @@ __all__ = [
     "hash_encode",
     "interval_weights",
     "keep_largest",
-    "light_ends",
     "occupied_samples",
     "optical_depth_before",
     "pixel_rays",
     "ray_indices",
+    "ray_termination",
     "visible_samples",
 ]
 

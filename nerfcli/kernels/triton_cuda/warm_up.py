@@ -23,7 +23,7 @@ def warm_up(device: torch.device) -> None:
     layers = tuple(torch.zeros(shape, device=device, requires_grad=True) for shape in shapes)
     grid = HashGrid(table, (2,) * 8, layers)
     edges, occupied = torch.linspace(0.0, 0.5, 6, device=device), torch.ones(2, 2, 2, dtype=torch.bool, device=device)
-    sink, first, second = (torch.zeros(8, 16, 4, device=device) for _ in range(3))
+    table_grad, first, second = (torch.zeros(8, 16, 4, device=device) for _ in range(3))
     for contraction in ("none", "l2"):
         march = March(edges, occupied, contraction, 7.0)
         for learn in (False, True):
@@ -31,11 +31,16 @@ def warm_up(device: torch.device) -> None:
             rays.origins.requires_grad_(learn)
             rays.directions.requires_grad_(learn)
             sums = backend.render_rays(
-                rays, march, grid, Targets(distortion=True), background=torch.zeros(2, 3, device=device), sink=sink
+                rays,
+                march,
+                grid,
+                Targets(distortion=True),
+                background=torch.zeros(2, 3, device=device),
+                table_grad=table_grad,
             )
             (sums.rgb.sum() + sums.distortion.sum()).backward()
         backend.trace_rays(rays.detached(), march, grid, background=torch.zeros(3, device=device), fractions=(0.5,))
     backend.density(torch.full((2, 3), 0.5, device=device), grid)
-    backend.adam_rows(table, sink, first, second, step=AdamStep(1, 0.0, (0.9, 0.99), 1e-15))
+    backend.adam_rows(table, table_grad, first, second, step=AdamStep(1, 0.0, (0.9, 0.99), 1e-15))
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -13,12 +13,10 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.render.files.depth_pictures import DepthMeta, difference_of, mixed
-from nerfcli.render.files.exr import CHANNELS, read_exr, write_exr
 from nerfcli.render.files.file_facts import depth_meta_of
-from nerfcli.render.files.float_tiff import read_tiff, write_tiff
+from nerfcli.render.files.float_maps import CHANNELS, read_exr, read_npy, read_tiff, write_exr, write_npy, write_tiff
 from nerfcli.render.files.levels import LARGEST_LEVEL, chosen_scale, write_png16
-from nerfcli.render.files.npy import read_npy, write_npy
-from nerfcli.render.files.quantiles import quantiles
+from nerfcli.render.files.preview import quantiles
 from nerfcli.render.job import with_suffix
 from nerfcli.render.outputs import EXR_FOLDER, FLOAT_FORMATS, LEVELS_FOLDER, ExportSettings, meaning_of
 from nerfcli.render.pictures import RenderedPicture

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli import __version__
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import photo_folder, recognised
 from nerfcli.captures.formats.run_cameras import MEND
+from nerfcli.captures.loading import fingerprint
 from nerfcli.captures.orientation import describe_rescaling
-from nerfcli.captures.scene import Scene, fingerprint
 from nerfcli.errors import UserError, in_shell
 from nerfcli.sealed import read_sealed, write_sealed
-from nerfcli.training.runs.components import Components
-from nerfcli.training.runs.decisions import Selection
+from nerfcli.training.runs.components import Components, Selection
 from nerfcli.training.runs.files import CONFIG, RECONSTRUCTION
 from nerfcli.training.runs.settings import TrainSettings
 
@@ -27,12 +27,12 @@ class RunConfig:
 
     Args:
         scene: the folder of the scene, absolute or relative to the working directory of the training.
-        scene_kind: the format of the scene, see `Scene`.
-        unit, unit_source: unit of length, see `Scene`.
-        scene_fingerprint: see `scene.fingerprint`.
+        scene_kind: the format of the scene, see `Capture`.
+        unit, unit_source: unit of length, see `Capture`.
+        scene_fingerprint: see `captures.loading.fingerprint`.
         split_sha256: see `split_hash`.
         holdout: the rule that chose the held-out photos; None where the scene defines them.
-        history: how cameras and points were found, see `Scene`; None if not recorded.
+        history: how cameras and points were found, see `Capture`; None if not recorded.
         missing_photos: photos that the scene lists but that were not on disk.
         warnings: warnings about the scene.
         settings: as requested, with the downscale and contraction that were chosen.
@@ -57,7 +57,7 @@ class RunConfig:
     @classmethod
     def describing(
         cls,
-        scene: Scene,
+        scene: Capture,
         settings: TrainSettings,
         *,
         factor: int,
@@ -74,7 +74,7 @@ class RunConfig:
             scene_fingerprint=fingerprint(scene),
             split_sha256=split_hash(scene.test_names),
             holdout=scene.holdout,
-            history=dict(scene.history),
+            history=dict(scene.provenance),
             missing_photos=tuple(scene.missing),
             warnings=tuple(describe_rescaling(scene.rescaled)),
             selection=selection,

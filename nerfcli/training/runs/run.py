@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.atomic import read_json
+from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import CAMERAS, RunCameras, read_cameras, read_given_cameras
-from nerfcli.captures.scene import Scene, fingerprint
+from nerfcli.captures.loading import fingerprint
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.render.model import Model, load_model
-from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.components import Components, Decision
 from nerfcli.training.runs.config import RunConfig, no_run, read_config, split_hash
-from nerfcli.training.runs.decisions import Decision
 from nerfcli.training.runs.files import CONFIG, FIELD, METRICS, STATE
 from nerfcli.training.runs.log import LogEntry, TrainingSummary, read_log
 from nerfcli.training.runs.settings import TrainSettings
@@ -129,7 +129,7 @@ class Run:
                 "photos used for training cannot be used for evaluation: train again with --overwrite",
             )
 
-    def is_trained_from(self, scene: Scene, settings: TrainSettings) -> bool:
+    def is_trained_from(self, scene: Capture, settings: TrainSettings) -> bool:
         """Return whether the run was trained from this scene with these settings.
 
         Threads and device do not matter; an automatic downscale, contraction or number of rows matches any value.

@@ -13,11 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from nerfcli.matching.camera_check import CameraCheck
-from nerfcli.training.runs.components import CHOICES, MOST_DEGREES, Change, Components
-from nerfcli.training.runs.decisions import Decision, Selection, untried
+from nerfcli.training.runs.components import CHOICES, MOST_DEGREES, Change, Components, Decision, Selection, untried
 from nerfcli.training.selection.diagnostics import Diagnostics
-from nerfcli.training.selection.judgement import Rule, judge_evidence, judge_likely, judge_supported
-from nerfcli.training.selection.race import Race, SearchBudget
+from nerfcli.training.selection.race import Race, Rule, SearchBudget, judge_evidence, judge_likely, judge_supported
 from nerfcli.training.selection.trials import Trials
 
 # Fraction of the budget for all trials together, and fraction of that for the training that they continue.

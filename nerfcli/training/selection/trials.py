@@ -27,8 +27,7 @@ from nerfcli.training.point_depth import PointDepths, PointRays
 from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import FEWEST_LOG2_ROWS, TrainSettings
-from nerfcli.training.selection.diagnostics import Diagnostics, diagnose
-from nerfcli.training.selection.sky import paint
+from nerfcli.training.selection.diagnostics import Diagnostics, diagnose, paint
 from nerfcli.training.storage import IN_MEMORY, PhotoStorage
 
 JUDGED_PIXELS = 8192
@@ -196,8 +195,8 @@ class Trials:
         gains = {"exif": self._exif, "matched": self._log_gains, "learned": learned}.get(components.exposure)
         fitting = self._fitting(components, seed=seed, log_gains=gains, cameras_from=FORK_FRACTION)
         self._take_up(fitting, start)
-        if fitting.parts.background is not None:
-            paint(fitting.parts.background, self._draws())
+        if fitting.appearance.background is not None:
+            paint(fitting.appearance.background, self._draws())
         seconds, halfway = [], None
         for done in range(steps):
             if halfway is None and 2 * done >= steps:
@@ -206,7 +205,7 @@ class Trials:
         errors = self._errors(fitting)
         # A median, so that other work on the machine does not look like the cost of a component.
         took = statistics.median(seconds) * steps if seconds else 0.0
-        exposure = fitting.parts.exposure
+        exposure = fitting.appearance.exposure
         found = exposure.log_gains().detach().clone() if exposure is not None else None
         return Trial(errors, errors if halfway is None else halfway, self._counts, took, steps, found)
 

@@ -1,20 +1,20 @@
-"""A scene: the photos of a capture with their cameras, read from any supported format.
+"""Load a capture of any format, with the photos that are on disk and their split.
 
-The world frame of a scene is that of its files: it is never rotated, moved or scaled here.
+The world frame is that of its files: it is never rotated, moved or scaled here.
 """
 
 import hashlib
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras.frame import Capture, Frame, Size
-from nerfcli.captures.formats.registry import Format, UserInputs, recognise
-from nerfcli.captures.formats.scene_folder import read_description
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats import run_cameras
+from nerfcli.captures.formats.format import Format, UserInputs
+from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.holdout import default_split, names_held_out
 from nerfcli.captures.orientation import counted, rescaling
 from nerfcli.captures.stored_pixels import measure_of, upright
@@ -22,50 +22,7 @@ from nerfcli.errors import UserError, in_shell
 from nerfcli.photos.masks import masks_inside
 
 
-@dataclass(frozen=True)
-class Scene:
-    """The photos of a capture with cameras and poses.
-
-    Args:
-        root: the folder that was loaded, or that the file is in.
-        kind: name of the format, see `captures.formats.registry`.
-        frames: all views whose photos are on disk.
-        test_names: names of the held-out frames.
-        points: (N, 3) surface points in the world frame, float64; N is 0 if the format has none.
-        missing: names of listed images that are not on disk.
-        unit: unit of length: "arbitrary" or "metre".
-        depth_bounds: (frames, 2) nearest and farthest z per frame, in scene units, if the format has them.
-        unit_source: source of the metric scale; None if the unit is arbitrary, or the source is unknown.
-        rescaled: number of photos whose intrinsics were given for another size, see `Capture.rescaled`.
-        history: origin of cameras and points: the provenance of `save`, or {"from": the format}.
-        holdout: the rule that chose the held-out frames; None for the split of the capture, or the default split.
-    """
-
-    root: Path
-    kind: str
-    frames: tuple[Frame, ...]
-    test_names: frozenset[str]
-    points: np.ndarray
-    missing: tuple[str, ...]
-    unit: str = "arbitrary"
-    depth_bounds: np.ndarray | None = None
-    unit_source: str | None = None
-    rescaled: Mapping[tuple[Size, Size], int] = field(default_factory=dict)
-    history: Mapping[str, Any] = field(default_factory=dict)
-    holdout: str | None = None
-
-    @property
-    def train_frames(self) -> tuple[Frame, ...]:
-        """The training frames, in order."""
-        return tuple(frame for frame in self.frames if frame.name not in self.test_names)
-
-    @property
-    def test_frames(self) -> tuple[Frame, ...]:
-        """The held-out frames, in order."""
-        return tuple(frame for frame in self.frames if frame.name in self.test_names)
-
-
-def load(path: str | Path, *, holdout: str | None = None) -> Scene:
+def load_scene(path: str | Path, *, holdout: str | None = None) -> Capture:
     """Load the scene in a file or folder of any format of captures, with the photos that are on disk.
 
     Example:
@@ -83,20 +40,20 @@ def load(path: str | Path, *, holdout: str | None = None) -> Scene:
     """
     path = Path(path)
     form, found = recognise(path)
-    if form.name == "run" and path.is_dir():
+    if form is run_cameras.FORMAT and path.is_dir():
         raise UserError(
             f"{path} is a run, not a scene",
             f"give the scene it was trained on, or {in_shell(found)} for its refined cameras; to continue it: nerfcli "
             f"train SCENE -o {in_shell(path)} --resume",
         )
-    scene = scene_of(path, form, found, form.parse(found, UserInputs()))
+    scene = with_photos_on_disk(path, form, found, form.parse(found, UserInputs()))
     if holdout is None:
         return scene
     names = names_held_out(holdout, (frame.name for frame in scene.frames), others=scene.missing)
     return replace(scene, test_names=names, holdout=holdout)
 
 
-def fingerprint(scene: Scene) -> str:
+def fingerprint(scene: Capture) -> str:
     """Compute a SHA-256 of names, cameras, poses and split: the same on every machine that reads the same capture.
 
     Numbers enter with nine digits after the point (positions after division by the power of ten that bounds them), so
@@ -118,8 +75,8 @@ def fingerprint(scene: Scene) -> str:
     return digest.hexdigest()
 
 
-def scene_of(path: Path, form: Format, found: Path, capture: Capture) -> Scene:
-    """Return the scene of a capture, with the photos that are on disk, and the split of its files if they have one.
+def with_photos_on_disk(path: Path, form: Format, found: Path, capture: Capture) -> Capture:
+    """Return a capture with the photos that are on disk, upright, and the split of its files if they have one.
 
     Args:
         path: the file or folder that was given.
@@ -130,10 +87,9 @@ def scene_of(path: Path, form: Format, found: Path, capture: Capture) -> Scene:
     """
     frames = capture.frames
     order = list(range(len(frames)))
-    if capture.kind == "colmap":  # ids of a model are in no particular order
+    if form.is_unordered:
         order.sort(key=lambda index: frames[index].name)
-    if form.name == "blender":  # NeRF's views for choosing settings
-        order = [index for index in order if frames[index].split != "val"]
+    order = [index for index in order if frames[index].split not in form.unused_splits]
     fitted = {index: _upright(capture, frames[index]) for index in order if frames[index].has_photo}
     if not fitted:
         first = frames[order[0] if order else 0]
@@ -143,9 +99,8 @@ def scene_of(path: Path, form: Format, found: Path, capture: Capture) -> Scene:
             "put the photos where the capture lists them, or give their folder: "
             f"nerfcli convert {in_shell(path)} SCENE --to nerfcli --images FOLDER",
         )
-    own = form.name == "nerfcli"
-    splits = {frames[index].split for index in (order if own else fitted)}
-    if own or {"test", "val"} & splits:
+    splits = {frames[index].split for index in (order if form.has_split else fitted)}
+    if form.has_split or {"test", "val"} & splits:
         held_out = "test" if "test" in splits else "val"
         # Views of other splits are used neither for training nor for evaluation.
         kept = [index for index in fitted if frames[index].split in ("train", held_out)]
@@ -153,18 +108,17 @@ def scene_of(path: Path, form: Format, found: Path, capture: Capture) -> Scene:
     else:
         kept = list(fitted)
         test_names = default_split(frames[index].name for index in kept)
-    return Scene(
+    return replace(
+        capture,
         root=path.parent if path.is_file() else path,
         kind=form.name,
         frames=tuple(fitted[index] for index in kept),
         test_names=test_names,
-        points=capture.points,
         missing=(*(frames[index].name for index in order if index not in fitted), *capture.missing),
-        unit=capture.unit,
         depth_bounds=None if capture.depth_bounds is None else capture.depth_bounds[kept],
-        unit_source=capture.unit_source,
+        observations=None,
         rescaled=counted(rescaling(frames[index].camera, frame.camera) for index, frame in fitted.items()),
-        history=read_description(found).provenance if own else {"from": form.name},
+        provenance=capture.provenance or {"from": form.name},
     )
 
 
@@ -175,7 +129,7 @@ def _upright(capture: Capture, frame: Frame) -> Frame:
     return upright(frame, measure_of(capture))
 
 
-def refuse_without_training_photos(scene: Scene) -> None:
+def refuse_without_training_photos(scene: Capture) -> None:
     """Refuse a scene that holds out every photo.
 
     Raises:
@@ -188,7 +142,7 @@ def refuse_without_training_photos(scene: Scene) -> None:
         )
 
 
-def describe_unused_masks(scene: Scene) -> str | None:
+def describe_unused_masks(scene: Capture) -> str | None:
     """Describe how to use a folder of masks in the scene's folder that none of its files mentions; None without one."""
     if any(frame.mask is not None for frame in scene.frames):
         return None
@@ -198,7 +152,7 @@ def describe_unused_masks(scene: Scene) -> str | None:
     return f"{masks}; to use them: nerfcli convert {in_shell(scene.root)} SCENE --to nerfcli --masks {in_shell(masks)}"
 
 
-def describe_source(path: Path, scene: Scene) -> str:
+def describe_source(path: Path, scene: Capture) -> str:
     """Describe which file or folder a scene at `path` was read from, in which format, and how many photos it has."""
     form, found = recognise(path)
     there = len(scene.frames)

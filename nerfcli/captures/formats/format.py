@@ -1,0 +1,126 @@
+"""What a format of captures is: how it is recognised, parsed and written, and what it cannot hold.
+
+Each format is a file of this folder with one `Format` at its end; `registry` lists them. A folder is recognised by the
+names of files in it, a file by its suffix and its beginning.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.fields import read_json_object
+from nerfcli.errors import UserError
+
+
+@dataclass(frozen=True)
+class UserInputs:
+    """Additional input of the user besides the capture's own files.
+
+    Args:
+        images: the folder of the photos, to which names are relative.
+        camera: the camera of all frames, for formats without cameras.
+        masks: a folder of masks named after the photos, see `photos.masks.mask_of`.
+    """
+
+    images: Path | None = None
+    camera: Camera | None = None
+    masks: Path | None = None
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of captures.
+
+    Args:
+        of: what it is, or which programs write it.
+        looked_for: what it is recognised by, in a few words for people; "" for formats that are only written.
+        find: returns where such a capture is in a file or folder; None if there is none.
+        parse: reads what `find` found, or what `write` wrote.
+        axes: the camera axes of its poses, as three letters or a name.
+        open_axes: whether poses with other axes are found in such files, so that --axes makes sense.
+        open_centre: whether principal points with other pixel centres are found in such files.
+        default_name: the name of its file if the target is a folder; "" for formats that fill a folder.
+        files: the names of all files that it may write, where "*" stands for that file's name without its suffix.
+        lacks: which of "cameras", "poses" and "points" it has no place for.
+        is_unordered: whether the order of frames in its files means nothing, so that photos are sorted by name.
+        has_split: whether its files say which photos are held out, for all photos.
+        unused_splits: splits whose photos are neither for training nor for evaluation.
+        listed_by: the order of frames in its files, as a key to sort by; by default, that of the capture.
+        write, losses: None for formats that are only read.
+    """
+
+    name: str
+    of: str
+    looked_for: str
+    find: Callable[[Path], Path | None]
+    parse: Callable[[Path, UserInputs], Capture]
+    axes: str = "opencv"
+    open_axes: bool = False
+    open_centre: bool = False
+    default_name: str = ""
+    files: tuple[str, ...] = ()
+    lacks: tuple[str, ...] = ()
+    is_unordered: bool = False
+    has_split: bool = False
+    unused_splits: tuple[str, ...] = ()
+    listed_by: Callable[[Frame], Any] = lambda frame: 0
+    write: Callable[[Capture, Path], None] | None = None
+    losses: Callable[[Capture], tuple[str, ...]] | None = None
+
+
+def named(*names: str) -> Callable[[Path], Path | None]:
+    """Return a finder of the first of these files in a folder."""
+
+    def find(path: Path) -> Path | None:
+        return next((path / name for name in names if (path / name).is_file()), None)
+
+    return find
+
+
+def by_suffix(suffix: str, *names: str) -> Callable[[Path], Path | None]:
+    """Return a finder of a file by its suffix, or of the first of these files in a folder."""
+    in_folder = named(*names)
+    return lambda path: path if path.is_file() and path.suffix.lower() == suffix else in_folder(path)
+
+
+def folder_of(name: str) -> Callable[[Path], Path | None]:
+    """Return a finder of the folder that holds this file, given the folder or the file."""
+
+    def find(path: Path) -> Path | None:
+        folder = path.parent if path.name == name else path
+        return folder if (folder / name).is_file() else None
+
+    return find
+
+
+def only_file(folder: Path, pattern: str, begins: str) -> Path | None:
+    """Return the file in a folder that matches a pattern and begins with a text, if there is only one."""
+    found = [path for path in sorted(folder.glob(pattern)) if path.is_file() and begins_with(path, begins)]
+    return found[0] if len(found) == 1 else None
+
+
+def begins_with(path: Path, text: str) -> bool:
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        return stream.read(len(text)) == text
+
+
+def find_json(path: Path, *, opening: str, name: str) -> Path | None:
+    """Find a JSON file that begins with a bracket or a brace, or the one with this name in a folder."""
+    if not path.is_file():
+        return path / name if (path / name).is_file() else None
+    if path.suffix.lower() != ".json":
+        return None
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        return path if stream.read(1000).lstrip().startswith(opening) else None
+
+
+def has_keys(path: Path, text: bytes, test: Callable[[dict[str, Any]], bool]) -> bool:
+    """Return whether a JSON object passes a test; it is parsed only if it contains a text."""
+    try:
+        return text in path.read_bytes() and test(read_json_object(path))
+    except UserError:  # damaged, or another program's file of this name
+        return False
