@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 from synthetic_captures import FISHEYE, LONG, PHONE, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 
-from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.judge.examine import examine
 
 BOUNDS_DEG = (1, 3, 5, 10)
@@ -63,7 +63,7 @@ class Result:
     reprojection_px: float
     focal_percent: float
     lens: str
-    rungs: int
+    attempts: int
     cpu_seconds: float
     verdict: str
 
@@ -122,8 +122,8 @@ def solve(name: str, capture: Capture, *, seed: int) -> Result:
         )
         job = synthetic.synthetic_job(folder, capture.views, seed=seed)
         start = time.process_time()
-        climbed = climb(job, lambda *reported: None)
-        examined = examine(climbed.models, climbed.job, lambda *reported: None, localised=climbed.localised)
+        mapped = map_with_fallbacks(job, lambda *reported: None)
+        examined = examine(mapped.models, mapped.job, lambda *reported: None, localised=mapped.localised)
         seconds = time.process_time() - start
         model = examined.model
         failures = [f"{failure.kind}: {failure.evidence}" for failure in examined.verdict.failures]
@@ -145,7 +145,7 @@ def solve(name: str, capture: Capture, *, seed: int) -> Result:
             reprojection_px=np.nan if model is None else model.compute_mean_reprojection_error(),
             focal_percent=np.nan if model is None else worst_focal_percent(model, capture.views),
             lens=", ".join(dict.fromkeys(cameras)),
-            rungs=len(climbed.attempts),
+            attempts=len(mapped.attempts),
             cpu_seconds=seconds,
             verdict="; ".join(failures) or "accepted",
         )
@@ -193,7 +193,7 @@ def main(
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     console = Console()
     table = Table(
-        "capture", "placed", "AUC 1", "3", "5", "10 deg", "px", "focal %", "lens", "rungs", "CPU s", "verdict"
+        "capture", "placed", "AUC 1", "3", "5", "10 deg", "px", "focal %", "lens", "attempts", "CPU s", "verdict"
     )
     results, wrong = [], []
     for seed in range(seeds):
@@ -205,7 +205,7 @@ def main(
             aucs = [f"{value:.1f}" for value in (result.auc_1, result.auc_3, result.auc_5, result.auc_10)]
             placed = f"{result.placed}/{result.photos}"
             focal, px = f"{result.focal_percent:+.2f}", f"{result.reprojection_px:.2f}"
-            numbers = [px, focal, result.lens, str(result.rungs), f"{result.cpu_seconds:.1f}"]
+            numbers = [px, focal, result.lens, str(result.attempts), f"{result.cpu_seconds:.1f}"]
             table.add_row(name, placed, *aucs, *numbers, result.verdict)
             if capture.refused is None:
                 expected = result.verdict == "accepted" and result.placed == result.photos - capture.missing

@@ -12,9 +12,9 @@ import synthetic_captures as synthetic
 from numpy.typing import NDArray
 from synthetic_captures import FISHEYE, WIDE, Noise, View
 
+from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.engine.initial_focal import with_focal_lengths
-from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.model.focal_length import focal_length
 from nerfcli.poses.model.two_views import VerifiedPair, read_verified_pairs
@@ -184,7 +184,7 @@ def test_verification_without_a_prior_asks_for_no_focal_length(job: Job):
 def test_a_first_mapping_starts_from_it(job: Job):
     """All photos placed, focal length within half a per cent of the truth."""
     notes: list[str] = []
-    climbed = climb(job, lambda *progress: None, notes.append)
-    assert [attempt["models"] for attempt in climbed.attempts] == [[14]]
-    assert climbed.job.groups[0].estimated_focal_px is not None
-    assert climbed.models[0].cameras[1].mean_focal_length() == pytest.approx(WIDE.params[0], rel=0.005)
+    mapped = map_with_fallbacks(job, lambda *progress: None, notes.append)
+    assert [attempt["models"] for attempt in mapped.attempts] == [[14]]
+    assert mapped.job.groups[0].estimated_focal_px is not None
+    assert mapped.models[0].cameras[1].mean_focal_length() == pytest.approx(WIDE.params[0], rel=0.005)

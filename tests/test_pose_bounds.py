@@ -13,9 +13,9 @@ import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import WIDE, Noise
 
-from nerfcli.poses.engine import features, ladder, worker
+from nerfcli.poses.engine import attempts, features, worker
+from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import clear_matches
-from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.pairs import all_pairs, in_blocks
@@ -72,7 +72,7 @@ def test_matching_ends_at_its_limit_and_the_next_call_does_the_rest(
 
 
 def test_what_was_cut_short_is_kept_with_the_models(job: Job):
-    mapped = climb(job, lambda *progress: None)
+    mapped = map_with_fallbacks(job, lambda *progress: None)
     assert mapped.cut_short == ()
     write_mapped(replace(mapped, cut_short=("matching: 1 of 28 pairs",)), mapping_key(job), name="cut")
     again = read_mapped(job, mapping_key(job), name="cut")
@@ -87,7 +87,7 @@ def test_no_attempt_begins_after_the_time_for_all(job: Job, tmp_path: Path, monk
     """
     shutil.copytree(job.database.parent, tmp_path / "again")
     job = replace(job, folder=str(tmp_path / "again" / "work"))
-    real = ladder.map_photos
+    real = attempts.map_photos
 
     def without_two(*arguments, **options) -> list[pycolmap.Reconstruction]:
         models = real(*arguments, **options)
@@ -96,14 +96,14 @@ def test_no_attempt_begins_after_the_time_for_all(job: Job, tmp_path: Path, monk
         return models
 
     now = iter(range(0, 100_000, 250))
-    monkeypatch.setattr(ladder, "map_photos", without_two)
-    monkeypatch.setattr(ladder.time, "perf_counter", lambda: next(now))
+    monkeypatch.setattr(attempts, "map_photos", without_two)
+    monkeypatch.setattr(attempts.time, "perf_counter", lambda: next(now))
     notes: list[str] = []
-    climbed = climb(job, lambda *progress: None, notes.append)
-    assert climbed.attempts[0]["what"] == "default thresholds"
-    assert not any("start from" in attempt["what"] for attempt in climbed.attempts)
+    mapped = map_with_fallbacks(job, lambda *progress: None, notes.append)
+    assert mapped.attempts[0]["what"] == "default thresholds"
+    assert not any("start from" in attempt["what"] for attempt in mapped.attempts)
     said = "no further attempts to place photos after 4 min"
-    assert climbed.cut_short == (said,)
+    assert mapped.cut_short == (said,)
     assert notes.count(f"cut short: {said}") == 1
 
 
@@ -125,7 +125,7 @@ def test_a_way_to_map_that_was_ended_is_reported_and_a_check_once(
 
 def test_merging_ends_at_its_limit(job: Job, tmp_path: Path):
     """Without time, two overlapping models stay two; with time, they become one."""
-    whole = climb(job, lambda *progress: None).models[0]
+    whole = map_with_fallbacks(job, lambda *progress: None).models[0]
     first, second = pycolmap.Reconstruction(whole), pycolmap.Reconstruction(whole)
     for photo in range(1, 9):
         if photo > 5:

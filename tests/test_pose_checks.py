@@ -28,7 +28,7 @@ from nerfcli.captures.loading import load_scene
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.engine import worker
-from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.largest_component import describe_components
 from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.worker import finite
@@ -54,7 +54,7 @@ def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
     scene = synthetic.boulder(450, seed=0)
     synthetic.write_database(folder / "database.db", views, scene, noise=Noise(outliers=0.1), seed=0)
     job = synthetic.synthetic_job(folder, views, seed=0)
-    write_mapped(climb(job, lambda *progress: None), mapping_key(job))
+    write_mapped(map_with_fallbacks(job, lambda *progress: None), mapping_key(job))
     return job
 
 

@@ -13,7 +13,7 @@ import synthetic_captures as synthetic
 from synthetic_captures import WIDE, Noise, View
 
 from nerfcli.poses.engine import largest_component
-from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.largest_component import choose_model
 from nerfcli.poses.engine.mapped import MappedModels
 from nerfcli.poses.engine.second_chance import ChosenModel
@@ -34,14 +34,14 @@ def apart(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], MappedM
     scene = synthetic.together(synthetic.boulder(800, seed=0), synthetic.boulder(800, seed=1, centre=FAR))
     synthetic.write_database(folder / "database.db", views, scene, noise=Noise(outliers=0.2), seed=0)
     reports: list[tuple[str, int, int]] = []
-    climbed = climb(
+    mapped = map_with_fallbacks(
         synthetic.synthetic_job(folder, views, seed=0), lambda stage, done, total: reports.append((stage, done, total))
     )
     # A second model does not set progress back: it counts 2 to 10 photos of the first, then stays at 10.
     placed = [done for stage, done, _ in reports if stage == "map"]
     assert placed[:17] == [*range(2, 11), *[10] * 8]
-    assert [sorted(model.reg_image_ids()) for model in climbed.models] == [FIRST, SECOND]
-    return views, climbed
+    assert [sorted(model.reg_image_ids()) for model in mapped.models] == [FIRST, SECOND]
+    return views, mapped
 
 
 @pytest.fixture

@@ -21,11 +21,11 @@ from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Lens, Noise, Scene, 
 
 from nerfcli.cameras.alignment import align
 from nerfcli.matching.graph import Bottlenecks, connected_groups, consistent_groups
-from nerfcli.poses.engine import ladder, mapping
+from nerfcli.poses.engine import attempts, mapping
 from nerfcli.poses.engine import second_chance as chances
+from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.engine.features import match
-from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.largest_component import choose_model
 from nerfcli.poses.engine.mapped import MappedModels
 from nerfcli.poses.engine.mapping import MapperOptions, map_photos
@@ -60,7 +60,7 @@ def _quiet() -> None:
 class Solved:
     views: Sequence[View]
     job: Job
-    climbed: MappedModels
+    mapped: MappedModels
     examined: ExaminedModel
 
     @property
@@ -76,9 +76,9 @@ class Solved:
 def solve(folder: Path, views: Sequence[View], scene: Scene, noise: Noise = Noise(), **options) -> Solved:
     synthetic.write_database(folder / "database.db", views, scene, noise=noise, seed=0, **options)
     job = synthetic.synthetic_job(folder, views, seed=0)
-    climbed = climb(job, lambda *progress: None)
-    examined = examine(climbed.models, climbed.job, lambda *progress: None, localised=climbed.localised)
-    return Solved(views, job, climbed, examined)
+    mapped = map_with_fallbacks(job, lambda *progress: None)
+    examined = examine(mapped.models, mapped.job, lambda *progress: None, localised=mapped.localised)
+    return Solved(views, job, mapped, examined)
 
 
 @pytest.fixture(scope="module")
@@ -334,7 +334,7 @@ def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(
     """Eight of ten are placed: attempts that continue from them are made, attempts from scratch are not."""
     shutil.copytree(solved.job.database.parent, tmp_path / "again")
     job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
-    real = ladder.map_photos
+    real = attempts.map_photos
 
     def without_two(*arguments, **options) -> list[pycolmap.Reconstruction]:
         models = real(*arguments, **options)
@@ -342,12 +342,12 @@ def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(
             models[0].deregister_frame(models[0].image(photo).frame_id)
         return models
 
-    monkeypatch.setattr(ladder, "map_photos", without_two)
-    monkeypatch.setattr(ladder, "_MANY_PHOTOS", 10)
+    monkeypatch.setattr(attempts, "map_photos", without_two)
+    monkeypatch.setattr(attempts, "_MANY_PHOTOS", 10)
     notes: list[str] = []
-    climbed = climb(job, lambda *progress: None, notes.append)
-    assert [attempt["what"] for attempt in climbed.attempts][:2] == ["default thresholds", "lower angles"]
-    assert not any("start from" in attempt["what"] for attempt in climbed.attempts)
+    mapped = map_with_fallbacks(job, lambda *progress: None, notes.append)
+    assert [attempt["what"] for attempt in mapped.attempts][:2] == ["default thresholds", "lower angles"]
+    assert not any("start from" in attempt["what"] for attempt in mapped.attempts)
     # By the plan, 10 photos take 0.09 + 10 * 0.0005 s each.
     assert "not trying other starts, which take about 1 s each: most photos are registered" in notes
 
@@ -381,7 +381,7 @@ def test_a_run_of_the_mapper_ends_if_no_photo_follows(solved: Solved, tmp_path: 
     """The plan's time for all photos, two minutes at least; those in the last snapshot are kept."""
     assert [mapping.stall_seconds(photos) for photos in (10, 1000)] == [120, pytest.approx(590)]
     monkeypatch.setattr(mapping, "stall_seconds", lambda photos: 0.0)
-    monkeypatch.setattr(ladder, "_other_starts", lambda *arguments: None)
+    monkeypatch.setattr(attempts, "map_from_other_starts", lambda *arguments: None)
     hangs = threading.Event()
 
     def report(stage: str, done: int, total: int) -> None:
@@ -390,9 +390,9 @@ def test_a_run_of_the_mapper_ends_if_no_photo_follows(solved: Solved, tmp_path: 
             time.sleep(1.5)
 
     notes: list[str] = []
-    climbed = climb(_again(solved, tmp_path / "again"), report, notes.append)
+    mapped = map_with_fallbacks(_again(solved, tmp_path / "again"), report, notes.append)
     stopped = "default thresholds: stopped after 0 s without another photo"
-    assert (climbed.attempts[0]["models"], climbed.cut_short[0], notes[0]) == ([8], stopped, f"cut short: {stopped}")
+    assert (mapped.attempts[0]["models"], mapped.cut_short[0], notes[0]) == ([8], stopped, f"cut short: {stopped}")
 
 
 def test_a_slow_run_of_the_mapper_is_not_ended_while_photos_follow(
@@ -544,7 +544,7 @@ def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
     views = synthetic.panorama(6, WIDE, turn_deg=120)
     still = solve(tmp_path, views, synthetic.room(900, seed=0))
     assert still.kinds[0] == "no baseline (pure rotation)"
-    assert [rung["what"] for rung in still.climbed.attempts] == ["default thresholds"]  # no other attempt can help
+    assert [attempt["what"] for attempt in still.mapped.attempts] == ["default thresholds"]  # no other attempt can help
     pairs = read_verified_pairs(still.job.database, min_matches=30)
     turn = best_rotation_fit(pairs, dict.fromkeys(still.job.image_ids, (WIDE.width, WIDE.height)))
     assert turn is not None
@@ -596,16 +596,16 @@ def test_parts_that_share_nothing_are_reported_separately(tmp_path: Path):
     assert sorted(apart.model.reg_image_ids()) == [1, 2, 3, 4, 5, 6]
 
 
-def test_every_rung_is_written_down_with_its_result(tmp_path: Path):
-    """A boulder with too few features for any start: all cheap rungs are tried, and none places a photo."""
+def test_every_attempt_is_written_down_with_its_result(tmp_path: Path):
+    """A boulder with too few features for any start: all cheap attempts are tried, and none places a photo."""
     views = synthetic.ring(5, [WIDE], seed=0, turn_deg=60)
     weak = solve(tmp_path, views, synthetic.boulder(70, seed=0), Noise(missed=0.1))
-    assert [rung["what"] for rung in weak.climbed.attempts] == [
+    assert [attempt["what"] for attempt in weak.mapped.attempts] == [
         "default thresholds",
         "start from a smaller baseline",
         "start from low angles",
     ]
-    assert all(rung["models"] == [] for rung in weak.climbed.attempts)
+    assert all(attempt["models"] == [] for attempt in weak.mapped.attempts)
     assert weak.examined.model is None
 
 
@@ -613,11 +613,11 @@ def test_a_photo_without_verified_pairs_is_placed_by_the_points_of_the_model(tmp
     """It has no match with any photo; its pose is right, and the list of attempts names it."""
     views = synthetic.ring(7, [WIDE], seed=0, turn_deg=140)
     weak = solve(tmp_path, views, synthetic.boulder(500, seed=0), pairs=lambda i, j: 3 not in (i, j))
-    assert [(rung["what"], rung["models"]) for rung in weak.climbed.attempts] == [
+    assert [(attempt["what"], attempt["models"]) for attempt in weak.mapped.attempts] == [
         ("default thresholds", [6]),
         ("remaining photos one by one, from the 3D points they see", [7]),
     ]
-    assert [(one["name"], one["refused"]) for one in weak.climbed.attempts[1]["photos"]] == [("00003.jpg", "")]
+    assert [(one["name"], one["refused"]) for one in weak.mapped.attempts[1]["photos"]] == [("00003.jpg", "")]
     assert (weak.examined.verdict.accepted, weak.examined.left_out) == (True, {})
     turned = weak.model.image(4).cam_from_world().rotation * weak.model.image(1).cam_from_world().rotation.inverse()
     truth = synthetic.true_model(views)
@@ -626,14 +626,14 @@ def test_a_photo_without_verified_pairs_is_placed_by_the_points_of_the_model(tmp
 
 
 def test_a_fisheye_without_metadata_is_recognized(tmp_path: Path):
-    """180 degrees wide, and the mapper starts from a perspective lens; a perspective capture has no such rung."""
+    """180 degrees wide, and the mapper starts from a perspective lens; a perspective capture has no such attempt."""
     scene = synthetic.together(synthetic.boulder(250, seed=0), synthetic.room(300, seed=1))
     views = synthetic.ring(6, [UNKNOWN_FISHEYE], seed=0, radius=2.0, turn_deg=100)
     synthetic.write_database(tmp_path / "database.db", views, scene, noise=Noise(), seed=0)
-    climbed = climb(synthetic.synthetic_job(tmp_path, views, seed=0), lambda *progress: None)
-    assert [rung["what"] for rung in climbed.attempts] == ["default thresholds", "start from a fisheye lens"]
-    assert climbed.models[0].num_reg_images() == 6
-    (camera,) = climbed.models[0].cameras.values()
+    mapped = map_with_fallbacks(synthetic.synthetic_job(tmp_path, views, seed=0), lambda *progress: None)
+    assert [attempt["what"] for attempt in mapped.attempts] == ["default thresholds", "start from a fisheye lens"]
+    assert mapped.models[0].num_reg_images() == 6
+    (camera,) = mapped.models[0].cameras.values()
     assert camera.is_perspective_fisheye()
     assert camera.mean_focal_length() == pytest.approx(UNKNOWN_FISHEYE.params[0], rel=0.02)
 
@@ -648,14 +648,14 @@ def test_a_wrong_focal_length_in_exif_is_ignored(tmp_path: Path):
     job = replace(job, groups=groups)
     register_photos(job)
     match(job, job.pairs, lambda *progress: None)
-    climbed = climb(job, lambda *progress: None, notes.append)
-    assert [rung["what"] for rung in climbed.attempts] == ["default thresholds", "without EXIF's focal length"]
-    assert climbed.attempts[0]["models"] == [] or max(climbed.attempts[0]["models"]) < 4
+    mapped = map_with_fallbacks(job, lambda *progress: None, notes.append)
+    assert [attempt["what"] for attempt in mapped.attempts] == ["default thresholds", "without EXIF's focal length"]
+    assert mapped.attempts[0]["models"] == [] or max(mapped.attempts[0]["models"]) < 4
     assert "next: without EXIF's focal length" in notes
     assert notes[-1].startswith("EXIF's focal length (4800 px) was not used, since few photos registered with it; the ")
     assert notes[-1].endswith(" px: if EXIF is right, give --intrinsics")
-    assert climbed.models[0].num_reg_images() == 8
-    (camera,) = climbed.models[0].cameras.values()
+    assert mapped.models[0].num_reg_images() == 8
+    (camera,) = mapped.models[0].cameras.values()
     assert camera.mean_focal_length() == pytest.approx(WIDE.params[0], rel=0.02)
     assert not camera.has_prior_focal_length
 
@@ -671,9 +671,9 @@ def test_a_camera_whose_photos_are_not_registered_is_no_error(tmp_path: Path):
     register_photos(job)
     match(job, job.pairs, lambda *progress: None)
     notes: list[str] = []
-    climbed = climb(job, lambda *progress: None, notes.append)
+    mapped = map_with_fallbacks(job, lambda *progress: None, notes.append)
     assert len(job.groups) == 2
-    assert list(climbed.models[0].cameras) == [1]
+    assert list(mapped.models[0].cameras) == [1]
     assert sum("was not used" in note for note in notes) == 1
 
 
@@ -740,12 +740,12 @@ def test_the_search_of_larger_pictures_is_worth_what_is_missing(
         model.deregister_frame(model.image(image_id).frame_id)
     searched: list[Job] = []
     notes: list[str] = []
-    monkeypatch.setattr(ladder, "extract", lambda job, report: searched.append(job))
+    monkeypatch.setattr(attempts, "extract", lambda job, report: searched.append(job))
     for name in ("match", "start_matching"):
-        monkeypatch.setattr(ladder, name, lambda *arguments: None)
-    monkeypatch.setattr(ladder, "map_photos", lambda *arguments, **options: [model])
-    monkeypatch.setattr(ladder, "localise", lambda model, job, **options: (model, []))
-    climb(job, lambda *progress: None, notes.append)
+        monkeypatch.setattr(attempts, name, lambda *arguments: None)
+    monkeypatch.setattr(attempts, "map_photos", lambda *arguments, **options: [model])
+    monkeypatch.setattr(attempts, "localise", lambda model, job, **options: (model, []))
+    map_with_fallbacks(job, lambda *progress: None, notes.append)
     assert [job.max_image_size for job in searched] == ([] if size is None else [size])
     assert any(note.startswith(words) for note in notes)
 

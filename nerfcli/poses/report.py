@@ -39,7 +39,7 @@ class PosesReport:
     largest, and the photo that has the largest. lenses: the lens models tried for each camera, with held-out errors.
     parts: sizes of the groups of photos connected by matches.
     seconds: per stage, for the call that wrote the report; time spent in earlier calls is not included. models: the
-    sizes of all models found, the kept one first. attempts: the result of each rung of the ladder. matching: the rule
+    sizes of all models found, the kept one first. attempts: the result of each mapping attempt. matching: the rule
     for pairs, and their number. points: number of points of the kept model. intrinsics: the given intrinsics, see
     `cameras.PhotoGroups`. strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components:
     each model's photos and why it is not joined to the largest, ordered by size.

@@ -19,7 +19,7 @@ import nerfcli
 from nerfcli.poses.input.job import Job, job_from_json
 from nerfcli.poses.input.stages import file_key, read_stage, stage_key, write_stage
 
-# Stage with the models of the ladder's attempts.
+# Stage with the models of the mapping attempts.
 FIRST = "mapped"
 
 

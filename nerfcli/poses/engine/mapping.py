@@ -127,7 +127,7 @@ def map_photos(
     Args:
         stalled: called with a number of seconds if the mapper was ended because it placed no photo for so long.
     """
-    output = Path(job.folder) / f"{job.rung}models_{attempt}"
+    output = Path(job.folder) / f"{job.variant}models_{attempt}"
     base_folder = output.with_name(f"{output.name}_base")
     if base is not None:
         base_folder.mkdir(exist_ok=True)

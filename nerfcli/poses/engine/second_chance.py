@@ -14,8 +14,8 @@ import pycolmap
 
 from nerfcli.errors import duration, several
 from nerfcli.matching.graph import consistent_groups
+from nerfcli.poses.engine.attempts import SMALLER_BASELINE
 from nerfcli.poses.engine.database import keep_geometries
-from nerfcli.poses.engine.ladder import SMALLER_BASELINE
 from nerfcli.poses.engine.mapped import MappedModels, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.mapping import (
     MapperOptions,
@@ -274,7 +274,7 @@ def _mapped_without(
 ) -> MappedModels:
     """Extend a model without the suspects, or map from scratch with another seed and a smaller initial baseline."""
     job = _with_own_database(mapped.job, without=suspects)
-    attempt = 100  # after those of the ladder; it is added to the seed
+    attempt = 100  # after all `attempts`; it is added to the seed
     if base is None:
         models = map_photos(job, report, attempt=attempt + 1, start=SMALLER_BASELINE)
     else:
@@ -304,7 +304,7 @@ def _set_cameras(job: Job, model: pycolmap.Reconstruction) -> None:
 
 def _with_own_database(job: Job, *, without: Iterable[tuple[int, int]] = ()) -> Job:
     """Copy the job's database, without some pairs of photo numbers, and return the job of the copy."""
-    copy = replace(job, rung="second-chance")
+    copy = replace(job, variant="second-chance")
     shutil.copyfile(job.database, copy.database)
     left_out = {(min(pair), max(pair)) for pair in without}
     keep_geometries(copy, [pair for pair in job.pairs if (min(pair), max(pair)) not in left_out])

@@ -23,9 +23,9 @@ from typing import Any
 import pycolmap
 
 from nerfcli.child import take_stdout
+from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
-from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.largest_component import choose_model, describe_components
 from nerfcli.poses.engine.mapped import MappedModels, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
@@ -198,9 +198,9 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
     report("matches", matches, matches)
     with _timed(seconds, "map"):
         start = time.perf_counter()
-        climbed = climb(matched, report, tell)
-        cut_short = climbed.cut_short if unmatched is None else (unmatched, *climbed.cut_short)
-        write_mapped(replace(climbed, seconds=time.perf_counter() - start, cut_short=cut_short), key)
+        mapped = map_with_fallbacks(matched, report, tell)
+        cut_short = mapped.cut_short if unmatched is None else (unmatched, *mapped.cut_short)
+        write_mapped(replace(mapped, seconds=time.perf_counter() - start, cut_short=cut_short), key)
     mapped = read_mapped(job, key)
     if mapped is None:
         raise OSError(f"cannot read back the models in {job.folder}")

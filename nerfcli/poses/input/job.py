@@ -61,8 +61,8 @@ class Job:
     folder: the work folder. files: the photos' names below folder/photos, which are numbers that a photo keeps as long
     as the folder exists. originals: the user's folder, and names: the photos' names there. keys: hashes of their
     content. pairs: to match. neighbours: how many look-alikes to add to the pairs of each photo; 0 once they are in
-    pairs. rung: "" or the name of an attempt with other features, which has its own database and stages:
-    `replace(job, rung="full-size", max_image_size=...)`. masks: one per photo, or none at all for a capture without
+    pairs. variant: "" or the name of an attempt with other features, which has its own database and stages:
+    `replace(job, variant="full-size", max_image_size=...)`. masks: one per photo, or none at all for a capture without
     masks; their pictures are in mask_folder. held_out: photos that are placed last, with everything else fixed.
     skipped_checks: (name, reason) of checks that ended an earlier process. The other fields are as in `PoseSettings`.
     """
@@ -80,7 +80,7 @@ class Job:
     seed: int
     threads: int
     masks: tuple[WorkMask, ...] = ()
-    rung: str = ""
+    variant: str = ""
     held_out: tuple[int, ...] = ()
     skipped_checks: tuple[tuple[str, str], ...] = ()
 
@@ -96,7 +96,7 @@ class Job:
 
     def stage_file(self, name: str) -> Path:
         """Return the path of a stage on the way to the database, see `stages`."""
-        return Path(self.folder) / f"{self.rung}{'-' if self.rung else ''}{name}.json"
+        return Path(self.folder) / f"{self.variant}{'-' if self.variant else ''}{name}.json"
 
     @property
     def fixed_cameras(self) -> list[int]:
@@ -111,7 +111,7 @@ class Job:
     @property
     def database(self) -> Path:
         """pycolmap's database of features and matches; it stays beside the model."""
-        return database_path(Path(self.folder), self.rung)
+        return database_path(Path(self.folder), self.variant)
 
     @cached_property
     def image_ids(self) -> tuple[int, ...]:
@@ -129,9 +129,9 @@ class Job:
         return {self.image_ids[photo]: (group.width, group.height) for group in self.groups for photo in group.photos}
 
 
-def database_path(work: Path, rung: str = "") -> Path:
-    """Return the path of a work folder's database: in the scene folder above it, or inside it for a named rung."""
-    return work / f"{rung}.db" if rung else work.parent / "database.db"
+def database_path(work: Path, variant: str = "") -> Path:
+    """Return the path of a work folder's database: in the scene folder above it, or inside it for a named variant."""
+    return work / f"{variant}.db" if variant else work.parent / "database.db"
 
 
 def write_job(path: Path, job: Job) -> None:
