@@ -29,8 +29,8 @@ from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.engine import worker
 from nerfcli.poses.engine.attempts import map_with_fallbacks
-from nerfcli.poses.engine.largest_component import describe_components
 from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.result import describe_components
 from nerfcli.poses.engine.worker import finite
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.settings import PoseSettings

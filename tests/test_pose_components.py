@@ -12,11 +12,10 @@ import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import WIDE, Noise, View
 
-from nerfcli.poses.engine import largest_component
+from nerfcli.poses.engine import remap
 from nerfcli.poses.engine.attempts import map_with_fallbacks
-from nerfcli.poses.engine.largest_component import choose_model
 from nerfcli.poses.engine.mapped import MappedModels
-from nerfcli.poses.engine.second_chance import ChosenModel
+from nerfcli.poses.engine.remap import ChosenModel, choose_model
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.examine import examine
 
@@ -74,16 +73,16 @@ def test_a_component_has_most_of_its_photos_for_itself(
     taken: int,
     components: list[int],
 ):
-    """The second chance of the largest component takes in six or four of the other's nine photos."""
+    """Mapped again, the largest component takes in six or four of the other's nine photos."""
     views, right = apart
     grown = synthetic.true_model(views)
     for image_id in range(taken + 1, 20):
         grown.deregister_frame(grown.image(image_id).frame_id)
     accepted = examine(right.models[:1], right.job, lambda *progress: None)
 
-    def chance(mapped: MappedModels, *arguments: object, **options: object) -> ChosenModel:
-        return ChosenModel(replace(mapped, models=[grown]), accepted)
+    def remapped(given: ChosenModel, *arguments: object, **options: object) -> ChosenModel:
+        return ChosenModel(replace(given.mapped, models=[grown]), accepted)
 
-    monkeypatch.setattr(largest_component, "second_chance", chance)
+    monkeypatch.setattr(remap, "remap_refused", remapped)
     found, _ = choose(misled)
     assert [model.num_reg_images() for model in found.mapped.models] == components

@@ -21,15 +21,13 @@ from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Lens, Noise, Scene, 
 
 from nerfcli.cameras.alignment import align
 from nerfcli.matching.graph import Bottlenecks, connected_groups, consistent_groups
-from nerfcli.poses.engine import attempts, mapping
-from nerfcli.poses.engine import second_chance as chances
+from nerfcli.poses.engine import attempts, mapping, remap
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.engine.features import match
-from nerfcli.poses.engine.largest_component import choose_model
 from nerfcli.poses.engine.mapped import MappedModels
 from nerfcli.poses.engine.mapping import MapperOptions, map_photos
-from nerfcli.poses.engine.second_chance import grow, is_contradicted, second_chance
+from nerfcli.poses.engine.remap import ChosenModel, choose_model, extend_accepted, is_contradicted, remap_refused
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge import acceptance
 from nerfcli.poses.judge.acceptance import Failure, Verdict, judge
@@ -172,17 +170,17 @@ def test_a_contradicted_model_is_mapped_again_from_its_sound_part(
     wrong = wrongly_mapped(solved, tmp_path / "again")
     assert is_contradicted(refused.verdict)
     notes: list[str] = []
-    chance = second_chance(wrong, refused, lambda *progress: None, notes.append, checks=Checks)
-    assert chance.examined.verdict.accepted
-    assert chance.examined.model is not None
-    assert [attempt["models"] for attempt in chance.mapped.attempts] == [[10], [10]]
+    chosen = remap_refused(ChosenModel(wrong, refused), lambda *progress: None, notes.append, checks=Checks)
+    assert chosen.examined.verdict.accepted
+    assert chosen.examined.model is not None
+    assert [attempt["models"] for attempt in chosen.mapped.attempts] == [[10], [10]]
     assert notes[0].endswith("mapping again, for at most 33 min")
     assert notes[-1] == "from the largest consistent part: 10 of 10 photos registered, accepted"
     truth = synthetic.true_model(solved.views)
     for image_id in range(2, 11):
         relative = [
             model.image(image_id).cam_from_world() * model.image(1).cam_from_world().inverse()
-            for model in (chance.examined.model, truth)
+            for model in (chosen.examined.model, truth)
         ]
         assert np.degrees((relative[0].rotation * relative[1].rotation.inverse()).angle()) < 0.4
 
@@ -235,7 +233,7 @@ def test_an_accepted_model_grows_with_the_lens_that_was_chosen_for_it(solved: So
     richer = converted(camera, "OPENCV")
     camera.model, camera.params = richer.model, richer.params.tolist()
     notes: list[str] = []
-    found = grow(mapped, first, lambda *progress: None, notes.append, checks=Checks)
+    found = extend_accepted(ChosenModel(mapped, first), lambda *progress: None, notes.append, checks=Checks)
     assert notes[-1] == "from the accepted model: 10 of 10 photos registered, accepted"
     assert found.mapped.models[0].num_reg_images() == 10
 
@@ -244,7 +242,7 @@ def test_a_model_that_grows_into_one_that_is_refused_stays_as_it_was(
     solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     mapped = in_two_parts(solved, tmp_path)
-    monkeypatch.setattr(chances, "map_photos", lambda *_, **__: [synthetic.bent(solved.model, 8)])
+    monkeypatch.setattr(remap, "map_photos", lambda *_, **__: [synthetic.bent(solved.model, 8)])
     notes: list[str] = []
     found = choose_model(mapped, lambda *progress: None, notes.append, checks=Checks)
     assert found.examined.verdict.accepted
@@ -257,8 +255,8 @@ def test_a_model_that_takes_in_no_further_photo_is_not_checked_again(
     solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     mapped = in_two_parts(solved, tmp_path)
-    monkeypatch.setattr(chances, "map_photos", lambda *_, **__: [pycolmap.Reconstruction(mapped.models[0])])
-    monkeypatch.delattr(chances, "examine")
+    monkeypatch.setattr(remap, "map_photos", lambda *_, **__: [pycolmap.Reconstruction(mapped.models[0])])
+    monkeypatch.delattr(remap, "examine")
     notes: list[str] = []
     found = choose_model(mapped, lambda *progress: None, notes.append, checks=Checks)
     assert [model.num_reg_images() for model in found.mapped.models] == [7, 4]
@@ -274,7 +272,7 @@ def test_nothing_is_mapped_again_where_the_camera_only_turned():
 
 
 @pytest.mark.parametrize(("failing", "attempts"), [(1, [[10], [10]]), (2, [[10], [10]]), (3, [[10], [7]])])
-def test_each_hypothesis_stands_in_for_the_one_before(
+def test_each_way_stands_in_for_the_one_before(
     solved: Solved,
     refused: ExaminedModel,
     tmp_path: Path,
@@ -282,16 +280,16 @@ def test_each_hypothesis_stands_in_for_the_one_before(
     failing: int,
     attempts: list[list[int]],
 ):
-    """The first one, two or all three that map again give nothing; the last hypothesis keeps the consistent part."""
+    """The first one, two or all three that map again give nothing; the last one keeps the consistent part."""
     wrong = wrongly_mapped(solved, tmp_path / "again")
-    for name in ("_regrown", "_all_at_once", "_from_nothing")[:failing]:
-        monkeypatch.setattr(chances, name, lambda *arguments: None)
-    chance = second_chance(wrong, refused, lambda *progress: None, lambda note: None, checks=Checks)
-    assert chance.examined.verdict.accepted
-    assert [attempt["models"] for attempt in chance.mapped.attempts] == attempts
+    for name in ("_extend_part", "_map_globally", "_map_from_scratch")[:failing]:
+        monkeypatch.setattr(remap, name, lambda *arguments: [])
+    chosen = remap_refused(ChosenModel(wrong, refused), lambda *progress: None, lambda note: None, checks=Checks)
+    assert chosen.examined.verdict.accepted
+    assert [attempt["models"] for attempt in chosen.mapped.attempts] == attempts
 
 
-def test_a_second_chance_is_bounded_in_time_and_says_what_contradicts_where_no_pair_does(
+def test_mapping_again_is_bounded_in_time_and_says_what_contradicts_where_no_pair_does(
     solved: Solved, refused: ExaminedModel, tmp_path: Path
 ):
     """Nothing is mapped again where the first mapping took no time; the sound part alone costs only its checks."""
@@ -300,32 +298,33 @@ def test_a_second_chance_is_bounded_in_time_and_says_what_contradicts_where_no_p
     verdict = Verdict({"pairs": {"judged": 15, "contradicting": 0}}, (Failure("contradict", evidence, "more photos"),))
     first = replace(refused, verdict=verdict)
     notes: list[str] = []
-    chance = second_chance(wrong, first, lambda *progress: None, notes.append, checks=Checks)
+    chosen = remap_refused(ChosenModel(wrong, first), lambda *progress: None, notes.append, checks=Checks)
     assert notes[0] == f"{evidence}: mapping again, for at most 0 s"
     assert sum(note.endswith(": skipped, since no time is left") for note in notes) == 4
     assert "from scratch, with other initial pairs: skipped, since no time is left" in notes
-    assert chance.examined.model is not None
-    assert chance.examined.model.num_reg_images() == 7
+    assert chosen.examined.model is not None
+    assert chosen.examined.model.num_reg_images() == 7
 
 
-def test_a_hypothesis_is_skipped_that_takes_longer_than_what_is_left(
+def test_a_way_is_skipped_that_takes_longer_than_what_is_left(
     solved: Solved, refused: ExaminedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Of 200 s, the first two take 130: mapping from scratch (100 s as before) does not fit; the sound part does."""
     wrong = replace(wrongly_mapped(solved, tmp_path / "again"), seconds=100.0)
     now = [0.0]
 
-    def late(*arguments) -> None:
+    def late(*arguments) -> list[pycolmap.Reconstruction]:
         now[0] += 65.0
+        return []
 
-    monkeypatch.setattr(chances.time, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(chances, "_regrown", late)
-    monkeypatch.setattr(chances, "_all_at_once", late)
+    monkeypatch.setattr(remap.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(remap, "_extend_part", late)
+    monkeypatch.setattr(remap, "_map_globally", late)
     notes: list[str] = []
-    chance = second_chance(wrong, refused, lambda *progress: None, notes.append, checks=Checks)
+    chosen = remap_refused(ChosenModel(wrong, refused), lambda *progress: None, notes.append, checks=Checks)
     assert "next: from the largest consistent part (about 30 s)" in notes
     assert "from scratch, with other initial pairs: skipped, since it takes about 2 min, and 70 s are left" in notes
-    assert chance.mapped.attempts[-1]["what"] == "only the largest consistent part of the first model"
+    assert chosen.mapped.attempts[-1]["what"] == "only the largest consistent part of the first model"
 
 
 def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(

@@ -6,9 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-import numpy as np
 import pycolmap
 
 from nerfcli.poses.engine.mapped import file_keys, mapping_key, read_models, write_models
@@ -16,7 +14,6 @@ from nerfcli.poses.engine.polling import every_second
 from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.input.plan import LEAST_LIMIT_SECONDS, limit_seconds, mapping_seconds
 from nerfcli.poses.input.stages import stage_key
-from nerfcli.poses.model.principal_points import camera_of_lens
 from nerfcli.poses.model.reasons import FEW_MATCHES
 
 # Change this whenever the mapper would make other models of the same matches.
@@ -39,75 +36,6 @@ class MapperOptions:
     init_max_forward_motion: float = 0.95
     filter_min_tri_angle: float = 1.5
     init_pair: tuple[int, int] | None = None
-
-
-def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
-    """Return the numbers of the photos that a model places, in ascending order."""
-    return sorted(job.numbers[image_id] for image_id in model.reg_image_ids())
-
-
-def describe_cameras(
-    model: pycolmap.Reconstruction,
-    job: Job,
-    uncertainty: Mapping[int, dict[str, Any]],
-    *,
-    lens_of: Mapping[int, int],
-) -> list[dict[str, Any]]:
-    """Describe, for the report, the intrinsics of the lenses of the placed photos, and their uncertainty.
-
-    `lens_of` has the lens of each photo, by image id. Photos may have principal points of their own; the lens has their
-    median.
-    """
-    photos: dict[int, list[int]] = {}
-    for image_id in model.reg_image_ids():
-        photos.setdefault(lens_of[image_id], []).append(image_id)
-    cameras = [(lens, camera_of_lens(model, taken), len(taken)) for lens, taken in sorted(photos.items())]
-    return [
-        {
-            "model": camera.model.name,
-            "width": camera.width,
-            "height": camera.height,
-            "params": [float(value) for value in camera.params],
-            "focal_from_exif": camera.has_prior_focal_length and lens not in job.given_cameras,
-            "images": count,
-            "uncertainty": uncertainty.get(lens),
-        }
-        for lens, camera, count in cameras
-    ]
-
-
-def with_colours(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
-    """Return the model with coloured points: a recoloured copy if most have no colour, as after merging sub-models.
-
-    Raises:
-        RuntimeError, ValueError: pycolmap cannot read a photo.
-    """
-    black = sum(not np.any(point.color) for point in model.points3D.values())
-    if 2 * black <= model.num_points3D():
-        return model
-    copy = pycolmap.Reconstruction(model)
-    copy.extract_colors_for_all_images(job.photos, num_threads=job.threads)
-    return copy
-
-
-def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
-    """Write sparse/0 into the job's folder, with the photos' own names."""
-    names = dict(zip(job.files, job.names, strict=True))
-    for image in model.images.values():
-        image.name = names[image.name]
-    folder = _model_folder(job)
-    shutil.rmtree(folder, ignore_errors=True)  # left by a run that was killed before it was complete
-    folder.mkdir(parents=True)
-    model.write_binary(folder)
-
-
-def model_keys(job: Job) -> dict[str, str]:
-    """Return a hash of each file of the model in the job's folder, by the file's name; none if there is no model."""
-    return file_keys(_model_folder(job))
-
-
-def _model_folder(job: Job) -> Path:
-    return Path(job.folder) / "sparse" / "0"
 
 
 def map_photos(

@@ -26,9 +26,16 @@ from nerfcli.child import take_stdout
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
-from nerfcli.poses.engine.largest_component import choose_model, describe_components
 from nerfcli.poses.engine.mapped import MappedModels, mapping_key, read_mapped, write_mapped
-from nerfcli.poses.engine.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
+from nerfcli.poses.engine.remap import choose_model
+from nerfcli.poses.engine.result import (
+    describe_cameras,
+    describe_components,
+    model_keys,
+    photo_numbers,
+    with_colours,
+    write_model,
+)
 from nerfcli.poses.engine.retrieval import with_neighbours
 from nerfcli.poses.engine.strict import place_held_out, training_part
 from nerfcli.poses.engine.turntable import recalled, with_object_masks
