@@ -14,9 +14,8 @@ from synthetic_captures import FISHEYE, WIDE, Noise, View
 
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import register_photos
-from nerfcli.poses.engine.initial_focal import with_focal_lengths
+from nerfcli.poses.engine.initial_lens import focal_length, with_focal_lengths
 from nerfcli.poses.input.job import Job
-from nerfcli.poses.model.focal_length import focal_length
 from nerfcli.poses.model.two_views import VerifiedPair, read_verified_pairs
 
 SIZE, FOCAL_PX = (1000, 750), 800.0

@@ -20,8 +20,8 @@ from nerfcli.errors import UserError
 from nerfcli.photos.exif import read_exif
 from nerfcli.photos.images import image_size, list_images, read_image
 from nerfcli.photos.masks import read_mask
+from nerfcli.poses.input.layout import lay_out_photos
 from nerfcli.poses.input.photos import find_photos
-from nerfcli.poses.input.work_photos import lay_out
 
 WIDTH, HEIGHT = 96, 64
 # Display P3's primaries, adapted to D50, as phones embed them (columns of the matrix to XYZ).
@@ -159,7 +159,7 @@ def test_structure_from_motion_gets_upright_jpegs(tmp_path: Path):
     found = find_photos(photos)
     assert found.names == tuple(f"IMG_{number}.HEIC" for number in range(4))
     assert {(photo.width, photo.height) for photo in found.photos} == {(HEIGHT, WIDTH)}
-    for laid_out in lay_out(found, tmp_path / "work"):
+    for laid_out in lay_out_photos(found, tmp_path / "work"):
         with Image.open(tmp_path / "work" / "photos" / laid_out.file) as copy:
             assert (copy.format, copy.size) == ("JPEG", (HEIGHT, WIDTH))
             assert np.abs(np.asarray(copy).astype(int) - read_image(photos / "IMG_0.HEIC")).mean() < 3

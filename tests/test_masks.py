@@ -1,4 +1,4 @@
-"""nerfcli.photos.masks and poses.input.masks: found by name, turned like the photo, obeyed by feature extraction."""
+"""nerfcli.photos.masks and poses.input.layout: found by name, turned like the photo, obeyed by feature extraction."""
 
 import json
 from dataclasses import replace
@@ -14,7 +14,7 @@ from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.masks import find_mask, read_mask
 from nerfcli.poses.engine.features import extract, feature_keys
 from nerfcli.poses.input.job import CameraGroup, Job, WorkMask, read_job, write_job
-from nerfcli.poses.input.masks import lay_out_masks
+from nerfcli.poses.input.layout import lay_out_masks
 from nerfcli.poses.input.photos import Photo, Photos, find_photos
 
 WIDTH, HEIGHT = 120, 80

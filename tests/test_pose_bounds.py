@@ -16,7 +16,7 @@ from synthetic_captures import WIDE, Noise
 from nerfcli.poses.engine import attempts, features, worker
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import clear_matches
-from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.mapping import mapping_key, read_mapped, write_mapped
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.pairs import all_pairs, in_blocks
 from nerfcli.poses.input.plan import checking_seconds, limit_seconds

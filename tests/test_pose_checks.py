@@ -29,9 +29,8 @@ from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.engine import worker
 from nerfcli.poses.engine.attempts import map_with_fallbacks
-from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
-from nerfcli.poses.engine.result import describe_components
-from nerfcli.poses.engine.worker import finite
+from nerfcli.poses.engine.mapping import mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.result import describe_components, replace_non_finite
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.judge import acceptance, examine
@@ -84,7 +83,7 @@ def examined(model: pycolmap.Reconstruction, job: Job, checks: Checks | None = N
     """Return what the report says about a model, after a round trip through JSON."""
     found = examine.examine([model], job, lambda *progress: None, checks=checks)
     content = {"verdict": found.verdict.to_json(), "blur": found.blur_px, "left_out": found.left_out, **found.details}
-    content, _ = finite(content)
+    content, _ = replace_non_finite(content)
     return json.loads(json.dumps(content, allow_nan=False))
 
 
@@ -180,8 +179,8 @@ def test_a_result_that_is_not_finite_is_written_as_null(job: Job, monkeypatch: p
 
 def test_finite_leaves_finite_content_as_it_is():
     content = {"a": [1, 2.5, None, "x", True], "b": {"c": (1.0, -0.0)}}
-    assert finite(content) == ({"a": [1, 2.5, None, "x", True], "b": {"c": [1.0, -0.0]}}, {})
-    assert finite([math.nan, {"x": -math.inf}]) == ([None, {"x": None}], {"0": "nan", "1.x": "-inf"})
+    assert replace_non_finite(content) == ({"a": [1, 2.5, None, "x", True], "b": {"c": [1.0, -0.0]}}, {})
+    assert replace_non_finite([math.nan, {"x": -math.inf}]) == ([None, {"x": None}], {"0": "nan", "1.x": "-inf"})
 
 
 def test_components_say_what_joins_them(job: Job):

@@ -14,7 +14,7 @@ from synthetic_captures import WIDE, Noise, View
 
 from nerfcli.poses.engine import remap
 from nerfcli.poses.engine.attempts import map_with_fallbacks
-from nerfcli.poses.engine.mapped import MappedModels
+from nerfcli.poses.engine.mapping import MappedModels
 from nerfcli.poses.engine.remap import ChosenModel, choose_model
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.examine import examine

@@ -28,7 +28,8 @@ from nerfcli.captures.formats.registry import format_named
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
-from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
+from nerfcli.poses.structure_from_motion import estimate_poses
+from nerfcli.poses.workspace import is_same_scene
 
 ONE_THREAD = PoseSettings(max_features=200, max_image_size=256, threads=1)
 # The true camera at twice the size of the larger photos, in a model whose distortion terms are zero.

@@ -29,8 +29,8 @@ from nerfcli.poses import structure_from_motion
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.input.stages import read_stage, write_stage
 from nerfcli.poses.report import PosesReport
-from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene, plan_poses
-from nerfcli.poses.workspace import database_bytes, workspace
+from nerfcli.poses.structure_from_motion import estimate_poses, plan_poses
+from nerfcli.poses.workspace import database_bytes, is_same_scene, workspace
 
 # A fixed lens model: choosing one would only add adjustments.
 ONE_THREAD = PoseSettings(max_features=200, max_image_size=192, threads=1, camera_model="SIMPLE_RADIAL")

@@ -16,7 +16,7 @@ from nerfcli.poses.engine.strict import fingerprint, held_out_last, training_par
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
-from nerfcli.poses.structure_from_motion import is_same_scene
+from nerfcli.poses.workspace import is_same_scene
 from nerfcli.training.runs.config import RunConfig
 
 HELD_OUT = 2  # in the middle, and stored upright

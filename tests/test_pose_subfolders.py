@@ -21,7 +21,7 @@ from nerfcli.photos.images import list_photos
 from nerfcli.photos.masks import find_mask
 from nerfcli.poses.input.photos import camera_groups, find_photos
 from nerfcli.poses.input.settings import QUALITIES, PoseSettings
-from nerfcli.poses.structure_from_motion import is_same_scene
+from nerfcli.poses.workspace import is_same_scene
 
 RIG = PoseSettings(max_features=200, threads=1, subfolders=True)
 PHOTOS, SCALE = 5, 2 / 3  # photos of each camera, and their size relative to those of `corner`

@@ -25,8 +25,8 @@ from nerfcli.poses.engine import attempts, mapping, remap
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.engine.features import match
-from nerfcli.poses.engine.mapped import MappedModels
-from nerfcli.poses.engine.mapping import MapperOptions, map_photos
+from nerfcli.poses.engine.initial_lens import as_fisheye
+from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_photos
 from nerfcli.poses.engine.remap import ChosenModel, choose_model, extend_accepted, is_contradicted, remap_refused
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge import acceptance
@@ -37,7 +37,6 @@ from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model import merging
 from nerfcli.poses.model.intrinsics import converted
-from nerfcli.poses.model.lens_family import as_fisheye
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs, rotation_errors
 
 pytestmark = pytest.mark.usefixtures("_quiet")
@@ -256,7 +255,8 @@ def test_a_model_that_takes_in_no_further_photo_is_not_checked_again(
 ):
     mapped = in_two_parts(solved, tmp_path)
     monkeypatch.setattr(remap, "map_photos", lambda *_, **__: [pycolmap.Reconstruction(mapped.models[0])])
-    monkeypatch.delattr(remap, "examine")
+    examined = iter([examine])  # the second time there is none
+    monkeypatch.setattr(remap, "examine", lambda *arguments, **options: next(examined)(*arguments, **options))
     notes: list[str] = []
     found = choose_model(mapped, lambda *progress: None, notes.append, checks=Checks)
     assert [model.num_reg_images() for model in found.mapped.models] == [7, 4]

@@ -10,9 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.errors import UserError
-from nerfcli.poses.input.frame_choice import MOVED_FRACTION, FrameMeasure, FrameMeter, MotionPicture, choose_frames
 from nerfcli.poses.input.pairs import capture_order
-from nerfcli.poses.input.video_frames import FRAMES_FILE, extract_frames
+from nerfcli.poses.input.video_frames import (
+    FRAMES_FILE,
+    MOVED_FRACTION,
+    FrameMeasure,
+    FrameMeter,
+    MotionPicture,
+    choose_frames,
+    extract_frames,
+)
 
 # One frame in five is sharp; each moves by 2 pixels of 160.
 SHARP = [3, 5, 13, 19, 20, 26, 34, 36]

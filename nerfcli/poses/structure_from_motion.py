@@ -5,35 +5,38 @@ The photos are not copied into the scene and not changed. The cameras refer to u
 upright copies of photos that are stored rotated.
 """
 
-import json
 import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 from nerfcli.atomic import write_json
 from nerfcli.captures.calibration import Calibration
 from nerfcli.captures.formats import scene_folder
 from nerfcli.captures.holdout import names_held_out
 from nerfcli.errors import UserError
-from nerfcli.photos.images import list_photos, name_in
 from nerfcli.poses.engine.strict import held_out_last
 from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
 from nerfcli.poses.engine.turntable import MASKS, advised
 from nerfcli.poses.input.job import Job, write_job
-from nerfcli.poses.input.masks import lay_out_masks
+from nerfcli.poses.input.layout import lay_out_masks, lay_out_photos
 from nerfcli.poses.input.pairs import Pairing, choose_pairs, read_pairs
 from nerfcli.poses.input.photos import Photos, find_photos
 from nerfcli.poses.input.plan import Plan, make_plan
 from nerfcli.poses.input.settings import PoseSettings, check_settings, for_panoramas
-from nerfcli.poses.input.stages import file_key
-from nerfcli.poses.input.work_photos import lay_out
 from nerfcli.poses.judge.checks import UNDERWAY
 from nerfcli.poses.model.cameras import PhotoGroups, group_by_given, group_photos
 from nerfcli.poses.report import PosesReport, closing_notes, make_report, refusal
-from nerfcli.poses.workspace import POINTS_FILE, is_under_construction, keep_refused, publish, workspace
+from nerfcli.poses.workspace import (
+    POINTS_FILE,
+    check_destination,
+    hash_named_files,
+    keep_refused,
+    publish,
+    read_json,
+    workspace,
+)
 
 
 def estimate_poses(
@@ -71,38 +74,25 @@ def estimate_poses(
     """
     start = time.perf_counter()
     photos, grouped, pairing, plan = plan_poses(photos_dir, settings=settings, progress=progress, given=given)
-    _check_destination(scene_dir, photos_dir, subfolders=settings.subfolders)
+    check_destination(scene_dir, photos_dir, subfolders=settings.subfolders)
     for note in photo_notes(photos, grouped):
         notify(note)
     planned(plan)
     work = scene_dir / "work"
     with workspace(scene_dir) as lock:
-        job = _prepare(photos, _searched(settings, grouped), grouped=grouped, pairing=pairing, work=work, notify=notify)
-        _work(job, work, memory_bytes=memory_bytes, lock=lock, progress=progress, notify=notify)
-        result = _read_json(work / "result.json")["content"]  # written by the worker, or complete from before
+        job = _lay_out(
+            photos, _search_settings(settings, grouped), grouped=grouped, pairing=pairing, work=work, notify=notify
+        )
+        _run(job, work, memory_bytes=memory_bytes, lock=lock, progress=progress, notify=notify)
+        result = read_json(work / "result.json")["content"]  # written by the worker, or complete from before
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
-        matching = {"rule": pairing.rule, "pairs": result["pairs"], **_file_keys(settings)}
+        matching = {"rule": pairing.rule, "pairs": result["pairs"], **hash_named_files(settings)}
         report = make_report(photos, settings, result=result, matching=matching, intrinsics=grouped.given)
         if error := refusal(report, photos_dir):
             if not (settings.accept_refused and report.models):
                 raise _refused(advised(error, report.moving_foreground), report, scene_dir)
             notify(f"accepted because of --accept-refused: {error.message}")
-
-        def describe() -> None:
-            write_json(scene_dir / "poses_report.json", report.to_json())
-            provenance = {"command": "poses", "settings": asdict(settings), "versions": report.versions}
-            provenance |= {} if given is None else {"intrinsics": given.to_json()}
-            provenance |= {"registered": report.registered, "total": report.total}
-            scene_folder.save(
-                scene_dir,
-                image_folder=photos_dir,
-                provenance=provenance,
-                unit="arbitrary",
-                masks=_masks_of(report, scene_dir),
-                split=_split(report, settings.holdout),
-            )
-
-        publish(scene_dir, describe)
+        publish(scene_dir, lambda: _describe_scene(report, scene_dir, photos_dir, given=given))
     for note in closing_notes(report):
         notify(note)
     return report
@@ -129,10 +119,10 @@ def plan_poses(
     else:
         pairing = read_pairs(Path(settings.pairs_file), photos)
     threads = settings.threads if settings.threads > 0 else os.cpu_count() or 1
-    return photos, grouped, pairing, make_plan(photos, pairing, _searched(settings, grouped), threads=threads)
+    return photos, grouped, pairing, make_plan(photos, pairing, _search_settings(settings, grouped), threads=threads)
 
 
-def _searched(settings: PoseSettings, grouped: PhotoGroups) -> PoseSettings:
+def _search_settings(settings: PoseSettings, grouped: PhotoGroups) -> PoseSettings:
     return for_panoramas(settings) if any(group.is_panorama for group in grouped.groups) else settings
 
 
@@ -141,45 +131,7 @@ def photo_notes(photos: Photos, grouped: PhotoGroups) -> list[str]:
     return [*(f"{name} is skipped: {why}" for name, why in photos.unreadable.items()), *grouped.notes]
 
 
-def is_same_scene(
-    scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: Calibration | None = None
-) -> bool:
-    """Return whether `scene_dir` was made from the current photos in `photos_dir` with these settings.
-
-    The settings threads and accept_refused are not compared.
-    """
-    try:
-        return _is_same(scene_dir, photos_dir, settings, given=given)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError):  # a file is missing or damaged
-        return False
-
-
-def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: Calibration | None) -> bool:
-    report = _read_json(scene_dir / "poses_report.json")
-    made = scene_dir.resolve() / _read_json(scene_dir / scene_folder.SCENE_FILE)["image_folder"]
-    names = [name_in(photos_dir, path) for path in list_photos(photos_dir, subfolders=settings.subfolders)]
-    earlier = report.get("intrinsics")
-    wanted_settings: dict[str, Any] = asdict(settings)
-    for name in ("threads", "accept_refused"):
-        del wanted_settings[name]
-    if (earlier and earlier["key"]) != (given and given.key):
-        return False
-    made_with = asdict(PoseSettings()) | report["settings"]  # settings newer than the report had their defaults
-    return (
-        made.resolve() == photos_dir.resolve()
-        and sorted(image["name"] for image in report["images"]) == sorted(names)
-        and {key: value for key, value in report["matching"].items() if key.endswith("_key")} == _file_keys(settings)
-        and all(made_with[key] == value for key, value in wanted_settings.items())
-    )
-
-
-def _file_keys(settings: PoseSettings) -> dict[str, str]:
-    """Return hashes of the files that the settings name."""
-    files = {"pairs_file_key": settings.pairs_file, "holdout_key": settings.holdout}
-    return {key: file_key(Path(file)) for key, file in files.items() if file is not None and Path(file).is_file()}
-
-
-def _work(
+def _run(
     job: Job,
     work: Path,
     *,
@@ -209,7 +161,7 @@ def _work(
             job = replace(job, skipped_checks=(*job.skipped_checks, (error.check, error.message)))
 
 
-def _prepare(
+def _lay_out(
     photos: Photos,
     settings: PoseSettings,
     *,
@@ -219,7 +171,7 @@ def _prepare(
     notify: Callable[[str], None],
 ) -> Job:
     """Lay out the photos and masks for the worker."""
-    laid_out = lay_out(photos, work)
+    laid_out = lay_out_photos(photos, work)
     files = tuple(photo.file for photo in laid_out)
     masks = Path(settings.masks) if settings.masks else None
     held_out = names_held_out(settings.holdout, photos.names, others=photos.unreadable) if settings.strict else ()
@@ -242,6 +194,22 @@ def _prepare(
     return held_out_last(job)
 
 
+def _describe_scene(report: PosesReport, scene_dir: Path, photos_dir: Path, *, given: Calibration | None) -> None:
+    """Write poses_report.json and scene.json."""
+    write_json(scene_dir / "poses_report.json", report.to_json())
+    provenance = {"command": "poses", "settings": asdict(report.settings), "versions": report.versions}
+    provenance |= {} if given is None else {"intrinsics": given.to_json()}
+    provenance |= {"registered": report.registered, "total": report.total}
+    scene_folder.save(
+        scene_dir,
+        image_folder=photos_dir,
+        provenance=provenance,
+        unit="arbitrary",
+        masks=_masks_of(report, scene_dir),
+        split=_split(report, report.settings.holdout),
+    )
+
+
 def _masks_of(report: PosesReport, scene_dir: Path) -> Path | None:
     """Return the folder of the masks used for the poses: the user's, those of a turning object, or None."""
     if report.settings.masks:
@@ -260,23 +228,6 @@ def _split(report: PosesReport, holdout: str) -> dict[str, str | None]:
     return {name: "test" if name in test else "train" for name in placed}
 
 
-def _check_destination(scene_dir: Path, photos_dir: Path, *, subfolders: bool) -> None:
-    """Refuse a destination that contains anything other than a scene, since the scene replaces it."""
-    scene_path, photos_path = scene_dir.resolve(), photos_dir.resolve()
-    hint = "choose another folder with -o"
-    if photos_path.is_relative_to(scene_path):
-        raise UserError(f"the scene {scene_dir} would overwrite the photos in {photos_dir}", hint)
-    if subfolders and scene_path.is_relative_to(photos_path):
-        raise UserError(
-            f"the pictures in {scene_dir} would count as photos, as it is a subfolder of {photos_dir}", hint
-        )
-    if scene_dir.exists() and not scene_dir.is_dir():
-        raise UserError(f"cannot write the scene {scene_dir}: a file with this name exists", hint)
-    ours = (scene_dir / scene_folder.SCENE_FILE).is_file() or is_under_construction(scene_dir)
-    if scene_dir.is_dir() and any(scene_dir.iterdir()) and not ours:
-        raise UserError(f"cannot write the scene {scene_dir}: the folder contains other files", hint)
-
-
 def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserError:
     """Make the error for a refused result, and keep its report and its model, but not as a scene."""
     older = (scene_dir / scene_folder.SCENE_FILE).is_file()
@@ -291,7 +242,3 @@ def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserErro
         f"{POINTS_FILE} in a mesh viewer), and --accept-refused uses it anyway"
     )
     return UserError(error.message, hint, error.exit_code)
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8"))

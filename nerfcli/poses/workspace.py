@@ -8,15 +8,23 @@
 The process that works in the folder holds its lock. If it is killed, the lock is released and the next one continues.
 """
 
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from nerfcli.atomic import atomic_folder, clear_leftovers
+from nerfcli.captures.calibration import Calibration
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
+from nerfcli.errors import UserError
 from nerfcli.exclusive import exclusive
+from nerfcli.photos.images import list_photos, name_in
 from nerfcli.poses.input.job import database_path
+from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.input.stages import file_key
 
 _LOCK = "poses.lock"
 # Folder of a model that the checks refused; nothing takes a folder of this name for a scene.
@@ -77,3 +85,61 @@ def database_bytes(scene_dir: Path) -> int:
     """Return the size of the database of features and matches, 0 if there is none."""
     path = database_path(scene_dir / "work")
     return path.stat().st_size if path.exists() else 0
+
+
+def check_destination(scene_dir: Path, photos_dir: Path, *, subfolders: bool) -> None:
+    """Refuse a destination that contains anything other than a scene, since the scene replaces it."""
+    scene_path, photos_path = scene_dir.resolve(), photos_dir.resolve()
+    hint = "choose another folder with -o"
+    if photos_path.is_relative_to(scene_path):
+        raise UserError(f"the scene {scene_dir} would overwrite the photos in {photos_dir}", hint)
+    if subfolders and scene_path.is_relative_to(photos_path):
+        raise UserError(
+            f"the pictures in {scene_dir} would count as photos, as it is a subfolder of {photos_dir}", hint
+        )
+    if scene_dir.exists() and not scene_dir.is_dir():
+        raise UserError(f"cannot write the scene {scene_dir}: a file with this name exists", hint)
+    ours = (scene_dir / SCENE_FILE).is_file() or is_under_construction(scene_dir)
+    if scene_dir.is_dir() and any(scene_dir.iterdir()) and not ours:
+        raise UserError(f"cannot write the scene {scene_dir}: the folder contains other files", hint)
+
+
+def is_same_scene(
+    scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: Calibration | None = None
+) -> bool:
+    """Return whether `scene_dir` was made from the current photos in `photos_dir` with these settings.
+
+    The settings threads and accept_refused are not compared.
+    """
+    try:
+        return _is_same(scene_dir, photos_dir, settings, given=given)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError):  # a file is missing or damaged
+        return False
+
+
+def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: Calibration | None) -> bool:
+    report = read_json(scene_dir / "poses_report.json")
+    made = scene_dir.resolve() / read_json(scene_dir / SCENE_FILE)["image_folder"]
+    names = [name_in(photos_dir, path) for path in list_photos(photos_dir, subfolders=settings.subfolders)]
+    earlier = report.get("intrinsics")
+    files = {key: value for key, value in report["matching"].items() if key.endswith("_key")}
+    made_with = asdict(PoseSettings()) | report["settings"]  # settings newer than the report had their defaults
+    wanted = {key: value for key, value in asdict(settings).items() if key not in ("threads", "accept_refused")}
+    return (
+        made.resolve() == photos_dir.resolve()
+        and sorted(image["name"] for image in report["images"]) == sorted(names)
+        and (earlier and earlier["key"]) == (given and given.key)
+        and files == hash_named_files(settings)
+        and all(made_with[key] == value for key, value in wanted.items())
+    )
+
+
+def hash_named_files(settings: PoseSettings) -> dict[str, str]:
+    """Return hashes of the files that the settings name, for the report."""
+    files = {"pairs_file_key": settings.pairs_file, "holdout_key": settings.holdout}
+    return {key: file_key(Path(file)) for key, file in files.items() if file is not None and Path(file).is_file()}
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the content of a JSON file."""
+    return json.loads(path.read_text(encoding="utf-8"))

@@ -10,7 +10,8 @@ from nerfcli.poses import structure_from_motion
 from nerfcli.poses.input.plan import Plan, TimeEstimate
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
-from nerfcli.poses.structure_from_motion import is_same_scene, photo_notes, plan_poses
+from nerfcli.poses.structure_from_motion import photo_notes, plan_poses
+from nerfcli.poses.workspace import is_same_scene
 
 _STAGES = {
     "read": "photos read",

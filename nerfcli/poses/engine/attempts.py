@@ -18,9 +18,8 @@ from nerfcli.errors import duration
 from nerfcli.matching.graph import connected_groups
 from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
-from nerfcli.poses.engine.initial_focal import with_focal_lengths
-from nerfcli.poses.engine.mapped import MappedModels
-from nerfcli.poses.engine.mapping import MapperOptions, map_photos, mapper_limit_seconds
+from nerfcli.poses.engine.initial_lens import as_fisheye, with_focal_lengths
+from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import ALL_ALIKE_UP_TO, all_pairs
 from nerfcli.poses.input.plan import extraction_seconds, mapping_seconds, matching_seconds
@@ -28,7 +27,6 @@ from nerfcli.poses.input.settings import FULL_SIZE, QUALITIES
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model.intrinsics import FISHEYE_FROM_DEG, field_of_view_deg
 from nerfcli.poses.model.lens_evidence import lenses_of
-from nerfcli.poses.model.lens_family import as_fisheye
 from nerfcli.poses.model.localise import left_out, localise
 from nerfcli.poses.model.merging import merge_models
 from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES

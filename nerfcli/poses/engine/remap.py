@@ -17,8 +17,7 @@ from nerfcli.errors import duration, several
 from nerfcli.matching.graph import consistent_groups
 from nerfcli.poses.engine.attempts import SMALLER_BASELINE
 from nerfcli.poses.engine.database import keep_geometries
-from nerfcli.poses.engine.mapped import MappedModels
-from nerfcli.poses.engine.mapping import MapperOptions, map_globally, map_photos, mapper_limit_seconds
+from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_globally, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import FOLLOWERS, capture_order
 from nerfcli.poses.input.plan import LEAST_LIMIT_SECONDS, at_once_seconds, mapping_seconds

@@ -1,5 +1,6 @@
 """Write the model that becomes the scene, and describe it and the other models for the report."""
 
+import math
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,11 +9,36 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from nerfcli.poses.engine.mapped import file_keys
+from nerfcli.poses.engine.database import evidence
+from nerfcli.poses.engine.mapping import file_keys
+from nerfcli.poses.engine.remap import ChosenModel
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.model.principal_points import camera_of_lens
 from nerfcli.poses.model.reasons import FEW_MATCHES
 from nerfcli.poses.model.two_views import count_matches
+
+
+def describe_result(chosen: ChosenModel, job: Job) -> dict[str, Any]:
+    """Describe, for the report, how the chosen model came about, and what the checks say of it."""
+    mapped, examined = chosen.mapped, chosen.examined
+    placed = [] if examined.model is None else photo_numbers(examined.model, job)
+    lacking = examined.details["not_computed"]  # of this model; ended attempts to map are skipped too
+    return {
+        "attempts": mapped.attempts,
+        "cut_short": [
+            *mapped.cut_short,
+            *(f"{what}: {why}" for what, why in job.skipped_checks if what not in lacking),
+        ],
+        "evidence": evidence(mapped.job),
+        "pairs": len(mapped.job.pairs),
+        "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
+        "models": [placed, *(photo_numbers(other, job) for other in mapped.models[1:])] if mapped.models else [],
+        "left_out": {str(number): reason for number, reason in examined.left_out.items()},
+        "pose_blur_px": {str(number): px for number, px in examined.blur_px.items()},
+        "verdict": examined.verdict.to_json(),
+        "components": describe_components(mapped.models, mapped.job),
+        **examined.details,
+    }
 
 
 def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
@@ -113,3 +139,31 @@ def _apart(photos: set[int], largest: set[int], pairs: Sequence[tuple[int, int, 
         return f"no pair connects it well enough to the largest (best: {best})"
     pairs_connect = "1 pair connects" if strong == 1 else f"{strong} pairs connect"
     return f"{pairs_connect} it to the largest (strongest: {best}), but no consistent alignment was found"
+
+
+def replace_non_finite(content: Any) -> tuple[Any, dict[str, str]]:
+    """Copy plain content, with None in place of every non-finite number.
+
+    Args:
+        content: dictionaries, lists, tuples and plain values. Tuples come back as lists.
+
+    Returns:
+        The copy, and the replaced numbers by their path: `{"lenses.0.gain": "inf"}`.
+
+    Example:
+        >>> replace_non_finite({"gain": [1.0, float("inf")]})
+        ({'gain': [1.0, None]}, {'gain.1': 'inf'})
+    """
+    replaced: dict[str, str] = {}
+
+    def copy(value: Any, place: str) -> Any:
+        if isinstance(value, dict):
+            return {key: copy(item, f"{place}.{key}" if place else str(key)) for key, item in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [copy(item, f"{place}.{index}" if place else str(index)) for index, item in enumerate(value)]
+        if isinstance(value, float) and not math.isfinite(value):
+            replaced[place] = str(float(value))
+            return None
+        return value
+
+    return copy(content, ""), replaced

@@ -29,7 +29,7 @@ from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.engine.retrieval import coarsest
 from nerfcli.poses.input import still_background as still
 from nerfcli.poses.input.job import Job, Tell, WorkMask
-from nerfcli.poses.input.masks import write_mask, write_no_mask
+from nerfcli.poses.input.layout import write_mask, write_no_mask
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
 # If fewer than this fraction of the first pairs have static matches, no further pairs are compared.

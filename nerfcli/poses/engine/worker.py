@@ -1,16 +1,15 @@
 """The child process: pycolmap from photos to a model on disk. Run as `python -m nerfcli.poses.engine.worker JOB.json`.
 
 pycolmap is C++ code that may end the process without a Python exception, so it runs in a separate process. This reads
-a job, continues from the completed stages in the job's folder, and leaves `sparse/0` and `result.json` there. It
-reports its progress on stdout as JSON lines {"stage", "done", "total"}, and messages for the user as {"note"}.
-Everything else, including glog's lines, goes to stderr. It ends by itself when its stdin closes, as happens whenever
-the parent dies.
+a job, extracts features, matches, maps, refines, accepts and writes, continuing from the completed stages in the job's
+folder, and leaves `sparse/0` and `result.json` there. It reports its progress on stdout as JSON lines {"stage", "done",
+"total"}, and messages for the user as {"note"}. Everything else, including glog's lines, goes to stderr. It ends by
+itself when its stdin closes, as happens whenever the parent dies.
 
 Photos have numbers as names here: pycolmap sees `00000.jpg`, `00001.png`..., so that a space or an umlaut in a name
 cannot break the list of pairs.
 """
 
-import math
 import sys
 import time
 from collections.abc import Iterator
@@ -24,15 +23,15 @@ import pycolmap
 
 from nerfcli.child import take_stdout
 from nerfcli.poses.engine.attempts import map_with_fallbacks
-from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images, register_photos
+from nerfcli.poses.engine.database import discard_if_damaged, name_images, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
-from nerfcli.poses.engine.mapped import MappedModels, mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.mapping import MappedModels, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.remap import choose_model
 from nerfcli.poses.engine.result import (
     describe_cameras,
-    describe_components,
+    describe_result,
     model_keys,
-    photo_numbers,
+    replace_non_finite,
     with_colours,
     write_model,
 )
@@ -67,25 +66,28 @@ def main(job_path: str) -> None:
 
 
 def solve(job: Job, report: Report, tell: Tell) -> None:
-    """Extract, match, map and check, each continuing from the results of earlier calls."""
+    """Do a job, from photos to a model on disk, continuing from what earlier calls have done; write the result."""
     stored = recalled(job)
-    result, key = Path(job.folder) / RESULT, result_key(job if stored is None else stored[0])
-    there = read_stage(result, key)
+    path, key = Path(job.folder) / RESULT, result_key(job if stored is None else stored[0])
+    there = read_stage(path, key)
     if there is not None and there["model_files"].items() <= model_keys(job).items():
         if job.database.exists():
             name_images(job)
         return
-    result.unlink(missing_ok=True)
+    path.unlink(missing_ok=True)
     seconds: dict[str, float] = {}
-    job, moving = _looked_at(job, report, tell, seconds=seconds) if stored is None else stored
-    key = result_key(job)
-    found = _solve_strictly(job, report, tell) if job.held_out else _estimate(job, report, tell)
+    job, moving = _mask_object(job, report, tell, seconds=seconds) if stored is None else stored
+    training = training_part(job) if job.held_out else job
+    result = _estimate(training, report, tell)
+    if job.held_out:
+        with _timed(result["seconds"], "place"):
+            result = place_held_out(job, training, result, report)
+        result["model_files"] = model_keys(job)  # these now contain the held-out photos
     for stage, value in seconds.items():
-        found["seconds"][stage] = round(found["seconds"].get(stage, 0.0) + value, 3)
-    found["moving_foreground"] = moving
-    found, replaced = finite(found)
-    found["not_finite"] = replaced
-    write_stage(result, key, found)
+        result["seconds"][stage] = round(result["seconds"].get(stage, 0.0) + value, 3)
+    result["moving_foreground"] = moving
+    result, replaced = replace_non_finite(result)
+    write_stage(path, result_key(job), result | {"not_finite": replaced})
     name_images(job)
 
 
@@ -94,96 +96,41 @@ def result_key(job: Job) -> str:
     return stage_key(mapping_key(job), job.skipped_checks, _RESULT_VERSION)
 
 
-def _looked_at(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> tuple[Job, dict[str, Any] | None]:
-    """Return the job with masks of an object that turns in front of a static background, and facts to report, if any.
-
-    Held-out photos get masks too, but only features of the training photos are compared. Panoramas are not
-    checked: what stands still in them is the tripod, or the person holding the camera.
-    """
-    if any(group.is_panorama for group in job.groups):
-        return job, None
-    discard_if_damaged(job.database)
-    with _timed(seconds, "extract"):
-        extract(training_part(job), report)
-    checks, name = _checks(job), "moving foreground"
-    with _timed(seconds, "motions"):
-        found = checks.run(name, lambda: with_object_masks(job, training_part(job), tell), otherwise=None)
-    if found is None:
-        tell(f"could not check for an object moving in front of a static background: {checks.not_computed[name]}")
-        return job, None
-    return found
-
-
-def _solve_strictly(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
-    """Estimate from the training photos alone, then place the held-out ones in the model."""
-    training = training_part(job)
-    found = _estimate(training, report, tell)
-    with _timed(found["seconds"], "place"):
-        found = place_held_out(job, training, found, report)
-    found["model_files"] = model_keys(job)  # these now contain the held-out photos
-    return found
-
-
 def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
-    """Write `sparse/0` if there is a model, and return the data for the report."""
+    """Map the photos, refine and accept a model, write it, and return the data for the report."""
     seconds = {"extract": 0.0, "match": 0.0, "map": 0.0, "check": 0.0}
-    mapped = _mapped(job, report, tell, seconds=seconds)
+    mapped = _map(job, report, tell, seconds=seconds)
     checks = partial(_checks, job)
     with _timed(seconds, "check"):
         chosen = choose_model(mapped, report, tell, checks=checks)
-    mapped, examined = chosen.mapped, chosen.examined
-    model = examined.model
-    placed = [] if model is None else photo_numbers(model, job)
-    lacking = examined.details["not_computed"]  # of this model; ended mapping hypotheses are skipped too
-    result: dict[str, Any] = {
-        "seconds": seconds,
-        "attempts": mapped.attempts,
-        "cut_short": [
-            *mapped.cut_short,
-            *(f"{what}: {why}" for what, why in job.skipped_checks if what not in lacking),
-        ],
-        "evidence": evidence(mapped.job),
-        "pairs": len(mapped.job.pairs),
-        "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
-        "models": [placed, *(photo_numbers(other, job) for other in mapped.models[1:])] if mapped.models else [],
-        "left_out": {str(number): reason for number, reason in examined.left_out.items()},
-        "pose_blur_px": {str(number): px for number, px in examined.blur_px.items()},
-        "verdict": examined.verdict.to_json(),
-        "components": describe_components(mapped.models, mapped.job),
-        **examined.details,
+    result = describe_result(chosen, job) | {"seconds": seconds, "model_files": {}}
+    model, uncertainty = chosen.examined.model, chosen.examined.uncertainty
+    if model is None:
+        return result
+    lens_of, finishing = lenses_of(model), checks()
+    if chosen.examined.verdict.accepted:
+        choose = partial(choose_principal_points, seed=job.seed, threads=job.threads, fixed=job.fixed_cameras)
+        with _timed(seconds, "stabilisation"):
+            found = finishing.run(
+                "principal points",
+                partial(choose, model, report=report),
+                otherwise=StabilisedModel(model, None, {}),
+            )
+        model, result["principal_points"] = found.model, found.evidence and asdict(found.evidence)
+        uncertainty = uncertainty | found.uncertainty
+    model = finishing.run("colours of points", partial(with_colours, model, job), otherwise=model)
+    result["not_computed"] |= finishing.not_computed
+    write_model(model, job)
+    return result | {
+        "cameras": describe_cameras(model, job, uncertainty, lens_of=lens_of),
+        "mean_reprojection_error_px": model.compute_mean_reprojection_error(),
+        "points": model.num_points3D(),
+        "model_files": model_keys(job),
     }
-    if model is not None:
-        finishing = checks()
-        lens_of = lenses_of(model)
-        uncertainty = examined.uncertainty
-        if examined.verdict.accepted:
-            with _timed(seconds, "stabilisation"):
-                found = finishing.run(
-                    "principal points",
-                    partial(
-                        choose_principal_points,
-                        model,
-                        seed=job.seed,
-                        threads=job.threads,
-                        fixed=job.fixed_cameras,
-                        report=report,
-                    ),
-                    otherwise=StabilisedModel(model, None, {}),
-                )
-            model, result["principal_points"] = found.model, found.evidence and asdict(found.evidence)
-            uncertainty = uncertainty | found.uncertainty
-        result["cameras"] = describe_cameras(model, job, uncertainty, lens_of=lens_of)
-        model = finishing.run("colours of points", partial(with_colours, model, job), otherwise=model)
-        result["not_computed"] |= finishing.not_computed
-        result["mean_reprojection_error_px"] = model.compute_mean_reprojection_error()
-        result["points"] = model.num_points3D()
-        write_model(model, job)
-    result["model_files"] = model_keys(job) if model is not None else {}
-    return result
 
 
-def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> MappedModels:
-    """Return the models of an earlier call if they are intact, else map the photos; either way they are on disk."""
+def _map(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> MappedModels:
+    """Extract, match and map, unless the models of an earlier call are intact; either way they are on disk."""
     discard_if_damaged(job.database)
     key = mapping_key(job)
     mapped = read_mapped(job, key)
@@ -214,6 +161,28 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
     return mapped
 
 
+def _mask_object(
+    job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]
+) -> tuple[Job, dict[str, Any] | None]:
+    """Return the job with masks of an object that turns in front of a static background, and facts to report, if any.
+
+    Held-out photos get masks too, but only features of the training photos are compared. Panoramas are not
+    checked: what stands still in them is the tripod, or the person holding the camera.
+    """
+    if any(group.is_panorama for group in job.groups):
+        return job, None
+    discard_if_damaged(job.database)
+    with _timed(seconds, "extract"):
+        extract(training_part(job), report)
+    checks, name = _checks(job), "moving foreground"
+    with _timed(seconds, "motions"):
+        found = checks.run(name, lambda: with_object_masks(job, training_part(job), tell), otherwise=None)
+    if found is None:
+        tell(f"could not check for an object moving in front of a static background: {checks.not_computed[name]}")
+        return job, None
+    return found
+
+
 def _checks(job: Job) -> Checks:
     """Make a check runner for one model."""
     most = limit_seconds(checking_seconds(len(job.files)))
@@ -225,34 +194,6 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     seconds[stage] = round(time.perf_counter() - start, 3)
-
-
-def finite(content: Any) -> tuple[Any, dict[str, str]]:
-    """Copy plain content, with None in place of every non-finite number.
-
-    Args:
-        content: dictionaries, lists, tuples and plain values. Tuples come back as lists.
-
-    Returns:
-        The copy, and the replaced numbers by their path: `{"lenses.0.gain": "inf"}`.
-
-    Example:
-        >>> finite({"gain": [1.0, float("inf")]})
-        ({'gain': [1.0, None]}, {'gain.1': 'inf'})
-    """
-    replaced: dict[str, str] = {}
-
-    def copy(value: Any, place: str) -> Any:
-        if isinstance(value, dict):
-            return {key: copy(item, f"{place}.{key}" if place else str(key)) for key, item in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [copy(item, f"{place}.{index}" if place else str(index)) for index, item in enumerate(value)]
-        if isinstance(value, float) and not math.isfinite(value):
-            replaced[place] = str(float(value))
-            return None
-        return value
-
-    return copy(content, ""), replaced
 
 
 if __name__ == "__main__":

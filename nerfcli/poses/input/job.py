@@ -22,7 +22,7 @@ class CameraGroup:
     choose: whether the model is only a starting point, and a better one may be chosen. params: known intrinsics, in
     COLMAP's order. fixed: whether these are kept fixed. focal_px: the initial focal length by EXIF, None if EXIF has
     none; focal_is_prior: whether it is reliable. estimated_focal_px: the initial focal length estimated from pairs of
-    the photos, see `engine.initial_focal`.
+    the photos, see `engine.initial_lens`.
     """
 
     photos: tuple[int, ...]
