@@ -91,6 +91,14 @@ def test_a_principal_point_off_the_centre_is_found():
     assert any(candidate.principal_point and candidate.kept for candidate in lenses.candidates)
 
 
+def test_a_fisheye_off_the_axis_is_found_from_a_fisheye():
+    """Synthetic truth: simpler and richer fisheyes are compared first with the principal point at the centre."""
+    noisy = ring_model("OPENCV_FISHEYE", (380.0, 380.0, 524.0, 380.0, 0.1, -0.05, 0.03, -0.02), points=(100, 400))
+    lenses = choose_lenses(started_from(noisy, "OPENCV_FISHEYE"), seed=0, threads=1)
+    assert camera_of(lenses.model).model.name == "OPENCV_FISHEYE"
+    assert camera_of(lenses.model).params[:4] == pytest.approx((380.0, 380.0, 524.0, 380.0), abs=1.0)
+
+
 @pytest.mark.parametrize(("exif", "seed"), [(800.0, 0), (790.0, 1), (None, 2), (None, 3)])
 def test_a_focal_length_that_flat_ground_from_above_leaves_open_stays_at_exif(exif: float | None, seed: int):
     """Height and focal length trade off. With EXIF's, distortion is right too; without it, the lens stays plausible."""

@@ -160,41 +160,8 @@ def observation_errors_px(model: pycolmap.Reconstruction) -> Array:
     return joined[np.isfinite(joined)]
 
 
-def intrinsic_deviations(
-    model: pycolmap.Reconstruction,
-    adjuster: pycolmap.CeresBundleAdjuster,
-    camera_id: int,
-    *,
-    principal_points: bool,
-) -> Array:
-    """Return the standard deviation of each intrinsic parameter of a camera after an adjustment; NaN if it was fixed.
-
-    The noise of the observations is estimated from the residuals.
-    """
-    options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
-    try:
-        covariance = pycolmap.estimate_ba_covariance(options, model, adjuster)
-    except (RuntimeError, ValueError):  # an image without a pose
-        covariance = None
-    camera = model.cameras[camera_id]
-    deviations = np.full(len(camera.params), np.nan)
-    found = None if covariance is None else covariance.get_other_params_cov(camera.params)
-    if found is not None:
-        free = [*camera.focal_length_idxs(), *camera.extra_params_idxs()]
-        free += camera.principal_point_idxs() if principal_points else []
-        deviations[sorted(free)] = np.sqrt(np.maximum(np.diag(found), 0)) * residual_deviation_px(model)
-    return deviations
-
-
 def residual_deviation_px(model: pycolmap.Reconstruction) -> float:
     """Estimate the standard deviation of one coordinate of an observation from the residuals, without bias."""
-    squares, count = 0.0, 0
-    for image_id in model.reg_image_ids():
-        image = model.image(image_id)
-        for point in image.get_observation_points2D():
-            projected = image.project_point(model.point3D(point.point3D_id).xyz)
-            if projected is not None:
-                squares += float(((projected - point.xy) ** 2).sum())
-                count += 2
+    errors = observation_errors_px(model)
     unknowns = 6 * model.num_reg_images() + 3 * model.num_points3D() - 7
-    return float(np.sqrt(squares / max(count - unknowns, 1)))
+    return float(np.sqrt((errors**2).sum() / max(2 * len(errors) - unknowns, 1)))

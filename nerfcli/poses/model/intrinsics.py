@@ -1,9 +1,9 @@
 """Choose the lens model that a capture supports, and adjust with it.
 
 Mapping starts from one distortion term. For a perspective camera, the observations then show which parameters are
-determined (see `lens_observability`). Fisheyes and very wide lenses are adjusted with richer models, each time without
-a tenth of the observations: a richer model is kept if it predicts these better by more than chance, and if its added
-parameters are larger than their uncertainty; the principal point is freed by the same criteria.
+determined (see `lens_observability`). Fisheyes and very wide lenses, for which several kinds of models compete, are
+adjusted with one after the other, without a tenth of the observations: another model, or a principal point off the
+centre, is kept if it predicts these better by more than chance.
 """
 
 from collections import Counter
@@ -36,7 +36,7 @@ FISHEYE_FROM_DEG = 90.0
 START_MODEL = "SIMPLE_RADIAL"
 START_FISHEYE = "OPENCV_FISHEYE"
 
-# A gain, and an added parameter, must be this many standard deviations from zero.
+# A gain must be this many standard errors.
 DEVIATIONS = 3.0
 # The gain must be this fraction of the error; a smaller one changes no picture.
 _GAIN_FRACTION = 0.001
@@ -54,7 +54,6 @@ class _Trial:
     model: pycolmap.Reconstruction
     principal_point: bool
     errors: Array  # (held out,) clipped, of the camera's own observations
-    deviations: Array  # of the camera's parameters, NaN where held
 
 
 @dataclass(frozen=True)
@@ -112,16 +111,15 @@ def choose_lenses(
             held[camera_id] = found
             continue
         if found is None or wide:
-            training, left_out = held_out.split(result, seed=seed)
-            choice = _Choice(left_out, camera_id, threads=threads, fixed=fixed)
-            best = choice.make(training, named=camera_id in named)
-            _set_lens(camera, best.model.cameras[camera_id])
-            free = best.principal_point
-            candidates.extend(choice.tried)
+            best, tried = _choose_by_held_out(
+                result, camera_id, named=camera_id in named, seed=seed, threads=threads, fixed=fixed
+            )
+            candidates.extend(tried)
+            lens, free = best.model.cameras[camera_id], best.principal_point
         else:
-            free = found.principal_point
             candidates.extend(found.steps)
-            _set_lens(camera, found.camera)
+            lens, free = found.camera, found.principal_point
+        _set_lens(camera, lens)
         freed += [camera_id] if free else []
     if held:
         return _with_held(
@@ -248,79 +246,42 @@ def _field_by_exif_deg(camera: pycolmap.Camera, exif_focal_px: float | None) -> 
     return float(2 * np.degrees(np.arctan(np.hypot(camera.width, camera.height) / 2 / exif_focal_px)))
 
 
-class _Choice:
-    """The trials of one camera, from the simplest model on, each compared with the best one before it."""
+def _choose_by_held_out(
+    model: pycolmap.Reconstruction, camera_id: int, *, named: bool, seed: int, threads: int, fixed: Sequence[int]
+) -> tuple[_Trial, list[Candidate]]:
+    """Adjust a model with one lens model of a camera after the other, each compared with the best one before it.
 
-    def __init__(
-        self, held: held_out.HeldOutObservations, camera_id: int, *, threads: int, fixed: Sequence[int]
-    ) -> None:
-        self.held, self.camera_id, self.threads, self.fixed = held, camera_id, threads, fixed
-        self.tried: list[Candidate] = []
-
-    def make(self, training: pycolmap.Reconstruction, *, named: bool) -> _Trial:
-        """Return the best trial.
-
-        The principal point comes before the tangential terms: both shift the picture, but real cameras have sensors off
-        the axis, and that rotates the poses.
-        """
-        camera = training.cameras[self.camera_id]
-        wide = field_of_view_deg(camera) > FISHEYE_FROM_DEG
-        if named:
-            simple, richer, others = camera.model.name, (camera.model.name,), ()
-        elif camera.is_perspective_fisheye():
-            simple, richer, others = FISHEYE[0], FISHEYE[1:], PERSPECTIVE
-        else:
-            simple, richer, others = PERSPECTIVE[0], PERSPECTIVE[1:], FISHEYE if wide else ()
-        best = self._trial(training, simple, principal_point=False)
-        self._note(best, gain=None, significance=None, kept=True)
-        for number, name in enumerate(richer):
-            richer_one = best if named else self._better(best, name, principal_point=best.principal_point)
-            changed, best = richer_one is not best, richer_one
-            if not best.principal_point and (changed or number == 0):
-                best = self._better(best, best.model.cameras[self.camera_id].model.name, principal_point=True)
-        for name in others:
-            best = self._better(best, name, principal_point=best.principal_point)
-        return best
-
-    def _better(self, best: _Trial, name: str, *, principal_point: bool) -> _Trial:
-        trial = self._trial(best.model, name, principal_point=principal_point)
-        gain, significance = held_out.gain(best.errors, trial.errors), _significance(best, trial, self.camera_id)
-        pays = bool(
-            gain > DEVIATIONS
-            and trial.errors.mean() < (1 - _GAIN_FRACTION) * best.errors.mean()
-            and significance > DEVIATIONS
-            and is_centred(trial.model.cameras[self.camera_id])
-        )
-        self._note(trial, gain=gain, significance=significance, kept=pays)
-        return trial if pays else best
-
-    def _trial(self, training: pycolmap.Reconstruction, name: str, *, principal_point: bool) -> _Trial:
-        model = pycolmap.Reconstruction(training)
-        camera = model.cameras[self.camera_id]
-        if camera.model.name != name:
+    The principal point comes before the tangential terms: both shift the picture, but real cameras have sensors off the
+    axis, and that rotates the poses.
+    """
+    training, held = held_out.split(model, seed=seed)
+    mine = np.array([training.image(int(i)).camera_id == camera_id for i in held.images], dtype=bool)
+    camera = training.cameras[camera_id]
+    # None stands for the best one so far with its principal point free.
+    names: tuple[str | None, ...] = (*PERSPECTIVE[:2], None, *PERSPECTIVE[2:], *FISHEYE)
+    if camera.is_perspective_fisheye():
+        names = (*FISHEYE, None, *PERSPECTIVE)
+    if named:
+        names = (camera.model.name, None)
+    best: _Trial | None = None
+    tried: list[Candidate] = []
+    for name in names:
+        trial = pycolmap.Reconstruction(training if best is None else best.model)
+        camera = trial.cameras[camera_id]
+        if name is not None and camera.model.name != name:
             _set_lens(camera, converted(camera, name))
-        others = [c for c in model.cameras if c != self.camera_id] if principal_point else self.fixed
-        adjuster = held_out.adjust(model, threads=self.threads, principal_points=principal_point, fixed=others)
-        mine = np.array([model.image(int(i)).camera_id == self.camera_id for i in self.held.images], dtype=bool)
-        errors = np.minimum(held_out.errors_px(model, self.held)[mine], held_out.MOST_ERROR_PX)
-        deviations = held_out.intrinsic_deviations(model, adjuster, self.camera_id, principal_points=principal_point)
-        return _Trial(model, principal_point, errors, deviations)
-
-    def _note(self, trial: _Trial, *, gain: float | None, significance: float | None, kept: bool) -> None:
-        error = float(trial.errors.mean()) if len(trial.errors) else None
-        name = trial.model.cameras[self.camera_id].model.name
-        self.tried.append(Candidate(self.camera_id, name, trial.principal_point, error, gain, significance, kept))
-
-
-def _significance(before: _Trial, after: _Trial, camera_id: int) -> float:
-    """Return the largest ratio of value to standard deviation of the parameters that are free only in `after`."""
-    old, new = before.model.cameras[camera_id], after.model.cameras[camera_id]
-    if old.is_perspective_fisheye() != new.is_perspective_fisheye():
-        return float("inf")  # another family, not added parameters
-    added = [(index, new.params[index]) for index in new.extra_params_idxs()[len(old.extra_params_idxs()) :]]
-    if after.principal_point and not before.principal_point:
-        before_it = (old.principal_point_x, old.principal_point_y)  # the centre, or the given point
-        indices = new.principal_point_idxs()
-        added += [(index, new.params[index] - start) for index, start in zip(indices, before_it, strict=True)]
-    ratios = [abs(value) / after.deviations[index] for index, value in added if after.deviations[index] > 0]
-    return max(ratios, default=0.0)
+        free = name is None or (best is not None and best.principal_point)
+        others = [c for c in trial.cameras if c != camera_id] if free else fixed
+        held_out.adjust(trial, threads=threads, principal_points=free, fixed=others)
+        errors = np.minimum(held_out.errors_px(trial, held)[mine], held_out.MOST_ERROR_PX)
+        gain = None if best is None else held_out.gain(best.errors, errors)
+        kept = best is None or bool(
+            held_out.gain(best.errors, errors) > DEVIATIONS
+            and errors.mean() < (1 - _GAIN_FRACTION) * best.errors.mean()
+            and is_centred(camera)
+        )
+        error = float(errors.mean()) if len(errors) else None
+        tried.append(Candidate(camera_id, camera.model.name, free, error, gain, None, kept))
+        best = _Trial(trial, free, errors) if kept or best is None else best
+    assert best is not None
+    return best, tried
