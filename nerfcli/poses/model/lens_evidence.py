@@ -170,7 +170,7 @@ def lens_evidence(
     clusters = (seen.photos, _scene_clusters(seen, seed=seed))
     camera = camera_of(model, camera_id, lens_of)
     return LensEvidence(
-        current=_current(camera),
+        current=lens_values(camera),
         information=products.sum(axis=0),
         scores=tuple(_summed(scores, labels) for labels in clusters),
         informations=tuple(_summed(products, labels) for labels in clusters),
@@ -220,32 +220,27 @@ class _Seen:
 
 
 def _observations(model: pycolmap.Reconstruction, lens_of: Mapping[int, int], *, seed: int) -> _Seen:
-    finite = [i for i, point in model.points3D.items() if np.isfinite(point.xyz).all()]
-    ids = np.array(sorted(finite), dtype=np.int64)
+    ids = np.array(sorted(i for i, point in model.points3D.items() if np.isfinite(point.xyz).all()), dtype=np.int64)
     kept = MOST_OBSERVATIONS / max(model.compute_num_observations(), 1)
     if kept < 1:
         ids = ids[np.random.default_rng(seed).uniform(size=len(ids)) < kept]
+    places = {int(point_id): place for place, point_id in enumerate(ids)}
     images = sorted(model.reg_image_ids())
-    photos, points, pixels = [], [], []
-    for position, image_id in enumerate(images):
-        seen = model.image(image_id).get_observation_points2D()
-        ours = np.array([point.point3D_id for point in seen], dtype=np.int64)
-        places = np.searchsorted(ids, ours)
-        inside = np.flatnonzero(places < len(ids))
-        inside = inside[ids[places[inside]] == ours[inside]]
-        photos.append(np.full(len(inside), position, dtype=np.int64))
-        points.append(places[inside])
-        pixels += [seen[i].xy for i in inside]
-    xyz = np.array([model.point3D(int(i)).xyz for i in ids], dtype=np.float64).reshape(-1, 3)
+    seen = [
+        (position, places[point.point3D_id], point.xy)
+        for position, image_id in enumerate(images)
+        for point in model.image(image_id).get_observation_points2D()
+        if point.point3D_id in places
+    ]
     lenses = [lens_of[image_id] for image_id in images]
     return _Seen(
         images,
         lenses,
         sorted(set(lenses)),
-        np.concatenate([np.zeros(0, dtype=np.int64), *photos]),
-        np.concatenate([np.zeros(0, dtype=np.int64), *points]),
-        np.array(pixels, dtype=np.float64).reshape(-1, 2),
-        xyz,
+        photos=np.array([photo for photo, _, _ in seen], dtype=np.int64),
+        points=np.array([point for _, point, _ in seen], dtype=np.int64),
+        pixels=np.array([pixel for _, _, pixel in seen], dtype=np.float64).reshape(-1, 2),
+        xyz=np.array([model.point3D(int(i)).xyz for i in ids], dtype=np.float64).reshape(-1, 3),
     )
 
 
@@ -366,16 +361,27 @@ def _summed(values: Array, labels: NDArray[np.int64]) -> Array:
     return total
 
 
-def _current(camera: pycolmap.Camera) -> Array:
-    values: dict[str, float] = dict.fromkeys(NAMES, 0.0)
-    values["f"] = camera.mean_focal_length()
-    values["fa"] = camera.focal_length_x - camera.focal_length_y
-    values["cx"] = camera.principal_point_x - camera.width / 2
-    values["cy"] = camera.principal_point_y - camera.height / 2
-    extra = [name for name in parameters_of(camera) if name not in ("f", "fa")]
-    for name, index in zip(extra, camera.extra_params_idxs(), strict=False):
-        values[name] = camera.params[index]
-    return np.array([values[name] for name in NAMES])
+def lens_values(camera: pycolmap.Camera) -> Array:
+    """Return the values of the `NAMES` of a camera, (8,): a principal point from the centre, 0 for absent terms."""
+    extra = camera.params[list(camera.extra_params_idxs())] if parameters_of(camera) else ()
+    x, y = camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2
+    values = [camera.mean_focal_length(), camera.focal_length_x - camera.focal_length_y, x, y, *extra]
+    return np.array([*values, *[0.0] * (len(NAMES) - len(values))])
+
+
+def camera_with(camera: pycolmap.Camera, name: str, values: Array) -> pycolmap.Camera:
+    """Return a camera of the COLMAP model `name` with these values of the `NAMES`, as far as the model has them."""
+    focal, difference, x, y, *extra = values.tolist()
+    new = pycolmap.Camera.create_from_model_name(camera.camera_id, name, focal, camera.width, camera.height)
+    if len(new.focal_length_idxs()) == 2:
+        new.focal_length_x, new.focal_length_y = focal + difference / 2, focal - difference / 2
+    new.principal_point_x, new.principal_point_y = camera.width / 2 + x, camera.height / 2 + y
+    indices = list(new.extra_params_idxs())
+    params = np.array(new.params)
+    params[indices] = extra[: len(indices)]
+    new.params = params.tolist()
+    new.has_prior_focal_length = camera.has_prior_focal_length
+    return new
 
 
 def _border_px(camera: pycolmap.Camera) -> Array:

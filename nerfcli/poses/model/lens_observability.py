@@ -21,7 +21,9 @@ from nerfcli.poses.model.lens_evidence import (
     LensEvidence,
     UndeterminedError,
     camera_of,
+    camera_with,
     lens_evidence,
+    lens_values,
     parameters_of,
 )
 
@@ -54,11 +56,10 @@ _MODELS = {
 class Candidate:
     """A lens model that was tried for a camera, or a decision by which parameters the observations determine.
 
-    held_out_px: for a wide lens, mean error of this camera's held-out observations, each clipped to 4 px. gain: how
-    many standard errors that is below the model kept before it. significance: for a wide lens, the largest ratio of an
-    added parameter to its standard deviation; else the squared distance of the added parameters from zero in units of
-    their uncertainty, relative to the required one: they are added above 1; None for the model to which the others are
-    added. kept: whether it was chosen.
+    held_out_px: where fisheyes are tried, mean error of this camera's held-out observations, each clipped to 4 px.
+    gain: how many standard errors that is below the model kept before it. significance: of the decisions by parameters,
+    the squared distance of the added ones from zero in units of their uncertainty, relative to the required one: they
+    are added above 1; None for the model to which the others are added. kept: whether it was chosen.
     """
 
     camera: int
@@ -251,12 +252,11 @@ def _between_px(mapped: pycolmap.Reconstruction, camera_id: int, *, seed: int, f
 
 def _held(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:
     """Return the camera with another focal length and the same distortion in pixels: k1 r^3 / f^2 at a radius r."""
-    held = pycolmap.Camera.create_from_model_name(
-        camera.camera_id, "SIMPLE_RADIAL", focal_px, camera.width, camera.height
-    )
-    if "k1" in parameters_of(camera):
-        k1 = camera.params[camera.extra_params_idxs()[0]]
-        _set(held, held.extra_params_idxs(), [k1 * (focal_px / camera.mean_focal_length()) ** 2])
+    values = np.zeros(len(NAMES))
+    values[NAMES.index("f")] = focal_px
+    k1 = NAMES.index("k1")
+    values[k1] = lens_values(camera)[k1] * (focal_px / camera.mean_focal_length()) ** 2
+    held = camera_with(camera, "SIMPLE_RADIAL", values)
     held.has_prior_focal_length = True
     return held
 
@@ -288,27 +288,6 @@ def _model_name(free: Sequence[str]) -> str:
 
 def _camera(camera: pycolmap.Camera, found: Estimate, *, named: bool) -> pycolmap.Camera:
     """Return a camera with the estimated parameters; those that were not free keep their values, or are absent."""
-    name = camera.model.name if named else _model_name(found.names)
-    values = dict(zip(found.names, found.values.tolist(), strict=True))
-    new = pycolmap.Camera.create_from_model_name(
-        camera.camera_id, name, values.get("f", camera.mean_focal_length()), camera.width, camera.height
-    )
-    if named:
-        new.params = camera.params.tolist()
-    if "fa" in values and len(new.focal_length_idxs()) == 2:
-        new.focal_length_x, new.focal_length_y = values["f"] + values["fa"] / 2, values["f"] - values["fa"] / 2
-    elif "f" in values:
-        _set(new, new.focal_length_idxs(), [values["f"]] * len(new.focal_length_idxs()))
-    new.principal_point_x = camera.width / 2 + values["cx"] if "cx" in values else camera.principal_point_x
-    new.principal_point_y = camera.height / 2 + values["cy"] if "cy" in values else camera.principal_point_y
-    extra = [term for term in parameters_of(new) if term not in ("f", "fa")]
-    indices = list(new.extra_params_idxs())[: len(extra)]
-    _set(new, indices, [values.get(term, new.params[index]) for term, index in zip(extra, indices, strict=True)])
-    new.has_prior_focal_length = camera.has_prior_focal_length
-    return new
-
-
-def _set(camera: pycolmap.Camera, indices: Sequence[int], values: Sequence[float]) -> None:
-    params = np.array(camera.params)
-    params[list(indices)] = values
-    camera.params = params.tolist()
+    values = lens_values(camera)
+    values[[NAMES.index(name) for name in found.names]] = found.values
+    return camera_with(camera, camera.model.name if named else _model_name(found.names), values)
