@@ -123,7 +123,7 @@ def solve(name: str, capture: Capture, *, seed: int) -> Result:
         job = synthetic.synthetic_job(folder, capture.views, seed=seed)
         start = time.process_time()
         mapped = map_with_fallbacks(job, lambda *reported: None)
-        examined = examine(mapped.models, mapped.job, lambda *reported: None, localised=mapped.localised)
+        examined = examine(mapped.models, mapped.job, lambda *reported: None, located=mapped.located)
         seconds = time.process_time() - start
         model = examined.model
         failures = [f"{failure.kind}: {failure.evidence}" for failure in examined.verdict.failures]

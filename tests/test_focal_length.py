@@ -14,7 +14,7 @@ from synthetic_captures import FISHEYE, WIDE, Noise, View
 
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import register_photos
-from nerfcli.poses.engine.initial_lens import focal_length, with_focal_lengths
+from nerfcli.poses.engine.initial_lens import estimate_focal_lengths, focal_length
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.model.two_views import VerifiedPair, read_verified_pairs
 
@@ -133,7 +133,7 @@ def focal_px_of(job: Job) -> list[float]:
 def test_mapping_starts_from_the_estimate_and_no_match_is_lost(job: Job):
     """Synthetic truth, within 5 % because of the distortion; 1.2 times the longer side is 50 % too long."""
     before, notes = verified(job), []
-    started = with_focal_lengths(job, notes.append)
+    started = estimate_focal_lengths(job, notes.append)
     (px,) = focal_px_of(job)
     assert px == started.groups[0].estimated_focal_px == pytest.approx(WIDE.params[0], rel=0.05)
     assert notes == [notes[0]]
@@ -153,9 +153,9 @@ def test_given_lens_parameters_are_left_alone(job: Job):
         replace(group, model=FISHEYE.model),
     ):
         alone = replace(job, groups=(camera_group,))
-        assert with_focal_lengths(alone, lambda note: None) is alone
+        assert estimate_focal_lengths(alone, lambda note: None) is alone
     doubted = replace(job, groups=(replace(group, focal_px=2000.0),))
-    assert with_focal_lengths(doubted, lambda note: None).groups[0].estimated_focal_px is not None
+    assert estimate_focal_lengths(doubted, lambda note: None).groups[0].estimated_focal_px is not None
 
 
 def test_a_changed_prior_focal_length_is_verified_anew(job: Job):

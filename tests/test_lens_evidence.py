@@ -10,7 +10,7 @@ from test_pose_lenses import camera_of, ring_model, started_from
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.intrinsics import choose_lenses
 from nerfcli.poses.model.lens_evidence import NAMES, UndeterminedError, lens_evidence
-from nerfcli.poses.model.lens_observability import determine, uncertainty
+from nerfcli.poses.model.lens_observability import determine_lens, uncertainty
 
 FOCAL_PX = 1400.0
 
@@ -52,7 +52,7 @@ def test_one_step_is_where_an_adjustment_goes():
 @pytest.mark.parametrize("seed", range(3))
 def test_highlights_free_no_parameter_that_is_not_there(seed: int):
     model = robot_capture(seed=seed, shiny=0.4)
-    found = determine(model, 1, mapped=model, seed=0)
+    found = determine_lens(model, 1, mapped=model, seed=0)
     assert not found.principal_point
     assert found.camera.model.name in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL")
 

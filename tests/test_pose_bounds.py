@@ -71,11 +71,13 @@ def test_matching_ends_at_its_limit_and_the_next_call_does_the_rest(
     assert looked_at(job) == set(pairs)
 
 
-def test_what_was_cut_short_is_kept_with_the_models(job: Job):
+def test_what_was_cut_short_is_kept_with_the_models(job: Job, tmp_path: Path):
+    shutil.copytree(job.database.parent, tmp_path / "again")
+    job = replace(job, folder=str(tmp_path / "again" / "work"))
     mapped = map_with_fallbacks(job, lambda *progress: None)
     assert mapped.cut_short == ()
-    write_mapped(replace(mapped, cut_short=("matching: 1 of 28 pairs",)), mapping_key(job), name="cut")
-    again = read_mapped(job, mapping_key(job), name="cut")
+    write_mapped(replace(mapped, cut_short=("matching: 1 of 28 pairs",)), mapping_key(job))
+    again = read_mapped(job, mapping_key(job))
     assert again is not None
     assert again.cut_short == ("matching: 1 of 28 pairs",)
 
@@ -116,7 +118,7 @@ def test_a_way_to_map_that_was_ended_is_reported_and_a_check_once(
     job = replace(job, folder=str(tmp_path / "again" / "work"), skipped_checks=ended)
     # There are no photos: their features are in the database already.
     monkeypatch.setattr(worker, "extract", lambda job, report: None)
-    monkeypatch.setattr(worker, "with_object_masks", lambda job, training, tell: (job, None))
+    monkeypatch.setattr(worker, "mask_turning_object", lambda job, training: (job, None))
     worker.solve(job, lambda *progress: None, lambda note: None)
     content = json.loads((Path(job.folder) / "result.json").read_text(encoding="utf-8"))["content"]
     assert content["not_computed"] == {"pose uncertainty": "it took longer than 5 min"}

@@ -168,7 +168,7 @@ def test_a_result_that_is_not_finite_is_written_as_null(job: Job, monkeypatch: p
     monkeypatch.setattr(examine, "pose_blur_px", lambda model, **options: infinite)
     # There are no photos: their features are in the database already.
     monkeypatch.setattr(worker, "extract", lambda job, report: None)
-    monkeypatch.setattr(worker, "with_object_masks", lambda job, training, tell: (job, None))
+    monkeypatch.setattr(worker, "mask_turning_object", lambda job, training: (job, None))
     worker.solve(
         replace(job, skipped_checks=(("another check", "too long"),)), lambda *progress: None, lambda note: None
     )
@@ -263,10 +263,9 @@ def test_checks_that_end_the_process_or_never_end_are_left_out(
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(
         "import os, time\n"
-        "from nerfcli.poses.judge import checks, uncertainty\n"
-        "from nerfcli.poses.model import intrinsics\n"
-        "uncertainty.pose_blur_px = lambda *a, **o: os.abort()\n"
-        "intrinsics.choose_lenses = lambda *a, **o: time.sleep(3600)\n"
+        "from nerfcli.poses.judge import checks, examine\n"
+        "examine.pose_blur_px = lambda *a, **o: os.abort()\n"
+        "examine.choose_lenses = lambda *a, **o: time.sleep(3600)\n"
         "run = checks.Checks.run\n"
         "def bounded(self, name, compute, *, otherwise, seconds=None):\n"
         "    most = 0.5 if name == 'lens models' else seconds\n"
@@ -371,11 +370,11 @@ def test_photos_without_features_and_a_failing_search_for_motions_end_nothing(
 ):
     """The search for a turntable is auxiliary: if it raises, a note says so, and the photos are mapped as they are."""
 
-    def broken(job: Job, training: Job, tell: Callable[[str], None]) -> None:
+    def broken(job: Job, training: Job) -> None:
         raise IndexError("tuple index out of range")
 
     monkeypatch.setattr(worker, "extract", lambda job, report: None)
-    monkeypatch.setattr(worker, "with_object_masks", broken)
+    monkeypatch.setattr(worker, "mask_turning_object", broken)
     notes: list[str] = []
     worker.solve(replace(job, skipped_checks=(("a third check", "slow"),)), lambda *progress: None, notes.append)
     why = "IndexError: tuple index out of range"

@@ -6,9 +6,9 @@ import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import WIDE, Lens
 
-from nerfcli.poses.judge.uncertainty import pose_blur_px
+from nerfcli.poses.judge.examine import pose_blur_px
 from nerfcli.poses.model import held_out
-from nerfcli.poses.model.intrinsics import choose_lenses, converted
+from nerfcli.poses.model.intrinsics import choose_lenses, convert_camera
 
 
 def ring_model(
@@ -50,7 +50,7 @@ def started_from(model: pycolmap.Reconstruction, name: str) -> pycolmap.Reconstr
     started = pycolmap.Reconstruction(model)
     for camera in started.cameras.values():
         camera.principal_point_x, camera.principal_point_y = camera.width / 2, camera.height / 2
-        simple = converted(camera, name)
+        simple = convert_camera(camera, name)
         camera.model = simple.model
         camera.params = simple.params.tolist()
     held_out.adjust(started, threads=1)
@@ -140,7 +140,7 @@ def test_a_converted_lens_sees_the_same(name: str):
     camera.params = [900.0, 512.0, 384.0, -0.05]
     pixels = np.random.default_rng(0).uniform(0, [1024, 768], size=(50, 2))
     rays = np.asarray(camera.cam_ray_from_img(pixels), dtype=np.float64)
-    assert converted(camera, name).img_from_cam(rays) == pytest.approx(pixels, abs=1.0)
+    assert convert_camera(camera, name).img_from_cam(rays) == pytest.approx(pixels, abs=1.0)
 
 
 def test_held_out_observations_are_a_tenth_and_off_by_the_noise():

@@ -12,7 +12,7 @@ from test_poses import FAST, similarity
 
 from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.ledger import leak_ledger
-from nerfcli.poses.engine.strict import fingerprint, held_out_last, training_part
+from nerfcli.poses.engine.strict import fingerprint, move_held_out_last, training_part
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
@@ -103,7 +103,7 @@ def test_the_training_part_keeps_files_cameras_and_pairs_together():
         threads=1,
         held_out=(1, 2),
     )
-    ordered = held_out_last(job)
+    ordered = move_held_out_last(job)
     assert [group.model for group in ordered.groups] == ["PINHOLE", "RADIAL", "OPENCV"]
     part = training_part(ordered)
     assert (part.files, part.names, part.keys) == (

@@ -25,7 +25,7 @@ from nerfcli.poses.engine import attempts, mapping, remap
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.engine.features import match
-from nerfcli.poses.engine.initial_lens import as_fisheye
+from nerfcli.poses.engine.initial_lens import detect_fisheyes
 from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_photos
 from nerfcli.poses.engine.remap import ChosenModel, choose_model, extend_accepted, is_contradicted, remap_refused
 from nerfcli.poses.input.job import Job
@@ -36,7 +36,7 @@ from nerfcli.poses.judge.contradictions import leave_out_contradicting
 from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model import merging
-from nerfcli.poses.model.intrinsics import converted
+from nerfcli.poses.model.intrinsics import convert_camera
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs, rotation_errors
 
 pytestmark = pytest.mark.usefixtures("_quiet")
@@ -74,7 +74,7 @@ def solve(folder: Path, views: Sequence[View], scene: Scene, noise: Noise = Nois
     synthetic.write_database(folder / "database.db", views, scene, noise=noise, seed=0, **options)
     job = synthetic.synthetic_job(folder, views, seed=0)
     mapped = map_with_fallbacks(job, lambda *progress: None)
-    examined = examine(mapped.models, mapped.job, lambda *progress: None, localised=mapped.localised)
+    examined = examine(mapped.models, mapped.job, lambda *progress: None, located=mapped.located)
     return Solved(views, job, mapped, examined)
 
 
@@ -229,7 +229,7 @@ def test_an_accepted_model_grows_with_the_lens_that_was_chosen_for_it(solved: So
     first = examine(mapped.models[:1], mapped.job, lambda *progress: None)
     assert first.model is not None
     camera = first.model.cameras[1]
-    richer = converted(camera, "OPENCV")
+    richer = convert_camera(camera, "OPENCV")
     camera.model, camera.params = richer.model, richer.params.tolist()
     notes: list[str] = []
     found = extend_accepted(ChosenModel(mapped, first), lambda *progress: None, notes.append, checks=Checks)
@@ -743,14 +743,14 @@ def test_the_search_of_larger_pictures_is_worth_what_is_missing(
     for name in ("match", "start_matching"):
         monkeypatch.setattr(attempts, name, lambda *arguments: None)
     monkeypatch.setattr(attempts, "map_photos", lambda *arguments, **options: [model])
-    monkeypatch.setattr(attempts, "localise", lambda model, job, **options: (model, []))
+    monkeypatch.setattr(attempts, "locate_photos", lambda model, job, **options: (model, []))
     map_with_fallbacks(job, lambda *progress: None, notes.append)
     assert [job.max_image_size for job in searched] == ([] if size is None else [size])
     assert any(note.startswith(words) for note in notes)
 
 
 def test_pairs_of_perspective_photos_ask_for_no_fisheye(solved: Solved):
-    assert as_fisheye(solved.job) is None
+    assert detect_fisheyes(solved.job) is None
 
 
 def test_sub_models_are_merged_where_they_overlap(solved: Solved, tmp_path: Path):

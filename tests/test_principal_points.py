@@ -21,8 +21,8 @@ from nerfcli.poses.model.principal_points import (
     StabilisedModel,
     camera_of_lens,
     choose_principal_points,
+    give_own_cameras,
     refine_with_principal_point,
-    with_own_cameras,
 )
 from nerfcli.poses.report import PosesReport, closing_notes
 
@@ -198,7 +198,7 @@ def test_points_in_two_photos_alone_are_no_evidence():
 
 def test_a_model_with_own_cameras_projects_as_before():
     model = capture(stabiliser(0))
-    own = with_own_cameras(model)
+    own = give_own_cameras(model)
     assert own.compute_num_observations() == model.compute_num_observations()
     assert sorted(own.point3D_ids()) == sorted(model.point3D_ids())
     for point_id in sorted(model.point3D_ids())[::50]:
@@ -214,7 +214,7 @@ def test_a_model_with_own_cameras_projects_as_before():
 
 
 def test_the_camera_of_a_lens_has_the_median_principal_point():
-    model = with_own_cameras(capture(np.zeros((PHOTOS, 2))))
+    model = give_own_cameras(capture(np.zeros((PHOTOS, 2))))
     for number, x in ((1, 500.0), (2, 510.0), (3, 532.0)):
         model.camera(model.image(number).camera_id).principal_point_x = x
     assert camera_of_lens(model, [1, 2, 3]).principal_point_x == 510.0

@@ -21,7 +21,7 @@ from nerfcli.doctor.photo_list import find_subject
 from nerfcli.errors import UserError
 from nerfcli.matching.stationary import Motions, Stationary, motions, still_px, together
 from nerfcli.pages.findings import LOOK
-from nerfcli.poses.engine.turntable import advised, sentence
+from nerfcli.poses.engine.turntable import add_advice, describe_motions
 from nerfcli.poses.input import still_background as still
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import estimate_poses
@@ -270,7 +270,8 @@ class TestPoses:
         narrower = np.asarray(Image.open(mask)).copy()
         narrower[:200] = False
         Image.fromarray(narrower).save(mask)
-        report, _ = solved(folder / "images", folder / "scene", seed=1)
+        report, notes = solved(folder / "images", folder / "scene", seed=1)
+        assert sum("an object moves in front" in note for note in notes) == 1
         assert (np.asarray(Image.open(mask)) == narrower).all()
         assert report["moving_foreground"]["masked"]
         assert report["images"][0]["registered"]
@@ -314,8 +315,8 @@ class TestDoctor:
 def test_refusal_says_what_to_do_about_it() -> None:
     error = UserError("only 3 of 66 photos registered", "take more", 4)
     facts = {"wide": True, "masked": False, "why_not": "x", "pairs": 9, "pairs_two_motions": 9, "unmasked": []}
-    assert "--masks" in (advised(error, facts).hint or "")
-    assert advised(error, facts).exit_code == 4
-    assert advised(error, None) is error
-    assert advised(error, facts | {"wide": False}) is error
-    assert "--masks" in sentence(facts)
+    assert "--masks" in (add_advice(error, facts).hint or "")
+    assert add_advice(error, facts).exit_code == 4
+    assert add_advice(error, None) is error
+    assert add_advice(error, facts | {"wide": False}) is error
+    assert "--masks" in describe_motions(facts)

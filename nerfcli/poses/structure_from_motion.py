@@ -16,9 +16,9 @@ from nerfcli.captures.calibration import Calibration
 from nerfcli.captures.formats import scene_folder
 from nerfcli.captures.holdout import names_held_out
 from nerfcli.errors import UserError
-from nerfcli.poses.engine.strict import held_out_last
+from nerfcli.poses.engine.strict import move_held_out_last
 from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
-from nerfcli.poses.engine.turntable import MASKS, advised
+from nerfcli.poses.engine.turntable import MASKS, add_advice
 from nerfcli.poses.input.job import Job, write_job
 from nerfcli.poses.input.layout import lay_out_masks, lay_out_photos
 from nerfcli.poses.input.pairs import Pairing, choose_pairs, read_pairs
@@ -90,7 +90,7 @@ def estimate_poses(
         report = make_report(photos, settings, result=result, matching=matching, intrinsics=grouped.given)
         if error := refusal(report, photos_dir):
             if not (settings.accept_refused and report.models):
-                raise _refused(advised(error, report.moving_foreground), report, scene_dir)
+                raise _refused(add_advice(error, report.moving_foreground), report, scene_dir)
             notify(f"accepted because of --accept-refused: {error.message}")
         publish(scene_dir, lambda: _describe_scene(report, scene_dir, photos_dir, given=given))
     for note in closing_notes(report):
@@ -191,7 +191,7 @@ def _lay_out(
         masks=lay_out_masks(photos, files, masks, folder=work / "masks", notify=notify) if masks else (),
         held_out=tuple(sorted(photos.names.index(name) for name in held_out)),
     )
-    return held_out_last(job)
+    return move_held_out_last(job)
 
 
 def _describe_scene(report: PosesReport, scene_dir: Path, photos_dir: Path, *, given: Calibration | None) -> None:

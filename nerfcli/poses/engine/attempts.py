@@ -18,7 +18,7 @@ from nerfcli.errors import duration
 from nerfcli.matching.graph import connected_groups
 from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
-from nerfcli.poses.engine.initial_lens import as_fisheye, with_focal_lengths
+from nerfcli.poses.engine.initial_lens import detect_fisheyes, estimate_focal_lengths
 from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import ALL_ALIKE_UP_TO, all_pairs
@@ -27,7 +27,7 @@ from nerfcli.poses.input.settings import FULL_SIZE, QUALITIES
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model.intrinsics import FISHEYE_FROM_DEG, field_of_view_deg
 from nerfcli.poses.model.lens_evidence import lenses_of
-from nerfcli.poses.model.localise import left_out, localise
+from nerfcli.poses.model.locate import left_out, locate_photos
 from nerfcli.poses.model.merging import merge_models
 from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
 from nerfcli.poses.model.two_views import count_matches, read_verified_pairs
@@ -60,7 +60,7 @@ def map_with_fallbacks(job: Job, report: Report, tell: Tell = lambda text: None)
     turned, no further attempt is made; nor is one after twenty times the planned time, four minutes at least. If the
     first attempt is not the last, `tell` receives each attempt and its result.
     """
-    given = with_focal_lengths(job, tell)
+    given = estimate_focal_lengths(job, tell)
     attempts = MappingAttempts(given, report, tell)
     attempts.map("default thresholds", MapperOptions())
     if attempts.leave_out_photos() and _only_turns(given):
@@ -245,12 +245,12 @@ def map_without_exif(attempts: MappingAttempts) -> None:
     what, bare = "without EXIF's focal length", _without_exif(attempts.job)
     attempts.announce(what)
     attempts.verify(bare)
-    attempts.map_with(what, with_focal_lengths(bare, attempts.tell))
+    attempts.map_with(what, estimate_focal_lengths(bare, attempts.tell))
 
 
 def map_from_fisheye(attempts: MappingAttempts) -> None:
     """Map from a fisheye lens if pairs of photos confirm one."""
-    what, fisheye = "start from a fisheye lens", as_fisheye(attempts.job)
+    what, fisheye = "start from a fisheye lens", detect_fisheyes(attempts.job)
     if fisheye is not None:
         attempts.announce(what)
         attempts.verify(fisheye)
@@ -329,21 +329,21 @@ FALLBACKS: tuple[tuple[Callable[[MappingAttempts], bool], Callable[[MappingAttem
 
 
 def locate_single_photos(attempts: MappingAttempts) -> None:
-    """Locate the photos that the best model lacks one by one, from the 3D points that they show, see `localise`."""
+    """Locate the photos that the best model lacks one by one, from the 3D points that they show."""
     what = "remaining photos one by one, from the 3D points they see"
     models, job = attempts.best.models, attempts.best.job
     left = left_out(models[0], job) if models else []
     if not 0 < len(left) <= _MOST_SINGLE_PHOTOS:
         return
     attempts.announce(what)
-    grown, located = localise(models[0], job, image_ids=left, report=attempts.report)
+    grown, located = locate_photos(models[0], job, image_ids=left, report=attempts.report)
     placed = tuple(one.image_id for one in located if not one.refused)
     names = dict(zip(job.image_ids, job.names, strict=True))
     rest = [model for model in models[1:] if not set(model.reg_image_ids()) <= set(grown.reg_image_ids())]
     attempts.take(what, [grown, *rest], job)
     attempts.record[-1]["photos"] = [{"name": names[one.image_id], **asdict(one)} for one in located]
     if placed:
-        attempts.best = replace(attempts.best, localised=placed)
+        attempts.best = replace(attempts.best, located=placed)
 
 
 def _without_exif(job: Job) -> Job:

@@ -47,7 +47,7 @@ _CLEARLY_MORE = 1.1
 _LEAST_FISHEYE_MATCHES = 60
 
 
-def with_focal_lengths(job: Job, tell: Tell) -> Job:
+def estimate_focal_lengths(job: Job, tell: Tell) -> Job:
     """Return the job, and update its database, with focal lengths estimated from pairs of photos that determine them.
 
     Only cameras without a reliable focal length from EXIF or the user are estimated. By default the mapper starts
@@ -178,7 +178,7 @@ def _lowest(focal_px: Array, costs: Array) -> float:
     return float(focal_px[index] * (focal_px[1] / focal_px[0]) ** offset)
 
 
-def as_fisheye(job: Job) -> Job | None:
+def detect_fisheyes(job: Job) -> Job | None:
     """Return the job with cameras that start from a fisheye where pairs of photos indicate one; None if none do.
 
     Only cameras without a model from a file or the user are tested.

@@ -34,7 +34,7 @@ _GROWTH, _DENSE = (1.1, 1.3), 3000
 # which takes seconds and gives the same bits as without interruption.
 _SNAPSHOTS, _MANY_PHOTOS = 10, 100
 # Stage with the models of the mapping attempts.
-FIRST = "mapped"
+_MAPPED = "mapped"
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.Increm
         random_seed=seed,
         min_model_size=3,  # models of small captures count too; the largest is chosen below
         constant_cameras=fixed,
-        extract_colors=False,  # see `with_colours`
+        extract_colors=False,  # see `colour_points`
         ba_global_frames_ratio=growth,
         ba_global_points_ratio=growth,
     )
@@ -233,27 +233,27 @@ class MappedModels:
     """The mapped models, largest first, and the job whose features and matches they use.
 
     attempts: in order, {"what", "models": sizes, largest first}; the one that locates single photos also has "photos":
-    the result for each. localised: ids of images located from the model's points, without a pair that supports them.
+    the result for each. located: ids of images located from the model's points, without a pair that supports them.
     seconds: spent on mapping. cut_short: what was stopped because it took far longer than planned.
     """
 
     models: list[pycolmap.Reconstruction]
     job: Job
     attempts: list[dict[str, Any]]
-    localised: tuple[int, ...] = ()
+    located: tuple[int, ...] = ()
     seconds: float = 0.0
     cut_short: tuple[str, ...] = ()
 
 
-def write_mapped(mapped: MappedModels, key: str, *, name: str = FIRST) -> None:
-    """Write models and stage into the work folder, replacing earlier ones of this name."""
-    also = {field: getattr(mapped, field) for field in ("attempts", "localised", "seconds", "cut_short")}
-    write_models(Path(mapped.job.folder) / name, mapped.models, key, also={"job": asdict(mapped.job), **also})
+def write_mapped(mapped: MappedModels, key: str) -> None:
+    """Write models and stage into the work folder, replacing earlier ones."""
+    also = {field: getattr(mapped, field) for field in ("attempts", "located", "seconds", "cut_short")}
+    write_models(Path(mapped.job.folder) / _MAPPED, mapped.models, key, also={"job": asdict(mapped.job), **also})
 
 
-def read_mapped(job: Job, key: str, *, name: str = FIRST) -> MappedModels | None:
+def read_mapped(job: Job, key: str) -> MappedModels | None:
     """Read what `write_mapped` wrote for this key; None if it is damaged or missing, or its database is missing."""
-    found = read_models(Path(job.folder) / name, key)
+    found = read_models(Path(job.folder) / _MAPPED, key)
     if found is None:
         return None
     models, content = found
@@ -266,8 +266,8 @@ def read_mapped(job: Job, key: str, *, name: str = FIRST) -> MappedModels | None
     )
     if not there.database.exists():
         return None
-    localised, cut_short = tuple(content["localised"]), tuple(content.get("cut_short", ()))
-    return MappedModels(models, there, content["attempts"], localised, content["seconds"], cut_short)
+    located, cut_short = tuple(content["located"]), tuple(content.get("cut_short", ()))
+    return MappedModels(models, there, content["attempts"], located, content["seconds"], cut_short)
 
 
 def write_models(

@@ -26,7 +26,7 @@ from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import without_photos
 from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import NO_PARALLAX_PX
-from nerfcli.poses.model.intrinsics import settle
+from nerfcli.poses.model.intrinsics import refine_model
 from nerfcli.poses.model.reasons import MIN_MATCHES
 from nerfcli.poses.model.two_views import agreements, count_matches, read_verified_pairs
 
@@ -52,7 +52,7 @@ def choose_model(mapped: MappedModels, report: Report, tell: Tell, *, checks: Ca
     `checks` makes a check runner for one model. Smaller models stay if they have most of their photos, and at least 3,
     for themselves.
     """
-    examined = examine(mapped.models[:1], mapped.job, report, localised=mapped.localised, checks=checks())
+    examined = examine(mapped.models[:1], mapped.job, report, located=mapped.located, checks=checks())
     if not is_contradicted(examined.verdict) and not examined.verdict.accepted:
         return ChosenModel(mapped, examined)
     again = extend_accepted if examined.verdict.accepted else remap_refused
@@ -216,7 +216,7 @@ def _extend_part(
 ) -> list[pycolmap.Reconstruction]:
     """Adjust a consistent part, and extend it to the other photos without the suspects."""
     base = pycolmap.Reconstruction(part)
-    settle(base, threads=job.threads, fixed=job.fixed_cameras)
+    refine_model(base, threads=job.threads, fixed=job.fixed_cameras)
     return _extend(base, suspects, job, report)
 
 

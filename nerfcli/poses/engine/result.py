@@ -76,7 +76,7 @@ def describe_cameras(
     ]
 
 
-def with_colours(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
+def colour_points(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
     """Return the model with coloured points: a recoloured copy if most have no colour, as after merging sub-models.
 
     Raises:

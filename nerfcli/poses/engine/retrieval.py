@@ -30,7 +30,7 @@ _MANY = 12
 _VERSION = "256 coarsest, ties kept, pairs without common features left out, or with few where there are many"
 
 
-def with_neighbours(job: Job, report: Report) -> Job:
+def select_pairs(job: Job, report: Report) -> Job:
     """Return the job with its final pairs: look-alikes of each photo added, pairs without common features removed.
 
     A completed stage is not repeated.

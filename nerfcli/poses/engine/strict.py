@@ -15,16 +15,16 @@ import pycolmap
 
 from nerfcli.poses.engine.database import evidence
 from nerfcli.poses.engine.features import extract, match, start_matching
-from nerfcli.poses.engine.retrieval import with_neighbours
+from nerfcli.poses.engine.retrieval import select_pairs
 from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.input.stages import stage_key
 from nerfcli.poses.model.held_out import MAPPER
-from nerfcli.poses.model.localise import place
+from nerfcli.poses.model.locate import place
 from nerfcli.poses.model.principal_points import LEAST_OBSERVATIONS, camera_of_lens, refine_with_principal_point
 from nerfcli.poses.model.reasons import FEW_MATCHES, NO_TRAINING_PHOTO
 
 
-def held_out_last(job: Job) -> Job:
+def move_held_out_last(job: Job) -> Job:
     """Return the job with cameras of only held-out photos moved last, so that the others keep their numbers."""
     held_out = frozenset(job.held_out)
     return replace(job, groups=tuple(sorted(job.groups, key=lambda group: held_out.issuperset(group.photos))))
@@ -62,7 +62,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     if not result["models"]:
         return whole
     extract(job, report)
-    job = with_neighbours(job, report)
+    job = select_pairs(job, report)
     held_out = frozenset(job.held_out)
     across = tuple((i, j) for i, j in job.pairs if (i in held_out) != (j in held_out))
     start_matching(job, [(i, j) for i, j in job.pairs if not {i, j} <= held_out])

@@ -28,7 +28,7 @@ from nerfcli.photos.masks import read_mask
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.engine.retrieval import coarsest
 from nerfcli.poses.input import still_background as still
-from nerfcli.poses.input.job import Job, Tell, WorkMask
+from nerfcli.poses.input.job import Job, WorkMask
 from nerfcli.poses.input.layout import write_mask, write_no_mask
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
@@ -41,7 +41,7 @@ _SAME_PLACE = 0.25
 _LEAST_RIGHT = 0.7
 _WHITE = (0.003, 0.9)
 # Change this whenever this module would find other masks or facts.
-_VERSION = "two motions, 1"
+_VERSION = "two motions, 2"
 _STAGE = "turntable.json"
 MASKS = "masks"
 
@@ -61,7 +61,7 @@ def scene_masks(job: Job) -> Path:
     return Path(job.folder).parent / MASKS
 
 
-def recalled(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
+def recall_masks(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
     """Return the job with the masks of an earlier call, and the facts to report; None if they must be found again.
 
     Masks that the user gave are used unchanged.
@@ -88,14 +88,14 @@ def recalled(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
     return replace(job, masks=tuple(masks)), content
 
 
-def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[str, Any] | None]:
+def mask_turning_object(job: Job, featured: Job) -> tuple[Job, dict[str, Any] | None]:
     """Return the job with masks of the object, if one turns in front of a static background, and the facts to report.
 
     The database has the features of the job `featured`, with the same photos or some of them. The job is unchanged if
     no masks can be accepted; the facts are None if there is nothing to report.
     """
     start = time.perf_counter()
-    compared = _compared(featured)
+    compared = _compare_photos(featured)
     motions = _together(compared)
     if not motions.two_motions:
         write_stage(Path(job.folder) / _STAGE, _key(job), {})
@@ -107,25 +107,24 @@ def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[st
         "pairs_one_motion": motions.moved,
         "still_share": round(motions.cells, 4),
         "wide": motions.wide,
+        "found": motions.found,
     }
     masks: list[np.ndarray | None] = [None] * len(job.files)
     if motions.found:
         number = [job.files.index(file) for file in featured.files]
         compared = [replace(pair, first=number[pair.first], second=number[pair.second]) for pair in compared]
-        masks = _masks(job, compared)
-        facts |= _judged(masks, compared)
+        masks = _make_masks(job, compared)
+        facts |= _judge_masks(masks, compared)
     facts["masked"] = facts.get("why_not") is None and motions.found
     facts["unmasked"] = [name for name, mask in zip(job.names, masks, strict=True) if mask is None]
     if facts["masked"]:
-        job = replace(job, masks=_written(job, masks))
+        job = replace(job, masks=_write_masks(job, masks))
     facts["seconds"] = round(time.perf_counter() - start, 3)
     write_stage(Path(job.folder) / _STAGE, _key(job), facts)
-    if motions.found:
-        tell(sentence(facts))
     return job, facts
 
 
-def sentence(facts: dict[str, Any]) -> str:
+def describe_motions(facts: dict[str, Any]) -> str:
     """Describe the result for the user."""
     text = (
         f"an object moves in front of a static background, as on a turntable ({facts['pairs_two_motions']} of "
@@ -138,7 +137,7 @@ def sentence(facts: dict[str, Any]) -> str:
     return f"{text}: its masks are in {MASKS}/ of the scene{rest}, and the poses are relative to the object"
 
 
-def advised(error: UserError, facts: dict[str, Any] | None) -> UserError:
+def add_advice(error: UserError, facts: dict[str, Any] | None) -> UserError:
     """Return a refusal with advice on an object that turns in front of a static background, if there is one."""
     if facts is None or not facts["wide"]:
         return error
@@ -147,7 +146,7 @@ def advised(error: UserError, facts: dict[str, Any] | None) -> UserError:
     return UserError(error.message, hint, error.exit_code)
 
 
-def _compared(job: Job) -> list[ComparedPair]:
+def _compare_photos(job: Job) -> list[ComparedPair]:
     """Compare photos near and far in the order of names; all pairs of a selection if names seem to have no order."""
 
     @cache
@@ -194,7 +193,7 @@ def _pairs(count: int, most: int) -> set[tuple[int, int]]:
     return {pair for pair in near | far if pair[0] < pair[1]}
 
 
-def _masks(job: Job, pairs: Sequence[ComparedPair]) -> list[np.ndarray | None]:
+def _make_masks(job: Job, pairs: Sequence[ComparedPair]) -> list[np.ndarray | None]:
     """Return a small mask of the object for each photo, None for photos without a matching background."""
     # Photos connected by static matches have one camera position.
     static = [(pair.first, pair.second) for pair in pairs if pair.motions.two or pair.motions.only_still]
@@ -216,7 +215,7 @@ def _masks(job: Job, pairs: Sequence[ComparedPair]) -> list[np.ndarray | None]:
     return masks
 
 
-def _judged(masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPair]) -> dict[str, Any]:
+def _judge_masks(masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPair]) -> dict[str, Any]:
     """Return the fraction of the photos that the masks keep, and of either motion's matches on the right side of them.
 
     "why_not" is there if the masks cannot be accepted.
@@ -250,7 +249,7 @@ def _judged(masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPair]) -
     return facts
 
 
-def _written(job: Job, masks: Sequence[np.ndarray | None]) -> tuple[WorkMask, ...]:
+def _write_masks(job: Job, masks: Sequence[np.ndarray | None]) -> tuple[WorkMask, ...]:
     """Write a mask of each photo for pycolmap, and the object masks that were found for the user."""
     job.mask_folder.mkdir(exist_ok=True)
     scene_masks(job).mkdir(exist_ok=True)

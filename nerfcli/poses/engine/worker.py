@@ -28,16 +28,16 @@ from nerfcli.poses.engine.features import extract, feature_counts, match, start_
 from nerfcli.poses.engine.mapping import MappedModels, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.remap import choose_model
 from nerfcli.poses.engine.result import (
+    colour_points,
     describe_cameras,
     describe_result,
     model_keys,
     replace_non_finite,
-    with_colours,
     write_model,
 )
-from nerfcli.poses.engine.retrieval import with_neighbours
+from nerfcli.poses.engine.retrieval import select_pairs
 from nerfcli.poses.engine.strict import place_held_out, training_part
-from nerfcli.poses.engine.turntable import recalled, with_object_masks
+from nerfcli.poses.engine.turntable import describe_motions, mask_turning_object, recall_masks
 from nerfcli.poses.input.job import Job, Report, Tell, read_job
 from nerfcli.poses.input.plan import checking_seconds, limit_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
@@ -67,7 +67,7 @@ def main(job_path: str) -> None:
 
 def solve(job: Job, report: Report, tell: Tell) -> None:
     """Do a job, from photos to a model on disk, continuing from what earlier calls have done; write the result."""
-    stored = recalled(job)
+    stored = recall_masks(job)
     path, key = Path(job.folder) / RESULT, result_key(job if stored is None else stored[0])
     there = read_stage(path, key)
     if there is not None and there["model_files"].items() <= model_keys(job).items():
@@ -77,6 +77,8 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
     path.unlink(missing_ok=True)
     seconds: dict[str, float] = {}
     job, moving = _mask_object(job, report, tell, seconds=seconds) if stored is None else stored
+    if moving is not None and moving["found"]:
+        tell(describe_motions(moving))
     training = training_part(job) if job.held_out else job
     result = _estimate(training, report, tell)
     if job.held_out:
@@ -118,7 +120,7 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
             )
         model, result["principal_points"] = found.model, found.evidence and asdict(found.evidence)
         uncertainty = uncertainty | found.uncertainty
-    model = finishing.run("colours of points", partial(with_colours, model, job), otherwise=model)
+    model = finishing.run("colours of points", partial(colour_points, model, job), otherwise=model)
     result["not_computed"] |= finishing.not_computed
     write_model(model, job)
     return result | {
@@ -143,7 +145,7 @@ def _map(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> 
     counts = feature_counts(job)
     report("features", round(sum(counts) / len(counts)), job.max_features)
     with _timed(seconds, "match"):
-        matched = with_neighbours(job, report)
+        matched = select_pairs(job, report)
         start_matching(matched, matched.pairs)
         unmatched = match(matched, matched.pairs, report)
         if unmatched is not None:
@@ -176,7 +178,7 @@ def _mask_object(
         extract(training_part(job), report)
     checks, name = _checks(job), "moving foreground"
     with _timed(seconds, "motions"):
-        found = checks.run(name, lambda: with_object_masks(job, training_part(job), tell), otherwise=None)
+        found = checks.run(name, lambda: mask_turning_object(job, training_part(job)), otherwise=None)
     if found is None:
         tell(f"could not check for an object moving in front of a static background: {checks.not_computed[name]}")
         return job, None

@@ -91,7 +91,7 @@ def judge(
         model: a converged model.
         turn: how well rotations of the camera alone explain the matches.
         names: the user's name for each photo of the model.
-        held: pairs that support photos located from points of the model, see `localise.shared_pairs`.
+        held: pairs that support photos located from points of the model, see `locate.shared_pairs`.
         given: ids of cameras with given intrinsics, whose focal lengths are not checked.
         determined: ids of cameras whose focal lengths are known to 1 %, see `lens_observability.focal_is_determined`.
     """

@@ -1,10 +1,20 @@
-"""Examine a model after mapping: lens model, contradictions, acceptance, uncertainty."""
+"""Examine a model after mapping: lens model, contradictions, acceptance, uncertainty.
+
+The uncertainty of a pose is given as blur in pixels, one standard deviation. The covariance of the adjustment depends
+on which points or cameras fix the frame, an arbitrary choice. It is transformed to the frame in which the pictures of a
+static scene move least over all photos together (an S-transformation, Baarda 1973); each photo's own uncertainty is
+read off there.
+
+Letters: R, t is a camera's pose from the world, C its centre. A pose's six unknowns are w, a rotation after R in the
+camera's axes, and the change of t; J maps them to pixels; a similarity has theta, tau, s as its seven.
+"""
 
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import numpy as np
 import pycolmap
 
 from nerfcli.matching.graph import connected_groups
@@ -13,12 +23,17 @@ from nerfcli.poses.judge.acceptance import Verdict, judge, nothing_placed
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting, without_photos
 from nerfcli.poses.judge.parallax import RotationFit, best_rotation_fit, panorama_rotation_fit
-from nerfcli.poses.judge.uncertainty import pose_blur_px
+from nerfcli.poses.model import held_out
 from nerfcli.poses.model.intrinsics import ModelLenses, choose_lenses
+from nerfcli.poses.model.lens_evidence import projection_jacobians
 from nerfcli.poses.model.lens_observability import focal_is_determined
-from nerfcli.poses.model.localise import shared_pairs
+from nerfcli.poses.model.locate import shared_pairs
+from nerfcli.poses.model.projection import Array
 from nerfcli.poses.model.reasons import FEW_MATCHES, MIN_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, read_verified_pairs
+
+# pycolmap's tangent space of a quaternion is half the angle.
+_ANGLE_FROM_TANGENT = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -42,14 +57,14 @@ def examine(
     job: Job,
     report: Callable[[str, int, int], None],
     *,
-    localised: Sequence[int] = (),
+    located: Sequence[int] = (),
     checks: Checks | None = None,
 ) -> ExaminedModel:
     """Leave out contradicting photos of the first model, choose lenses, adjust, judge, and measure the uncertainty.
 
     A check that cannot be computed is left out and listed in `details["not_computed"]`; the others go on.
 
-    `report` is called with ("check", done, total); `localised` are ids of images that are supported by points of the
+    `report` is called with ("check", done, total); `located` are ids of images that are supported by points of the
     model instead of a pair.
     """
     checks = Checks() if checks is None else checks
@@ -64,7 +79,7 @@ def examine(
     report("check", 0, 4)
     mapped = without_photos(models[0])
     held: list[VerifiedPair] = checks.run(
-        "points of single photos", lambda: shared_pairs(mapped, localised, min_matches=MIN_MATCHES), otherwise=[]
+        "points of single photos", lambda: shared_pairs(mapped, located, min_matches=MIN_MATCHES), otherwise=[]
     )
     model, left_out = checks.run(
         "contradicting photos", lambda: leave_out_contradicting(mapped, [*pairs, *held]), otherwise=(mapped, {})
@@ -136,3 +151,92 @@ def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> ModelLenses:
         named=named,
         exif_focal_px=exif_focal_px,
     )
+
+
+def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int, fixed: Sequence[int] = ()) -> dict[int, float]:
+    """Compute the root mean square motion of a typical point in each photo by one standard deviation of its pose.
+
+    The noise of an observation is estimated from the residuals of the adjustment. Points and intrinsics are treated as
+    uncertain too; the lens model is taken as chosen. Errors common to all photos, and errors that no lens model
+    describes, are not included. The model has converged and is not changed; the intrinsics of the cameras `fixed` are
+    taken to be exact. The result is by image id; empty if there is no covariance, since the model is not constrained in
+    all directions.
+    """
+    copy = pycolmap.Reconstruction(model)
+    # The model has converged with robust errors, which differ little: the covariance needs no further convergence.
+    adjuster = held_out.adjust(copy, threads=threads, fixed=fixed, tolerance=1e-3)
+    options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
+    found = pycolmap.estimate_ba_covariance(options, copy, adjuster)
+    photos = sorted(copy.reg_image_ids())
+    if found is None:
+        return {}
+    covariance = _joint_covariance(found, photos)
+    if covariance is None:
+        return {}
+    metrics = [_pixel_metric(copy, photo) for photo in photos]
+    gauge = np.vstack([_gauge_directions(copy.image(photo)) for photo in photos])  # (6 photos, 7)
+    weighted = np.vstack([metric @ gauge[6 * i : 6 * i + 6] for i, metric in enumerate(metrics)])
+    onto_gauge = np.linalg.solve(gauge.T @ weighted, weighted.T)  # (7, 6 photos)
+    moved = onto_gauge @ covariance
+    noise = held_out.residual_deviation_px(copy)
+    blur = {}
+    for i, photo in enumerate(photos):
+        rows = slice(6 * i, 6 * i + 6)
+        shift = gauge[rows] @ moved[:, rows]
+        own = covariance[rows, rows] - shift - shift.T + gauge[rows] @ moved @ onto_gauge.T @ gauge[rows].T
+        blur[photo] = float(noise * np.sqrt(max(np.trace(metrics[i] @ own), 0.0)))
+    return blur
+
+
+def _joint_covariance(found: pycolmap.BACovariance, photos: list[int]) -> Array | None:
+    """Return the covariance of all poses, (6 photos, 6 photos), for unit noise, with rotations as angles."""
+    joint = np.zeros((6 * len(photos), 6 * len(photos)))
+    for i, one in enumerate(photos):
+        for j, other in enumerate(photos[: i + 1]):
+            block = found.get_cam_cov_from_world(one) if i == j else found.get_cam_cross_cov_from_world(one, other)
+            if block is None or block.shape != (6, 6):
+                return None
+            block = _ANGLE_FROM_TANGENT @ block @ _ANGLE_FROM_TANGENT
+            joint[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] = block
+            joint[6 * j : 6 * j + 6, 6 * i : 6 * i + 6] = block.T
+    return joint
+
+
+def _pixel_metric(model: pycolmap.Reconstruction, photo: int) -> Array:
+    """Return the mean of J^T J over points that a photo sees, (6, 6): the mean squared pixel motion per pose motion."""
+    image = model.image(photo)
+    camera = model.camera(image.camera_id)
+    seen = image.get_observation_points2D()
+    chosen = seen[:: max(1, len(seen) // 60)]  # enough to measure how the picture moves
+    pose = image.cam_from_world()
+    points = np.array([model.point3D(point.point3D_id).xyz for point in chosen]).reshape(-1, 3)
+    rotated = points @ pose.rotation.matrix().T
+    local = rotated + pose.translation
+    metric, counted = np.zeros((6, 6)), 0
+    for turned, point, jacobian in zip(rotated, local, projection_jacobians(camera, local), strict=True):
+        if not np.isfinite(jacobian).all() or point[2] <= 0:
+            continue
+        x, y, z = turned
+        by_rotation = jacobian @ np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # d(w x RX) / dw = -[RX]x
+        both = np.hstack([by_rotation, jacobian])
+        metric += both.T @ both
+        counted += 1
+    return metric / max(counted, 1)
+
+
+def _gauge_directions(image: pycolmap.Image) -> Array:
+    """Return the change of a camera's unknowns, (6, 7), for a world rotated by theta, moved by tau, scaled by 1 + s.
+
+    X' = (1 + s) X + theta x X + tau and R' = R exp(-theta), so w = -R theta and dt = w x t - R (s C + theta x C + tau).
+    """
+    pose = image.cam_from_world()
+    R, t, C = pose.rotation.matrix(), pose.translation, image.projection_center()
+    directions = np.zeros((6, 7))
+    for axis in range(3):
+        theta = np.eye(3)[axis]
+        w = -R @ theta
+        directions[:3, axis] = w
+        directions[3:, axis] = np.cross(w, t) - R @ np.cross(theta, C)
+        directions[3:, 3 + axis] = -R @ theta
+    directions[3:, 6] = -R @ C
+    return directions

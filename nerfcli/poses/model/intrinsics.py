@@ -21,7 +21,7 @@ from nerfcli.poses.model.lens_evidence import UndeterminedError, lenses_of, para
 from nerfcli.poses.model.lens_observability import (
     Candidate,
     DeterminedLens,
-    determine,
+    determine_lens,
     has_open_distortion,
     is_centred,
     uncertainty,
@@ -95,7 +95,7 @@ def choose_lenses(
         found = None
         if parameters_of(camera):
             try:
-                found = determine(
+                found = determine_lens(
                     result,
                     camera_id,
                     mapped=model,
@@ -129,13 +129,13 @@ def choose_lenses(
     everywhere = bool(freed) and len(freed) == len(photos)
     if freed and not everywhere:
         held_out.adjust(result, threads=threads, principal_points=True, fixed=[c for c in photos if c not in freed])
-    settle(result, threads=threads, principal_points=everywhere, fixed=fixed)
+    refine_model(result, threads=threads, principal_points=everywhere, fixed=fixed)
     strayed = [c for c in freed if not is_centred(result.cameras[c])]
     if strayed:
         for camera_id in strayed:
             camera = result.cameras[camera_id]
             camera.principal_point_x, camera.principal_point_y = camera.width / 2, camera.height / 2
-        settle(result, threads=threads, fixed=fixed)
+        refine_model(result, threads=threads, fixed=fixed)
     certain = {
         camera_id: uncertainty(
             result, camera_id, principal_point=camera_id in freed and camera_id not in strayed, seed=seed, fixed=fixed
@@ -186,7 +186,7 @@ def _set_lens(camera: pycolmap.Camera, lens: pycolmap.Camera) -> None:
     camera.params = lens.params.tolist()
 
 
-def settle(
+def refine_model(
     model: pycolmap.Reconstruction, *, threads: int, principal_points: bool = False, fixed: Sequence[int] = ()
 ) -> None:
     """Adjust a whole model in place, drop the observations that no longer fit, and adjust once more.
@@ -202,7 +202,7 @@ def settle(
     held_out.drop_misfits(model)
 
 
-def converted(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
+def convert_camera(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
     """Return a camera of another COLMAP model that projects rays to nearly the same pixels, same principal point."""
     start = pycolmap.Camera.create_from_model_name(
         camera.camera_id, name, camera.mean_focal_length(), camera.width, camera.height
@@ -269,7 +269,7 @@ def _choose_by_held_out(
         trial = pycolmap.Reconstruction(training if best is None else best.model)
         camera = trial.cameras[camera_id]
         if name is not None and camera.model.name != name:
-            _set_lens(camera, converted(camera, name))
+            _set_lens(camera, convert_camera(camera, name))
         free = name is None or (best is not None and best.principal_point)
         others = [c for c in trial.cameras if c != camera_id] if free else fixed
         held_out.adjust(trial, threads=threads, principal_points=free, fixed=others)

@@ -88,7 +88,7 @@ class DeterminedLens:
     steps: tuple[Candidate, ...]
 
 
-def determine(
+def determine_lens(
     model: pycolmap.Reconstruction,
     camera_id: int,
     *,
@@ -142,7 +142,7 @@ def determine(
     return DeterminedLens(_camera(camera, found, named=named), "cx" in free, False, tuple(steps))
 
 
-def with_own_principal_points(
+def refine_lens(
     model: pycolmap.Reconstruction,
     lens: int,
     *,

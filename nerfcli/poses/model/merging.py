@@ -20,8 +20,8 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import duration
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.held_out import MAPPER
-from nerfcli.poses.model.intrinsics import settle
-from nerfcli.poses.model.localise import pixels_of, place
+from nerfcli.poses.model.intrinsics import refine_model
+from nerfcli.poses.model.locate import pixels_of, place
 from nerfcli.poses.model.projection import Array, is_ahead, offsets_px
 from nerfcli.poses.model.reasons import MIN_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, count_matches, read_verified_pairs
@@ -89,7 +89,7 @@ def merge_models(
         else:
             merged.append(model)
     for index in joined_once:
-        settle(merged[index], threads=threads, fixed=fixed)
+        refine_model(merged[index], threads=threads, fixed=fixed)
     report("merge", len(models), len(models))
     return sorted(merged, key=lambda model: -model.num_reg_images())
 

@@ -19,8 +19,8 @@ from nerfcli.poses.input.job import Report
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.intrinsics import DEVIATIONS, LEAST_PHOTOS, MOST_CAMERAS
 from nerfcli.poses.model.lens_evidence import lenses_of
-from nerfcli.poses.model.lens_observability import PRINCIPAL_POINT_RANGE, uncertainty, with_own_principal_points
-from nerfcli.poses.model.localise import pixels_of, place
+from nerfcli.poses.model.lens_observability import PRINCIPAL_POINT_RANGE, refine_lens, uncertainty
+from nerfcli.poses.model.locate import pixels_of, place
 from nerfcli.poses.model.projection import Array, projected
 
 # The principal points stay shared unless their own ones clearly reduce the error of held-out observations, and by this
@@ -88,7 +88,7 @@ def choose_principal_points(
     scale_px = held_out.loss_scale_px(held_out.observation_errors_px(shared))
     _adjust(shared, set(), threads=threads, robust_px=scale_px)
     report("stabilise", 1, 2)
-    own = with_own_cameras(shared)
+    own = give_own_cameras(shared)
     _adjust(own, free, threads=threads, robust_px=scale_px)
     before, after = held_out.errors_px(shared, held), held_out.errors_px(own, held)
     most = _CLIP * float(np.median(before))
@@ -102,7 +102,7 @@ def choose_principal_points(
     return _settled(model, evidence, seed=seed, threads=threads, fixed=fixed, report=report)
 
 
-def with_own_cameras(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+def give_own_cameras(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Return a copy of a model in which each photo has a camera of its own, with the id of the image."""
     own = pycolmap.Reconstruction()
     for image_id in sorted(model.reg_image_ids()):
@@ -161,7 +161,7 @@ def _settled(
 ) -> StabilisedModel:
     """Adjust the model with own principal points, and drop the observations that no longer fit."""
     report("settle", 0, 1 + _ROUNDS)
-    own, lens_of = with_own_cameras(model), lenses_of(model)
+    own, lens_of = give_own_cameras(model), lenses_of(model)
     free, held = _free_photos(model, fixed), set[int]()
     scale_px = held_out.loss_scale_px(held_out.observation_errors_px(own))
     _adjust(own, free, threads=threads, robust_px=scale_px, tolerance=_TOLERANCE)
@@ -217,7 +217,7 @@ def _move_lenses(
 ) -> None:
     """Take a step of focal lengths and distortions, which shared principal points have biased, in place."""
     for lens in sorted(set(lens_of.values())):
-        found = with_own_principal_points(own, lens, lens_of=lens_of, shifting=shifting, seed=seed, fixed=fixed)
+        found = refine_lens(own, lens, lens_of=lens_of, shifting=shifting, seed=seed, fixed=fixed)
         if found is None:
             continue
         kept = [*found.focal_length_idxs(), *found.extra_params_idxs()]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from nerfcli.poses.input.job import Job, Report
-from nerfcli.poses.model.intrinsics import settle
+from nerfcli.poses.model.intrinsics import refine_model
 from nerfcli.poses.model.point_descriptors import (
     ALIKE,
     BLOCK,
@@ -50,7 +50,7 @@ _MOST_TURN_DEG, _MOST_SHIFT = 0.5, 0.02
 
 
 @dataclass(frozen=True)
-class Attempt:
+class LocationAttempt:
     """Result of an attempt to locate a photo.
 
     votes: number of features that vote for a point. agreeing: votes that the pose explains. found: points found where
@@ -73,13 +73,13 @@ class _Placed:
     points: Indices
 
 
-def localise(
+def locate_photos(
     model: pycolmap.Reconstruction,
     job: Job,
     *,
     image_ids: Sequence[int],
     report: Report = lambda stage, done, total: None,
-) -> tuple[pycolmap.Reconstruction, list[Attempt]]:
+) -> tuple[pycolmap.Reconstruction, list[LocationAttempt]]:
     """Return an adjusted copy of the model with the photos that can be located from its points, and the attempts.
 
     Photos that resemble the points of a newly placed one are tried again, so that chains of photos are followed. A
@@ -89,8 +89,10 @@ def localise(
     """
     grown = pycolmap.Reconstruction(model)
     if model.num_points3D() < _LEAST_FOUND:
-        return grown, [Attempt(image_id, refused="the model has too few points") for image_id in sorted(image_ids)]
-    attempts: dict[int, Attempt] = {}
+        return grown, [
+            LocationAttempt(image_id, refused="the model has too few points") for image_id in sorted(image_ids)
+        ]
+    attempts: dict[int, LocationAttempt] = {}
     left = sorted(image_ids)
     files = dict(zip(job.image_ids, job.files, strict=True))
     with pycolmap.Database.open(job.database) as database:
@@ -105,7 +107,7 @@ def localise(
                 report("locate", turn * len(image_ids) + number, total)
                 photo = photo_features(grown, database, image_id)
                 if photo is None:
-                    attempts[image_id] = Attempt(image_id, refused="its camera is unknown")
+                    attempts[image_id] = LocationAttempt(image_id, refused="its camera is unknown")
                     continue
                 if turn > 0 and resembling(photo, model_points.descriptors[fresh]) < _LEAST_VOTES:
                     continue
@@ -124,7 +126,7 @@ def localise(
         report("locate", total, total)
     pairs = read_verified_pairs(job.database, min_matches=FEW_MATCHES)
     if any(not attempt.refused for attempt in attempts.values()):
-        settle(grown, threads=job.threads, fixed=job.fixed_cameras)
+        refine_model(grown, threads=job.threads, fixed=job.fixed_cameras)
     for image_id in (image_id for image_id, attempt in attempts.items() if not attempt.refused):
         if doubt := _doubt(grown, image_id, pairs):
             grown.deregister_frame(grown.image(image_id).frame_id)
@@ -174,14 +176,14 @@ def _doubt(model: pycolmap.Reconstruction, image_id: int, pairs: Sequence[Verifi
     return f"{against[0].matches} verified matches contradict its pose" if against else ""
 
 
-def _place(photo: PhotoFeatures, model_points: KnownPoints, *, seed: int) -> tuple[_Placed | None, Attempt]:
+def _place(photo: PhotoFeatures, model_points: KnownPoints, *, seed: int) -> tuple[_Placed | None, LocationAttempt]:
     """Return a photo's pose with the points it sees, or None; and the record of the attempt."""
     features, points = votes(photo, model_points)
     first = _pose(photo, model_points, features, points, seed=seed)
     agreeing = 0 if first is None else len(first.features)
-    attempt = Attempt(photo.image_id, len(features), agreeing)
+    attempt = LocationAttempt(photo.image_id, len(features), agreeing)
 
-    def refused(why: str) -> tuple[None, Attempt]:
+    def refused(why: str) -> tuple[None, LocationAttempt]:
         return None, replace(attempt, refused=why)
 
     if first is None or agreeing < _LEAST_VOTES:

@@ -16,8 +16,8 @@ from synthetic_captures import WIDE, View, looking_at
 
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
-from nerfcli.poses.model import localise as localising
-from nerfcli.poses.model.localise import Attempt, left_out, localise, shared_pairs
+from nerfcli.poses.model import locate
+from nerfcli.poses.model.locate import LocationAttempt, left_out, locate_photos, shared_pairs
 from nerfcli.poses.model.point_descriptors import KnownPoints, PhotoFeatures
 
 POINTS = synthetic.boulder(700, seed=0)
@@ -53,7 +53,7 @@ def capture(folder: Path, last: Shown, *, camera_id: int = 1) -> tuple[pycolmap.
 def refusal(folder: Path, last: Shown) -> str:
     model, job = capture(folder, last)
     reports: list[tuple[str, int, int]] = []
-    grown, (attempt,) = localise(
+    grown, (attempt,) = locate_photos(
         model, job, image_ids=[LAST], report=lambda stage, done, total: reports.append((stage, done, total))
     )
     assert reports == [("locate", 0, 3), ("locate", 3, 3)]
@@ -68,7 +68,7 @@ def test_a_photo_without_any_pair_is_placed_where_it_was_taken(tmp_path: Path, a
     view = View(WIDE, looking_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.5]), np.array([0.1, 0.0, 0.1])))
     model, job = capture(tmp_path, shown(view))
     assert left_out(model, job) == [LAST]
-    grown, (attempt,) = localise(model, job, image_ids=[LAST])
+    grown, (attempt,) = locate_photos(model, job, image_ids=[LAST])
     assert (attempt.refused, model.num_reg_images()) == ("", len(VIEWS))
     assert attempt.found > 10 * attempt.beside
     relative = grown.image(LAST).cam_from_world() * grown.image(1).cam_from_world().inverse()
@@ -114,7 +114,7 @@ def test_a_place_that_the_photos_own_matches_contradict_is_not_kept(tmp_path: Pa
     geometry.inlier_matches = rng.permutation(120)[:80].reshape(40, 2).astype(np.uint32)
     with pycolmap.Database.open(str(job.database)) as database:
         database.write_two_view_geometry(4, LAST, geometry)
-    grown, (attempt,) = localise(model, job, image_ids=[LAST])
+    grown, (attempt,) = locate_photos(model, job, image_ids=[LAST])
     assert attempt.refused == "40 verified matches contradict its pose"
     assert LAST not in grown.reg_image_ids()
 
@@ -131,14 +131,14 @@ def test_only_a_photo_that_resembles_a_placed_one_is_tried_again(tmp_path: Path,
     job = synthetic.synthetic_job(tmp_path / "three", views, seed=0)
     shutil.copy(tmp_path / "database.db", job.database)
     tried: list[int] = []
-    votes = localising.votes
+    votes = locate.votes
 
     def counted(photo: PhotoFeatures, model_points: KnownPoints) -> tuple[np.ndarray, np.ndarray]:
         tried.append(photo.image_id)
         return votes(photo, model_points)
 
-    monkeypatch.setattr(localising, "votes", counted)
-    _, attempts = localise(model, job, image_ids=[LAST, LAST + 1, LAST + 2])
+    monkeypatch.setattr(locate, "votes", counted)
+    _, attempts = locate_photos(model, job, image_ids=[LAST, LAST + 1, LAST + 2])
     assert [attempt.refused == "" for attempt in attempts] == [True, False, False]
     assert tried == [LAST, LAST + 1, LAST + 2, LAST + 2]
 
@@ -146,18 +146,18 @@ def test_only_a_photo_that_resembles_a_placed_one_is_tried_again(tmp_path: Path,
 def test_nothing_is_placed_without_a_known_lens(tmp_path: Path):
     """The photo has a camera of its own with unknown intrinsics."""
     model, job = capture(tmp_path, shown(VIEWS[3]), camera_id=2)
-    _, attempts = localise(model, job, image_ids=[LAST])
-    assert attempts == [Attempt(LAST, refused="its camera is unknown")]
+    _, attempts = locate_photos(model, job, image_ids=[LAST])
+    assert attempts == [LocationAttempt(LAST, refused="its camera is unknown")]
 
 
 def test_a_model_without_points_places_nothing(tmp_path: Path):
     _, job = capture(tmp_path, shown(VIEWS[3]))
-    _, (attempt,) = localise(synthetic.true_model(VIEWS), job, image_ids=[LAST])
+    _, (attempt,) = locate_photos(synthetic.true_model(VIEWS), job, image_ids=[LAST])
     assert attempt.refused == "the model has too few points"
 
 
 def test_what_is_drawn_at_random_depends_on_the_seed_alone(tmp_path: Path):
     model, job = capture(tmp_path, shown(VIEWS[3]))
-    runs = [localise(model, replace(job, threads=1), image_ids=[LAST]) for _ in range(2)]
+    runs = [locate_photos(model, replace(job, threads=1), image_ids=[LAST]) for _ in range(2)]
     poses = [grown.image(LAST).cam_from_world().matrix() for grown, _ in runs]
     np.testing.assert_array_equal(poses[0], poses[1])
