@@ -7,7 +7,7 @@ from statistics import median
 from typing import Any
 
 import nerfcli
-from nerfcli.errors import TOO_FEW_PHOTOS, UserError
+from nerfcli.errors import TOO_FEW_PHOTOS, UserError, several
 from nerfcli.poses.input.photos import MIN_PHOTOS, Photos
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.model.reasons import dominant, reason
@@ -152,8 +152,7 @@ def closing_notes(report: PosesReport) -> list[str]:
         if certain["distortion_border_px"] is not None:
             accuracy += f", distortion ± {certain['distortion_border_px']:.1f} px at the corners"
         notes.append(
-            f"intrinsics are weakly determined ({which} {images} photo{'' if images == 1 else 's'}: {accuracy}): "
-            "give --intrinsics"
+            f"intrinsics are weakly determined ({which} {several(images, 'photo')}: {accuracy}): give --intrinsics"
         )
     stabilised = report.principal_points
     if stabilised is not None and stabilised["kept"]:

@@ -133,7 +133,7 @@ def _panorama_notes(groups: Sequence[CameraGroup], *, chosen: bool) -> tuple[str
     if chosen or not count:
         return ()
     return (
-        f"{_photos(count)} recognized as 360-degree panoramas (equirectangular); if this is wrong, give "
+        f"{several(count, 'photo')} recognized as 360-degree panoramas (equirectangular); if this is wrong, give "
         "--camera-model SIMPLE_RADIAL",
     )
 
@@ -142,17 +142,17 @@ def _doubts(doubted: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     """Return a note for each reason to doubt EXIF; if there are many, for the first ones and the number of the rest."""
     notes = []
     for doubt, names in list(doubted.items())[:_MOST_LISTED]:
-        which = names[0] if len(names) == 1 else f"{names[0]} and {_photos(len(names) - 1, 'more ')}"
+        which = names[0] if len(names) == 1 else f"{names[0]} and {several(len(names) - 1, 'more photo')}"
         notes.append(f"EXIF's focal length is not used for {which}: {doubt}")
     rest = sum(len(names) for names in list(doubted.values())[_MOST_LISTED:])
-    return (*notes, f"nor for {_photos(rest, 'more ')}, for reasons like these") if rest else tuple(notes)
+    return (*notes, f"nor for {several(rest, 'more photo')}, for reasons like these") if rest else tuple(notes)
 
 
 def _summary(groups: Sequence[CameraGroup]) -> str:
     """Describe the cameras one by one if they are few, else by their numbers of photos, sizes and models."""
     counts = [len(group.photos) for group in groups]
     if len(groups) <= _MOST_LISTED:
-        return ", ".join(f"{_photos(len(g.photos))} of {g.width}x{g.height} ({g.model})" for g in groups)
+        return ", ".join(f"{several(len(g.photos), 'photo')} of {g.width}x{g.height} ({g.model})" for g in groups)
     each = "one photo" if max(counts) == 1 else f"{min(counts)} to {max(counts)} photos"
     if min(counts) == max(counts) > 1:
         each = f"{max(counts)} photos"
@@ -163,10 +163,6 @@ def _summary(groups: Sequence[CameraGroup]) -> str:
     models = Counter(group.model for group in groups).most_common()
     of_model = ", ".join(name if len(models) == 1 else f"{count} {name}" for name, count in models)
     return f"{each} each, {of_size} ({of_model})"
-
-
-def _photos(count: int, more: str = "") -> str:
-    return f"{count} {more}photo{'' if count == 1 else 's'}"
 
 
 def _notes(calibration: Calibration, found: Sequence[PhotoCalibration]) -> tuple[str, ...]:
