@@ -71,22 +71,20 @@ def map_photos(
         base_folder.mkdir(exist_ok=True)
         base.write(base_folder)
     key = stage_key(mapping_key(job), _VERSION, attempt, asdict(start), base is not None and file_keys(base_folder))
-    if (found := read_models(output, key)) is None:
-        snapshots = output.with_name(f"{output.name}_snapshots") / key
-        if len(job.files) < _MANY_PHOTOS:
-            shutil.rmtree(snapshots, ignore_errors=True)
-        snapshots.mkdir(parents=True, exist_ok=True)
-        placed, begin = _largest_snapshot(snapshots) or (0 if base is None else base.num_reg_images(), base_folder)
-        options = _options(job, attempt=attempt, start=start)
-        options.snapshot_path = snapshots
-        options.snapshot_frames_freq = max(1, len(job.files) // _SNAPSHOTS)
-        models = _run_mapper(job, report, options, begin if placed else None, placed=placed, stalled=stalled)
-        write_models(output, models, key)
-        shutil.rmtree(snapshots.parent)
-        found = read_models(output, key)
-    if found is None:
-        raise OSError(f"cannot read back the models in {output}")
-    return found[0]
+    if (found := read_models(output, key)) is not None:
+        return found[0]
+    snapshots = output.with_name(f"{output.name}_snapshots") / key
+    if len(job.files) < _MANY_PHOTOS:
+        shutil.rmtree(snapshots, ignore_errors=True)
+    snapshots.mkdir(parents=True, exist_ok=True)
+    placed, begin = _largest_snapshot(snapshots) or (0 if base is None else base.num_reg_images(), base_folder)
+    options = _options(job, attempt=attempt, start=start)
+    options.snapshot_path = snapshots
+    options.snapshot_frames_freq = max(1, len(job.files) // _SNAPSHOTS)
+    models = _run_mapper(job, report, options, begin if placed else None, placed=placed, stalled=stalled)
+    models = _write_and_read(output, models, key)
+    shutil.rmtree(snapshots.parent)
+    return models
 
 
 def _largest_snapshot(snapshots: Path) -> tuple[int, Path] | None:
@@ -111,10 +109,13 @@ def stall_seconds(photos: int) -> float:
 
 
 def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
-    """Run the global mapper once (all rotations, then all positions); return its models, largest first, with errors.
+    """Run the global mapper once (all rotations, then all positions), unless an earlier call has done so.
 
-    The intrinsics in the database must be about right.
+    The intrinsics in the database must be about right. The models are read back from disk, largest first, with errors.
     """
+    kept, key = Path(job.folder) / f"{job.variant}models_globally", stage_key(mapping_key(job), _VERSION)
+    if (found := read_models(kept, key)) is not None:
+        return found[0]
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = job.threads
     options.random_seed = options.mapper.random_seed = job.seed
@@ -122,7 +123,7 @@ def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
     options.mapper.bundle_adjustment.ceres.use_gpu = False
     with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
         models = pycolmap.global_mapping(job.database, job.photos, output, options)
-    return _largest_first(models)
+    return _write_and_read(kept, _largest_first(models), key)
 
 
 def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.IncrementalPipelineOptions:
@@ -282,6 +283,14 @@ def write_models(
         target.mkdir(parents=True)
         model.write_binary(target)
     write_stage(stage, key, {**(also or {}), "models": len(models), "files": file_keys(folder)})
+
+
+def _write_and_read(folder: Path, models: Sequence[pycolmap.Reconstruction], key: str) -> list[pycolmap.Reconstruction]:
+    write_models(folder, models, key)
+    found = read_models(folder, key)
+    if found is None:
+        raise OSError(f"cannot read back the models in {folder}")
+    return found[0]
 
 
 def read_models(folder: Path, key: str) -> tuple[list[pycolmap.Reconstruction], dict[str, Any]] | None:
