@@ -1,11 +1,11 @@
-"""Reconstructions of computed scans, by kind of field (at equal time), number of views and seed of the noise.
+"""Reconstructions of computed scans, by number of views and seed of the noise.
 
     python benchmarks/tomography.py ct_tooth/line_integrals_f32.npy -o tooth --views 60,30,15 --seeds 3
-    python benchmarks/tomography.py sample_scenes/phantom -o phantom --views 40,20,10 --fields voxels,hash
+    python benchmarks/tomography.py sample_scenes/phantom -o phantom --views 40,20,10
 
-SCAN is any input of `convert` that names its true volume. Line integrals get counting noise of --photons, different for
-each seed; counts stay unchanged. Every n-th training view is fitted; the held-out views are always the same. All other
-settings are the defaults of `train`. Writes OUT.csv and prints a table; the runs stay in the folder OUT.
+SCAN is any input of `ct convert` that names its true volume. Line integrals get counting noise of --photons, different
+for each seed; counts stay unchanged. Every n-th training view is fitted; the held-out views are always the same. All
+other settings are the defaults of `ct train`. Writes OUT.csv and prints a table; the runs stay in the folder OUT.
 """
 
 import csv
@@ -21,11 +21,11 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels
+from nerfcli.ct.evaluate import evaluate_scan
 from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.result import ReconstructionSettings
 from nerfcli.ct.scan import Scan, save_scan
-from nerfcli.ct.training import train_scan
-from nerfcli.ct.training_scores import evaluate_scan
+from nerfcli.ct.train import train_scan
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,10 @@ def main(
     scan: Annotated[Path, typer.Argument()],
     output: Annotated[Path, typer.Option("-o")],
     views: str = "60,30,15",
-    methods: Annotated[str, typer.Option("--fields")] = "voxels",
     seeds: int = 1,
     first_seed: int = 0,
     seconds: float = 120.0,
-    steps: Annotated[int | None, typer.Option(help="Passes, instead of a time.")] = None,
+    passes: Annotated[int | None, typer.Option(help="Passes, instead of a time.")] = None,
     photons: float = 2e4,
     threads: int = 2,
     baselines: Annotated[bool, typer.Option(help="Other methods too, for the first seed.")] = True,
@@ -96,30 +95,27 @@ def main(
             for seed in range(first_seed, first_seed + seeds):
                 folder = output / f"{count}-views-{seed}"
                 save_scan(folder, thinned(with_noise(whole, photons, seed), count))
-                for method in methods.split(","):
-                    settings = ReconstructionSettings(
-                        None if steps else seconds, steps, field=method, seed=seed, threads=threads
+                settings = ReconstructionSettings(None if passes else seconds, passes, threads=threads)
+                run = folder.with_name(f"{folder.name}-run")
+                begun, used = clock(), time.process_time()
+                result = train_scan(folder, run, settings, overwrite=True, notify=print)
+                spent = {"clock_s": clock() - begun, "cpu_s": time.process_time() - used}
+                others = baselines and seed == first_seed
+                metrics = evaluate_scan(run, threads=threads, overwrite=True, baselines=others).metrics
+                for name, found in metrics["methods"].items():
+                    own = name == "nerfcli"
+                    projections, volume = found["projections"], found["volume"]
+                    line = Line(
+                        name,
+                        *(count, seed, volume["psnr"], volume["ssim"]),
+                        *(projections["rms"], projections["psnr"], projections["chi_square"]),
+                        *((result.passes, result.settled) if own else (0, False)),
+                        **(spent if own else dict.fromkeys(spent, 0.0)),
                     )
-                    run = folder.with_name(f"{folder.name}-{method}")
-                    begun, used = clock(), time.process_time()
-                    result = train_scan(folder, run, settings, overwrite=True, notify=print)
-                    spent = {"clock_s": clock() - begun, "cpu_s": time.process_time() - used}
-                    others = baselines and seed == first_seed and method == methods.split(",")[0]
-                    metrics = evaluate_scan(run, threads=threads, overwrite=True, baselines=others).metrics
-                    for name, found in metrics["methods"].items():
-                        own = name == "nerfcli"
-                        projections, volume = found["projections"], found["volume"]
-                        line = Line(
-                            method if own else name,
-                            *(count, seed, volume["psnr"], volume["ssim"]),
-                            *(projections["rms"], projections["psnr"], projections["chi_square"]),
-                            *((result.passes, result.settled) if own else (0, False)),
-                            **(spent if own else dict.fromkeys(spent, 0.0)),
-                        )
-                        lines.append(line)
-                        writer.writerow(asdict(line))
-                        file.flush()
-                        print(line, flush=True)
+                    lines.append(line)
+                    writer.writerow(asdict(line))
+                    file.flush()
+                    print(line, flush=True)
     print_table(lines)
 
 

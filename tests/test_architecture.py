@@ -45,9 +45,9 @@ MAY_IMPORT: dict[str, set[str]] = {
         *("poses.engine", "poses.judge", "poses.model", "poses.input", "captures", "matching", "photos", "cameras"),
         "pages",
     },
-    "ct": {"captures", "export", "render", "kernels", "photos", "pages"},
+    "ct": {"captures", "render", "kernels", "photos", "pages"},
     "workflows": {
-        *("bench", "viewer", "splats", "evaluate", "training", "export", "render", "field", "ct", "doctor", "poses"),
+        *("bench", "viewer", "splats", "evaluate", "training", "export", "render", "field", "doctor", "poses"),
         *("poses.input", "captures", "photos", "cameras", "pages"),
     },
 }

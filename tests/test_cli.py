@@ -41,6 +41,7 @@ from nerfcli.workflows import poses as poses_workflow
 BATCH_COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench", "export")
 COMMANDS = (*BATCH_COMMANDS, "view")
 WITHOUT_INPUT = ("selftest",)
+OF_SCANS = ("convert", "doctor", "train", "evaluate", "render", "export", "info")
 USAGE = 2
 PROJECT = Path(__file__).parent.parent
 GUIDES = (PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md")))
@@ -66,8 +67,11 @@ def check_that_it_parses(line: str) -> None:
         if not words or words[0] != "nerfcli":
             continue
         if words[1:] not in (["--help"], ["--version"]) and "--help" not in words:
-            group: Any = typer.testing._get_command(cli.app)
-            group.commands[words[1]].make_context(words[1], words[2:])
+            command: Any = typer.testing._get_command(cli.app)
+            while hasattr(command, "commands"):
+                words = words[1:]
+                command = command.commands[words[0]]
+            command.make_context(words[0], words[1:])
 
 
 def needed(command: str, folder: Path) -> tuple[Any, ...]:
@@ -75,9 +79,9 @@ def needed(command: str, folder: Path) -> tuple[Any, ...]:
     return {"convert": (folder / "out.json", "--to", "transforms"), "export": ("--to", "mesh")}.get(command, ())
 
 
-@pytest.mark.parametrize("command", [*COMMANDS, *WITHOUT_INPUT])
+@pytest.mark.parametrize("command", [*COMMANDS, *WITHOUT_INPUT, *(f"ct {command}" for command in OF_SCANS)])
 def test_help_has_examples_that_parse(command):
-    result = nerfcli(command, "--help")
+    result = nerfcli(*command.split(), "--help")
     assert result.exit_code == 0
     after = result.stdout.split("Examples:")[1]
     examples = [line.strip() for line in after.splitlines() if re.match(rf"\s+.*nerfcli {command} ", line)]
@@ -189,7 +193,10 @@ def test_all_threads_are_the_processors_of_this_process():
         ("train x --field mlp --log2-rows 12", "--log2-rows: it works with --field hash"),
         ("export x --to page --faces 100", "--faces: it is for meshes"),
         ("export x --to page --voxel-size 0.1", "--voxel-size: it is for meshes and points"),
-        ("export x --to volume --water 0.2", "--water: it is for X-ray scans"),
+        ("export x --to mesh --water 0.2", "--water, which belongs to ct export"),
+        ("ct export x --box 1", "--box, which belongs to export"),
+        ("ct train x y", "(y); give one, or several on standard input: ls -d scans/*/ | nerfcli ct train -"),
+        ("ct convert x", "missing; give the folder to write"),
         ("export x --to mesh --format obj -o x.ply", "'obj' contradicts -o x.ply"),
         ("train x y", "(y); give one, or several on standard input: ls -d *-scene/ | nerfcli train -"),
         ("train x --downscale 3", "'3'; choose auto, 1, 2, 4 or 8"),

@@ -1,6 +1,8 @@
 """Commands refuse before any work what they can know by then: wrong inputs, read-only folders, nothing left to do."""
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,14 +13,61 @@ from nerfcli.errors import BAD_INPUT
 PHANTOM = Path(__file__).parent.parent / "sample_scenes" / "phantom"
 
 
-@pytest.mark.parametrize("command", ["view", "bench", "ablate"])
-def test_a_scan_where_photos_are_needed_is_named(command, tmp_path):
-    phantom = PHANTOM
-    output = () if command == "view" else ("-o", tmp_path / "out")
-    error, hint = error_of(nerfcli(command, phantom, *output))
-    assert error == f"Error: {phantom} is an X-ray scan, not a scene of photos"
-    assert hint.startswith(f"Hint:  {command} is for photos; commands for scans: convert, doctor, train")
-    assert listing(tmp_path) == {}
+COMMANDS_FOR_PHOTOS = (
+    *("doctor", "poses", "train", "evaluate", "render", "view", "export", "report", "run", "info", "convert", "bench"),
+    "ablate",
+)
+
+
+@pytest.fixture(scope="module")
+def scanned(tmp_path_factory):
+    """A scan folder, a reconstruction as far as its first words, and an exported volume."""
+    folder = tmp_path_factory.mktemp("scanned")
+    assert nerfcli("ct", "convert", PHANTOM, folder / "scan").exit_code == 0
+    for name in ("run/reconstruction.json", "volume.nrrd"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text('{"measurement": "transmission"}')
+    return folder
+
+
+@pytest.mark.parametrize("command", COMMANDS_FOR_PHOTOS)
+def test_commands_for_photos_name_the_command_for_a_scan(command, scanned, tmp_path):
+    same = {kind: command if command in commands else commands[0] for kind, commands in SUITED.items()}
+    for path, what, suited in (
+        (PHANTOM, "an X-ray scan (stack)", f"{same['raw']} {PHANTOM}{' SCAN' if same['raw'] == 'convert' else ''}"),
+        (scanned / "scan", "an X-ray scan", f"{same['scan']} {scanned / 'scan'}"),
+        (scanned / "run", "the reconstruction of an X-ray scan", f"{same['run']} {scanned / 'run'}"),
+    ):
+        result = nerfcli(command, path, *(("--to", "mesh") if command == "export" else ()))
+        assert result.exit_code == BAD_INPUT
+        error = f"Error: {path} is {what}, and {command} is for photos"
+        assert error_of(result) == (error, f"Hint:  use nerfcli ct {suited}")
+    volume = scanned / "volume.nrrd"
+    assert error_of(nerfcli("info", volume))[1] == f"Hint:  use nerfcli ct info {volume}"
+    if command in ("train", "render", "convert"):
+        result = nerfcli(
+            command, "-", *((tmp_path / "out", "--to", "colmap") if command == "convert" else ()), stdin=f"{PHANTOM}\n"
+        )
+        assert f"an X-ray scan (stack), and {command} is for photos" in result.stderr
+
+
+SUITED = {
+    "raw": ("convert", "doctor", "info"),
+    "scan": ("train", "doctor", "info"),
+    "run": ("render", "evaluate", "export", "info"),
+}
+
+
+def test_a_scan_is_recognised_before_anything_heavy_is_loaded():
+    """Regression: `train` loaded torch, 4 s of processor time, to say that a scan has to be converted."""
+    program = (
+        "import sys; from nerfcli.cli import app\n"
+        f"try: app(['train', {str(PHANTOM)!r}])\n"
+        "finally: print(*{'torch', 'numpy', 'scipy', 'h5py'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == BAD_INPUT
+    assert done.stdout.split() == []
 
 
 def test_json_nested_too_deeply_is_refused_and_not_a_traceback(tmp_path):
@@ -31,7 +80,7 @@ def test_json_nested_too_deeply_is_refused_and_not_a_traceback(tmp_path):
 
 def test_doctor_refuses_a_run(finished):
     error, hint = error_of(nerfcli("doctor", finished))
-    assert error == f"Error: {finished} is a run: doctor examines photos, scenes and scans"
+    assert error == f"Error: {finished} is a run: doctor examines photos and scenes"
     assert hint.startswith("Hint:  nerfcli report RUN shows how many photos see what")
 
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from commands import error_of, nerfcli
 from ellipsoids import Ellipsoid, attenuation_at, attenuation_of_voxels, bean, line_integrals, sphere
-from typer.testing import CliRunner
 
-from nerfcli.cli import app
 from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.likelihood import likelihood_of
 from nerfcli.ct.truth import load_truth
@@ -80,7 +79,7 @@ def test_the_sample_scan_follows_its_statement(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_train_asks_to_convert_the_sample_scan(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["train", str(PHANTOM), "-o", str(tmp_path / "run")])
-    assert result.exit_code == 3
-    assert "convert it first: nerfcli convert" in result.stderr
+    error, hint = error_of(nerfcli("ct", "train", PHANTOM, "-o", tmp_path / "run"))
+    assert error == f"Error: {PHANTOM} is a scan in a scanner's format"
+    assert hint == f"Hint:  convert it first: nerfcli ct convert {PHANTOM} SCAN"
     assert not (tmp_path / "run").exists()

@@ -14,17 +14,15 @@ from nerfcli.ct import reconstruct as reconstruction
 from nerfcli.ct.baselines import filtered_back_projection, sart_total_variation
 from nerfcli.ct.calibrate import air_factors, detector_tilt, model_error
 from nerfcli.ct.centre import centre_of
+from nerfcli.ct.evaluate import resampled, score_volume
 from nerfcli.ct.geometry import ScanGeometry, circular_cone, circular_parallel
 from nerfcli.ct.grid import VoxelGrid, centred_grid, grid_of_scan
-from nerfcli.ct.hash_fit import ARRAYS, fit_hash, hash_volume, new_arrays, total_variation
-from nerfcli.ct.hash_fit import line_integrals as hash_line_integrals
 from nerfcli.ct.likelihood import Gaussian, Poisson, likelihood_of, noise, photons_per_value
 from nerfcli.ct.marks import OUTSIDE, TRUNCATED, UNSEEN, WEDGE, marks, missing_wedge_deg
 from nerfcli.ct.quick import highest_contrast_row
-from nerfcli.ct.reconstruct import Problem, Projector, mean_attenuation, reconstruct, start
+from nerfcli.ct.reconstruct import Problem, Projector, reconstruct, start
 from nerfcli.ct.scan import Scan, held_out_views, load_scan, save_scan
-from nerfcli.ct.scores import resampled, score_volume
-from nerfcli.ct.training import Limit
+from nerfcli.ct.train import Limit
 from nerfcli.errors import UserError
 
 PHOTONS = 2e4
@@ -118,64 +116,9 @@ def test_many_views_over_a_limited_angle_do_not_diverge(monkeypatch: pytest.Monk
     assert max(few, halved) < 0.3 * diverged, (few, halved, diverged)
 
 
-def test_rays_of_pixels_are_those_of_whole_views() -> None:
-    for geometry in (
-        cone(3, rows=4, columns=5),
-        circular_parallel([0.1, 2.0], pixel_width=1, pixel_height=2, rows=3, columns=4),
-    ):
-        count = geometry.views * geometry.rows * geometry.columns
-        for some, whole in zip(geometry.rays_of_pixels(np.arange(count)), geometry.rays(), strict=True):
-            np.testing.assert_array_equal(some, whole.reshape(-1, 3))
-
-
-def test_line_integrals_of_a_constant_hash_grid_are_chords_of_the_box(generator: torch.Generator) -> None:
-    """Closed form: attenuation times the length inside the box, 0 beside it; no total variation."""
-    grid = centred_grid((4.0, 6.0, 3.0), 0.5)
-    learned = {name: np.zeros_like(array) for name, array in new_arrays(0).items()}
-    volume = hash_volume(grid, 0.3, learned)
-    origins = torch.tensor([[0.0, 0, 0], [9, 0, 0], [-7, 1, 1], [0, 50, 0], [0, 0, 0]], dtype=torch.float64)
-    directions = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0.6, 0.8]], dtype=torch.float64)
-    jitter = torch.rand(7, generator=generator, dtype=torch.float64)
-    found = hash_line_integrals(volume, (origins, directions), grid, jitter=jitter)
-    expected = torch.tensor([1.2, 1.2, 1.2, 0.0, 0.3 * 3.0 / 0.8])
-    torch.testing.assert_close(found.detach(), expected, rtol=1e-5, atol=0)
-    assert total_variation(volume, torch.rand(5, 3, generator=generator), 0.5).item() < 1e-6
-    assert volume.on_grid(grid).shape == grid.shape
-    torch.testing.assert_close(volume.on_grid(grid), torch.full(grid.shape, 0.3))
-
-
-def test_hash_grid_takes_no_step_without_time(scan: Scan, grid: VoxelGrid) -> None:
-    """The pass limit only stops a fit that ignores the time."""
-    problem = problem_of(scan, grid)
-    volume = hash_volume(grid, mean_attenuation(problem), new_arrays(0))
-    before = volume.on_grid(grid)
-    fit_hash(problem, volume, strength=1.0, passes=1, seconds=0.0)
-    assert volume.passes == 0
-    assert torch.equal(volume.on_grid(grid), before)
-
-
 def test_fit_keeps_a_quarter_of_the_budget_when_trials_took_it_all() -> None:
     assert Limit(None, 8.0, time.perf_counter() - 100.0, 0).seconds == 2.0
     assert Limit(4, None, time.perf_counter() - 100.0, 0).seconds is None
-
-
-def test_hash_grid_beats_filtered_back_projection_and_repeats(scan: Scan, grid: VoxelGrid) -> None:
-    """Against the phantom's own voxels; equal seeds give equal bits, and another seed others, of a small scan."""
-    whole, small = problem_of(scan, grid), problem_of(scan_of(cone(10, rows=12, columns=20)), grid)
-    found = []
-    for problem, seed, passes in ((whole, 0, 4), (small, 0, 1), (small, 0, 1), (small, 1, 1)):
-        volume = hash_volume(grid, mean_attenuation(problem), new_arrays(seed))
-        fit_hash(problem, volume, strength=1.0, seed=seed, passes=passes)
-        assert passes <= volume.passes < passes + 0.2
-        found.append(volume.on_grid(grid).numpy())
-    views = scan.training_views
-    integrals = scan.line_integrals(views)
-    filtered = filtered_back_projection(scan.geometry.select(views), integrals, grid).clamp_min(0).numpy()
-    true = truth(grid)
-    assert score_volume(found[0], grid, true, grid).psnr > score_volume(filtered, grid, true, grid).psnr + 1
-    np.testing.assert_array_equal(found[1], found[2])
-    assert not np.array_equal(found[1], found[3])
-    assert set(new_arrays(0)) == set(ARRAYS)
 
 
 @pytest.mark.parametrize("beam", ["cone", "parallel", "half"])

@@ -405,7 +405,7 @@ def test_points_are_written(blocked, tmp_path):
         (("--to", "mesh", "--voxel-size", "nan"), "--voxel-size"),
         (("--to", "voxels"), "'voxels'; choose page"),
         (("--to", "mesh", "--sh", "1"), "it is for splats"),
-        (("--to", "volume"), "--to volume is for X-ray scans"),
+        (("--to", "volume"), "'volume'; choose page"),
         (("--to", "mesh", "-o", "a.stl"), "not have the suffix of a mesh"),
     ],
 )

@@ -12,6 +12,7 @@ from nerfcli.cli import (
     ablate,
     bench,
     convert,
+    ct,
     doctor,
     evaluate,
     export,
@@ -24,7 +25,7 @@ from nerfcli.cli import (
     train,
     view,
 )
-from nerfcli.cli.usage import Command, Program
+from nerfcli.cli.usage import PhotoCommand, Program
 from nerfcli.errors import INTERRUPTED, TERMINATED
 from nerfcli.interrupts import install_handlers
 from nerfcli.memory import keep_freed_memory
@@ -53,7 +54,8 @@ for _module in (
     ablate,
 ):
     _name = _module.__name__.rsplit(".", 1)[-1]
-    app.command(_name, cls=Command)(getattr(_module, _name))
+    app.command(_name, cls=PhotoCommand)(getattr(_module, _name))
+app.add_typer(ct.app, name="ct")
 
 
 @app.callback(invoke_without_command=True)
@@ -77,6 +79,8 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
       nerfcli ablate photos-scene/                 -> photos-scene-ablation/
     Convert cameras between formats:
       nerfcli convert photos-scene/ transforms.json --to transforms
+    X-ray scans instead of photos:
+      nerfcli ct --help
     Many captures:
       ls -d captures/*/ | nerfcli poses - | nerfcli train - --budget 2m | nerfcli render -
 

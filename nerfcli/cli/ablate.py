@@ -63,7 +63,6 @@ def ablate(
       nerfcli ablate photos-scene --seeds 5 -o paper/ablation
     """
     from nerfcli.bench.ablation import COLUMNS, ResultRow, table_of
-    from nerfcli.cli.scans import refuse_scan
     from nerfcli.memory import default_memory_limit
     from nerfcli.training.runs.components import CHOICES
     from nerfcli.training.runs.settings import TrainSettings, sizes_for
@@ -88,7 +87,6 @@ def ablate(
     limit = default_memory_limit(torch_device)
 
     def work(path: Path, one_of_many: bool) -> None:
-        refuse_scan(path, "ablate")
         folder = result_path(path, suffix="-ablation", output=output, one_of_many=one_of_many)
         with console.callbacks(f"ablate {path.name}") as callbacks:
             content = ablate_scene(

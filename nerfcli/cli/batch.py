@@ -7,6 +7,7 @@ from pathlib import Path
 import typer
 
 from nerfcli.cli.console import out_of_memory_explained, report_error
+from nerfcli.cli.scans import refuse_scan
 from nerfcli.errors import UserError
 from nerfcli.memory import return_freed_memory
 
@@ -37,6 +38,8 @@ def for_each_input(source: str, work: Callable[[Path, bool], None], *, command: 
         count += 1
         try:
             with out_of_memory_explained():
+                if not command.startswith("ct "):
+                    refuse_scan(path, command)
                 work(path, True)
         except UserError as error:
             report_error(error, about=str(path))
@@ -55,7 +58,8 @@ def no_paths(command: str) -> UserError:
 
 def example_of_many(command: str) -> str:
     """Return an example of a command line with several inputs."""
-    inputs = "*-scene/" if command in _READ_SCENES else "*-run/" if command in _READ_RUNS else "captures/*/"
+    captures = "scans/*/" if command.startswith("ct ") else "captures/*/"
+    inputs = "*-scene/" if command in _READ_SCENES else "*-run/" if command.split()[-1] in _READ_RUNS else captures
     return f"ls -d {inputs} | nerfcli {command} -"
 
 

@@ -54,9 +54,6 @@ def bench(
     console = Console(quiet=quiet, json_lines=json)
 
     def work(path: Path, one_of_many: bool) -> None:
-        from nerfcli.cli.scans import refuse_scan
-
-        refuse_scan(path, "bench")
         folder = result_path(path, suffix="-bench", output=output, one_of_many=one_of_many)
         how = {"device": device_name(device), "threads": thread_count(threads), "seconds": seconds}
         content = bench_one(path, folder, how, overwrite=overwrite, console=console)

@@ -1,16 +1,13 @@
 """nerfcli convert: convert cameras between formats; detect conventions."""
 
-import inspect
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nerfcli.cli.batch import STDIN, for_each_input
+from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.convert_scan import CentreOfRotation, Mirrored, Photons, Unit, scan_work
-from nerfcli.cli.options import Holdout, Json, Overwrite, Quiet, one_of
-from nerfcli.errors import UserError
+from nerfcli.cli.options import Json, Overwrite, Quiet, one_of
 
 if TYPE_CHECKING:
     from nerfcli.captures.detect import Detection, HypothesisScore, Question
@@ -118,11 +115,6 @@ def convert(
     allow_loss: Annotated[
         bool, typer.Option("--allow-loss", help="Drop what the format cannot hold (it is listed).")
     ] = False,
-    photons: Photons = None,
-    unit: Unit = None,
-    mirrored: Mirrored = False,
-    centre_of_rotation: CentreOfRotation = None,
-    holdout: Holdout = None,
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
@@ -150,15 +142,7 @@ def convert(
     If you are not sure, --detect compares the possible conventions with the photos.
 
     \b
-    Scans by X-rays become a scan folder, whose scene.json has ASTRA's vectors:
-      DataExchange and NXtomo (.h5, .nxs), Nikon (.xtekct), SkyScan (.log), HelTomo (.mat), R2-Gaussian
-      (meta_data.json), pictures with a scan.json that states what they are
-    --photons, --unit, --mirrored, --centre-of-rotation and --holdout are for them; --detect ranks the direction of
-    rotation, the side that columns are numbered from, and the centre of rotation by how well they predict other views.
-
-    \b
     Examples:
-      nerfcli convert tooth.h5 tooth-scan --centre-of-rotation 295.8
       nerfcli convert photos-scene transforms.json --to transforms
       nerfcli convert fox/transforms.json fox/sparse/0 --to colmap
       nerfcli convert fern poses.txt --to kitti --allow-loss
@@ -172,20 +156,14 @@ def convert(
       nerfcli convert strange/ repaired.json --to transforms --from-axes opencv --from-inverted
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
     """
-    values = dict(locals())
     from nerfcli.captures.calibration import read_intrinsics
     from nerfcli.captures.conversion import ConventionOverrides, TargetOptions
     from nerfcli.captures.formats.format import UserInputs
     from nerfcli.captures.formats.registry import format_named
     from nerfcli.captures.world_frame import WorldFrame
-    from nerfcli.ct.result import is_reconstruction
     from nerfcli.workflows.convert import convert_capture, detect_convention, detection_record
 
     console = Console(quiet=quiet, json_lines=json)
-    defaults = {name: parameter.default for name, parameter in inspect.signature(convert).parameters.items()}
-    convert_scan = scan_work(values, defaults, console)
-    if source != STDIN and convert_scan(Path(source), False):
-        return
     from_centre = _pixel_centre(from_pixel_center, "--from-pixel-center")
     overrides = ConventionOverrides(
         axes=from_axes, inverted=from_inverted, pixel_centre=from_centre, intrinsics_scale=from_size
@@ -238,15 +216,7 @@ def convert(
             console.note(f"{done.path}: read back{off}")
             console.result(done.path, record)
 
-    def either(path: Path, one_of_many: bool) -> None:
-        if is_reconstruction(path):
-            raise UserError(
-                f"{path} is the reconstruction of an X-ray scan, which has no photos", "use nerfcli export --to volume"
-            )
-        if not convert_scan(path, one_of_many):
-            work(path, one_of_many)
-
-    for_each_input(source, either, command="convert")
+    for_each_input(source, work, command="convert")
 
 
 def _table(found: "Detection") -> list[str]:

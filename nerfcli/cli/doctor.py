@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from nerfcli.ct.checks.examine import ScanDiagnosis
     from nerfcli.doctor.examination import Diagnosis
 
-_GATES = ("good", "look")
+GATES = ("good", "look")
+Gate = Annotated[
+    str | None, typer.Option(help="good or look: exit code 7 if any finding is worse.", show_default=False)
+]
 _STYLES = {"good": "green", "look": "yellow", "bad": "bold red"}
 
 
@@ -29,9 +32,7 @@ def doctor(
     output: Output = None,
     intrinsics: Intrinsics = None,
     subfolders: Subfolders = False,
-    require: Annotated[
-        str | None, typer.Option(help="good or look: exit code 7 if any finding is worse.", show_default=False)
-    ] = None,
+    require: Gate = None,
     threads: Threads = 0,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -43,9 +44,6 @@ def doctor(
     cameras. Prints a table on stderr and writes a page with thumbnails next to the capture, CAPTURE-doctor.html. Each
     finding is good, look or bad, with its number, its threshold and advice.
 
-    Of a scan by X-rays: I > I0, drift, rings, counts, truncation, directions and number of views, the centre of
-    rotation, beam hardening.
-
     \b
     Examples:
       nerfcli doctor photos/kitchen
@@ -55,10 +53,8 @@ def doctor(
       nerfcli doctor stereo-rig/ --subfolders
       ls -d captures/*/ | nerfcli doctor - -o pages/
     """
-    one_of(require, _GATES, "--require")
+    one_of(require, GATES, "--require")
     from nerfcli.captures.formats.run_cameras import find_run
-    from nerfcli.ct.formats.read import recognise
-    from nerfcli.ct.result import is_reconstruction
     from nerfcli.doctor.examination import content
     from nerfcli.workflows.doctor import examine_capture
 
@@ -67,25 +63,10 @@ def doctor(
     def work(path: Path, one_of_many: bool) -> None:
         if find_run(path) is not None:
             raise UserError(
-                f"{path} is a run: doctor examines photos, scenes and scans",
+                f"{path} is a run: doctor examines photos and scenes",
                 "nerfcli report RUN shows how many photos see what; render has --outputs coverage,parallax",
             )
-        if is_reconstruction(path):
-            raise UserError(
-                f"{path} is the reconstruction of an X-ray scan", "doctor examines the scan itself: give its folder"
-            )
         page = result_path(path, suffix="-doctor.html", output=output, one_of_many=one_of_many)
-        if recognise(path) is not None:
-            if intrinsics is not None or subfolders:
-                raise UserError(
-                    f"{path}: --intrinsics and --subfolders are for photos, and this is a scan", "leave them out"
-                )
-            from nerfcli.ct.scans import examine_scan_input, scan_diagnosis_record
-
-            with console.callbacks(f"doctor {path.name}") as callbacks:
-                of_scan = examine_scan_input(path, page, overwrite=overwrite, **callbacks)
-            _show(of_scan, page, scan_diagnosis_record(of_scan), console, require=require)
-            return
         with console.callbacks(f"doctor {path.name}") as callbacks:
             diagnosis = examine_capture(
                 path,
@@ -96,15 +77,19 @@ def doctor(
                 subfolders=subfolders,
                 **callbacks,
             )
-        _show(diagnosis, page, content(diagnosis), console, require=require)
+        show_findings(diagnosis, page, content(diagnosis), console, require=require)
 
     for_each_input(capture, work, command="doctor")
 
 
-def _show(
+def show_findings(
     diagnosis: "Diagnosis | ScanDiagnosis", page: Path, record: dict[str, Any], console: Console, *, require: str | None
 ) -> None:
-    """Print a table of the findings and the result, and raise if a finding is worse than required."""
+    """Print a table of the findings and the result.
+
+    Raises:
+        UserError: a finding is worse than required.
+    """
     rows = []
     for finding in diagnosis.findings:
         found = ": ".join(filter(None, (finding.summary, listed(finding.names))))

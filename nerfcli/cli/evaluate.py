@@ -21,9 +21,6 @@ _COLUMNS = {
 }
 _MEASURES = (("psnr", 2), ("ssim", 4), ("lpips", 4))
 
-# Parameters for reconstructions of X-ray scans.
-_OF_SCANS = "runs reference device threads overwrite json quiet"
-
 
 @command
 def evaluate(
@@ -35,12 +32,6 @@ def evaluate(
     ] = None,
     splats: Annotated[
         Path | None, typer.Option(help="A .ply or .spz of splats, measured on the held-out photos beside the field.")
-    ] = None,
-    reference: Annotated[
-        Path | None,
-        typer.Option(
-            help="Scans: run folder of a reconstruction from more views, to compare with; it is not the truth."
-        ),
     ] = None,
     require: Require = None,
     device: Device = "auto",
@@ -55,9 +46,6 @@ def evaluate(
     after a colour correction; training and render time; the distance of each view from the nearest training view; and
     which stages have used held-out photos.
 
-    Of a reconstruction from a scan: held-out projections (rms, dB, chi-square against the counting noise), the true
-    volume where the scan names one, and filtered back-projection and SART from the same views beside it.
-
     \b
     Examples:
       nerfcli evaluate photos-scene-run
@@ -66,10 +54,7 @@ def evaluate(
       nerfcli evaluate photos-scene-run --save-predictions png --overwrite
       nerfcli evaluate first-run second-run third-run
       nerfcli evaluate photos-scene-run --splats photos-scene-run-splats.ply
-      nerfcli evaluate tooth-15-views-run --reference tooth-run
     """
-    values = dict(locals())
-    from nerfcli.ct.result import is_reconstruction
     from nerfcli.evaluate.predictions import KINDS
     from nerfcli.training.runs.run import Run
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run, evaluate_splats
@@ -84,16 +69,6 @@ def evaluate(
     console = Console(quiet=quiet, json_lines=json)
     requirements = requirements_of(require)
     cores, torch_device = thread_count(threads), device_name(device)
-
-    def measure_scan(folder: Path) -> None:
-        from nerfcli.cli.scans import print_scan_numbers, refuse_photo_options
-        from nerfcli.ct.training_scores import evaluate_scan
-
-        refuse_photo_options(folder, evaluate, values, of_scans=_OF_SCANS)
-        with console.callbacks("evaluate") as callbacks:
-            scan = evaluate_scan(folder, threads=cores, overwrite=overwrite, reference=reference, **callbacks)
-        print_scan_numbers(folder, scan, console)
-        console.result(scan.path, scan.metrics)
 
     def measure(folder: Path) -> dict[str, Any]:
         with console.callbacks("evaluate") as callbacks:
@@ -110,11 +85,6 @@ def evaluate(
         return evaluation.metrics
 
     def work(folder: Path, one_of_many: bool) -> None:
-        if is_reconstruction(folder):
-            measure_scan(folder)
-            return
-        if reference is not None:
-            raise typer.BadParameter(f"{folder} is no reconstruction of a scan", param_hint="--reference")
         found = measure(folder)
         if splats is not None:
             with console.callbacks("evaluate splats") as callbacks:

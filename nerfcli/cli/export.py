@@ -1,4 +1,4 @@
-"""nerfcli export: export a run as a page, a mesh, points or splats; of a scan, its volume."""
+"""nerfcli export: export a run as a page, a mesh, points or splats."""
 
 import math
 from pathlib import Path
@@ -10,25 +10,19 @@ from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, one_of, seconds_from_text
 from nerfcli.cli.render_options import finite
-from nerfcli.errors import UserError
 from nerfcli.machine import device_name, thread_count
-
-# Parameters for reconstructions of X-ray scans.
-_OF_SCANS = "run to output form water device threads overwrite json quiet"
 
 
 @command
 def export(
     run: Annotated[str, typer.Argument(help="Run folder written by train, or - to read paths from standard input.")],
-    to: Annotated[
-        str, typer.Option("--to", help="What to export: page, mesh, points, splats; of an X-ray scan: volume.")
-    ],
+    to: Annotated[str, typer.Option("--to", help="What to export: page, mesh, points or splats.")],
     output: Output = None,
     form: Annotated[
         str | None,
         typer.Option(
             "--format",
-            help="File format if -o does not determine it: ply, glb, obj, spz, html; of scans nrrd, mha, nii, tif.",
+            help="File format if -o does not determine it: ply, glb, obj, spz, html.",
         ),
     ] = None,
     box: Annotated[
@@ -60,16 +54,13 @@ def export(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on refining the splats of the run, to a larger --budget.")
     ] = False,
-    water: Annotated[
-        float | None, typer.Option(help="Scans: attenuation of water, so that values are Hounsfield units.")
-    ] = None,
     device: Device = "auto",
     threads: Threads = 0,
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Export a run: page, mesh, points, splats; of a scan, its volume.
+    """Export a run: page, mesh, points, splats.
 
     All results are in the frame and unit of the scene, splats turned so that y points down. Files state both; nerfcli
     info shows them.
@@ -85,9 +76,6 @@ def export(
     Writes RUN.html, RUN-mesh.ply, ... next to the run. Regions that no photo sees stay open. In a .glb, the rotation to
     +Y up is in the root node; positions stay in the scene's frame.
 
-    Of a reconstruction from a scan: --to volume, as .nrrd, .mha, .nii or .tif, with a second file of marks where the
-    views do not determine the values.
-
     \b
     Examples:
       nerfcli export photos-scene-run --to page
@@ -96,42 +84,15 @@ def export(
       nerfcli export photos-scene-run --to points -o kitchen.ply
       nerfcli export photos-scene-run --to splats -o kitchen.spz --budget 2m
       nerfcli export photos-scene-run --to splats -o kitchen.html --budget 5m --resume
-      nerfcli export tooth-scene-run --to volume -o tooth.nrrd
     """
-    values = dict(locals())
-    from nerfcli.ct.result import is_reconstruction
     from nerfcli.export.extent import FACES, SurfaceSettings
-    from nerfcli.training.runs.run import load_run
     from nerfcli.workflows.export import TARGETS, default_target, export_run
     from nerfcli.workflows.splats import SplatSettings
 
     console = Console(quiet=quiet, json_lines=json)
-    finite(water, "--water")
-    if water is not None and water <= 0:
-        raise typer.BadParameter(f"{water:g} is not a positive attenuation", param_hint="--water")
-
-    def export_one_scan(folder: Path, one_of_many: bool) -> None:
-        from nerfcli.cli.scans import refuse_photo_options
-        from nerfcli.ct.training_files import export_scan
-        from nerfcli.ct.volume_files import SUFFIXES
-
-        refuse_photo_options(folder, export, values, of_scans=_OF_SCANS)
-        one_of(to, ("volume",), "--to")
-        suffix = "nrrd" if form is None else form.lstrip(".").lower()
-        one_of(suffix, [known[1:] for known in SUFFIXES], "--format")
-        if form is not None and output is not None and not one_of_many and output.suffix.lower() != f".{suffix}":
-            raise typer.BadParameter(f"{form!r} contradicts -o {output}; remove one of them", param_hint="--format")
-        usual = folder.with_name(f"{folder.name}-volume.{suffix}")
-        target = usual if output is None else output / usual.name if one_of_many else output
-        for path in export_scan(folder, target, water=water, overwrite=overwrite, notify=console.note):
-            console.result(path)
-
-    if run != STDIN and is_reconstruction(Path(run)):
-        export_one_scan(Path(run), False)
-        return
-    one_of(to, (*TARGETS, "volume"), "--to")
+    one_of(to, TARGETS, "--to")
     suffix = None if form is None else f".{form.lstrip('.').lower()}"
-    if suffix is not None and to != "volume":
+    if suffix is not None:
         one_of(suffix[1:], [kind[1:] for kind in TARGETS[to]], "--format")
     finite(voxel_size, "--voxel-size")
     if voxel_size is not None and voxel_size <= 0:
@@ -139,7 +100,6 @@ def export(
     unused = {
         "--faces": (faces is not None and to != "mesh", "meshes"),
         "--voxel-size": (voxel_size is not None and to not in ("mesh", "points"), "meshes and points"),
-        "--water": (water is not None, "X-ray scans"),
         **{
             option: (to != "splats" and value not in (None, False), "splats")
             for option, value in {
@@ -168,12 +128,6 @@ def export(
     settings = SurfaceSettings(box=None if box is None else box_of(box), voxel_size=voxel_size, faces=faces or FACES)
 
     def work(folder: Path, one_of_many: bool) -> None:
-        if is_reconstruction(folder):
-            export_one_scan(folder, one_of_many)
-            return
-        if to == "volume":
-            _ = load_run(folder).config
-            raise UserError(f"{folder}: --to volume is for X-ray scans", "use --to mesh or --to points", exit_code=2)
         target = output
         if output is None or one_of_many:
             usual = default_target(folder, to, suffix)

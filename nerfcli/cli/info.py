@@ -35,7 +35,7 @@ def info(
     depth file  (TIFF, EXR, NPY, PNG; also pictures, videos and folders of renders) definition, axis, unit and its
                 source, invalid value, camera, run, range of values; for files of other programs, what is not stated
     splats      (PLY, SPZ) count, degree, extent, frame, background, unit, run
-    mesh        (PLY, GLB, OBJ) and volume (NRRD, MHA, NIfTI, TIFF): counts, unit, frame, run
+    mesh        (PLY, GLB, OBJ): counts, unit, frame, run
     failure     (saved by train) which numbers became non-finite, where, and whether that repeats
 
     \b

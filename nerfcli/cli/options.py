@@ -71,11 +71,7 @@ Strict = Annotated[
 ]
 FieldKind = Annotated[
     str | None,
-    typer.Option("--field", help="Type of field: hash, voxels or mlp.  [default: hash, voxels for scans]"),
-]
-VoxelSize = Annotated[
-    float | None,
-    typer.Option(help="Side of a voxel, in the unit of the scan; scans only.  [default: a pixel where the object is]"),
+    typer.Option("--field", help="Type of field: hash, voxels or mlp.  [default: hash]"),
 ]
 FieldMemory = Annotated[
     str | None,

@@ -1,7 +1,6 @@
 """nerfcli render: render pictures, depth maps and videos of a run."""
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,15 +9,10 @@ import typer
 from nerfcli.cli import options, render_options
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.scans import is_of_scan, refuse_photo_options, slices_of
-from nerfcli.errors import UserError
 from nerfcli.machine import device_name, thread_count
 
 if TYPE_CHECKING:
     from nerfcli.workflows.views import Views
-
-# Parameters for reconstructions of X-ray scans.
-_OF_SCANS = "run output outputs slices cameras device threads overwrite json quiet"
 
 
 @command
@@ -35,17 +29,12 @@ def render(
         str | None, typer.Option(help="Photos a.jpg,b.jpg,... that define the path, in this order.")
     ] = None,
     outputs: Annotated[
-        str | None,
+        str,
         typer.Option(
             help="Any of rgb, depth, opacity, spread, disagreement, coverage, parallax, lower, upper, confidence, "
-            "with commas between them; for scans projection, transmission, residual."
-            "  [default: rgb,depth,opacity; projection]"
+            "with commas between them."
         ),
-    ] = None,
-    slices: Annotated[
-        list[str] | None,
-        typer.Option(help="Scans: slices through the volume, z=0.3, in the unit of the scan. Repeatable."),
-    ] = None,
+    ] = "rgb,depth,opacity",
     depth: Annotated[
         str,
         typer.Option(help="Definition of depth: conditional, moment, background, max-weight, median or quantile:0.05."),
@@ -165,12 +154,9 @@ def render(
       nerfcli render photos-scene-run --cameras test --width 1920 --height 1080 --crop 480,270,960,540
       nerfcli render photos-scene-run --splats kitchen.ply --cameras orbit --video
       nerfcli render kitchen.ply --cameras camera_path.json --video
-      nerfcli render tooth-scene-run --outputs projection,residual
-      nerfcli render tooth-scene-run --slices z=0 --slices x=12.5
     """
     values = dict(locals())
     from nerfcli.captures.formats.camera_path import DEFAULT_FPS
-    from nerfcli.ct.result import is_reconstruction
     from nerfcli.render.outputs import OUTPUTS, ExportSettings
     from nerfcli.splats.files import SUFFIXES
     from nerfcli.training.runs.run import load_run
@@ -178,10 +164,7 @@ def render(
     from nerfcli.workflows.views import Views, file_fps, usual_axis
 
     console = Console(quiet=quiet, json_lines=json)
-    if is_of_scan(run, outputs=outputs, slices=slices):
-        for_each_input(run, partial(_render_scan, given=values, console=console), command="render")
-        return
-    chosen = options.some_of("rgb,depth,opacity" if outputs is None else outputs, OUTPUTS, "--outputs")
+    chosen = options.some_of(outputs, OUTPUTS, "--outputs")
     request = render_options.depth_request(
         depth,
         depth_axis,
@@ -211,9 +194,6 @@ def render(
     views = Views(cameras, count, through, max_size, look)
 
     def work(folder: Path, one_of_many: bool) -> None:
-        if is_reconstruction(folder):
-            _render_scan(folder, one_of_many, given=values, console=console)
-            return
         if folder.suffix.lower() in SUFFIXES:
             for option, given in {"--cameras-only": cameras_only, "--splats": splats is not None}.items():
                 if given:
@@ -253,40 +233,6 @@ def render(
             console.result(path)
 
     for_each_input(run, work, command="render")
-
-
-def _render_scan(folder: Path, one_of_many: bool, *, given: dict[str, Any], console: Console) -> None:
-    """Write projections, residuals and slices of a reconstruction; `given` has the values of all parameters, by name.
-
-    Raises:
-        UserError: it is no reconstruction, or an option is for photos.
-        typer.BadParameter: scans do not have such outputs, views or slices.
-    """
-    from nerfcli.ct.result import OUTPUTS, is_reconstruction
-    from nerfcli.ct.training_files import render_scan
-    from nerfcli.workflows.render import RENDERS
-
-    outputs, output = given["outputs"], given["output"]
-    if not is_reconstruction(folder):
-        option = "--slices" if given["slices"] else f"--outputs {outputs}"
-        raise UserError(f"{folder} is not a reconstruction of a scan; {option} is for those", f"remove {option}", 2)
-    refuse_photo_options(folder, render, given, of_scans=_OF_SCANS)
-    chosen = options.some_of("projection" if outputs is None else outputs, OUTPUTS, "--outputs")
-    options.one_of(given["cameras"], ("test", "train"), "--cameras")
-    cuts = slices_of(given["slices"] or [])
-    target = folder / RENDERS if output is None else output / folder.name if one_of_many else output
-    with console.callbacks("render") as callbacks:
-        for path in render_scan(
-            folder,
-            target,
-            outputs=chosen,
-            views=given["cameras"],
-            slices=cuts,
-            threads=thread_count(given["threads"]),
-            overwrite=given["overwrite"],
-            **callbacks,
-        ):
-            console.result(path)
 
 
 def _refuse_unused(given: dict[str, Any], *, outputs: tuple[str, ...], writes_video: bool) -> None:

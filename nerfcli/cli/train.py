@@ -13,8 +13,6 @@ from nerfcli.cli.console import Console, command
 from nerfcli.machine import device_name, is_first, is_one_of_several, local_rank_and_size, thread_count
 
 DEFAULT_BUDGET = "2m"
-# Parameters for X-ray scans.
-_OF_SCANS = "scene output budget steps include exclude field voxel_size seed threads device resume overwrite json quiet"
 
 
 @command
@@ -31,7 +29,6 @@ def train(
     exclude: options.Exclude = None,
     field: options.FieldKind = None,
     field_memory: options.FieldMemory = None,
-    voxel_size: options.VoxelSize = None,
     model: options.ModelChoice = "auto",
     downscale: options.Downscale = "auto",
     contraction: options.Contraction = "auto",
@@ -99,12 +96,6 @@ def train(
     voxels (a dense grid of density and spherical harmonics), mlp (one network on Fourier features: small and slow).
     The resolution of the last two is one pixel's footprint at the centre of the scene.
 
-    An X-ray scan, as `nerfcli convert` writes it, is reconstructed as a volume: Poisson likelihood and total variation,
-    --field voxels (of --voxel-size; the default, and better) or hash. Its components are tv (the weight of total
-    variation), centre (columns between the centre of rotation and where the scan says), tilt (degrees of the detector
-    in its plane) and air (measured: the brightness of each view from pixels beside the object); unless they are set,
-    all four are estimated from the scan.
-
     \b
     Examples:
       nerfcli train photos-scene --budget 90s
@@ -116,12 +107,8 @@ def train(
       nerfcli train photos-scene --without view --with distortion=0.01
       nerfcli train photos-scene --with cameras=poses
       nerfcli train photos-scene --field voxels --field-memory 16MB
-      nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
     """
-    values = dict(locals())
-    from nerfcli.ct.formats.read import recognise
-    from nerfcli.ct.scan import is_scan
-    from nerfcli.errors import UserError, in_shell
+    from nerfcli.errors import UserError
     from nerfcli.field.kinds import KINDS
     from nerfcli.memory import default_memory_limit
     from nerfcli.training.runs.components import Components, choose
@@ -134,21 +121,12 @@ def train(
     if field not in (None, "hash") and log2_rows is not None:
         message = "it works with --field hash; for other fields, give --field-memory"
         raise typer.BadParameter(message, param_hint="--log2-rows")
-    if is_one_of_several() and (dry_run or scene == STDIN or is_scan(Path(scene))):
+    if is_one_of_several() and (dry_run or scene == STDIN):
         raise UserError("processes of torchrun train one field of photos", "use this command without torchrun", 2)
     console = Console(quiet=quiet or not is_first(), json_lines=json)
     budget_seconds = None if budget is None else options.seconds_from_text(budget)
     rule = options.holdout_rule(holdout)
     limit = None if memory is None else options.bytes_from_text(memory)
-
-    def train_one_scan(folder: Path, run: Path) -> None:
-        from nerfcli.cli.scans import reconstruction_settings, refuse_photo_options
-        from nerfcli.ct.training import train_scan
-
-        refuse_photo_options(folder, train, values, of_scans=_OF_SCANS)
-        settings = reconstruction_settings(values, budget_seconds=budget_seconds, threads=thread_count(threads))
-        with console.callbacks(f"train {folder.name}") as callbacks:
-            train_scan(folder, run, settings, resume=resume, overwrite=overwrite, warn=console.warn, **callbacks)
 
     @functools.cache
     def photo_settings() -> TrainSettings:
@@ -201,23 +179,12 @@ def train(
 
     def work(folder: Path, one_of_many: bool) -> None:
         run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
-        if is_scan(folder):
-            train_one_scan(folder, run)
-        elif recognise(folder):
-            raise UserError(
-                f"{folder} is a scan in a scanner's format",
-                f"convert it first: nerfcli convert {in_shell(folder)} SCAN",
-            )
-        elif voxel_size is not None:
-            raise UserError(f"--voxel-size is for X-ray scans, and {folder} is not one", "remove --voxel-size")
-        elif dry_run:
+        if dry_run:
             plan_one_scene(folder)
             return
-        else:
-            train_one_scene(folder, run)
+        train_one_scene(folder, run)
         if is_first():
             console.result(run)
 
-    if scene == STDIN or not is_scan(Path(scene)):
-        photo_settings()  # refuses invalid options before anything is read
+    photo_settings()  # refuses invalid options before anything is read
     for_each_input(scene, work, command="train")

@@ -1,5 +1,7 @@
 """Parsing of the command line: usage errors that explain the correct usage, and what ends the program meanwhile."""
 
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -8,6 +10,7 @@ from typer.core import TyperCommand, TyperGroup
 from nerfcli.cli.batch import example_of_many
 from nerfcli.cli.console import command
 from nerfcli.cli.removed import refuse_removed
+from nerfcli.cli.scans import refuse_scan
 
 # The class of click, or of typer's own copy of click, depending on the version of typer.
 _UsageError: Any = typer.BadParameter.__bases__[0]
@@ -49,18 +52,18 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; see `TyperCommand.parse_args`."""
-        refuse_removed(str(self.name), args)
+        name = " ".join(ctx.command_path.split()[1:]) or str(self.name)
+        refuse_removed(name, args)
         try:
             return super().parse_args(ctx, args)
         except _UsageError as error:
             if option := getattr(error, "option_name", None):
-                commands = ctx.parent.command.commands if ctx.parent else {}
-                owners = [name for name, command in commands.items() if _has(command, option)]
+                owners = [owner for owner, each in _commands(ctx.find_root().command) if _has(each, option)]
                 if owners:
                     error.message = f"No such option: {option}, which belongs to {', '.join(owners)}"
                     error.possibilities = None
             elif "unexpected extra argument" in error.message and self._reads_paths():
-                error.message += f"; give one, or several on standard input: {example_of_many(str(self.name))}"
+                error.message += f"; give one, or several on standard input: {example_of_many(name)}"
             elif text := _wrong_value(error):
                 error.message = text
             elif not error.message and (help_text := getattr(error.param, "help", None)):  # missing argument
@@ -69,6 +72,25 @@ class Command(TyperCommand):
 
     def _reads_paths(self) -> bool:
         return any("standard input" in (getattr(parameter, "help", None) or "") for parameter in self.params)
+
+
+class PhotoCommand(Command):
+    """A command for photos: given an X-ray scan, it names the command for it before anything is loaded."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; see `TyperCommand.invoke`."""
+        argument = next((str(each.name) for each in self.params if each.param_type_name == "argument"), "")
+        given = ctx.params.get(argument) or ()
+        for path in given if isinstance(given, list | tuple) else (given,):
+            refuse_scan(Path(path), str(self.name))
+        return super().invoke(ctx)
+
+
+def _commands(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the name of each command, and of each command of a command, with the command."""
+    for name, each in getattr(group, "commands", {}).items():
+        yield prefix + name, each
+        yield from _commands(each, f"{prefix}{name} ")
 
 
 def _wrong_value(error: Any) -> str | None:

@@ -39,10 +39,8 @@ def view(
       nerfcli view photos-scene-run
       nerfcli view photos-scene-run --port 9000 --no-browser
     """
-    from nerfcli.cli.scans import refuse_scan
     from nerfcli.workflows.view import view_run
 
-    refuse_scan(run, "view")
     console = Console(quiet=False, json_lines=False)
 
     def on_ready(url: str, from_elsewhere: str) -> None:

@@ -1,12 +1,10 @@
 """Circular scans as most scanners describe them: a source and a flat detector around an axis.
 
 `Circle.geometry` turns such a description into vectors, and `circle_of` turns vectors into a description by independent
-formulas, so that a round trip verifies a conversion.
+formulas.
 """
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -69,16 +67,6 @@ class Circle:
         lengths = ("pixel_width", "pixel_height", "source_origin", "source_detector", "lateral")
         return replace(self, **{name: factor * getattr(self, name) for name in lengths})
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the circle as plain values."""
-        return asdict(self) | {"angles": list(self.angles)}
-
-
-def circle_from_json(content: Mapping[str, Any]) -> Circle:
-    """Restore a circle from the output of `Circle.to_json`."""
-    values: dict[str, Any] = {**content, "angles": tuple(content["angles"])}
-    return Circle(**values)
-
 
 def circle_of(geometry: ScanGeometry) -> tuple[Circle, float]:
     """Fit a circle to a geometry; also return its distance from the geometry.
@@ -127,24 +115,6 @@ def circle_of(geometry: ScanGeometry) -> tuple[Circle, float]:
         return found, _distance(found.geometry(), turned) / found.pixel_width
     except ValueError:  # the source is not on the outer side of the axis
         return found, float("inf")
-
-
-def differences(one: Circle, other: Circle) -> dict[str, float]:
-    """Return the largest differences of two circles: angles in degrees, lengths relative, shifts in pixels."""
-    turn = np.angle(np.exp(1j * (np.array(one.angles) - np.array(other.angles))))
-    lengths = ("pixel_width", "pixel_height", "source_origin", "source_detector")
-    relative = [abs(getattr(one, n) - getattr(other, n)) / max(abs(getattr(one, n)), 1e-300) for n in lengths]
-    shifts = [abs(one.column_shift - other.column_shift), abs(one.row_shift - other.row_shift)]
-    shifts.append(abs(one.lateral - other.lateral) / one.pixel_width)
-    if one.mirrored != other.mirrored:
-        shifts.append(float("inf"))
-    tilt = np.degrees(one.tilt - other.tilt)
-    return {
-        "angle_deg": float(np.degrees(np.abs(turn)).max()),
-        "length": float(max(relative)),
-        "shift_px": float(max(shifts)),
-        "tilt_deg": float(abs(tilt)),
-    }
 
 
 def _distance(one: ScanGeometry, other: ScanGeometry) -> float:

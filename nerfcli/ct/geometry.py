@@ -93,6 +93,11 @@ class ScanGeometry:
             self, column_step=width * (cos * along + sin * down), row_step=height * (cos * down - sin * along)
         )
 
+    def corrected(self, centre: float, tilt: float) -> "ScanGeometry":
+        """Return the scan with its detector moved by `centre` columns and turned by `tilt` radians."""
+        shifted = self.shifted(centre) if centre else self
+        return shifted.tilted(tilt) if tilt else shifted
+
     def scaled(self, factor: float) -> "ScanGeometry":
         """Return the same scan in a unit that is `factor` times smaller."""
         emitter = self.emitter if self.beam == "parallel" else factor * self.emitter
@@ -114,16 +119,9 @@ class ScanGeometry:
             frame's origin.
         """
         index = np.arange(self.views) if views is None else np.asarray(views)
-        return self._through(index[:, None, None], np.arange(self.rows)[:, None], np.arange(self.columns))
-
-    def rays_of_pixels(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return origins and directions (N, 3), as `rays` does, for flat indices (N,) of pixels in all views."""
-        line, column = np.divmod(pixels, self.columns)
-        return self._through(*np.divmod(line, self.rows), column)
-
-    def _through(self, view: np.ndarray, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        along = (column - (self.columns - 1) / 2)[..., None]
-        down = (row - (self.rows - 1) / 2)[..., None]
+        view = index[:, None, None]
+        along = (np.arange(self.columns) - (self.columns - 1) / 2)[:, None]
+        down = (np.arange(self.rows)[:, None] - (self.rows - 1) / 2)[..., None]
         pixels = self.centre[view] + down * self.row_step[view] + along * self.column_step[view]
         emitter = np.broadcast_to(self.emitter[view], pixels.shape)
         if self.beam == "parallel":

@@ -7,7 +7,6 @@ likelihoods are negative logarithms, view by view; tensors are (views, pixels), 
     curvature    second derivative, >= 0, at the line integrals that the data themselves suggest
     deviance     squared misfit over the noise variance, 1 on average for a correct model; NaN if unusable
     suggested    line integrals estimated directly from the data, to start a fit; NaN for unusable pixels
-    by_ray       the same likelihood with each pixel as a separate view
 """
 
 from dataclasses import dataclass, replace
@@ -68,10 +67,6 @@ class Poisson:
         signal = (self.counts[views] - self.background[views]).clamp_min(0.5)
         return torch.where(self.open_beam[views] > 0, torch.log(self.open_beam[views] / signal), torch.nan)
 
-    def by_ray(self) -> "Poisson":
-        counts, open_beam, background = (x.reshape(-1, 1) for x in (self.counts, self.open_beam, self.background))
-        return replace(self, counts=counts, open_beam=open_beam, background=background)
-
     def scaled(self, factors: Tensor) -> "Poisson":
         """Return the same counts with the open beam multiplied by one factor per view (views,)."""
         return replace(self, open_beam=self.open_beam * factors[:, None])
@@ -116,9 +111,6 @@ class Gaussian:
 
     def suggested(self, views: Tensor) -> Tensor:
         return torch.where(self.weight[views] > 0, self.measured[views], torch.nan)
-
-    def by_ray(self) -> "Gaussian":
-        return Gaussian(self.measured.reshape(-1, 1), self.weight.reshape(-1, 1))
 
 
 Likelihood = Poisson | Gaussian

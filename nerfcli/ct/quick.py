@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid
+from nerfcli.ct.reconstruct import Projector
 from nerfcli.ct.scan import Scan
 
 # Number of accelerated steps of the reconstruction; more steps fit noise.
@@ -102,13 +102,13 @@ def misfit(row: Row, *, shift: float = 0.0, mirrored: bool = False) -> np.ndarra
     fitted, left = views[::2], views[1::2]
     grid = _grid(geometry)
     volume = _reconstructed(geometry.select(fitted), row.integrals[fitted], grid)
-    others = _forward(volume, _rays(geometry.select(left)), grid).reshape(len(left), -1).numpy()
+    others = Projector(geometry.select(left), grid).forward(volume).numpy()
     return ((others - row.integrals[left]) ** 2).mean(1)
 
 
 def predicted(volume: np.ndarray, row: Row, grid: VoxelGrid) -> np.ndarray:
     """Return line integrals (V, columns) of a volume (Y, X) along the rays of a row."""
-    return _forward(torch.from_numpy(volume[None]), _rays(row.geometry), grid).reshape(row.integrals.shape).numpy()
+    return Projector(row.geometry, grid).forward(torch.from_numpy(volume[None])).numpy()
 
 
 def reconstructed(row: Row) -> tuple[np.ndarray, VoxelGrid]:
@@ -119,42 +119,21 @@ def reconstructed(row: Row) -> tuple[np.ndarray, VoxelGrid]:
 
 def _reconstructed(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid) -> Tensor:
     """Reconstruct a volume (1, Y, X) by SIRT with positivity and Nesterov's momentum."""
-    measured = torch.from_numpy(np.ascontiguousarray(integrals, dtype=np.float32).reshape(-1))
-    rays = _rays(geometry)
-    ones = torch.ones(grid.shape)
-    chord = _forward(ones, rays, grid)
+    measured = torch.from_numpy(np.ascontiguousarray(integrals, dtype=np.float32))
+    projector = Projector(geometry, grid)
+    chord = projector.forward(torch.ones(grid.shape))
     by_ray = torch.where(chord > grid.size, 1 / chord.clamp_min(grid.size), 0)
-    met = _backward(torch.ones_like(chord), rays, grid)
+    met = projector.backward(torch.ones_like(chord))
     by_voxel = torch.where(met > 0, 1 / met.clamp_min(1e-3 * float(met.max())), 0)
     volume = torch.zeros(grid.shape)
     ahead, momentum = volume, 1.0
     for _ in range(STEPS):
-        left = (measured - _forward(ahead, rays, grid)) * by_ray
-        stepped = (ahead + by_voxel * _backward(left, rays, grid)).clamp_min(0)
+        left = (measured - projector.forward(ahead)) * by_ray
+        stepped = (ahead + by_voxel * projector.backward(left)).clamp_min(0)
         following = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
         ahead = stepped + (momentum - 1) / following * (stepped - volume)
         volume, momentum = stepped, following
     return volume
-
-
-def _forward(volume: Tensor, rays: tuple[Tensor, Tensor], grid: VoxelGrid) -> Tensor:
-    return _backend().project(volume, *rays, first=grid.first, size=grid.size)
-
-
-def _backward(values: Tensor, rays: tuple[Tensor, Tensor], grid: VoxelGrid) -> Tensor:
-    return _backend().back_project(values, *rays, shape=grid.shape, first=grid.first, size=grid.size)
-
-
-def _backend() -> kernels.Backend:
-    return kernels.backend_for(torch.device("cpu"), torch.float32)
-
-
-def _rays(geometry: ScanGeometry) -> tuple[Tensor, Tensor]:
-    origins, directions = geometry.rays()
-    return (
-        torch.from_numpy(np.ascontiguousarray(origins.reshape(-1, 3))),
-        torch.from_numpy(np.ascontiguousarray(directions.reshape(-1, 3))),
-    )
 
 
 def _grid(geometry: ScanGeometry) -> VoxelGrid:

@@ -71,26 +71,32 @@ class Fit:
 
 
 class Projector:
-    """Rays of a scan through a grid, view by view."""
+    """Rays of a scan through a grid, view by view; the rays of all views are kept once they are used together."""
 
     def __init__(self, geometry: ScanGeometry, grid: VoxelGrid):
         self._geometry, self._grid = geometry, grid
         self._backend = kernels.backend_for(torch.device("cpu"), torch.float32)
+        self._of_all: tuple[Tensor, Tensor] | None = None
 
-    def forward(self, volume: Tensor, views: np.ndarray) -> Tensor:
-        """Return line integrals (len(views), pixels) of a volume."""
+    def forward(self, volume: Tensor, views: np.ndarray | None = None) -> Tensor:
+        """Return line integrals (views, pixels) of a volume, for some views or for all."""
         grid = self._grid
         integrals = self._backend.project(volume, *self._rays(views), first=grid.first, size=grid.size)
-        return integrals.view(len(views), -1)
+        return integrals.view(self._geometry.views if views is None else len(views), -1)
 
-    def backward(self, values: Tensor, views: np.ndarray) -> Tensor:
-        """Apply the transpose of `forward`: return a volume from values (len(views), pixels)."""
+    def backward(self, values: Tensor, views: np.ndarray | None = None) -> Tensor:
+        """Apply the transpose of `forward`: return a volume from values (views, pixels)."""
         grid, rays = self._grid, self._rays(views)
         return self._backend.back_project(values.reshape(-1), *rays, shape=grid.shape, first=grid.first, size=grid.size)
 
-    def _rays(self, views: np.ndarray) -> tuple[Tensor, Tensor]:
+    def _rays(self, views: np.ndarray | None) -> tuple[Tensor, Tensor]:
+        if views is None and self._of_all is not None:
+            return self._of_all
         origins, directions = self._geometry.rays(views)
-        return torch.from_numpy(origins.reshape(-1, 3)), torch.from_numpy(directions.reshape(-1, 3))
+        rays = torch.from_numpy(origins.reshape(-1, 3)), torch.from_numpy(directions.reshape(-1, 3))
+        if views is None:
+            self._of_all = rays
+        return rays
 
 
 def start(problem: Problem) -> Fit:

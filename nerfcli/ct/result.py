@@ -13,19 +13,15 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.ct.grid import VoxelGrid
-from nerfcli.ct.scan import MEASUREMENT, array_digest, read_array
+from nerfcli.ct.recognise import DESCRIPTION, MEASUREMENT, is_reconstruction
+from nerfcli.ct.scan import Scan, array_digest, load_scan, read_array
 from nerfcli.errors import UserError
 from nerfcli.sealed import read_sealed, write_sealed
 
-DESCRIPTION = "reconstruction.json"
 VOLUME = "volume.npy"
 MARKS = "marks.npy"
 METRICS = "metrics.json"
 LOCK = ".train.lock"
-
-FIELDS = ("voxels", "hash")
-# Outputs that can be rendered from a reconstruction.
-OUTPUTS = ("projection", "transmission", "residual")
 
 
 @dataclass(frozen=True)
@@ -35,13 +31,11 @@ class ReconstructionSettings:
     Args:
         budget_seconds: time limit for everything, trials included; None for no limit.
         passes: number of passes over all views; None for no limit.
-        field: one of `FIELDS`.
         voxel_size: in the scan's unit; None for the size of a pixel at the object.
         strength: weight of total variation, see `reconstruct`.
         centre: offset of the detector in columns; None to estimate it.
         tilt: rotation of the detector in its plane in radians; None to estimate it.
         air: whether the open beam of each view is measured in its pixels beside the object; None to decide by the data.
-        seed: seed for a hash grid's initial values and its choice of pixels and samples.
         threads: number of CPU threads; 0 for all.
 
     Raises:
@@ -50,25 +44,24 @@ class ReconstructionSettings:
 
     budget_seconds: float | None = None
     passes: int | None = None
-    field: str = "voxels"
     voxel_size: float | None = None
     strength: float = 1.0
     centre: float | None = None
     tilt: float | None = None
     air: bool | None = None
-    seed: int = 0
     threads: int = 0
 
     def __post_init__(self) -> None:
         if self.budget_seconds is None and self.passes is None:
             raise UserError(
-                "no stopping criterion: neither --budget nor --steps is given", "give --budget 2m or --steps 30"
+                "no stopping criterion: neither --budget nor --passes is given", "give --budget 2m or --passes 30"
             )
         if self.voxel_size is not None and not self.voxel_size > 0:
             raise UserError(f"invalid voxel size {self.voxel_size:g}", "give --voxel-size a length above 0")
         if not 0 <= self.strength < float("inf"):
             raise UserError(
-                f"invalid weight of total variation: {self.strength:g}", "give a number of 0 or more, or leave it out"
+                f"invalid weight of total variation: {self.strength:g}",
+                "give --tv a number of 0 or more, or leave it out",
             )
 
 
@@ -90,7 +83,6 @@ class Reconstruction:
         settled: whether the last pass hardly changed the volume.
         missing_wedge_deg: range of directions without rays, see `marks.missing_wedge_deg`.
         versions: versions of the programs used.
-        learned: arrays of a hash grid, keyed by file name, which `volume` samples; empty for voxels.
         complete: False if the fit was interrupted.
     """
 
@@ -108,16 +100,7 @@ class Reconstruction:
     settled: bool = False
     missing_wedge_deg: float = 0.0
     versions: Mapping[str, str] = field(default_factory=dict)
-    learned: Mapping[str, np.ndarray] = field(default_factory=dict)
     complete: bool = True
-
-
-def is_reconstruction(run: Path) -> bool:
-    """Return whether a folder is a run that `save_reconstruction` wrote."""
-    try:
-        return (run / DESCRIPTION).is_file() and read_sealed(run / DESCRIPTION).get("measurement") == MEASUREMENT
-    except (OSError, ValueError):
-        return False
 
 
 def save_reconstruction(run: Path, result: Reconstruction) -> None:
@@ -127,7 +110,7 @@ def save_reconstruction(run: Path, result: Reconstruction) -> None:
         UserError: it cannot be written.
     """
     digests = {}
-    for name, array in {VOLUME: result.volume, MARKS: result.marks, **result.learned}.items():
+    for name, array in {VOLUME: result.volume, MARKS: result.marks}.items():
         with atomic_path(run / name) as partial:
             np.save(partial, array, allow_pickle=False)
         digests[name] = array_digest(array)
@@ -159,10 +142,19 @@ def load_reconstruction(run: Path) -> Reconstruction:
     Raises:
         UserError: there is none, or its files are damaged.
     """
+    if not is_reconstruction(run):
+        hint = "give a run folder that nerfcli ct train wrote"
+        raise UserError(f"{run} is not a reconstruction" if run.exists() else f"{run} does not exist", hint)
     try:
         content = read_sealed(run / DESCRIPTION)
         arrays = {name: read_array(run / name, digest) for name, digest in content["arrays"].items()}
         grid, settings = content["grid"], content["settings"]
+        settings.pop("seed", None)  # of earlier runs
+        if settings.pop("field", "voxels") != "voxels":
+            raise UserError(
+                f"{run} is a hash grid, which scans no longer have: voxels are better in the same time",
+                "train the scan again, into another folder",
+            )
         if settings["strength"] is None:  # earlier runs could choose it
             settings["strength"] = content["used"]["strength"]
         return Reconstruction(
@@ -180,8 +172,31 @@ def load_reconstruction(run: Path) -> Reconstruction:
             content["settled"],
             content["missing_wedge_deg"],
             content["versions"],
-            arrays,
             complete=content.get("complete", True),  # earlier runs do not say
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{run} cannot be read as a reconstruction: {error}", "train the scan again") from error
+
+
+def scan_of(result: Reconstruction, run: Path) -> Scan:
+    """Load the scan of a reconstruction.
+
+    Raises:
+        UserError: the scan no longer exists, or has changed.
+    """
+    if not result.scan.exists():
+        raise UserError(
+            f"the scan {result.scan} of {run} does not exist",
+            "run the command from the folder that train was run in, or train again",
+        )
+    scan = load_scan(result.scan)
+    if scan.digest != result.scan_digest:
+        raise UserError(f"{result.scan} has changed since {run} was trained", "train again with --overwrite")
+    return scan
+
+
+def refuse_existing(*paths: Path, overwrite: bool) -> None:
+    """Raise unless none of the files exists, or they may be replaced."""
+    there = [path for path in paths if path.exists()]
+    if there and not overwrite:
+        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another path with -o")

@@ -1,7 +1,7 @@
 """A scan: a detector's measurements behind an object, the geometry of their rays, and the folder that holds them.
 
 SCAN/scene.json holds geometry, unit and provenance; the arrays are .npy files beside it, which are memory-mapped when
-they are read. `nerfcli convert` writes such folders from the formats of scanners.
+they are read. `nerfcli ct convert` writes such folders from the formats of scanners.
 """
 
 import hashlib
@@ -14,11 +14,10 @@ import numpy as np
 
 from nerfcli.atomic import atomic_folder
 from nerfcli.ct.geometry import Beam, ScanGeometry, from_vectors
+from nerfcli.ct.recognise import MEASUREMENT, SCENE_FILE
 from nerfcli.errors import UserError
 from nerfcli.sealed import read_sealed, write_sealed
 
-SCENE_FILE = "scene.json"
-MEASUREMENT = "transmission"
 FORMAT = "nerfcli scan 1"
 
 # One in this many views is held out if the scan does not state which.
@@ -127,14 +126,6 @@ class Scan:
         elif self.photons_per_value is not None:
             floor = np.float32(0.5 / self.photons_per_value)
         return -np.log(np.maximum(values, floor)).astype(np.float32)
-
-
-def is_scan(path: Path) -> bool:
-    """Return whether a folder holds a scan that `save_scan` wrote."""
-    try:
-        return (path / SCENE_FILE).is_file() and read_sealed(path / SCENE_FILE).get("measurement") == MEASUREMENT
-    except (OSError, ValueError):
-        return False
 
 
 def save_scan(folder: Path, scan: Scan) -> None:

@@ -14,8 +14,6 @@ from nerfcli.captures.formats.registry import recognise, recognised
 from nerfcli.captures.formats.run_cameras import CAMERAS
 from nerfcli.captures.loading import describe_unused_masks, fingerprint, with_photos_on_disk
 from nerfcli.captures.orientation import describe_rescaling
-from nerfcli.ct.result import is_reconstruction, load_reconstruction
-from nerfcli.ct.volume_files import is_volume_file, volume_facts
 from nerfcli.errors import UserError
 from nerfcli.export.model_facts import SUFFIXES as MODEL_SUFFIXES
 from nerfcli.export.model_facts import is_splat_file, model_facts
@@ -27,7 +25,7 @@ _CAPTURE_SUFFIXES = (".sfm", ".json", ".xml", ".csv", ".out", ".npz")
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Return the facts of a scan, a reconstruction, a capture, a run, renders, a file of data, or else of a scene.
+    """Return the facts of a capture, a run, renders, a file of data, or else of a scene.
 
     Raises:
         UserError: the path is none of these, or damaged.
@@ -38,12 +36,6 @@ def describe(path: str | Path) -> dict[str, Any]:
     if folder.name == RENDERS:
         folder = folder.parent
     folder = _whole(folder)
-    if _is_scan_to_describe(folder):
-        from nerfcli.ct.scans import describe_scan
-
-        return describe_scan(folder)
-    if is_reconstruction(folder):
-        return _describe_reconstruction(folder)
     if folder.is_file() and folder.suffix == ".safetensors":
         from nerfcli.workflows.describe_run import describe_tensors
 
@@ -57,8 +49,6 @@ def describe(path: str | Path) -> dict[str, Any]:
         return splat_facts(folder)
     if folder.suffix.lower() in MODEL_SUFFIXES:
         return model_facts(folder)
-    if folder.is_file() and is_volume_file(folder):
-        return volume_facts(folder)
     if folder.is_file() and folder.suffix.lower() != ".json":
         return file_facts(folder)
     if (folder / RENDERS).exists():
@@ -79,30 +69,6 @@ def _whole(path: Path) -> Path:
     if path.name == "poses_report.json" and (path.parent / "scene.json").is_file():
         return path.parent
     return path
-
-
-def _is_scan_to_describe(path: Path) -> bool:
-    """Return whether the path is a scan; single depth files and pictures are not, even if they are beside a scan."""
-    if path.is_file() and path.suffix.lower() in (".npy", ".npz", ".tif", ".tiff", ".png", ".safetensors"):
-        return False
-    from nerfcli.ct.formats.read import recognise
-
-    return recognise(path) is not None
-
-
-def _describe_reconstruction(run: Path) -> dict[str, Any]:
-    result = load_reconstruction(run)
-    return {
-        "kind": "reconstruction",
-        "scan": str(result.scan),
-        "voxels": "x".join(str(count) for count in reversed(result.grid.shape)),
-        "voxel_size": result.grid.size,
-        "unit": result.unit,
-        "passes": result.passes,
-        "seconds": round(result.seconds, 1),
-        "settled": result.settled,
-        "decisions": list(result.decisions),
-    }
 
 
 def _camera_facts(frames: Iterable[Frame]) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from nerfcli.captures.formats.format import Format, folder_of
 from nerfcli.captures.formats.photo_names import seen_from
 from nerfcli.captures.holdout import default_split
 from nerfcli.captures.stored_pixels import UPRIGHT
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, in_shell
 from nerfcli.photos.masks import find_mask
 
 SCENE_FILE = "scene.json"
@@ -93,7 +93,7 @@ def read_description(root: Path) -> Description:
     if content.get("measurement") == "transmission":
         raise UserError(
             f"{root} is an X-ray scan, not a scene of photos",
-            "use convert, doctor, info or train with it, and evaluate, render or export with its run",
+            f"use nerfcli ct train {in_shell(root)}",
         )
     if content.get("version") != SCENE_VERSION:
         raise UserError(

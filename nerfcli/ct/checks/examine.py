@@ -1,13 +1,26 @@
-"""All checks of a scan."""
+"""All checks of a scan, and the HTML page of their findings: with a projection, and the sinogram of a row."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
 
 from nerfcli.ct.checks import fit, values, views
 from nerfcli.ct.checks.sample import Sample, sample_of
+from nerfcli.ct.describe import in_words
+from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.scan import Scan
-from nerfcli.pages.findings import Finding, worst
+from nerfcli.errors import UserError
+from nerfcli.notices import Notify, Progress, no_progress, silent
+from nerfcli.pages import page as pages
+from nerfcli.pages.findings import VERDICTS, Finding, as_json, worst
+from nerfcli.pages.page import data_uri, jpeg_bytes
 
+_LONGEST_PX = 640
 Check = Callable[[Sample], Finding | str]
 CHECKS: dict[str, Check] = {
     "open beam": values.above_open_beam,
@@ -42,10 +55,18 @@ class ScanDiagnosis:
         """The worst of the findings' verdicts."""
         return worst(finding.verdict for finding in self.findings)
 
+    @property
+    def record(self) -> dict[str, Any]:
+        """The findings as plain values."""
+        return {
+            "kind": "scan",
+            "verdict": self.verdict,
+            "findings": [as_json(finding) for finding in self.findings],
+            "not_checked": dict(self.not_checked),
+        }
 
-def examine_scan(
-    scan: Scan, *, progress: Callable[[float, str], None] = lambda fraction, detail: None
-) -> ScanDiagnosis:
+
+def examine_scan(scan: Scan, *, progress: Progress = no_progress) -> ScanDiagnosis:
     """Run all checks of a scan. Deterministic."""
     progress(0.0, "reading")
     sample = sample_of(scan)
@@ -59,3 +80,83 @@ def examine_scan(
         else:
             not_checked.append((name, found))
     return ScanDiagnosis(sample, tuple(findings), tuple(not_checked))
+
+
+def examine(
+    source: Path, page: Path, *, overwrite: bool = False, notify: Notify = silent, progress: Progress = no_progress
+) -> ScanDiagnosis:
+    """Run all checks of a scan in any format, and write a page of the findings, atomically.
+
+    Raises:
+        UserError: the scan cannot be read, or the page's path holds something else.
+    """
+    if page.is_dir():
+        raise UserError(f"{page} is a folder", "give the page's file name with -o")
+    if not overwrite:
+        pages.refuse_foreign(page, pages.Mark("doctor", source), about="scan")
+    scan = read_scan(source)
+    notify(f"{source}: {in_words(scan)}")
+    diagnosis = examine_scan(scan, progress=progress)
+    pages.write_page(page_html(diagnosis, source), page)
+    return diagnosis
+
+
+def page_html(diagnosis: ScanDiagnosis, source: Path) -> str:
+    """Return the page's text."""
+    order = sorted(diagnosis.findings, key=lambda finding: -VERDICTS.index(finding.verdict))
+    sample = diagnosis.sample
+    middle = sample.integrals.shape[1] // 2
+    sinogram = sample.integrals[:, middle]
+    pictures = [("Sinogram", f"line integrals of row {int(sample.rows[middle])}, a line per view", sinogram)]
+    if sample.scan.geometry.rows > 1:
+        first = sample.scan.line_integrals(np.array([0]))[0]
+        pictures.insert(0, ("First projection", "line integrals", first))
+    body = _BODY.substitute(
+        title=escape(source.resolve().name),
+        findings="\n".join(map(_finding_html, order)),
+        not_checked="".join(f"<li><b>{escape(c)}</b>: {escape(why)}</li>" for c, why in diagnosis.not_checked)
+        or "<li>everything was checked</li>",
+        pictures="\n".join(_picture_html(*each) for each in pictures),
+    )
+    return pages.page_html(title=source.resolve().name, mark=pages.Mark("doctor", source), style=_STYLE, body=body)
+
+
+def _finding_html(finding: Finding) -> str:
+    advice = f'<p class="advice">{escape(_sentence(finding.advice))}</p>' if finding.advice else ""
+    return (
+        f'<article class="{finding.verdict}"><h3>{escape(finding.check)}</h3>'
+        f"<p>{escape(_sentence(finding.summary))}</p>{advice}"
+        f'<p class="threshold">{escape(finding.threshold)}</p></article>'
+    )
+
+
+def _picture_html(title: str, text: str, values: np.ndarray) -> str:
+    low, high = np.quantile(values, [0.005, 0.995])
+    grey = np.clip((values - low) / max(float(high - low), 1e-12), 0, 1)
+    levels = np.repeat((255 * grey).astype(np.uint8)[..., None], 3, axis=2)
+    uri = data_uri(jpeg_bytes(levels, longest_px=_LONGEST_PX), "jpeg")
+    return (
+        f"<figure><img src={uri!r} alt={title!r}><figcaption><b>{escape(title)}</b> {escape(text)}, "
+        f"{low:.3g} (black) to {high:.3g}</figcaption></figure>"
+    )
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + "."
+
+
+_STYLE = """\
+article{background:var(--card);border:1px solid var(--line);border-left:4px solid var(--good);border-radius:8px;
+padding:12px 16px;margin:8px 0}
+article.look{border-left-color:var(--look);background:var(--tint-look)}
+article.bad{border-left-color:var(--bad);background:var(--tint-bad)}
+article h3,article p{margin:2px 0}.advice{font-weight:600}.threshold,figcaption{color:var(--soft);font-size:12.5px}
+figure{margin:12px 0}img{max-width:100%}
+"""
+_BODY = Template("""\
+<div class="top"><div><h1>$title</h1><p>nerfcli ct doctor: an X-ray scan</p></div></div>
+<h2>Findings</h2>
+$findings
+<h2>Not checked</h2><ul>$not_checked</ul>
+<h2>What was measured</h2>
+$pictures""")

@@ -5,12 +5,10 @@ import numpy as np
 from nerfcli.ct.centre import FEWEST_VIEWS, FINE, centre_of
 from nerfcli.ct.checks.sample import Sample
 from nerfcli.ct.formats.assemble import axis_column
-from nerfcli.ct.quick import Row, highest_contrast_row, predicted, reconstructed
+from nerfcli.ct.quick import highest_contrast_row, predicted, reconstructed
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, verdict_above
 
 CENTRE_LOOK, CENTRE_BAD = 0.3, 1.0
-# Views of a parallel beam that are half a turn apart, to within this many steps, count as opposite.
-_OPPOSITE = 1.01
 HARDENING_LOOK, HARDENING_BAD = 0.05, 0.25
 # Below this fraction of explained variance, the object has several materials, whose effect looks like beam hardening.
 ONE_MATERIAL = 0.97
@@ -27,39 +25,14 @@ def centre(sample: Sample) -> Finding | str:
     column = stated - found.shift
     number = abs(found.shift) if found.is_off else 0.0
     verdict = verdict_above(number, look=CENTRE_LOOK, bad=CENTRE_BAD)
-    pair = mirror_centre(row)
-    by_pair = f"; opposite views give {pair:.1f}" if pair is not None else ""
     return Finding(
         "centre of rotation",
         verdict,
-        f"axis at column {column:.2f} ± {found.error:.2f}; the scan states {stated:.2f}{by_pair}",
+        f"axis at column {column:.2f} ± {found.error:.2f}; the scan states {stated:.2f}",
         abs(found.shift),
         f"look from {CENTRE_LOOK:g} columns, bad from {CENTRE_BAD:g}, if it predicts other views significantly better",
-        "" if verdict == GOOD else f"convert with --centre-of-rotation {column:.2f}, or let train estimate it",
+        "" if verdict == GOOD else f"convert with --centre-of-rotation {column:.2f}, or let ct train estimate it",
     )
-
-
-def mirror_centre(row: Row) -> float | None:
-    """Estimate the column of the axis from two opposite views of a parallel beam; None if there are none."""
-    geometry = row.geometry
-    if geometry.beam != "parallel":
-        return None
-    angles = np.arctan2(geometry.emitter[:, 1], geometry.emitter[:, 0])
-    step = float(np.median(np.abs(np.diff(np.unwrap(angles))))) if len(angles) > 1 else 0.0
-    apart = np.abs(np.angle(np.exp(1j * (angles - angles[0] - np.pi))))
-    other = int(np.argmin(apart))
-    if apart[other] > _OPPOSITE * step:
-        return None
-    one, two = row.integrals[0].astype(np.float64), row.integrals[other].astype(np.float64)
-    columns = np.arange(len(one), dtype=np.float64)
-    least, best = np.inf, None
-    for middle in np.arange(0.3 * len(one), 0.7 * len(one), 0.25):
-        mirrored = np.interp(2 * middle - columns, columns, two, left=np.nan, right=np.nan)
-        there = np.isfinite(mirrored)
-        error = float(np.mean((one[there] - mirrored[there]) ** 2)) if there.sum() > len(one) // 3 else np.inf
-        if error < least:
-            least, best = error, float(middle)
-    return best
 
 
 def beam_hardening(sample: Sample) -> Finding | str:

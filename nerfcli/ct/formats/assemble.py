@@ -89,7 +89,6 @@ def scan_of(found: ReaderOutput, given: ScanOptions) -> Scan:
         "source": str(found.path),
         **(found.history or {}),
         "notes": notes,
-        **({"circle": placed.to_json()} if isinstance(placed, Circle) else {}),
     }
     beam = found.beam
     return Scan(

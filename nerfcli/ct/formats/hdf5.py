@@ -13,10 +13,10 @@ from nerfcli.ct.circle import Circle
 from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
 from nerfcli.ct.formats.scan_options import ScanOptions, angles_in_radians, millimetres
 from nerfcli.ct.open_beam import check_sizes, open_beam_of
+from nerfcli.ct.recognise import datasets_in, open_hdf5
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 
-SUFFIXES = (".h5", ".hdf5", ".hdf", ".nxs", ".nx")
 # Names of the pixel size, in order of preference: the size at the object before that of the camera.
 _PIXEL_WIDTH = (
     *("sample_x_pixel_size", "actual_pixel_size_x", "x_actual_pixel_size", "pixel_size_x"),
@@ -33,7 +33,7 @@ def read_data_exchange(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     Raises:
         UserError: it cannot be read, lacks something, or its parts do not fit together.
     """
-    with _opened(path) as file:
+    with open_hdf5(path) as file:
         data = _frames(file, "exchange/data", path)
         theta = _dataset(file, "exchange/theta", path, "the angles of the projections")
         angles = angles_in_radians(theta[...], views=len(data), unit=_unit(theta), where=f"{path}: exchange/theta")
@@ -49,7 +49,7 @@ def read_nxtomo(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     Raises:
         UserError: as for `read_data_exchange`.
     """
-    with _opened(path) as file:
+    with open_hdf5(path) as file:
         key_name = _first(file, "image_key", path)
         key = np.asarray(file[key_name][...]).reshape(-1)
         folder = key_name.rpartition("/")[0]
@@ -62,7 +62,7 @@ def read_nxtomo(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
         angle_name = _first(file, "rotation_angle", path)
         all_angles = np.asarray(file[angle_name][...]).reshape(-1)
         unit = _unit(file[angle_name])
-        control = [name for name in _walk(file) if name.endswith("image_key_control")]
+        control = [name for name in datasets_in(file) if name.endswith("image_key_control")]
         # Frames for alignment have key 0 and a control of -1.
         aligned = np.asarray(file[control[0]][...]).reshape(-1) < 0 if control else np.zeros(len(key), bool)
         sides = _pixel_mm(file, path)
@@ -80,18 +80,6 @@ def read_nxtomo(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
         sides=sides,
         given=given,
     )
-
-
-def hdf5_form(path: Path) -> str | None:
-    """Return "data-exchange", "nxtomo", or None for other HDF5 files.
-
-    Raises:
-        UserError: the file cannot be opened as HDF5.
-    """
-    with _opened(path) as file:
-        if "exchange/data" in file or "exchange" in file:
-            return "data-exchange"
-        return "nxtomo" if any(name.rpartition("/")[2] == "image_key" for name in _walk(file)) else None
 
 
 def _parallel(
@@ -127,17 +115,6 @@ def _parallel(
     return scan_of(ReaderOutput(path, form, data, kind, circle, unit, beam=beam, notes=notes, stated_mm=stated), given)
 
 
-def _opened(path: Path) -> Any:
-    import h5py
-
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        if not path.exists():
-            raise UserError(f"{path} does not exist", "give the path of an HDF5 file") from error
-        raise UserError(f"{path} cannot be read as HDF5: {error}", "it is damaged: copy it again") from error
-
-
 def _dataset(file: Any, name: str, path: Path, what: str) -> Any:
     import h5py
 
@@ -159,17 +136,8 @@ def _frames(file: Any, name: str, path: Path) -> np.ndarray:
     return array
 
 
-def _walk(file: Any) -> list[str]:
-    """Return the names of all datasets, in the order of the file."""
-    import h5py
-
-    names: list[str] = []
-    file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-    return names
-
-
 def _first(file: Any, name: str, path: Path) -> str:
-    for found in _walk(file):
+    for found in datasets_in(file):
         if found.rpartition("/")[2] == name:
             return found
     raise UserError(f"{path} has no {name}", "an NXtomo entry has image_key, data and rotation_angle")
@@ -185,7 +153,7 @@ def _unit(dataset: Any) -> str | None:
 
 def _pixel_mm(file: Any, path: Path) -> tuple[float, float, float] | None:
     """Return width and height of a pixel in mm, and the mm per unit of the width; None if the file has no size."""
-    names = {found.rpartition("/")[2]: found for found in _walk(file)}
+    names = {found.rpartition("/")[2]: found for found in datasets_in(file)}
     width = next((names[name] for name in _PIXEL_WIDTH if name in names), None)
     if width is None:
         return None

@@ -18,7 +18,6 @@ from nerfcli.ct.formats.statement import Statement, read_lines
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 
-SUFFIXES = (".xtekct",)
 _HINT = "a .xtekct file has SrcToObject, SrcToDetector, DetectorPixelsX, DetectorPixelSizeX, WhiteLevel and Projections"
 
 

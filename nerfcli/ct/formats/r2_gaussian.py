@@ -13,11 +13,11 @@ from nerfcli.ct.circle import Circle
 from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
 from nerfcli.ct.formats.scan_options import ScanOptions, angles_in_radians
 from nerfcli.ct.formats.statement import Statement, read_object
+from nerfcli.ct.recognise import R2_GAUSSIAN
 from nerfcli.ct.scan import Scan
 from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
-NAME = "meta_data.json"
 _HINT = "expected R2-Gaussian's meta_data.json: scanner, proj_train and proj_test"
 
 
@@ -27,7 +27,7 @@ def read_r2_gaussian(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     Raises:
         UserError: it cannot be read, lacks something, or its parts do not fit together.
     """
-    file = path / NAME if path.is_dir() else path
+    file = path / R2_GAUSSIAN if path.is_dir() else path
     meta = read_object(file, hint=_HINT)
     scanner = Statement(file, _mapping(meta.value("scanner"), "scanner", file), hint=_HINT)
     frames = [
@@ -88,7 +88,7 @@ def _projection(file: Path, frame: dict[str, Any]) -> np.ndarray:
     try:
         array = np.load(place, allow_pickle=False)
     except FileNotFoundError as error:
-        raise UserError(f"{place} does not exist", f"{NAME} lists it: restore the projection") from error
+        raise UserError(f"{place} does not exist", f"{R2_GAUSSIAN} lists it: restore the projection") from error
     except (OSError, ValueError, EOFError) as error:
         raise UserError(f"{place} cannot be read: {error}", "it is damaged: export it again") from error
     if array.ndim != 2:

@@ -17,7 +17,6 @@ from nerfcli.ct.formats.statement import Statement, read_lines
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 
-SUFFIXES = (".log",)
 _HINT = "a SkyScan .log has Object to Source (mm), Image Pixel Size (um), Rotation Step (deg) and Number of Files"
 # Pictures that are not projections: reconstructed slices, the preview, the extra views for the check of movement.
 _OTHERS = r"(_rec|_spr|_arc|_TS)\w*\.\w+$"

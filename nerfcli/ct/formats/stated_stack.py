@@ -38,11 +38,11 @@ from nerfcli.ct.formats.scan_options import ScanOptions, angles_in_radians, mill
 from nerfcli.ct.formats.statement import Statement, read_object
 from nerfcli.ct.geometry import Beam, ScanGeometry, from_vectors
 from nerfcli.ct.open_beam import OpenBeam, check_sizes, open_beam_of
+from nerfcli.ct.recognise import STACK
 from nerfcli.ct.scan import KINDS, Kind, Scan
 from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
-NAME = "scan.json"
 _HINT = "a scan.json states projections, kind, beam, pixel_size, unit and angles_deg; see nerfcli's guide of tomography"
 _KEYS = (
     *("projections", "flats", "darks", "white_level", "kind", "beam", "unit", "pixel_size", "source_origin"),
@@ -57,7 +57,7 @@ def read_stated_stack(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     Raises:
         UserError: it cannot be read, states something unknown, lacks something, or does not fit the pictures.
     """
-    file = path / NAME if path.is_dir() else path
+    file = path / STACK if path.is_dir() else path
     fields = read_object(file, hint=_HINT)
     unknown = [name for name in fields.names if name not in _KEYS]
     if unknown:

@@ -17,12 +17,11 @@ from nerfcli.ct.formats.pictures import read_stack
 from nerfcli.ct.formats.scan_options import ScanOptions
 from nerfcli.ct.formats.statement import Statement, read_object
 from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.recognise import TRANSFORMS, TRANSFORMS_GEOMETRY
 from nerfcli.ct.scan import Scan
 from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
-NAME = "geometry.json"
-TRANSFORMS = ("transforms_train.json", "transforms_test.json")
 WHITE = 65535.0
 _HINT = "expected geometry.json, transforms_train.json and transforms_test.json, with transmissions"
 
@@ -34,14 +33,15 @@ def read_transmission_transforms(path: Path, given: ScanOptions = ScanOptions())
         UserError: it cannot be read, lacks something, or its parts do not fit together.
     """
     folder = path if path.is_dir() else path.parent
-    stated = read_object(folder / NAME, hint=_HINT)
+    stated = read_object(folder / TRANSFORMS_GEOMETRY, hint=_HINT)
     frames, lens = _frames(folder)
     pitch = stated.positive("detector_pitch")
     distance = stated.positive("source_detector_distance")
     expected = stated.value("n_projections")
     if isinstance(expected, int) and expected != len(frames):
         raise UserError(
-            f"{folder}: {len(frames)} frames in the transforms, but {NAME} states {expected}", "a transform is missing"
+            f"{folder}: {len(frames)} frames in the transforms, but {TRANSFORMS_GEOMETRY} states {expected}",
+            "a transform is missing",
         )
     poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
     if poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():

@@ -17,7 +17,7 @@ from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, in_shell
 from nerfcli.sealed import read_sealed, write_sealed
 from nerfcli.training.runs.components import Components, Selection
-from nerfcli.training.runs.files import CONFIG, RECONSTRUCTION
+from nerfcli.training.runs.files import CONFIG
 from nerfcli.training.runs.settings import TrainSettings
 
 
@@ -161,11 +161,6 @@ def no_run(path: Path) -> UserError:
         return UserError(f"{path} does not exist", hint)
     if path.is_file():
         return UserError(f"{path} is a file, not a run folder", hint)
-    if (path / RECONSTRUCTION).exists():
-        return UserError(
-            f"{path} is the reconstruction of an X-ray scan, not a run of photos",
-            "evaluate, render, export and info work with it",
-        )
     if recognised(path) is not None:
         return UserError(f"{path} is a scene, not a run", f"train it first: nerfcli train {in_shell(path)}")
     if photos := photo_folder(path):

@@ -10,5 +10,3 @@ DEPTH_ERRORS = "depth_errors.json"
 PHOTO_DEPTHS = "photo_depths.npz"
 REPORT = "report.html"
 LOCK = ".train.lock"
-# Of a reconstruction from an X-ray scan, which is no run.
-RECONSTRUCTION = "reconstruction.json"

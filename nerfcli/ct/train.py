@@ -3,11 +3,9 @@
 import platform
 import time
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,17 +16,16 @@ from nerfcli.ct.calibrate import air_factors, beside_object, detector_tilt, mode
 from nerfcli.ct.centre import FEWEST_VIEWS, centre_of
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid, grid_of_scan
-from nerfcli.ct.hash_fit import fit_hash, hash_volume, new_arrays
 from nerfcli.ct.likelihood import Poisson, likelihood_of
 from nerfcli.ct.marks import TRUNCATED, UNSEEN, marks, marks_in_words, missing_wedge_deg
 from nerfcli.ct.quick import highest_contrast_row
-from nerfcli.ct.reconstruct import Fit, Problem, Projector, finer, mean_attenuation, reconstruct, start
+from nerfcli.ct.recognise import is_reconstruction
+from nerfcli.ct.reconstruct import Fit, Problem, Projector, finer, reconstruct, start
 from nerfcli.ct.result import (
     LOCK,
     METRICS,
     Reconstruction,
     ReconstructionSettings,
-    is_reconstruction,
     load_reconstruction,
     save_reconstruction,
 )
@@ -66,8 +63,8 @@ def train_scan(
     """Fit a volume to a scan, keep an existing one with the same settings, or refuse to touch another one.
 
     Args:
-        scan: a folder that `nerfcli convert` wrote.
-        settings: budget, field, and values that are not to be estimated from the scan.
+        scan: a folder that `nerfcli ct convert` wrote.
+        settings: budget, and values that are not to be estimated from the scan.
         resume: continue from the volume in `run`; start from the beginning if there is none.
 
     Raises:
@@ -80,7 +77,7 @@ def train_scan(
     if earlier is not None:
         same = earlier.scan_digest == loaded.digest and _wanted(earlier.settings) == _wanted(settings)
         if same and earlier.complete:
-            again = "give a larger --budget or --steps" if resume else "add --overwrite to fit again"
+            again = "give a larger --budget or --passes" if resume else "add --overwrite to fit again"
             notify(f"{run} is kept: it is complete and has these settings; {again}")
             return earlier
         if same and not resume:
@@ -88,14 +85,13 @@ def train_scan(
                 f"{run} holds a fit that was interrupted after pass {earlier.passes}",
                 "add --resume to continue, or --overwrite to replace it",
             )
-        continued = earlier.scan_digest == loaded.digest and earlier.settings.field == settings.field
-        if not (same or (resume and continued)):
+        if not (same or (resume and earlier.scan_digest == loaded.digest)):
             raise UserError(
                 f"{run} holds another reconstruction", "choose another folder with --output, or add --overwrite"
             )
     elif _holds_something(run) and not (overwrite and is_reconstruction(run)):
         raise UserError(f"{run} exists and is not a reconstruction", "choose another folder with --output")
-    with exclusive(run / LOCK, f"another nerfcli train is writing {run}"):
+    with exclusive(run / LOCK, f"another nerfcli ct train is writing {run}"):
         clear_leftovers(run)
         if loaded.kind != "line_integral" and loaded.photons_per_value is None:
             warn("photons per detector value not given: estimated from the noise of neighbouring pixels")
@@ -110,12 +106,6 @@ def train_scan(
     for sentence in result.decisions:
         notify(sentence)
     return result
-
-
-def corrected_by(geometry: ScanGeometry, centre: float, tilt: float) -> ScanGeometry:
-    """Return the geometry with its centre shifted by `centre` columns and its detector turned by `tilt` radians."""
-    shifted = geometry.shifted(centre) if centre else geometry
-    return shifted.tilted(tilt) if tilt else shifted
 
 
 def _holds_something(run: Path) -> bool:
@@ -143,7 +133,7 @@ def _fit(
     # Check memory first: correcting the geometry takes seconds, and hardly changes the number of voxels.
     _fits_memory(grid_of_scan(scan.geometry, settings.voxel_size) if earlier is None else earlier.grid)
     centre, tilt = _geometry(scan, settings, earlier, decisions, progress)
-    geometry = corrected_by(scan.geometry, centre, tilt)
+    geometry = scan.geometry.corrected(centre, tilt)
     grid = earlier.grid if earlier is not None else grid_of_scan(geometry, settings.voxel_size)
     if earlier is not None:
         strength, error = float(earlier.used["strength"]), float(earlier.used["model_error"])
@@ -167,18 +157,11 @@ def _fit(
 
     used = {"strength": strength, "model_error": error, "centre": centre, "tilt": tilt, "air": factors}
     limit = Limit(settings.passes, settings.budget_seconds, begun, 0 if earlier is None else earlier.passes)
-    if settings.field == "hash":
-        used["start"] = mean_attenuation(problem) if earlier is None else earlier.used["start"]
-        fit, learned, interrupt = _fit_hash(
-            problem, used, limit, earlier=earlier, seed=settings.seed, progress=progress
-        )
+    if earlier is not None:
+        fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
     else:
-        if earlier is not None:
-            fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
-        else:
-            fit = _coarse_start(scan, geometry, grid, factors, (strength, error), limit.seconds)
-        fit, interrupt = _fit_voxels(problem, fit, strength, limit, progress=progress)
-        learned = {}
+        fit = _coarse_start(scan, geometry, grid, factors, (strength, error), limit.seconds)
+    fit, interrupt = _fit_voxels(problem, fit, strength, limit, progress=progress)
     found = marks(problem.geometry, grid)
     decisions += [f"{words}; they are marked" for words in marks_in_words(found, (UNSEEN, TRUNCATED))]
     wedge = missing_wedge_deg(problem.geometry)
@@ -199,7 +182,6 @@ def _fit(
         fit.settled,
         wedge,
         {"nerfcli": __version__, "python": platform.python_version(), "torch": version("torch")},
-        learned,
         complete=interrupt is None,
     )
     return result, interrupt
@@ -250,36 +232,6 @@ def _fit_voxels(
         return fitted, None
     except KeyboardInterrupt as interrupt:
         return kept[-1], interrupt
-
-
-def _fit_hash(
-    problem: Problem,
-    used: Mapping[str, Any],
-    limit: Limit,
-    *,
-    earlier: Reconstruction | None,
-    seed: int,
-    progress: Progress,
-) -> tuple[Fit, dict[str, np.ndarray], KeyboardInterrupt | None]:
-    """Fit a hash grid; return its volume on the voxel grid, its learned arrays, and what interrupted it."""
-    learned = new_arrays(seed) if earlier is None else earlier.learned
-    volume = hash_volume(problem.grid, used["start"], learned, passes=limit.done)
-    interrupt: KeyboardInterrupt | None = None
-    try:
-        fit_hash(
-            problem,
-            volume,
-            strength=used["strength"],
-            seed=seed + limit.done,
-            passes=limit.passes,
-            seconds=limit.seconds,
-            progress=progress,
-        )
-    except KeyboardInterrupt as came:
-        interrupt = came
-    # The last step ends a little beyond a pass.
-    passes = max(1, round(volume.passes))
-    return Fit(volume.on_grid(problem.grid), torch.zeros(0), passes), volume.arrays, interrupt
 
 
 def _geometry(

@@ -1,26 +1,66 @@
 """Evaluate a reconstruction on held-out projections and the true volume, next to other methods on the same views."""
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.ndimage import map_coordinates
+from skimage.metrics import structural_similarity
 
 from nerfcli.atomic import read_json, write_json
 from nerfcli.ct.baselines import filtered_back_projection, sart_total_variation
 from nerfcli.ct.calibrate import air_factors
 from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.grid import VoxelGrid
 from nerfcli.ct.likelihood import Poisson, likelihood_of
+from nerfcli.ct.recognise import MEASUREMENT
 from nerfcli.ct.reconstruct import Projector
-from nerfcli.ct.result import METRICS, Reconstruction, load_reconstruction
-from nerfcli.ct.scan import Scan, load_scan
-from nerfcli.ct.scores import score_projections, score_volume
-from nerfcli.ct.training import corrected_by
+from nerfcli.ct.result import METRICS, Reconstruction, load_reconstruction, scan_of
+from nerfcli.ct.scan import Scan
 from nerfcli.ct.truth import load_truth
 from nerfcli.errors import UserError
 from nerfcli.machine import thread_count
 from nerfcli.notices import Notify, Progress, no_progress, silent
+
+# Number of layers along each axis over which SSIM is averaged.
+SSIM_LAYERS = 24
+
+
+@dataclass(frozen=True)
+class ProjectionScores:
+    """Comparison of held-out views with their predictions.
+
+    Args:
+        rms: root mean square difference of line integrals, over all views together.
+        psnr: 20 log10(peak / rms) in dB.
+        peak: reference line integral of the PSNR: the quantile 1 - 1e-5 of the training views.
+        chi_square: mean squared misfit in units of the counting noise: 1 is the best possible; below 1, the fit has
+            used held-out measurements.
+        chi_square_of_view: the same for each held-out view.
+    """
+
+    rms: float
+    psnr: float
+    peak: float
+    chi_square: float
+    chi_square_of_view: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class VolumeScores:
+    """Comparison of a volume with the true one, on the voxels of the true one.
+
+    Args:
+        psnr: 20 log10(largest true value / rms difference) in dB.
+        ssim: mean over layers across all three axes.
+        bias: mean difference, in 1 / unit.
+    """
+
+    psnr: float
+    ssim: float
+    bias: float
 
 
 class ScanEvaluation(NamedTuple):
@@ -68,13 +108,13 @@ def evaluate_scan(
             notify(f"{path} is kept; add --overwrite to measure again")
             return ScanEvaluation(path, kept, True)
     scan = scan_of(result, run)
-    geometry = corrected(scan.geometry, result)
+    geometry = scan.geometry.corrected(result.used["centre"], result.used["tilt"])
     truth = load_truth(scan.history)
     methods: dict[str, Any] = {}
 
     def measure(name: str, volume: np.ndarray) -> None:
         projections = score_projections(
-            scan, geometry, torch.from_numpy(np.array(volume)), result.grid, air=_held_out_air(scan, result)
+            scan, geometry, torch.from_numpy(np.array(volume)), result.grid, air=_held_out_air(scan, geometry, result)
         )
         methods[name] = {
             "projections": None if projections is None else asdict(projections),
@@ -102,7 +142,7 @@ def evaluate_scan(
             "SART with total variation", sart_total_variation(geometry.select(views), integrals, result.grid).numpy()
         )
     metrics = {
-        "measurement": "transmission",
+        "measurement": MEASUREMENT,
         "scan_digest": result.scan_digest,
         "passes": result.passes,
         "unit": result.unit,
@@ -125,29 +165,7 @@ def _reference_of(run: Path, unit: str) -> Reconstruction:
     return reference
 
 
-def scan_of(result: Reconstruction, run: Path) -> Scan:
-    """Load the scan of a reconstruction.
-
-    Raises:
-        UserError: the scan no longer exists, or has changed.
-    """
-    if not result.scan.exists():
-        raise UserError(
-            f"the scan {result.scan} of {run} does not exist",
-            "run the command from the folder that train was run in, or train again",
-        )
-    scan = load_scan(result.scan)
-    if scan.digest != result.scan_digest:
-        raise UserError(f"{result.scan} has changed since {run} was trained", "train again with --overwrite")
-    return scan
-
-
-def corrected(geometry: ScanGeometry, result: Reconstruction) -> ScanGeometry:
-    """Apply the centre and tilt of a reconstruction to a geometry."""
-    return corrected_by(geometry, result.used["centre"], result.used["tilt"])
-
-
-def _held_out_air(scan: Scan, result: Reconstruction) -> np.ndarray | None:
+def _held_out_air(scan: Scan, geometry: ScanGeometry, result: Reconstruction) -> np.ndarray | None:
     """Estimate the factor on the open beam of each held-out view from its pixels beside the object, as in the fit.
 
     None if the reconstruction did not use such factors.
@@ -157,8 +175,62 @@ def _held_out_air(scan: Scan, result: Reconstruction) -> np.ndarray | None:
     views = np.array(scan.held_out, dtype=int)
     likelihood = likelihood_of(scan, views)
     assert isinstance(likelihood, Poisson)
-    geometry = corrected(scan.geometry, result).select(views)
-    integrals = Projector(geometry, result.grid).forward(
+    integrals = Projector(geometry.select(views), result.grid).forward(
         torch.from_numpy(np.array(result.volume)), np.arange(len(views))
     )
     return air_factors(likelihood, integrals).numpy()
+
+
+def score_projections(
+    scan: Scan, geometry: ScanGeometry, volume: torch.Tensor, grid: VoxelGrid, *, air: np.ndarray | None = None
+) -> ProjectionScores | None:
+    """Compare the projections of a volume with the held-out views; return None if no view is held out.
+
+    Args:
+        geometry: corrected geometry of all its views.
+        air: factor on the open beam of each held-out view; 1 if not given.
+    """
+    views = np.array(scan.held_out, dtype=int)
+    if len(views) == 0:
+        return None
+    every = np.arange(len(views))
+    predicted = Projector(geometry.select(views), grid).forward(volume, every)
+    likelihood = likelihood_of(scan, views)
+    measured = scan.line_integrals(views).reshape(len(views), -1)
+    if air is not None:
+        assert isinstance(likelihood, Poisson)
+        likelihood = likelihood.scaled(torch.from_numpy(air.astype(np.float32)))
+        measured = measured + np.log(air)[:, None].astype(np.float32)
+    deviance = likelihood.deviance(predicted, torch.from_numpy(every)).numpy()
+    usable = np.isfinite(deviance) & np.isfinite(measured)
+    rms = float(np.sqrt(np.mean((predicted.numpy() - measured)[usable] ** 2)))
+    peak = float(np.nanquantile(scan.line_integrals(scan.training_views), 1 - 1e-5))
+    return ProjectionScores(
+        rms,
+        float(20 * np.log10(peak / max(rms, 1e-30))),
+        peak,
+        float(np.mean(deviance[usable])),
+        tuple(float(np.nanmean(row)) for row in deviance),
+    )
+
+
+def score_volume(volume: np.ndarray, grid: VoxelGrid, true: np.ndarray, true_grid: VoxelGrid) -> VolumeScores:
+    """Compare a volume, interpolated at the voxel centres of the true one, with the true one; 0 outside its grid."""
+    seen = volume if grid == true_grid else resampled(volume, grid, true_grid)
+    difference = seen.astype(np.float64) - true
+    peak = float(true.max())
+    values = [
+        structural_similarity(np.take(seen, k, axis), np.take(true, k, axis), data_range=peak)
+        for axis in range(3)
+        if min(np.take(true, 0, axis).shape) >= 7
+        for k in np.unique(np.linspace(0, true.shape[axis] - 1, SSIM_LAYERS).astype(int))
+    ]
+    psnr = 20 * np.log10(peak / max(float(np.sqrt(np.mean(difference**2))), 1e-30))
+    return VolumeScores(float(psnr), float(np.mean(values)) if values else float("nan"), float(difference.mean()))
+
+
+def resampled(volume: np.ndarray, grid: VoxelGrid, other: VoxelGrid) -> np.ndarray:
+    """Return a volume at the voxel centres of another grid, by trilinear interpolation; 0 outside."""
+    place = [(other.axis(name) - grid.first["xyz".index(name)]) / grid.size for name in "zyx"]
+    coordinates = np.meshgrid(*place, indexing="ij")
+    return map_coordinates(volume, coordinates, order=1, mode="constant", cval=0.0, prefilter=False)

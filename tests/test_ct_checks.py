@@ -142,7 +142,6 @@ def test_a_centre_off_the_middle(beam: str) -> None:
     assert found.verdict == "bad"
     assert found.number == pytest.approx(2.5, abs=0.1)
     assert "--centre-of-rotation 21.0" in found.advice or "--centre-of-rotation 20.9" in found.advice
-    assert ("opposite views" in found.summary) == (beam == "parallel")
 
 
 @pytest.mark.parametrize(("bend", "verdict"), [(0.0, "good"), (0.10, "look"), (0.30, "bad")])
@@ -164,7 +163,7 @@ def test_hardening_is_not_distinguished_from_two_materials() -> None:
 def test_the_command_writes_a_page_and_holds_a_gate(tmp_path: Path) -> None:
     folder, page = tmp_path / "scan", tmp_path / "page.html"
     save_scan(folder, changed(scan(), lambda values: values * 1.1))
-    result = nerfcli("doctor", folder, "-o", page, "--json", "--require", "look")
+    result = nerfcli("ct", "doctor", folder, "-o", page, "--json", "--require", "look")
     record = json.loads(result.stdout)
     assert record["verdict"] == "bad"
     assert {each["check"] for each in record["findings"]} <= set(CHECKS)

@@ -1,4 +1,4 @@
-"""Volumes in file formats of other programs: NRRD, MetaImage, NIfTI-1, and TIFF stacks for ImageJ.
+"""The volume of a reconstruction in file formats of other programs: NRRD, MetaImage, NIfTI-1, TIFF for ImageJ.
 
 All are float32 (or uint8 for marks), little-endian, x fastest, with spacing, origin and unit. The frame
 is that of the scan: x and y across the rotation axis, z along it.
@@ -17,17 +17,17 @@ import tifffile
 
 from nerfcli.atomic import atomic_path
 from nerfcli.ct.grid import VoxelGrid
+from nerfcli.ct.marks import MEANINGS, UNSEEN, marks_in_words
+from nerfcli.ct.recognise import VOLUMES
+from nerfcli.ct.result import load_reconstruction, refuse_existing
 from nerfcli.errors import UserError
-from nerfcli.ply import KEY
+from nerfcli.notices import Notify, silent
 
 _NIFTI_HEADER = 352
 _NIFTI_UNITS = {"m": 1, "mm": 2, "um": 3}
 _NIFTI_TYPES = {np.dtype(np.uint8): (2, 8), np.dtype(np.float32): (16, 32)}
 _NRRD_TYPES = {np.dtype(np.uint8): "uchar", np.dtype(np.float32): "float"}
 _WORDS = {np.dtype(np.uint8): "MET_UCHAR", np.dtype(np.float32): "MET_FLOAT"}
-
-# Suffixes of volumes, the default first.
-SUFFIXES = (".nrrd", ".mha", ".nii", ".tif")
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,42 @@ class VolumeFile:
     quantity: str
 
 
+def export_scan(
+    run: str | Path, target: str | Path, *, water: float | None = None, overwrite: bool = False, notify: Notify = silent
+) -> list[Path]:
+    """Write the volume of a reconstruction as .nrrd, .mha, .nii or .tif, and its marks beside it.
+
+    Voxels that no view sees are NaN. TARGET-marks has the marks of all voxels that the views do not determine, see
+    `marks`; it is written only if there are any.
+
+    Args:
+        run: the folder that `train_scan` wrote.
+        target: the file; its suffix determines the format.
+        water: attenuation of water in 1 / unit, to write Hounsfield units, 1000 (mu / water - 1); None for attenuation.
+
+    Raises:
+        UserError: there is no reconstruction, or a file exists.
+    """
+    target = Path(target)
+    result = load_reconstruction(Path(run))
+    marks = np.asarray(result.marks)
+    values = np.where(marks & UNSEEN, np.float32(np.nan), result.volume).astype(np.float32)
+    quantity = f"1/{result.unit}"
+    if water is not None:
+        values, quantity = (1000 * (values / np.float32(water) - 1)).astype(np.float32), "HU"
+    beside = target.with_name(f"{target.stem}-marks{target.suffix}")
+    refuse_existing(target, beside, overwrite=overwrite)
+    write_volume(target, VolumeFile(values, result.grid, result.unit, quantity))
+    written = [target]
+    if marks.any():
+        quantity = "marks: " + ", ".join(f"{mark} {meaning}" for mark, meaning in MEANINGS.items())
+        write_volume(beside, VolumeFile(marks, result.grid, result.unit, quantity))
+        written.append(beside)
+        for words in marks_in_words(marks):
+            notify(f"{beside.name}: {words}")
+    return written
+
+
 def write_volume(path: Path, volume: VolumeFile) -> None:
     """Write a volume in the format of the path's suffix: .nrrd, .mha, .nii or .tif; atomic.
 
@@ -60,7 +96,7 @@ def write_volume(path: Path, volume: VolumeFile) -> None:
     if volume.values.dtype not in _WORDS:
         raise ValueError(f"volumes are float32 or uint8, not {volume.values.dtype}")
     if path.suffix.lower() not in _FORMATS:
-        raise UserError(f"{path.name}: unknown volume format", f"choose one of {', '.join(SUFFIXES)}")
+        raise UserError(f"{path.name}: unknown volume format", f"choose one of {', '.join(VOLUMES)}")
     with atomic_path(path) as partial:
         _FORMATS[path.suffix.lower()][0](partial, volume)
 
@@ -79,17 +115,6 @@ def read_volume(path: Path) -> VolumeFile:
         raise UserError(
             f"{path} is damaged or not a volume written by nerfcli: {error}", "export the volume again"
         ) from error
-
-
-def is_volume_file(path: Path) -> bool:
-    """Return whether a file is an NRRD, a MetaImage or a NIfTI, or a TIFF stack that `write_volume` wrote."""
-    if path.suffix.lower() not in (".tif", ".tiff"):
-        return path.suffix.lower() in (".nrrd", ".mha", ".nii") and path.is_file()
-    try:
-        with tifffile.TiffFile(path) as tiff:
-            return {"first", "spacing"} <= set(tiff.imagej_metadata or {})
-    except (OSError, ValueError, IndexError, struct.error):  # damaged, or no TIFF
-        return False
 
 
 def volume_facts(path: Path) -> dict[str, Any]:
@@ -141,7 +166,7 @@ def _write_nrrd(path: Path, volume: VolumeFile) -> None:
         "centers: cell cell cell",
         "endian: little",
         "encoding: gzip",
-        f"{KEY}:={json.dumps(stated, ensure_ascii=True, allow_nan=False)}",
+        f"nerfcli:={json.dumps(stated, ensure_ascii=True, allow_nan=False)}",
         "",
         "",
     ]
@@ -156,7 +181,7 @@ def _read_nrrd(path: Path) -> VolumeFile:
     for line in head.decode("utf-8", errors="replace").splitlines()[1:]:
         name, _, value = line.partition(":")
         fields[name] = value.removeprefix("=").strip()
-    stated = json.loads(fields[KEY])
+    stated = json.loads(fields["nerfcli"])
     kind = {word: kind for kind, word in _NRRD_TYPES.items()}[fields["type"]]
     shape = tuple(int(count) for count in reversed(fields["sizes"].split()))
     values = np.frombuffer(zlib.decompress(body, 31), kind).reshape(shape)

@@ -1,23 +1,25 @@
-"""Files of a reconstruction: projections, residuals, slices, volumes."""
+"""Pictures of a reconstruction: projections, residuals, slices."""
 
 from pathlib import Path
 
 import numpy as np
+import tifffile
 import torch
 
+from nerfcli.atomic import atomic_path
 from nerfcli.ct.grid import VoxelGrid
 from nerfcli.ct.likelihood import Likelihood, likelihood_of
-from nerfcli.ct.marks import MEANINGS, UNSEEN, marks_in_words
+from nerfcli.ct.marks import MEANINGS, UNSEEN
 from nerfcli.ct.reconstruct import Projector
-from nerfcli.ct.result import Reconstruction, load_reconstruction
-from nerfcli.ct.training_scores import corrected, scan_of
-from nerfcli.ct.volume_files import VolumeFile, write_volume
+from nerfcli.ct.result import Reconstruction, load_reconstruction, refuse_existing, scan_of
 from nerfcli.errors import UserError
 from nerfcli.machine import thread_count
 from nerfcli.notices import Notify, Progress, no_progress, silent
 from nerfcli.photos.images import write_png
 from nerfcli.render.files.preview import coloured
 
+# Outputs that can be rendered from a reconstruction.
+OUTPUTS = ("projection", "transmission", "residual")
 # Residuals are shown from minus to plus this many standard deviations of the noise.
 RESIDUAL_RANGE = 4.0
 
@@ -54,7 +56,7 @@ def render_scan(
     result = load_reconstruction(run)
     if slices:
         cuts = {target / f"{name}.tif": cut for axis, at in slices for name, cut in _slice(result, axis, at).items()}
-        _refuse_existing(*cuts, overwrite=overwrite)
+        refuse_existing(*cuts, overwrite=overwrite)
         for path, (values, high) in cuts.items():
             # Picture rows run downwards, but the vertical axis of a slice points up.
             _write_picture(path, values[::-1].copy(), 0.0, high)
@@ -63,12 +65,12 @@ def render_scan(
     chosen = np.array(scan.held_out, dtype=int) if views == "test" else scan.training_views
     if len(chosen) == 0:
         raise UserError(f"{run} has no held-out views", "render the training views with --cameras train")
-    geometry = corrected(scan.geometry, result).select(chosen)
+    geometry = scan.geometry.corrected(result.used["centre"], result.used["tilt"]).select(chosen)
     projector, likelihood = Projector(geometry, result.grid), likelihood_of(scan, chosen)
     volume = torch.from_numpy(np.array(result.volume))
     top = float(np.nanmax(scan.line_integrals(chosen)))
     paths = {(view, name): target / name / f"{view:04d}.tif" for view in chosen for name in outputs}
-    _refuse_existing(*paths.values(), overwrite=overwrite)
+    refuse_existing(*paths.values(), overwrite=overwrite)
     for number, view in enumerate(chosen):
         index = np.array([number])
         integrals = projector.forward(volume, index)
@@ -83,42 +85,6 @@ def render_scan(
         progress((number + 1) / len(chosen), f"view {view}")
     notify(f"{len(paths)} pictures of {len(chosen)} views; line integrals up to {top:.3g}")
     return list(paths.values())
-
-
-def export_scan(
-    run: str | Path, target: str | Path, *, water: float | None = None, overwrite: bool = False, notify: Notify = silent
-) -> list[Path]:
-    """Write the volume of a reconstruction as .nrrd, .mha, .nii or .tif, and its marks beside it.
-
-    Voxels that no view sees are NaN. TARGET-marks has the marks of all voxels that the views do not determine, see
-    `marks`; it is written only if there are any.
-
-    Args:
-        run: the folder that `train_scan` wrote.
-        target: the file; its suffix determines the format.
-        water: attenuation of water in 1 / unit, to write Hounsfield units, 1000 (mu / water - 1); None for attenuation.
-
-    Raises:
-        UserError: there is no reconstruction, or a file exists.
-    """
-    target = Path(target)
-    result = load_reconstruction(Path(run))
-    marks = np.asarray(result.marks)
-    values = np.where(marks & UNSEEN, np.float32(np.nan), result.volume).astype(np.float32)
-    quantity = f"1/{result.unit}"
-    if water is not None:
-        values, quantity = (1000 * (values / np.float32(water) - 1)).astype(np.float32), "HU"
-    beside = target.with_name(f"{target.stem}-marks{target.suffix}")
-    _refuse_existing(target, beside, overwrite=overwrite)
-    write_volume(target, VolumeFile(values, result.grid, result.unit, quantity))
-    written = [target]
-    if marks.any():
-        quantity = "marks: " + ", ".join(f"{mark} {meaning}" for mark, meaning in MEANINGS.items())
-        write_volume(beside, VolumeFile(marks, result.grid, result.unit, quantity))
-        written.append(beside)
-        for words in marks_in_words(marks):
-            notify(f"{beside.name}: {words}")
-    return written
 
 
 def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
@@ -169,16 +135,6 @@ def _slice(result: Reconstruction, axis: str, at: float) -> dict[str, tuple[np.n
 
 
 def _write_picture(path: Path, values: np.ndarray, low: float, high: float) -> None:
-    import tifffile
-
-    from nerfcli.atomic import atomic_path
-
     with atomic_path(path) as partial:
         tifffile.imwrite(partial, values.astype(np.float32), photometric="minisblack", compression="zlib")
     write_png(path.with_suffix(".png"), coloured(values, lo=low, hi=high, colour_map="grey"))
-
-
-def _refuse_existing(*paths: Path, overwrite: bool) -> None:
-    there = [path for path in paths if path.exists()]
-    if there and not overwrite:
-        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another path with -o")

@@ -266,7 +266,6 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
     "no photons": (lambda f: stack(f).path, ("--photons", "-5"), "--photons -5"),
     "unit that is none": (lambda f: stack(f).path, ("--unit", "parsec"), "--unit parsec is not a unit"),
     "axis far outside": (lambda f: stack(f).path, ("--centre-of-rotation", "900"), "far outside the 10 columns"),
-    "format of photos": (lambda f: stack(f).path, ("--to", "colmap"), "cannot be written as colmap"),
 }
 
 
@@ -276,7 +275,7 @@ def test_damage_is_reported_in_two_lines_and_nothing_is_written(name: str, tmp_p
     place = tmp_path / "in"
     place.mkdir()
     path = make(place)
-    result = nerfcli("convert", path, tmp_path / "out", *options)
+    result = nerfcli("ct", "convert", path, tmp_path / "out", *options)
     assert result.exit_code == BAD_INPUT, result.stderr
     error, hint = error_of(result)
     assert re.search(expected, error), error
@@ -326,7 +325,7 @@ def test_a_flat_with_the_object_in_the_beam_is_an_outlier(tmp_path: Path) -> Non
 def test_a_wrong_unit_is_mended(tmp_path: Path) -> None:
     """The file says 75 m, --unit says that its 75 are micrometres."""
     path = rewritten(nxtomo(tmp_path).path, "entry/instrument/detector/x_pixel_size", 75.0, units="m")
-    result = nerfcli("convert", path, tmp_path / "out", "--unit", "um")
+    result = nerfcli("ct", "convert", path, tmp_path / "out", "--unit", "um")
     assert result.exit_code == 0, result.stderr
     scan = load_scan(tmp_path / "out")
     assert scan.unit == "mm"
@@ -335,10 +334,10 @@ def test_a_wrong_unit_is_mended(tmp_path: Path) -> None:
 
 def test_a_changed_scan_folder_is_refused(tmp_path: Path) -> None:
     written = stack(tmp_path)
-    nerfcli("convert", written.path, tmp_path / "out")
+    nerfcli("ct", "convert", written.path, tmp_path / "out")
     values = np.load(tmp_path / "out/values.npy")
     values[0, 0, 0] += 1
     np.save(tmp_path / "out/values.npy", values)
-    error, hint = error_of(nerfcli("info", tmp_path / "out"))
+    error, hint = error_of(nerfcli("ct", "info", tmp_path / "out"))
     assert "values.npy is not what was written" in error
     assert "convert" in hint

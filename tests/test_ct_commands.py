@@ -14,13 +14,15 @@ from test_reconstruct import cone, scan_of
 from typer.testing import CliRunner
 
 from nerfcli.cli import app
+from nerfcli.ct.export import VolumeFile, export_scan, read_volume, write_volume
 from nerfcli.ct.grid import VoxelGrid, centred_grid
 from nerfcli.ct.marks import UNSEEN
-from nerfcli.ct.result import DESCRIPTION, ReconstructionSettings, load_reconstruction
+from nerfcli.ct.recognise import DESCRIPTION
+from nerfcli.ct.render import residual_of, slice_of
+from nerfcli.ct.result import ReconstructionSettings, load_reconstruction
+from nerfcli.ct.result import scan_of as scan_behind
 from nerfcli.ct.scan import save_scan
-from nerfcli.ct.training import train_scan
-from nerfcli.ct.training_files import export_scan, slice_of
-from nerfcli.ct.volume_files import VolumeFile, read_volume, write_volume
+from nerfcli.ct.train import train_scan
 from nerfcli.errors import UserError
 from nerfcli.interrupts import Terminated
 from nerfcli.photos.images import read_image
@@ -28,7 +30,7 @@ from nerfcli.sealed import read_sealed, write_sealed
 
 
 def call(*arguments: str | Path) -> tuple[int, str, str]:
-    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    result = CliRunner().invoke(app, ["ct", *(str(a) for a in arguments)])
     return result.exit_code, result.stdout, result.stderr
 
 
@@ -51,7 +53,7 @@ def bean_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from dataclasses import replace
 
     save_scan(folder / "bean", replace(scan, history={"truth": described}))
-    code, out, err = call("train", folder / "bean", "--steps", "8", "--with", "centre=0", "--with", "tilt=0")
+    code, out, err = call("train", folder / "bean", "--passes", "8", "--centre", "0", "--tilt", "0")
     assert code == 0, err
     assert out.strip() == str(folder / "bean-run")
     return folder / "bean-run"
@@ -63,11 +65,11 @@ def test_train_says_what_it_decided_and_keeps_a_run(bean_run: Path) -> None:
     assert any("model error" in sentence for sentence in result.decisions)
     assert result.grid.size == pytest.approx(0.8)
     scan = bean_run.with_name("bean")
-    again = ("train", scan, "--steps", "8", "--with", "centre=0", "--with", "tilt=0")
+    again = ("train", scan, "--passes", "8", "--centre", "0", "--tilt", "0")
     code, _, err = call(*again)
     assert code == 0
     assert "is kept" in err
-    code, _, err = call("train", scan, "--steps", "9")
+    code, _, err = call("train", scan, "--passes", "9")
     assert code == 3
     assert "another reconstruction" in err
 
@@ -151,33 +153,15 @@ def test_info_reads_reconstructions_and_their_volumes(bean_run: Path, tmp_path: 
     assert facts["attenuation"].startswith("float32, ")
 
 
-def test_commands_for_runs_of_photos_name_what_works(bean_run: Path) -> None:
-    from nerfcli.ct.result import DESCRIPTION
-    from nerfcli.training.runs.files import RECONSTRUCTION
-
-    assert RECONSTRUCTION == DESCRIPTION
-    for command in (("report",), ("bench",), ("doctor",), ("export", "--to", "mesh")):
-        code, _, err = call(*command, bean_run)
-        assert code in (2, 3)
-        assert "is the reconstruction of an X-ray scan" in err or "choose volume" in err, err
-        assert len([line for line in err.strip().splitlines() if line.strip()]) <= 8
-
-
 def test_lists_of_runs_on_standard_input(bean_run: Path, tmp_path: Path) -> None:
     """Runs mixed with other paths: each run is processed, and a path that is no run is reported."""
     lines = f"{bean_run}\n{tmp_path}\n"
-    for arguments, suffix in ((("render",), ".tif"), (("export", "--to", "volume"), ".nrrd")):
-        result = CliRunner().invoke(app, [*arguments, "-", "-o", str(tmp_path / "out")], input=lines)
+    for arguments, suffix in ((("render",), ".tif"), (("export",), ".nrrd")):
+        result = CliRunner().invoke(app, ["ct", *arguments, "-", "-o", str(tmp_path / "out")], input=lines)
         assert result.exit_code == 3, result.stderr
-        assert "is not a run folder" in result.stderr
+        assert f"Error: {tmp_path} is not a reconstruction" in result.stderr
         assert result.stdout.splitlines()
         assert all(line.endswith(suffix) and Path(line).is_file() for line in result.stdout.splitlines())
-
-
-def test_commands_for_photos_name_a_scan(bean_run: Path) -> None:
-    code, _, err = call("ablate", bean_run.with_name("bean"), "--budget", "5s")
-    assert code == 3
-    assert "is an X-ray scan, not a scene of photos" in err
 
 
 def test_sign_of_residuals(bean_run: Path) -> None:
@@ -185,7 +169,6 @@ def test_sign_of_residuals(bean_run: Path) -> None:
     import torch
 
     from nerfcli.ct.likelihood import Gaussian, Poisson
-    from nerfcli.ct.training_files import residual_of
 
     zero = torch.zeros(1, 1)
     view = torch.tensor([0])
@@ -197,25 +180,22 @@ def test_sign_of_residuals(bean_run: Path) -> None:
 
 def test_resume_goes_on_from_the_volume(bean_run: Path, tmp_path: Path) -> None:
     scan, run = bean_run.with_name("bean"), tmp_path / "run"
-    fixed = ("--with", "centre=0", "--with", "tilt=0", "--with", "tv=1", "-o", run)
-    assert call("train", scan, "--steps", "2", *fixed)[0] == 0
+    fixed = ("--centre", "0", "--tilt", "0", "--tv", "1", "-o", run)
+    assert call("train", scan, "--passes", "2", *fixed)[0] == 0
     assert load_reconstruction(run).passes == 2
-    code, _, err = call("train", scan, "--steps", "5", "--resume", *fixed)
+    code, _, err = call("train", scan, "--passes", "5", "--resume", *fixed)
     assert code == 0, err
     assert load_reconstruction(run).passes == 5
     before = (run / "reconstruction.json").read_bytes()
-    again = call("train", scan, "--steps", "5", "--resume", *fixed)[2]
+    again = call("train", scan, "--passes", "5", "--resume", *fixed)[2]
     assert "is kept: it is complete" in again
     assert (run / "reconstruction.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("field", ["voxels", "hash"])
-def test_an_interrupted_fit_is_not_complete_and_resume_goes_on_from_it(
-    field: str, bean_run: Path, tmp_path: Path
-) -> None:
+def test_an_interrupted_fit_is_not_complete_and_resume_goes_on_from_it(bean_run: Path, tmp_path: Path) -> None:
     """Regression: the same command kept it as complete, and SIGTERM ended with the code of Ctrl-C."""
     scan, run, notes = bean_run.with_name("bean"), tmp_path / "run", list[str]()
-    settings = ReconstructionSettings(passes=3, field=field, strength=1.0, centre=0.0, tilt=0.0, air=False)
+    settings = ReconstructionSettings(passes=3, strength=1.0, centre=0.0, tilt=0.0, air=False)
 
     def terminate_in_second_pass(fraction: float, words: str) -> None:
         if fraction > 0.5:
@@ -224,12 +204,12 @@ def test_an_interrupted_fit_is_not_complete_and_resume_goes_on_from_it(
     with pytest.raises(Terminated):
         train_scan(scan, run, settings, notify=notes.append, progress=terminate_in_second_pass)
     interrupted = load_reconstruction(run)
-    assert (interrupted.passes, interrupted.complete) == (2 if field == "hash" else 1, False)
+    assert (interrupted.passes, interrupted.complete) == (1, False)
     saved = f"the volume of pass {interrupted.passes} is saved in {run}"
     assert notes == [f"{saved}; to continue, add --resume to the same command"]
 
-    fixed = ("--field", field, "--with", "centre=0", "--with", "tilt=0", "--with", "tv=1", "--without", "air")
-    command = ("train", scan, "--steps", "3", *fixed, "-o", run)
+    fixed = ("--centre", "0", "--tilt", "0", "--tv", "1", "--air", "stated")
+    command = ("train", scan, "--passes", "3", *fixed, "-o", run)
     code, out, err = call(*command)
     assert (code, out) == (3, "")
     assert err.startswith(f"Error: {run} holds a fit that was interrupted after pass {interrupted.passes}\n")
@@ -241,27 +221,19 @@ def test_an_interrupted_fit_is_not_complete_and_resume_goes_on_from_it(
     assert "is kept: it is complete" in call(*command)[2]
 
 
-def test_hash_grids_are_trained_resumed_evaluated_rendered_and_exported(bean_run: Path, tmp_path: Path) -> None:
-    scan, run = bean_run.with_name("bean"), tmp_path / "run"
-    fixed = ("--field", "hash", "--with", "centre=0", "--with", "tilt=0", "--with", "tv=1", "-o", run)
-    code, _, err = call("train", scan, "--steps", "1", *fixed)
-    assert code == 0, err
-    first = load_reconstruction(run)
-    assert "is kept" in call("train", scan, "--steps", "1", *fixed)[2]
-    code, _, err = call("train", scan, "--steps", "2", "--resume", *fixed)
-    assert code == 0, err
-    result = load_reconstruction(run)
-    assert (first.passes, result.passes) == (1, 2)
-    assert set(result.learned) == set(first.learned) == {"table.npy", "first-layer.npy", "last-layer.npy"}
-    code, out, err = call("evaluate", run, "--json")
-    assert code == 0, err
-    methods = json.loads(out.splitlines()[-1])["methods"]
-    assert methods["nerfcli"]["volume"]["psnr"] > 20
-    assert call("render", run, "--slices", "z=0", "-o", tmp_path / "slices")[0] == 0
-    assert call("export", run, "--to", "volume", "-o", tmp_path / "bean.nrrd")[0] == 0
-    code, _, err = call("train", scan, "--steps", "5", "--resume", "-o", run)
+def test_a_hash_grid_of_an_earlier_version_is_refused(bean_run: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(bean_run, tmp_path / "run")
+    content = read_sealed(run / DESCRIPTION)
+    content["settings"] |= {"field": "voxels", "seed": 0}
+    write_sealed(run / DESCRIPTION, content)
+    assert load_reconstruction(run).settings == load_reconstruction(bean_run).settings
+    content["settings"]["field"] = "hash"
+    write_sealed(run / DESCRIPTION, content)
+    code, _, err = call("evaluate", run)
     assert code == 3
-    assert "another reconstruction" in err
+    assert err.splitlines()[0] == (
+        f"Error: {run} is a hash grid, which scans no longer have: voxels are better in the same time"
+    )
 
 
 @pytest.mark.parametrize(
@@ -333,46 +305,10 @@ def test_hounsfield_units_of_water_and_air(tmp_path: Path, bean_run: Path) -> No
     np.testing.assert_allclose(back.values[seen], 1000 * (volume[seen] / 0.12 - 1), rtol=1e-4, atol=0.02)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "option"),
-    [
-        (("train", "SCAN", "--holdout", "every:4"), "--holdout"),
-        (("render", "RUN", "--video"), "--video"),
-        (("render", "RUN", "--lens", "fisheye"), "--lens"),
-        (("evaluate", "RUN", "--save-predictions", "png"), "--save-predictions"),
-        (("export", "RUN", "--to", "volume", "--box", "0,0,0,1,1,1"), "--box"),
-        (("export", "RUN", "--to", "volume", "--faces", "5"), "--faces"),
-    ],
-)
-def test_options_for_photos_are_refused_and_nothing_is_written(
-    arguments: tuple[str, ...], option: str, bean_run: Path, tmp_path: Path
-) -> None:
-    named = {"SCAN": bean_run.with_name("bean"), "RUN": bean_run}
-    place = () if arguments[0] == "evaluate" else ("-o", tmp_path / "out")
-    code, _, err = call(*(named.get(word, word) for word in arguments), *place)
-    assert code == 2
-    assert f"of an X-ray scan; {option} is for photos" in err
-    assert f"remove {option}" in err
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_reconstruction_is_not_taken_for_cameras(bean_run: Path, tmp_path: Path) -> None:
-    code, _, err = call("convert", bean_run, tmp_path / "out", "--to", "nerfcli")
-    assert code == 3
-    assert "is the reconstruction of an X-ray scan, which has no photos" in err
-
-
-def test_outputs_of_scans_are_refused_for_runs_of_photos(finished: Path) -> None:
-    for options in (("--slices", "z=0"), ("--outputs", "projection")):
-        code, _, err = call("render", finished, *options)
-        assert code == 2
-        assert f"{finished} is not a reconstruction of a scan; {options[0]}" in err
-
-
 def test_the_format_and_the_attenuation_of_water_are_used_and_checked(bean_run: Path, tmp_path: Path) -> None:
     run = tmp_path / "bean-run"
     shutil.copytree(bean_run, run)
-    code, out, err = call("export", run, "--to", "volume", "--format", "mha")
+    code, out, err = call("export", run, "--format", "mha")
     assert code == 0, err
     assert Path(out.split()[0]) == tmp_path / "bean-run-volume.mha"
     for options in (
@@ -381,7 +317,7 @@ def test_the_format_and_the_attenuation_of_water_are_used_and_checked(bean_run: 
         ("--water", "0"),
         ("--water", "nan"),
     ):
-        assert call("export", run, "--to", "volume", "--overwrite", *options)[0] == 2
+        assert call("export", run, "--overwrite", *options)[0] == 2
 
 
 def test_other_suffixes_and_types_are_refused(tmp_path: Path) -> None:
@@ -395,16 +331,13 @@ def test_other_suffixes_and_types_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--field", "mlp"), "cannot use --field mlp"),
-        (("--with", "exposure=learned"), "--with exposure: unknown component"),
-        (("--with", "tv=much"), "expected a number"),
-        (("--with", "tv=-1"), "invalid weight"),
+        (("--tv", "-1"), "invalid weight"),
         (("--voxel-size", "0"), "invalid voxel size 0"),
         (("--voxel-size", "0.001"), "need .* GB of memory"),
     ],
 )
 def test_train_refuses_in_two_lines(bean_run: Path, tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
-    code, _, err = call("train", bean_run.with_name("bean"), "--steps", "1", "-o", tmp_path / "run", *arguments)
+    code, _, err = call("train", bean_run.with_name("bean"), "--passes", "1", "-o", tmp_path / "run", *arguments)
     assert code == 3
     assert re.search(said, err)
     assert len([line for line in err.strip().splitlines() if line.strip()]) <= 3
@@ -415,7 +348,6 @@ def test_a_changed_scan_is_not_evaluated_as_the_old_one(bean_run: Path, tmp_path
 
     shutil.copytree(bean_run.parent, tmp_path / "copy")
     run = tmp_path / "copy" / "bean-run"
-    from nerfcli.ct.training_scores import scan_of as scan_behind
 
     result = load_reconstruction(run)
     from dataclasses import replace

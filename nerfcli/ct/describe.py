@@ -1,0 +1,89 @@
+"""Describe scans, reconstructions and volumes as plain values."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.ct.circle import circle_of
+from nerfcli.ct.formats.assemble import axis_column
+from nerfcli.ct.formats.read import read_scan
+from nerfcli.ct.recognise import is_reconstruction, is_volume
+from nerfcli.ct.result import load_reconstruction
+from nerfcli.ct.scan import MEASUREMENT, Scan
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Describe a reconstruction, a volume's file, or a scan in a supported format.
+
+    Raises:
+        UserError: the path is none of these, or damaged.
+    """
+    if is_reconstruction(path):
+        return _describe_reconstruction(path)
+    if is_volume(path):
+        from nerfcli.ct.export import volume_facts
+
+        return volume_facts(path)
+    scan = read_scan(path)
+    return {"kind": "scan", **facts_of(scan), "notes": list(scan.history.get("notes", ()))}
+
+
+def _describe_reconstruction(run: Path) -> dict[str, Any]:
+    result = load_reconstruction(run)
+    return {
+        "kind": "reconstruction",
+        "scan": str(result.scan),
+        "voxels": "x".join(str(count) for count in reversed(result.grid.shape)),
+        "voxel_size": result.grid.size,
+        "unit": result.unit,
+        "passes": result.passes,
+        "seconds": round(result.seconds, 1),
+        "settled": result.settled,
+        "decisions": list(result.decisions),
+    }
+
+
+def facts_of(scan: Scan) -> dict[str, Any]:
+    """Return the facts of a scan that `nerfcli ct info` shows, as plain values."""
+    geometry = scan.geometry
+    height, width = geometry.pixel_at_origin
+    circle, apart = circle_of(geometry)
+    angles = np.degrees(np.array(circle.angles))
+    around = apart < 1e-3
+    return {
+        "measurement": MEASUREMENT,
+        "format": scan.history.get("format"),
+        "views": geometry.views,
+        "held_out": len(scan.held_out),
+        "detector": f"{geometry.columns} x {geometry.rows} pixels",
+        "beam": _beam(scan),
+        "values": scan.kind,
+        "unit": scan.unit,
+        "pixel_at_object": {"width": _rounded(width), "height": _rounded(height)},
+        "magnification": _rounded(np.median(geometry.magnification)),
+        "angles_deg": {"from": _rounded(angles.min()), "to": _rounded(angles.max())} if around else None,
+        "orbit": "a circle" if around else "views that are not on one circle",
+        "source_origin": _rounded(circle.source_origin) if around and geometry.beam == "cone" else None,
+        "source_detector": _rounded(circle.source_detector) if around and geometry.beam == "cone" else None,
+        "axis_column": float(f"{axis_column(geometry):.6g}"),
+        "photons_per_value": scan.photons_per_value,
+        "unusable": None if scan.usable is None else float(f"{1 - float(scan.usable.mean()):.4g}"),
+        "truth": (scan.history.get("truth") or {}).get("path"),
+    }
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}") + 0.0  # no minus before 0
+
+
+def _beam(scan: Scan) -> str:
+    return "fan" if scan.geometry.beam == "cone" and scan.geometry.rows == 1 else scan.geometry.beam
+
+
+def in_words(scan: Scan) -> str:
+    """Describe a scan in a few words."""
+    geometry = scan.geometry
+    size = f"{geometry.columns} x {geometry.rows} pixels"
+    words = f"{geometry.views} views of {size}, {_beam(scan)} beam, {scan.kind.replace('_', ' ')}s"
+    return words.replace("countss", "counts") + f", {len(scan.held_out)} held out"
