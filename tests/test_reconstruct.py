@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 from ellipsoids import attenuation_of_voxels, bean, line_integrals
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_erosion, gaussian_filter
 
 from nerfcli.ct import reconstruct as reconstruction
-from nerfcli.ct.baselines import filtered_back_projection, sart_total_variation
-from nerfcli.ct.calibrate import air_factors, detector_tilt, model_error
+from nerfcli.ct.baselines import filtered_back_projection, filtered_misfit, sart_total_variation
+from nerfcli.ct.calibrate import air_factors, detector_tilt, found_noise
 from nerfcli.ct.centre import centre_of
 from nerfcli.ct.evaluate import resampled, score_volume
 from nerfcli.ct.geometry import ScanGeometry, circular_cone, circular_parallel
 from nerfcli.ct.grid import VoxelGrid, centred_grid, grid_of_scan
-from nerfcli.ct.likelihood import Gaussian, Poisson, likelihood_of, noise, photons_per_value
+from nerfcli.ct.likelihood import Gaussian, Poisson, likelihood_of, noise, photons_per_value, with_noise
 from nerfcli.ct.marks import OUTSIDE, TRUNCATED, UNSEEN, WEDGE, marks, missing_wedge_deg
 from nerfcli.ct.quick import highest_contrast_row
 from nerfcli.ct.reconstruct import Problem, Projector, reconstruct, start
@@ -75,7 +75,7 @@ def problem_of(scan: Scan, grid: VoxelGrid) -> Problem:
 def test_fit_beats_the_baselines_with_the_same_views(scan: Scan, grid: VoxelGrid) -> None:
     """Against the phantom's own voxels, with the model error of a trial; the baselines use the same views."""
     views = scan.training_views
-    error = model_error(scan, scan.geometry, grid, seconds=None)
+    _, error = found_noise(scan, scan.geometry, grid, seconds=None)
     problem = problem_of(scan, grid)
     assert isinstance(problem.likelihood, Poisson)
     problem = replace(problem, likelihood=problem.likelihood.with_model_error(error))
@@ -237,9 +237,63 @@ def test_few_photons_are_not_biased(grid: VoxelGrid) -> None:
 def test_the_model_error_of_a_scan_is_that_of_edges(grid: VoxelGrid) -> None:
     """Voxels do not follow the edges of the bean; line integrals have no model error."""
     scan = scan_of(cone(20), photons=2e5)
-    assert 0.005 < model_error(scan, scan.geometry, grid, seconds=None) < 0.05
+    lower, error = found_noise(scan, scan.geometry, grid, seconds=None)
+    assert (lower, 0.005 < error < 0.05) == (1.0, True)
     logs = Scan(scan.geometry, "line_integral", scan.line_integrals(np.arange(20)).astype(np.float32))
-    assert model_error(logs, logs.geometry, grid, seconds=None) == 0.0
+    assert found_noise(with_noise(logs), logs.geometry, grid, seconds=None)[1] == 0.0
+
+
+@pytest.mark.parametrize("kind", ["transmission", "line_integral"])
+def test_too_much_assumed_noise_is_corrected_by_views_that_were_left_out(kind: str, grid: VoxelGrid) -> None:
+    """Regression: of data without noise, neighbouring pixels suggested 30 times too much of it, and the fit was worse
+    than filtered back-projection; with the noise that is there, nothing is corrected.
+    """
+    geometry = cone(30)
+    noisy = scan_of(geometry, photons=1e3)
+    integrals = scan_of(geometry, photons=1e9).line_integrals(np.arange(30))
+    true = truth(grid)
+    values = integrals if kind == "line_integral" else np.exp(-integrals)
+    clean = Scan(geometry, kind, values.astype(np.float32), photons_per_value=30.0, deviation=0.3)  # type: ignore[arg-type]
+    lower, _ = found_noise(clean, geometry, grid, seconds=None)
+    assert lower > 3
+    assert found_noise(noisy, geometry, grid, seconds=None)[0] == 1.0
+
+    def psnr(scan: Scan) -> float:
+        problem = problem_of(scan, grid)
+        return score_volume(
+            reconstruct(problem, start(problem), strength=1.0, passes=8).volume.numpy(), grid, true, grid
+        ).psnr
+
+    filtered = filtered_back_projection(geometry, integrals, grid).clamp_min(0).numpy()
+    before, after, baseline = (
+        psnr(clean),
+        psnr(with_noise(clean, lower=lower)),
+        score_volume(filtered, grid, true, grid).psnr,
+    )
+    assert after > before + 3, (before, after, baseline)
+    assert before + 1 < baseline + 1 < after, (before, after, baseline)
+
+
+@pytest.mark.parametrize(("views", "filtered_is_better"), [(90, True), (8, False)])
+def test_the_filtered_misfit_ranks_volumes_as_their_errors_do(
+    views: int, filtered_is_better: bool, grid: VoxelGrid
+) -> None:
+    """Back-projection of many views is sharper than a smooth volume, of few views it is worse."""
+    geometry, true = cone(views), truth(grid)
+    integrals = scan_of(geometry, photons=1e9).line_integrals(np.arange(views))
+    found = {
+        "filtered": filtered_back_projection(geometry, integrals, grid).clamp_min(0),
+        "smooth": torch.from_numpy(gaussian_filter(true, 1.0)),
+    }
+    errors = {name: float(((volume.numpy() - true) ** 2).sum()) for name, volume in found.items()}
+    misfits = {name: filtered_misfit(geometry, integrals, grid, volume) for name, volume in found.items()}
+    assert (errors["filtered"] < errors["smooth"]) == filtered_is_better, errors
+    assert (misfits["filtered"] < misfits["smooth"]) == filtered_is_better, misfits
+
+
+def test_a_tilt_is_not_estimated_where_time_is_short() -> None:
+    found = detector_tilt(scan_of(cone(12, rows=20, columns=32, pixel=1.1)), seconds=0.0)
+    assert (found.value, found.error, found.holds) == (0.0, np.inf, False)
 
 
 def test_model_error_is_found_where_it_is_put_in(generator: torch.Generator) -> None:

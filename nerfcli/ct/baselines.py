@@ -4,6 +4,8 @@ Both use the same views as the fit, and SART also its projector. Line integrals 
 established reconstruction programs.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,6 +15,7 @@ from nerfcli import kernels
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid
 from nerfcli.ct.reconstruct import Projector
+from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 
 # Number of rounds over all views; relaxation of the first round and its decay per round.
@@ -24,6 +27,12 @@ TV_OF_VIEWS = 0.24
 TV_STEPS = 20
 # Largest deviation of a geometry from a circle around z, as a fraction of its radius and in cosines.
 _CIRCULAR = 1e-3
+
+
+def logarithms(scan: Scan, air: Sequence[float] | None) -> np.ndarray:
+    """Return line integrals (V, rows, columns) of the training views, with the open beam of each view corrected."""
+    integrals = scan.line_integrals(scan.training_views)
+    return integrals if air is None else integrals + np.log(np.asarray(air, dtype=np.float32))[:, None, None]
 
 
 def filtered_back_projection(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid) -> Tensor:
@@ -83,6 +92,16 @@ def filtered_back_projection(geometry: ScanGeometry, integrals: np.ndarray, grid
         )
         volume += seen.view(grid.shape) / depth.square().float()
     return volume * (turn / geometry.views) * (1.0 if turn < 1.5 * np.pi else 0.5)
+
+
+def filtered_misfit(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid, volume: Tensor) -> float:
+    """Return the sum of squared misfits of a volume, weighted by frequency along the rows (the ramp).
+
+    As the projections of an error have its spectrum on lines through the origin, this is proportional to the squared
+    error of the volume, if the data have no noise and views are dense.
+    """
+    left = integrals - Projector(geometry, grid).forward(volume).view(integrals.shape).numpy()
+    return float((left * _ramp(left.astype(np.float64), 1.0)).sum())
 
 
 def sart_total_variation(

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 from skimage.metrics import structural_similarity
 
 from nerfcli.atomic import read_json, write_json
-from nerfcli.ct.baselines import filtered_back_projection, sart_total_variation
+from nerfcli.ct.baselines import filtered_back_projection, logarithms, sart_total_variation
 from nerfcli.ct.calibrate import air_factors
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid
@@ -128,9 +128,7 @@ def evaluate_scan(
     measure("nerfcli", np.asarray(result.volume))
     if baselines:
         views = scan.training_views
-        integrals = scan.line_integrals(views)
-        if (factors := result.used.get("air")) is not None:
-            integrals = integrals + np.log(np.asarray(factors, dtype=np.float32))[:, None, None]
+        integrals = logarithms(scan, result.used.get("air"))
         progress(0.3, "filtered back-projection")
         try:
             filtered = filtered_back_projection(geometry.select(views), integrals, result.grid)

@@ -129,20 +129,16 @@ def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Likelih
     Returns:
         A likelihood with float32 tensors.
     """
-    values = np.asarray(scan.values[views], dtype=np.float32)
-    usable = scan.of_views("usable", views)
-    good = np.isfinite(values) if usable is None else np.isfinite(values) & usable
+    values, good = _values(scan, views)
     if scan.kind == "line_integral":
-        weight = good.astype(np.float32) / np.float32(noise(np.where(good, values, np.nan)) ** 2)
+        weight = good.astype(np.float32) / np.float32(assumed_noise(scan, views) ** 2)
         total = _binned(weight, binning)
         mean = _binned(np.where(good, values, 0) * weight, binning) / np.maximum(total, np.float32(1e-30))
         return Gaussian(_flat(mean), _flat(total))
     dark, open_beam = scan.of_views("dark", views), scan.of_views("open_beam", views)
     background = np.zeros_like(values) if dark is None else np.broadcast_to(dark, values.shape)
     beam = np.ones_like(values) if open_beam is None else np.broadcast_to(open_beam, values.shape)
-    photons = scan.photons_per_value
-    if photons is None:
-        photons = photons_per_value(np.where(good, values - background, np.nan))
+    photons = assumed_noise(scan, views)
     good = good & (beam > 0)
     # Negative detector values are noise of the electronics; a Poisson likelihood has no negative counts.
     parts = (np.maximum(values, 0), beam, np.maximum(background, 0))
@@ -150,6 +146,26 @@ def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Likelih
         _flat(_binned(np.where(good, part, 0) * np.float32(photons), binning)) for part in parts
     )
     return Poisson(counts, beam, background)
+
+
+def assumed_noise(scan: Scan, views: np.ndarray) -> float:
+    """Return the photons per value, or the standard deviation of line integrals; where unknown, those of some views."""
+    known = scan.deviation if scan.kind == "line_integral" else scan.photons_per_value
+    if known is not None:
+        return known
+    values, good = _values(scan, views)
+    if scan.kind == "line_integral":
+        return noise(np.where(good, values, np.nan))
+    dark = scan.of_views("dark", views)
+    return photons_per_value(np.where(good, values if dark is None else values - dark, np.nan))
+
+
+def with_noise(scan: Scan, *, lower: float = 1.0) -> Scan:
+    """Return a scan whose noise is known: if it was not, as its training views suggest; lower by a factor."""
+    level = assumed_noise(scan, scan.training_views)
+    if scan.kind == "line_integral":
+        return replace(scan, deviation=level / lower)
+    return replace(scan, photons_per_value=level * lower**2)
 
 
 def photons_per_value(values: np.ndarray) -> float:
@@ -179,6 +195,13 @@ def noise(values: np.ndarray) -> float:
     deviation = float(np.median(found)) if len(found) else 0.0
     # The squares of 1, -4, 6, -4, 1 sum up to 70.
     return deviation / _MEDIAN_DEVIATION / np.sqrt(70) or 1.0
+
+
+def _values(scan: Scan, views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values of views, and the mask of those that are usable."""
+    values = np.asarray(scan.values[views], dtype=np.float32)
+    usable = scan.of_views("usable", views)
+    return values, np.isfinite(values) if usable is None else np.isfinite(values) & usable
 
 
 def _binned(values: np.ndarray, factor: int) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.ct.grid import VoxelGrid
+from nerfcli.ct.likelihood import with_noise
 from nerfcli.ct.recognise import DESCRIPTION, MEASUREMENT, is_reconstruction
 from nerfcli.ct.scan import Scan, array_digest, load_scan, read_array
 from nerfcli.errors import UserError
@@ -179,7 +180,7 @@ def load_reconstruction(run: Path) -> Reconstruction:
 
 
 def scan_of(result: Reconstruction, run: Path) -> Scan:
-    """Load the scan of a reconstruction.
+    """Load the scan of a reconstruction, with the noise that was corrected in the fit.
 
     Raises:
         UserError: the scan no longer exists, or has changed.
@@ -192,7 +193,7 @@ def scan_of(result: Reconstruction, run: Path) -> Scan:
     scan = load_scan(result.scan)
     if scan.digest != result.scan_digest:
         raise UserError(f"{result.scan} has changed since {run} was trained", "train again with --overwrite")
-    return scan
+    return with_noise(scan, lower=lower) if (lower := result.used.get("noise_lower", 1.0)) > 1 else scan
 
 
 def refuse_existing(*paths: Path, overwrite: bool) -> None:

@@ -46,6 +46,7 @@ class Scan:
         held_out: sorted indices of the views that no reconstruction reads.
         unit: unit of lengths: "mm", "voxel" (pixels), or "unit" if unknown; attenuation is in its inverse.
         history: provenance of the scan, as plain values.
+        deviation: standard deviation of the noise of "line_integral"; None if unknown. It is not stored.
     """
 
     geometry: ScanGeometry
@@ -58,6 +59,7 @@ class Scan:
     held_out: tuple[int, ...] = ()
     unit: str = "mm"
     history: Mapping[str, Any] = field(default_factory=dict)
+    deviation: float | None = None
 
     def __post_init__(self) -> None:
         expected = (self.geometry.views, self.geometry.rows, self.geometry.columns)

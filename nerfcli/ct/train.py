@@ -1,8 +1,10 @@
 """Reconstruct a scan: correct its geometry, choose weights, fit a volume."""
 
+import math
 import platform
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -12,11 +14,12 @@ import torch
 
 from nerfcli import __version__
 from nerfcli.atomic import clear_leftovers
-from nerfcli.ct.calibrate import air_factors, beside_object, detector_tilt, model_error
+from nerfcli.ct.baselines import filtered_back_projection, filtered_misfit, logarithms
+from nerfcli.ct.calibrate import air_factors, beside_object, detector_tilt, found_noise
 from nerfcli.ct.centre import FEWEST_VIEWS, centre_of
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid, grid_of_scan
-from nerfcli.ct.likelihood import Poisson, likelihood_of
+from nerfcli.ct.likelihood import Poisson, likelihood_of, with_noise
 from nerfcli.ct.marks import TRUNCATED, UNSEEN, marks, marks_in_words, missing_wedge_deg
 from nerfcli.ct.quick import highest_contrast_row
 from nerfcli.ct.recognise import is_reconstruction
@@ -36,8 +39,8 @@ from nerfcli.machine import thread_count
 from nerfcli.memory import default_memory_limit
 from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
 
-# Fraction of the time budget for the trial of the model error, and of the time left for the coarse start.
-TRIAL_FRACTION, COARSE_FRACTION = 0.0375, 0.1
+# Largest fraction of the time budget for estimates before the fit, and of the time left for the coarse start.
+CHOICE_FRACTION, COARSE_FRACTION = 0.25, 0.1
 # Minimum fraction of the budget for the fit, even if the trials before it took longer than planned.
 LEAST_FRACTION = 0.25
 COARSE_PASSES = 6
@@ -128,19 +131,27 @@ def _fit(
 ) -> tuple[Reconstruction, KeyboardInterrupt | None]:
     """Fit the volume, and return what interrupted the fit, if anything; before the fit, an interrupt is passed on."""
     begun = time.perf_counter() - (0.0 if earlier is None else earlier.seconds)
+    deadline = math.inf if settings.budget_seconds is None else begun + CHOICE_FRACTION * settings.budget_seconds
+
+    def left() -> float | None:
+        return None if deadline == math.inf else max(deadline - time.perf_counter(), 0.0)
+
     decisions: list[str] = []
-    views = scan.training_views
+    views, digest = scan.training_views, scan.digest
     # Check memory first: correcting the geometry takes seconds, and hardly changes the number of voxels.
     _fits_memory(grid_of_scan(scan.geometry, settings.voxel_size) if earlier is None else earlier.grid)
-    centre, tilt = _geometry(scan, settings, earlier, decisions, progress)
+    centre, tilt = _geometry(scan, settings, earlier, decisions, progress, left)
     geometry = scan.geometry.corrected(centre, tilt)
     grid = earlier.grid if earlier is not None else grid_of_scan(geometry, settings.voxel_size)
     if earlier is not None:
         strength, error = float(earlier.used["strength"]), float(earlier.used["model_error"])
+        lower = float(earlier.used.get("noise_lower", 1.0))
     else:
-        progress(0.0, "model error")
-        most = None if settings.budget_seconds is None else TRIAL_FRACTION * settings.budget_seconds
-        strength, error = settings.strength, model_error(scan, geometry, grid, seconds=most)
+        progress(0.0, "noise and model error")
+        strength = settings.strength
+        lower, error = found_noise(with_noise(scan), geometry, grid, seconds=left())
+        if lower > 1:
+            decisions.append(f"noise: lowered by a factor of {lower:.2g}, as views that were left out show")
         if error > 0:
             decisions.append(f"model error: line integrals are uncertain by {error:.2g} beyond photon noise")
     likelihood = likelihood_of(scan, views)
@@ -148,19 +159,36 @@ def _fit(
     if earlier is not None:
         factors = earlier.used.get("air")
     elif settings.air is not False and isinstance(likelihood, Poisson):
-        factors = _air(scan, geometry, grid, likelihood, strength, forced=settings.air is True, decisions=decisions)
+        factors = _air(
+            *(scan, geometry, grid, likelihood, strength),
+            forced=settings.air is True,
+            seconds=left(),
+            decisions=decisions,
+        )
+    if lower > 1:  # after the open beam, whose estimate has errors that are not those of counting
+        scan = with_noise(scan, lower=lower)
+        likelihood = likelihood_of(scan, views)
     if factors is not None and isinstance(likelihood, Poisson):
         likelihood = likelihood.scaled(torch.tensor(factors))
     if isinstance(likelihood, Poisson):
         likelihood = likelihood.with_model_error(error)
     problem = Problem(geometry.select(views), likelihood, grid)
 
-    used = {"strength": strength, "model_error": error, "centre": centre, "tilt": tilt, "air": factors}
+    used = {
+        "strength": strength,
+        "noise_lower": lower,
+        "model_error": error,
+        "centre": centre,
+        "tilt": tilt,
+        "air": factors,
+    }
     limit = Limit(settings.passes, settings.budget_seconds, begun, 0 if earlier is None else earlier.passes)
     if earlier is not None:
         fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
     else:
         fit = _coarse_start(scan, geometry, grid, factors, (strength, error), limit.seconds)
+        if lower > 1:
+            fit = _better_start(fit, problem, logarithms(scan, factors))
     fit, interrupt = _fit_voxels(problem, fit, strength, limit, progress=progress)
     found = marks(problem.geometry, grid)
     decisions += [f"{words}; they are marked" for words in marks_in_words(found, (UNSEEN, TRUNCATED))]
@@ -173,7 +201,7 @@ def _fit(
         grid,
         scan.unit,
         folder,
-        scan.digest,
+        digest,
         settings,
         used,
         tuple(decisions),
@@ -240,6 +268,7 @@ def _geometry(
     earlier: Reconstruction | None,
     decisions: list[str],
     progress: Progress,
+    left: Callable[[], float | None],
 ) -> tuple[float, float]:
     if earlier is not None:
         return float(earlier.used["centre"]), float(earlier.used["tilt"])
@@ -253,8 +282,13 @@ def _geometry(
         if found.is_off:
             decisions.append(f"centre of rotation: shifted by {found.shift:+.2f} ± {found.error:.2f} columns")
     if tilt is None:
-        found = detector_tilt(replace(scan, geometry=scan.geometry.shifted(centre)))
+        progress(0.0, "detector tilt")
+        # At most half of the time for estimates, so that the noise is judged too.
+        most = None if (seconds := left()) is None else seconds / 2
+        found = detector_tilt(replace(scan, geometry=scan.geometry.shifted(centre)), seconds=most)
         tilt = found.value if found.holds else 0.0
+        if math.isinf(found.error):
+            decisions.append("detector tilt: not estimated, for lack of time; set --tilt, or give a larger --budget")
         if found.holds:
             decisions.append(
                 f"detector tilt: {np.rad2deg(found.value):+.2f} degrees, which lowers chi-square of left-out views "
@@ -271,6 +305,7 @@ def _air(
     strength: float,
     *,
     forced: bool,
+    seconds: float | None,
     decisions: list[str],
 ) -> list[float] | None:
     """Estimate factors on the open beam of each training view; None if, unless forced, they vary no more than noise."""
@@ -280,7 +315,7 @@ def _air(
     binned = likelihood_of(scan, views, binning=binning)
     assert isinstance(binned, Poisson)
     problem = Problem(coarse, binned, small)
-    fit = reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES)
+    fit = reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES, seconds=seconds)
     integrals = Projector(coarse, small).forward(fit.volume, np.arange(len(views)))
     factors = air_factors(binned, integrals)
     photons = torch.where(beside_object(binned, integrals), binned.counts, 0).sum(1)
@@ -314,6 +349,20 @@ def _coarse_start(
     problem = Problem(geometry.binned(2).select(views), likelihood, small)
     limit = None if seconds is None else COARSE_FRACTION * seconds
     return finer(reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES, seconds=limit), grid)
+
+
+def _better_start(coarse: Fit, problem: Problem, integrals: np.ndarray) -> Fit:
+    """Return the better start where noise is negligible: a coarse fit, or filtered back-projection, which is sharper.
+
+    With few views, or over a limited angle, back-projection is worse; where the views are no circle, there is none.
+    """
+    geometry, grid = problem.geometry, problem.grid
+    try:
+        filtered = filtered_back_projection(geometry, integrals, grid).clamp_min(0)
+    except UserError:  # no circle
+        return coarse
+    sharp, smooth = (filtered_misfit(geometry, integrals, grid, each) for each in (filtered, coarse.volume))
+    return replace(coarse, volume=filtered) if sharp < smooth else coarse
 
 
 def _fits_memory(grid: VoxelGrid) -> None:
