@@ -22,7 +22,7 @@ from nerfcli.ct.marks import OUTSIDE, TRUNCATED, UNSEEN, WEDGE, marks, missing_w
 from nerfcli.ct.quick import highest_contrast_row
 from nerfcli.ct.reconstruct import Problem, Projector, reconstruct, start
 from nerfcli.ct.scan import Scan, held_out_views, load_scan, save_scan
-from nerfcli.ct.train import Limit
+from nerfcli.ct.train import seconds_left
 from nerfcli.errors import UserError
 
 PHOTONS = 2e4
@@ -117,8 +117,8 @@ def test_many_views_over_a_limited_angle_do_not_diverge(monkeypatch: pytest.Monk
 
 
 def test_fit_keeps_a_quarter_of_the_budget_when_trials_took_it_all() -> None:
-    assert Limit(None, 8.0, time.perf_counter() - 100.0, 0).seconds == 2.0
-    assert Limit(4, None, time.perf_counter() - 100.0, 0).seconds is None
+    assert seconds_left(8.0, time.perf_counter() - 100.0) == 2.0
+    assert seconds_left(None, time.perf_counter() - 100.0) is None
 
 
 @pytest.mark.parametrize("beam", ["cone", "parallel", "half"])

@@ -5,7 +5,7 @@ import platform
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -182,14 +182,20 @@ def _fit(
         "tilt": tilt,
         "air": factors,
     }
-    limit = Limit(settings.passes, settings.budget_seconds, begun, 0 if earlier is None else earlier.passes)
     if earlier is not None:
         fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
     else:
-        fit = _coarse_start(scan, geometry, grid, factors, (strength, error), limit.seconds)
+        fit = _coarse_start(
+            scan, geometry, grid, factors, (strength, error), seconds_left(settings.budget_seconds, begun)
+        )
         if lower > 1:
             fit = _better_start(fit, problem, logarithms(scan, factors))
-    fit, interrupt = _fit_voxels(problem, fit, strength, limit, progress=progress)
+    fit, interrupt = _fit_voxels(
+        *(problem, fit, strength),
+        passes=MOST_PASSES if settings.passes is None else max(settings.passes - fit.passes, 1),
+        seconds=seconds_left(settings.budget_seconds, begun),
+        progress=progress,
+    )
     found = marks(problem.geometry, grid)
     decisions += [f"{words}; they are marked" for words in marks_in_words(found, (UNSEEN, TRUNCATED))]
     wedge = missing_wedge_deg(problem.geometry)
@@ -215,36 +221,13 @@ def _fit(
     return result, interrupt
 
 
-@dataclass(frozen=True)
-class Limit:
-    """Stopping criterion of a fit.
-
-    Args:
-        total_passes, total_seconds: limits including earlier passes and the time before the fit; None for no limit.
-        begun: `time.perf_counter` at the start, less the seconds of an earlier run.
-        done: number of passes of an earlier run.
-    """
-
-    total_passes: int | None
-    total_seconds: float | None
-    begun: float
-    done: int
-
-    @property
-    def passes(self) -> int | None:
-        """Number of passes left, at least one."""
-        return None if self.total_passes is None else max(self.total_passes - self.done, 1)
-
-    @property
-    def seconds(self) -> float | None:
-        """Seconds left, at least `LEAST_FRACTION` of the total."""
-        if self.total_seconds is None:
-            return None
-        return max(self.total_seconds - (time.perf_counter() - self.begun), LEAST_FRACTION * self.total_seconds)
+def seconds_left(total: float | None, begun: float) -> float | None:
+    """Return the seconds left of a budget, but at least `LEAST_FRACTION` of it; None without a budget."""
+    return None if total is None else max(total - (time.perf_counter() - begun), LEAST_FRACTION * total)
 
 
 def _fit_voxels(
-    problem: Problem, fit: Fit, strength: float, limit: Limit, *, progress: Progress
+    problem: Problem, fit: Fit, strength: float, *, passes: int, seconds: float | None, progress: Progress
 ) -> tuple[Fit, KeyboardInterrupt | None]:
     kept = deque([fit], maxlen=1)
     try:
@@ -252,8 +235,8 @@ def _fit_voxels(
             problem,
             fit,
             strength=strength,
-            passes=limit.passes or MOST_PASSES,
-            seconds=limit.seconds,
+            passes=passes,
+            seconds=seconds,
             progress=progress,
             keep=kept.append,
         )
