@@ -1,6 +1,7 @@
 """Checks that need a quick reconstruction: the centre of rotation and beam hardening."""
 
 import numpy as np
+from skimage.filters import threshold_otsu
 
 from nerfcli.ct.centre import FEWEST_VIEWS, FINE, centre_of
 from nerfcli.ct.checks.sample import Sample
@@ -41,7 +42,7 @@ def beam_hardening(sample: Sample) -> Finding | str:
         return "too few views"
     row = highest_contrast_row(sample.scan).thinned().binned(FINE)
     volume, grid = reconstructed(row)
-    inside = volume > _otsu(volume)
+    inside = volume > threshold_otsu(volume)
     lengths = predicted(inside.astype(np.float32), row, grid)
     longest = float(np.quantile(lengths, 0.999))
     used = lengths > 0.1 * longest
@@ -66,15 +67,3 @@ def beam_hardening(sample: Sample) -> Finding | str:
         if verdict == GOOD
         else "values inside come out too low (cupping): filter the beam, or correct line integrals by a polynomial",
     )
-
-
-def _otsu(volume: np.ndarray) -> float:
-    """Return the threshold between two classes of values. Source: Otsu 1979, IEEE SMC 9(1)."""
-    counts, edges = np.histogram(volume, bins=256)
-    middles = (edges[:-1] + edges[1:]) / 2
-    below = np.cumsum(counts)
-    above = below[-1] - below
-    sums = np.cumsum(counts * middles)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        between = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
-    return float(middles[int(np.nanargmax(np.where(above > 0, between, np.nan)))])
