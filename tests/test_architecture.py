@@ -37,7 +37,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "splats": {"export", "render", "field", "kernels", "photos", "cameras", "pages"},
     "viewer": {"render", "field", "kernels", "photos", "cameras", "pages"},
     "poses.input": {"captures", "photos"},
-    "poses.model": {"poses.input", "captures", "photos", "cameras"},
+    "poses.model": {"poses.input", "captures", "matching", "photos", "cameras"},
     "poses.judge": {"poses.model", "poses.input", "matching"},
     "poses.engine": {"poses.judge", "poses.model", "poses.input", "matching", "photos"},
     "poses": {"poses.engine", "poses.judge", "poses.model", "poses.input", "captures", "photos"},

@@ -21,12 +21,18 @@ from nerfcli.doctor import connectivity, examination
 from nerfcli.doctor.brightness import Brightness
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.examination import examine
-from nerfcli.doctor.misplaced_groups import NEAREST, misplaced_groups, nearest_pairs
 from nerfcli.doctor.photo_facts import PhotoFacts, PhotoFeatures, Source
 from nerfcli.doctor.photo_list import ExaminedCapture
-from nerfcli.doctor.pose_agreement import PairError, agreement, contradicting, pair_errors
+from nerfcli.doctor.pose_agreement import (
+    NEAREST,
+    PairError,
+    contradicting,
+    misplaced_groups,
+    nearest_pairs,
+    pair_errors,
+    poses_by_matches,
+)
 from nerfcli.doctor.sharpness import Sharpness
-from nerfcli.matching.epipolar import sampson_angles
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding
 from nerfcli.photos.exif import Exif
 
@@ -80,7 +86,7 @@ def pairs_of(frames: Sequence[Frame]) -> list[Pair]:
 
 def checked(given: Sequence[Frame], pairs: Sequence[Pair]) -> Finding:
     photos = facts(len(given))
-    found = agreement(photos, pair_errors(given, photos, pairs))
+    found = poses_by_matches(photos, pair_errors(given, photos, pairs))
     assert found is not None
     return found
 
@@ -221,7 +227,7 @@ def test_wrong_conventions_are_wrong_cameras_as_a_whole_and_name_no_photo(wrong:
 
 def test_without_matches_nothing_is_said():
     frames, photos = ring(), facts(24)
-    assert agreement(photos, pair_errors(frames, photos, [])) is None
+    assert poses_by_matches(photos, pair_errors(frames, photos, [])) is None
     assert misplaced_groups(frames, photos, [], []) is None
 
 
@@ -303,34 +309,7 @@ def test_nearest_pairs_by_a_double_loop():
     assert nearest_pairs(frames) == expected
 
 
-# Geometry, photos
-
-
-def test_sampson_angles_in_closed_form():
-    """A camera moves to the right; a match that is off by a small angle upwards is off by that angle in two photos."""
-    first = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.0, 1.0]])
-    second = np.array([[-0.2, 1e-4, 1.0], [-0.1, 0.0, 1.0], [0.2, 0.0, 1.0]])
-    first, second = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (first, second))
-    angles, behind = sampson_angles(first, second, np.eye(3), np.array([-1.0, 0.0, 0.0]))
-    # Each of the two rays takes its part of the error, so that the distance is smaller by the square root of 2.
-    np.testing.assert_allclose(
-        angles, [1e-4 / np.sqrt(2) * np.cos(np.arctan(0.2) / 2), 0.0, 0.0], rtol=0.03, atol=1e-15
-    )
-    assert behind.tolist() == [False, False, True]
-    no_baseline, _ = sampson_angles(first, second, np.eye(3), np.zeros(3))
-    assert np.isnan(no_baseline).all()
-
-
-@pytest.mark.parametrize(("first_ahead", "second_ahead"), [(True, True), (True, False), (False, True), (False, False)])
-def test_points_behind_either_camera_are_behind(first_ahead: bool, second_ahead: bool):
-    """The point at the given signed distances along the two rays, from a camera at t in the second one's axes."""
-    t = np.array([0.4, -0.1, 0.2])
-    first = np.array([[0.1, 0.2, 0.97]]) / np.linalg.norm([0.1, 0.2, 0.97])
-    point = (3.0 if first_ahead else -3.0) * first + t
-    second = point / np.linalg.norm(point) * (1 if second_ahead else -1)
-    angles, behind = sampson_angles(first, second, np.eye(3), t)
-    np.testing.assert_allclose(angles, 0, atol=1e-15)
-    assert behind.tolist() == [not (first_ahead and second_ahead)]
+# Photos
 
 
 def test_the_doctor_of_a_scene_names_the_wrong_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

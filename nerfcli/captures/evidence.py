@@ -4,7 +4,7 @@ Each kind of evidence computes one error for every item, from the poses and from
 depend only on the intrinsics. An item behind a camera has an infinite error.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -16,7 +16,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.axes import Convention, for_picture, shifted
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
-from nerfcli.matching.epipolar import fundamental_matrix, sampson_angles
+from nerfcli.matching.agreement import agreement, fundamental_matrix, rays_of
 from nerfcli.matching.features import Features, Matches, find_features, mutual_matches
 
 # The longer side of the photos in which features are detected: a larger one finds better features, but takes longer.
@@ -143,17 +143,17 @@ class ObservationEvidence:
         self.name = f"{len(rows)} observations of points in {len(np.unique(self.groups))} photos"
 
     def directions(self, convention: Convention) -> tuple[np.ndarray, ...]:
-        """Return the unit viewing directions of the pixels, (M, 3), their validity and their pixels per radian."""
+        """Return the unit viewing directions of the pixels, (M, 3), and their pixels per radian."""
         return _directions(self._cameras, self.groups, self._pixels, convention)
 
     def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
         """Return the error of each observation, (M,)."""
-        seen, valid, focal_px = directions
+        seen, focal_px = directions
         cam_from_world = rigid.inverse(world_from_cam)[self.groups]
         towards = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], self._points) + cam_from_world[:, :3, 3]
         angle = np.arctan2(np.linalg.norm(np.cross(seen, towards), axis=1), np.einsum("mi,mi->m", seen, towards))
         # A point 90 degrees or more off its pixel's direction counts as behind the camera, for wide cameras too.
-        return np.where(valid & (angle < np.pi / 2), focal_px * angle, np.inf)
+        return np.where(angle < np.pi / 2, focal_px * angle, np.inf)
 
 
 class MatchEvidence:
@@ -176,21 +176,20 @@ class MatchEvidence:
         self.name = f"{len(self.groups)} SIFT matches in {len(pairs)} pairs of photos"
 
     def directions(self, convention: Convention) -> tuple[np.ndarray, ...]:
-        """Return unit viewing directions of both pixels of each match, (M, 3) twice, validity, pixels per radian."""
-        first, valid1, focal1 = _directions(self._cameras, self._first, self._first_pixels, convention)
-        second, valid2, focal2 = _directions(self._cameras, self._second, self._second_pixels, convention)
-        return first, second, valid1 & valid2, (focal1 + focal2) / 2
+        """Return unit viewing directions of both pixels of each match, (M, 3) twice, and pixels per radian."""
+        first, focal1 = _directions(self._cameras, self._first, self._first_pixels, convention)
+        second, focal2 = _directions(self._cameras, self._second, self._second_pixels, convention)
+        return first, second, (focal1 + focal2) / 2
 
     def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
         """Return the error of each match, (M,)."""
-        first, second, valid, focal_px = directions
+        first, second, focal_px = directions
         firsts, seconds = self._pairs
         second_from_first = (rigid.inverse(world_from_cam[seconds]) @ world_from_cam[firsts])[self.groups]
-        rotation, t = second_from_first[:, :3, :3], second_from_first[:, :3, 3]
-        sampson, behind = sampson_angles(first, second, rotation, t)
-        turned = np.einsum("mij,mj->mi", rotation, first)  # the first direction in the second camera's axes
-        parallax = np.linalg.norm(np.cross(turned, second), axis=1) * focal_px > _LEAST_PARALLAX_PX
-        return np.where(valid & ~(behind & parallax) & np.isfinite(sampson), focal_px * sampson, np.inf)
+        found = agreement(first, second, second_from_first, focal_px=focal_px)
+        behind = found.behind & (found.parallax_px > _LEAST_PARALLAX_PX)
+        still = ~second_from_first[:, :3, 3].any(axis=1)
+        return np.where(behind | still | np.isnan(found.sampson_px), np.inf, np.abs(found.sampson_px))
 
 
 class FrustumEvidence:
@@ -219,27 +218,19 @@ class FrustumEvidence:
         cam_from_world = rigid.inverse(world_from_cam)[self.groups]
         in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], self._points) + cam_from_world[:, :3, 3]
         shown = np.zeros(len(self.groups), dtype=bool)
-        for camera, rows in _rows_of_each(self._cameras, self.groups):
-            shown[rows] = camera.shows(in_camera[rows])
+        for index in np.unique(self.groups):
+            rows = self.groups == index
+            shown[rows] = self._cameras[index].shows(in_camera[rows])
         return np.where(shown, 0.0, np.inf)
 
 
 def _directions(
     cameras: Sequence[Camera], frame_index: np.ndarray, pixels: np.ndarray, convention: Convention
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the unit viewing directions (M, 3) of pixels of frames, their validity, and pixels per radian."""
-    directions, valid = np.zeros((len(pixels), 3)), np.zeros(len(pixels), dtype=bool)
-    focal_px = np.zeros(len(pixels))
-    for camera, rows in _rows_of_each(cameras, frame_index):
-        corrected = for_picture(shifted(camera, 0.5 - convention.pixel_centre), convention.intrinsics_scale)
-        directions[rows], valid[rows] = corrected.bearings(pixels[rows])
-        focal_px[rows] = corrected.focal_px
-    return directions, valid, focal_px
-
-
-def _rows_of_each(cameras: Sequence[Camera], index: np.ndarray) -> Iterator[tuple[Camera, np.ndarray]]:
-    """Yield each distinct camera, in the order of first appearance, and the rows of `index` (M,) that refer to it."""
-    places: dict[Camera, int] = {}
-    labels = np.array([places.setdefault(camera, len(places)) for camera in cameras], dtype=np.int64)[index]
-    order = np.argsort(labels, kind="stable")
-    yield from zip(places, np.split(order, np.searchsorted(labels[order], np.arange(1, len(places)))), strict=True)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unit viewing directions (M, 3) of pixels of frames, NaN without one, and pixels per radian (M,)."""
+    corrected = {
+        camera: for_picture(shifted(camera, 0.5 - convention.pixel_centre), convention.intrinsics_scale)
+        for camera in set(cameras)
+    }
+    focal_px = np.array([corrected[camera].focal_px for camera in cameras])
+    return rays_of([corrected[camera] for camera in cameras], frame_index, pixels), focal_px[frame_index]

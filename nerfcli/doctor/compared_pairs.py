@@ -12,7 +12,7 @@ import numpy as np
 from nerfcli.doctor import camera_motion
 from nerfcli.doctor.moving import Patch, moving_patches
 from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, PhotoFeatures
-from nerfcli.matching.epipolar import fundamental_matrix
+from nerfcli.matching.agreement import fundamental_matrix
 from nerfcli.matching.features import LOOSE_RATIO, mutual_matches
 from nerfcli.matching.stationary import Motions, in_place, motions
 from nerfcli.photos.exif import Exif

@@ -9,12 +9,11 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.calibration import Calibration, Picture, calibrated
 from nerfcli.captures.capture import Capture
-from nerfcli.doctor import camera_layout, connectivity, geometry, inventory, pose_agreement, quality
+from nerfcli.doctor import camera_layout, connectivity, geometry, inventory, quality
 from nerfcli.doctor.compared_pairs import Pair, compare, focal_px
-from nerfcli.doctor.misplaced_groups import misplaced_groups, nearest_pairs
 from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, read_all
 from nerfcli.doctor.photo_list import ExaminedCapture
-from nerfcli.doctor.pose_agreement import pair_errors
+from nerfcli.doctor.pose_agreement import misplaced_groups, nearest_pairs, pair_errors, poses_by_matches
 from nerfcli.pages.findings import Finding, as_json, worst
 from nerfcli.poses.judge.checks import Checks
 
@@ -197,7 +196,7 @@ def judged(
             ("directions", lambda: camera_layout.directions(of_scene)),
             ("points", lambda: camera_layout.points(of_scene)),
             ("intrinsics", lambda: camera_layout.intrinsics(of_scene)),
-            ("poses", lambda: found_or_noted("poses", pose_agreement.agreement(photos, errors))),
+            ("poses", lambda: found_or_noted("poses", poses_by_matches(photos, errors))),
             ("places", lambda: misplaced_groups(frames, photos, errors, pairs)),
         ]
         found += [checks.run(name, compute, otherwise=None) for name, compute in planned]

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from nerfcli.matching.epipolar import epipolar_px, fundamental_matrix
+from nerfcli.matching.agreement import epipolar_px, fundamental_matrix
 
 # A match farther than this many tolerances from its epipolar line does not follow the camera.
 _FAR = 3.0

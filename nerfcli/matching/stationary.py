@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerfcli.matching.epipolar import epipolar_px, fundamental_matrix
+from nerfcli.matching.agreement import epipolar_px, fundamental_matrix
 
 # A match is still if it moved by less than this fraction of the picture's diagonal: 2 px at 1600 x 1200.
 _STILL = 0.001

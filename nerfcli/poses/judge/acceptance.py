@@ -19,7 +19,7 @@ from nerfcli.poses.model import held_out
 from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.lens_observability import is_centred
 from nerfcli.poses.model.reasons import MIN_MATCHES
-from nerfcli.poses.model.two_views import Agreement, RotationError, VerifiedPair, agreements, rotation_errors
+from nerfcli.poses.model.two_views import PairAgreement, RotationError, VerifiedPair, agreements, rotation_errors
 
 # Largest fraction of all matches in pairs that strongly contradict the model, as of a scene that repeats itself.
 _MOST_RIVALS = 0.05
@@ -96,7 +96,7 @@ def judge(
         determined: ids of cameras whose focal lengths are known to 1 %, see `lens_observability.focal_is_determined`.
     """
     run = (Checks() if checks is None else checks).run
-    found: list[Agreement] = run("agreement of pairs", lambda: agreements(model, pairs), otherwise=[])
+    found: list[PairAgreement] = run("agreement of pairs", lambda: agreements(model, pairs), otherwise=[])
     rotations: list[RotationError] = run(
         "rotations of pairs", lambda: rotation_errors(model, pairs, seed=seed), otherwise=[]
     )
@@ -237,7 +237,7 @@ def _no_baseline(turn: RotationFit | None, geometry: Mapping[str, Any], held_out
 def _contradicted(
     contradictions: Sequence[Contradiction],
     fraction: float,
-    found: Sequence[Agreement],
+    found: Sequence[PairAgreement],
     *,
     names: Mapping[str, str],
 ) -> list[Failure]:

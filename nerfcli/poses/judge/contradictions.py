@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 
 from nerfcli.matching.graph import Bottlenecks, connected_groups, spanning_tree
-from nerfcli.poses.model.two_views import LEAST_ANGLE_DEG, Agreement, VerifiedPair, agreements
+from nerfcli.poses.model.two_views import LEAST_ANGLE_DEG, PairAgreement, VerifiedPair, agreements
 
 # A pair with fewer may be wrong even if no other pair joins its photos.
 _CERTAIN_MATCHES = 100
@@ -82,7 +82,7 @@ def without_photos(model: pycolmap.Reconstruction, photos: Iterable[int] = ()) -
     return rest
 
 
-def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[Agreement]) -> list[Contradiction]:
+def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[PairAgreement]) -> list[Contradiction]:
     """Return pairs that contradict a model, more than half as strong as the chain that supports it, strongest first."""
     chains = Bottlenecks(
         sorted(model.reg_image_ids()), [(a.one, a.other, a.matches * a.fraction) for a in found if not a.contradicts]
@@ -95,7 +95,7 @@ def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[Agreem
     return pairs
 
 
-def _is_held(photo: int, found: Sequence[Agreement]) -> bool:
+def _is_held(photo: int, found: Sequence[PairAgreement]) -> bool:
     """Return whether more matches of a photo determine its position than contradict it."""
     own = [a for a in found if photo in (a.one, a.other)]
     supporting = sum(a.matches for a in own if not a.contradicts and a.angle_deg > LEAST_ANGLE_DEG)

@@ -2,8 +2,6 @@
 
 The verified matches of a pair do not depend on the mapper. A wrong model has small residuals because it has discarded
 the observations that contradict it; they are still in the database, and are tested here.
-
-Letters: p, q are unit rays of a match in the two cameras; R, t the pose of the second camera from the first.
 """
 
 from collections import Counter
@@ -15,11 +13,14 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from nerfcli.matching.agreement import Agreement, agreement
 from nerfcli.poses.model.held_out import MOST_ERROR_PX
 from nerfcli.poses.model.projection import Array, panorama_camera, px_per_radian
 
 # Below this median angle between the rays of a match, the relative pose of a pair is too weak to contradict anything.
 LEAST_ANGLE_DEG = 2.0
+# Matches are verified within MOST_ERROR_PX; a model that fits more than the pair may leave twice that.
+_MOST_PX = 2 * MOST_ERROR_PX
 # A relative rotation is estimated from this many matches of a pair: more make it no better than 10 degrees need.
 _MOST_FOR_ROTATION = 400
 
@@ -40,7 +41,7 @@ class VerifiedPair:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class PairAgreement:
     """Agreement of a pair's matches with the poses of a model.
 
     matches: how many can be judged. fraction: of them within 8 px of the epipolar line and in front
@@ -90,27 +91,18 @@ def placed_pairs(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) 
     return [pair for pair in pairs if pair.one in placed and pair.other in placed]
 
 
-def agreements(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) -> list[Agreement]:
+def agreements(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) -> list[PairAgreement]:
     """Compare each pair's matches with the model's poses and intrinsics; pairs without a finite ray are left out."""
     found = []
-    # Matches are verified within this error; a model that fits more than the pair may leave twice that.
-    most_px = 2 * MOST_ERROR_PX
     for pair in placed_pairs(model, pairs):
-        first, second = model.image(pair.one), model.image(pair.other)
-        camera, other_camera = model.camera(first.camera_id), model.camera(second.camera_id)
-        p, q = rays(camera, pair.pixels_one), rays(other_camera, pair.pixels_other)
-        finite = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
-        if not finite.any():
+        seen = _compared(_cameras(model, pair), (pair.pixels_one, pair.pixels_other), _other_from_one(model, pair))
+        judged = np.isfinite(seen.parallax)
+        if not judged.any():
             continue
-        pose = second.cam_from_world() * first.cam_from_world().inverse()
-        R, t = pose.rotation.matrix(), np.asarray(pose.translation)
-        p, q = p[finite] @ R.T, q[finite]  # both in the second camera's axes
-        focal_px = 0.5 * (px_per_radian(camera) + px_per_radian(other_camera))
-        angles = _angles(p, q)
         # Noise decides on which side of the cameras nearly parallel rays meet.
-        far = angles * focal_px < most_px
-        fits = far | ((epipolar_angles(p, q, t) * focal_px < most_px) & _in_front(p, q, t))
-        found.append(Agreement(pair.one, pair.other, len(p), float(fits.mean()), float(np.degrees(np.median(angles)))))
+        fits = (seen.parallax_px < _MOST_PX) | ((np.abs(seen.line_px) < _MOST_PX) & ~seen.behind)
+        angle_deg = float(np.degrees(np.median(seen.parallax[judged])))
+        found.append(PairAgreement(pair.one, pair.other, seen.count, float(fits[judged].mean()), angle_deg))
     return found
 
 
@@ -118,20 +110,6 @@ def rays(camera: pycolmap.Camera, pixels: Array) -> Array:
     """Return unit rays (n, 3) in the camera's axes; NaN where the lens model cannot be inverted."""
     found = np.asarray(camera.cam_ray_from_img(pixels), dtype=np.float64).reshape(-1, 3)
     return found / np.linalg.norm(found, axis=1, keepdims=True)
-
-
-def epipolar_angles(p: Array, q: Array, t: Array) -> Array:
-    """Return the angles, radians, by which the rays of each match miss each other's epipolar plane, the larger of two.
-
-    p and q are in the same axes, t is the baseline in them; without a baseline, it is the angle between the rays.
-    """
-    if np.linalg.norm(t) < 1e-12:
-        return _angles(p, q)
-    across = np.cross(t, np.eye(3))  # row p times this is t x p; `np.cross` of many rows takes five times as long
-    normals = p @ across
-    lift = np.einsum("ij,ij->i", normals, q)
-    norms = np.minimum(np.linalg.norm(normals, axis=1), np.linalg.norm(q @ across, axis=1))
-    return np.arcsin(np.clip(np.abs(lift) / np.maximum(norms, 1e-300), 0, 1))
 
 
 @dataclass(frozen=True)
@@ -152,21 +130,17 @@ def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair
     options = pycolmap.RANSACOptions(max_error=MOST_ERROR_PX, min_num_trials=50, max_num_trials=500, random_seed=seed)
     errors = []
     for pair in strongest(placed_pairs(model, pairs), per_photo=4):
-        first, second = model.image(pair.one), model.image(pair.other)
-        camera, other_camera = model.camera(first.camera_id), model.camera(second.camera_id)
+        cameras = _cameras(model, pair)
         step = max(1, pair.matches // _MOST_FOR_ROTATION)
-        pixels, other_pixels = pair.pixels_one[::step], pair.pixels_other[::step]
-        found = pycolmap.estimate_relative_pose(camera, pixels, other_camera, other_pixels, options=options)
+        one, other = pair.pixels_one[::step], pair.pixels_other[::step]
+        found = pycolmap.estimate_relative_pose(cameras[0], one, cameras[1], other, options=options)
         if found is None:
             continue
-        own = found["cam2_from_cam1"]
-        inliers = np.asarray(found["inlier_mask"])
-        p = rays(camera, pixels[inliers]) @ own.rotation.matrix().T
-        q = rays(other_camera, other_pixels[inliers])
-        if not len(p) or np.degrees(np.nanmedian(_angles(p, q))) < LEAST_ANGLE_DEG:
+        own, inliers = found["cam2_from_cam1"], np.asarray(found["inlier_mask"])
+        parallax = _compared(cameras, (one[inliers], other[inliers]), own).parallax
+        if not len(parallax) or np.degrees(np.nanmedian(parallax)) < LEAST_ANGLE_DEG:
             continue
-        pose = second.cam_from_world() * first.cam_from_world().inverse()
-        degrees = float(np.degrees((own.rotation * pose.rotation.inverse()).angle()))
+        degrees = float(np.degrees((own.rotation * _other_from_one(model, pair).rotation.inverse()).angle()))
         errors.append(RotationError(degrees, step * int(inliers.sum())))
     return errors
 
@@ -195,15 +169,19 @@ def strongest(pairs: Sequence[VerifiedPair], *, per_photo: int) -> list[Verified
     return kept
 
 
-def _angles(p: Array, q: Array) -> Array:
-    """Return the angles between unit vectors, radians; exact for small ones, where arccos is not."""
-    return 2 * np.arcsin(np.clip(np.linalg.norm(p - q, axis=1) / 2, 0, 1))
+def _compared(
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera], pixels: tuple[Array, Array], other_from_one: pycolmap.Rigid3d
+) -> Agreement:
+    """Measure how the matches (n, 2) of two photos agree with a relative pose."""
+    one, other = (rays(camera, places) for camera, places in zip(cameras, pixels, strict=True))
+    focal_px = 0.5 * sum(px_per_radian(camera) for camera in cameras)
+    return agreement(one, other, other_from_one.matrix(), focal_px=focal_px)
 
 
-def _in_front(p: Array, q: Array, t: Array) -> NDArray[np.bool_]:
-    """Return whether rays a p + t and b q come nearest at positive a and b; False for parallel rays."""
-    cosine = np.einsum("ij,ij->i", p, q)
-    along_p, along_q = p @ t, q @ t
-    distance_p = cosine * along_q - along_p  # times 1 / (1 - cosine^2), which is positive
-    distance_q = along_q - cosine * along_p
-    return (distance_p > 0) & (distance_q > 0)
+def _cameras(model: pycolmap.Reconstruction, pair: VerifiedPair) -> tuple[pycolmap.Camera, pycolmap.Camera]:
+    return model.camera(model.image(pair.one).camera_id), model.camera(model.image(pair.other).camera_id)
+
+
+def _other_from_one(model: pycolmap.Reconstruction, pair: VerifiedPair) -> pycolmap.Rigid3d:
+    """Return the transform from the axes of a pair's first camera to those of its second."""
+    return model.image(pair.other).cam_from_world() * model.image(pair.one).cam_from_world().inverse()
