@@ -17,12 +17,10 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.doctor import connectivity, examination
-from nerfcli.doctor.brightness import Brightness
+from nerfcli.doctor import examination
 from nerfcli.doctor.compared_pairs import Pair
-from nerfcli.doctor.examination import examine
-from nerfcli.doctor.photo_facts import PhotoFacts, PhotoFeatures, Source
-from nerfcli.doctor.photo_list import ExaminedCapture
+from nerfcli.doctor.examination import ExaminedCapture, examine
+from nerfcli.doctor.photo_facts import Brightness, PhotoFacts, PhotoFeatures, Sharpness, Source
 from nerfcli.doctor.pose_agreement import (
     NEAREST,
     PairError,
@@ -32,7 +30,6 @@ from nerfcli.doctor.pose_agreement import (
     pair_errors,
     poses_by_matches,
 )
-from nerfcli.doctor.sharpness import Sharpness
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding
 from nerfcli.photos.exif import Exif
 
@@ -74,7 +71,7 @@ def matched(frames: Sequence[Frame], first: int, second: int, *, matches: int) -
         whole = frame.camera.project(local)[0] * SIZE[0] / frame.camera.width
         pixels.append(whole + rng.normal(0, 0.5, whole.shape))
     none = float("nan")
-    return Pair(first, second, matches, matches, 0.1, none, none, none, none, None, (), None, (pixels[0], pixels[1]))
+    return Pair(first, second, matches, 0.1, none, none, none, none, None, (), None, (pixels[0], pixels[1]))
 
 
 def pairs_of(frames: Sequence[Frame]) -> list[Pair]:
@@ -243,7 +240,7 @@ def compared_pairs(frames: Sequence[Frame], matching: Callable[[int, int], bool]
             found.append(matched(frames, i, j, matches=60))
         else:
             none = float("nan")
-            found.append(Pair(i, j, 5, 0, none, none, none, none, none, None, ()))
+            found.append(Pair(i, j, 0, none, none, none, none, none, None, ()))
     return found
 
 
@@ -323,7 +320,7 @@ def test_the_doctor_of_a_scene_names_the_wrong_pose(tmp_path: Path, monkeypatch:
         return of_groups
 
     monkeypatch.setattr(examination, "misplaced_groups", reported)
-    monkeypatch.setattr(connectivity, "choose_pairs", lambda facts: [(i, i + 2) for i in range(len(facts) - 2)])
+    monkeypatch.setattr(examination, "choose_pairs", lambda facts: [(i, i + 2) for i in range(len(facts) - 2)])
     steps = np.linspace(-1, 1, 7)
     folder = write(tmp_path / "photos", walk())
     camera = Camera.pinhole(WIDTH, HEIGHT, FOCAL_PX)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfcli.doctor.photo_list import find_subject
+from nerfcli.doctor.examination import find_subject
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.photos.exif import Exif
 from nerfcli.poses.input.photos import Photo, camera_groups, find_photos

@@ -16,8 +16,7 @@ from turntable_capture import Turntable, turntable, write
 
 from nerfcli.cameras.alignment import align
 from nerfcli.captures.loading import load_scene
-from nerfcli.doctor.examination import Diagnosis, examine
-from nerfcli.doctor.photo_list import find_subject
+from nerfcli.doctor.examination import Diagnosis, examine, find_subject
 from nerfcli.errors import UserError
 from nerfcli.matching.stationary import Motions, Stationary, motions, still_px, together
 from nerfcli.pages.findings import LOOK

@@ -1,21 +1,39 @@
-"""Run the complete examination of a folder of photos or a scene."""
+"""Find the photos of a folder or a scene, and run the complete examination."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.calibration import Calibration, Picture, calibrated
 from nerfcli.captures.capture import Capture
-from nerfcli.doctor import camera_layout, connectivity, geometry, inventory, quality
-from nerfcli.doctor.compared_pairs import Pair, compare, focal_px
-from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, read_all
-from nerfcli.doctor.photo_list import ExaminedCapture
+from nerfcli.captures.formats.registry import recognised
+from nerfcli.captures.loading import load_scene
+from nerfcli.doctor import camera_layout, geometry, inventory, quality
+from nerfcli.doctor.compared_pairs import Pair, choose_pairs, compare, focal_px, pair_count
+from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, Source, read_all
 from nerfcli.doctor.pose_agreement import misplaced_groups, nearest_pairs, pair_errors, poses_by_matches
+from nerfcli.errors import UserError, in_shell
 from nerfcli.pages.findings import Finding, as_json, worst
+from nerfcli.photos.images import list_photos, list_unreadable, name_in, where_photos_may_be
 from nerfcli.poses.judge.checks import Checks
+
+
+@dataclass(frozen=True)
+class ExaminedCapture:
+    """A capture to examine: its path as the user gave it, and the scene with the poses, None for a folder of photos."""
+
+    path: Path
+    sources: tuple[Source, ...]
+    scene: Capture | None
+
+    @property
+    def kind(self) -> str:
+        """Kind of capture, "photos" or "scene"."""
+        return "photos" if self.scene is None else "scene"
 
 
 @dataclass(frozen=True)
@@ -26,22 +44,51 @@ class Diagnosis:
         findings: results of the checks that were made, in order.
         not_checked: (name, reason) of the checks that were not made.
         photos: the readable photos.
-        lack: (photos,) log2 of the detail that each photo lacks relative to the others; NaN without texture.
-        lighter: (photos,) stops by which each shows the same points brighter than the median photo; NaN where unknown.
+        missing_detail: (photos,) log2 of the detail that each photo lacks relative to the others; NaN without texture.
+        exposure_stops: (photos,) stops by which each shows the same points brighter than the median photo; NaN where
+            unknown.
     """
 
     subject: ExaminedCapture
     findings: tuple[Finding, ...]
     not_checked: tuple[tuple[str, str], ...]
     photos: tuple[PhotoFacts, ...]
-    lack: np.ndarray
-    lighter: np.ndarray
+    missing_detail: np.ndarray
+    exposure_stops: np.ndarray
     pairs: tuple[Pair, ...]
 
     @property
     def verdict(self) -> str:
         """The worst verdict of the findings."""
         return worst(finding.verdict for finding in self.findings)
+
+
+def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
+    """Find the photos in a folder, with those in its subfolders on request, or the photos of a scene.
+
+    A folder with photos and the files of a scene counts as a scene.
+
+    Raises:
+        UserError: the path does not exist, is a video, has no photos, or is a scene with malformed files, or one with
+            `subfolders`.
+    """
+    if not path.exists():
+        raise UserError(f"{path} does not exist", "give a folder of photos, or a scene folder")
+    if recognised(path) is not None:
+        if subfolders:
+            raise UserError(f"{path}: --subfolders is for photos, and this is a scene", "leave --subfolders out")
+        scene = load_scene(path)
+        sources = tuple(Source(f.name, f.image, f.mask) for f in scene.frames if f.image is not None)
+        return ExaminedCapture(path, sources, scene)
+    if path.is_file():
+        raise UserError(
+            f"{path} is a file, neither a folder of photos nor a scene",
+            f"if it is a video, nerfcli poses {in_shell(path)} writes its frames to a folder that can be given here",
+        )
+    photos = [*list_photos(path, subfolders=subfolders), *list_unreadable(path, subfolders=subfolders)]
+    if not photos:
+        raise UserError(f"no photos and no scene in {path}", where_photos_may_be(path))
+    return ExaminedCapture(path, tuple(Source(name_in(path, photo), photo) for photo in photos), None)
 
 
 def estimated_seconds(count: int, threads: int) -> float:
@@ -51,7 +98,7 @@ def estimated_seconds(count: int, threads: int) -> float:
 
 def _cpu_seconds(count: int) -> tuple[float, float]:
     """Estimate the time to read the photos and to compare them."""
-    return 0.45 * count, 0.03 * connectivity.pair_count(count)
+    return 0.45 * count, 0.03 * pair_count(count)
 
 
 def examine(
@@ -80,7 +127,7 @@ def examine(
         findings = [inventory.readable(unreadable, 0), inventory.enough(0)]
         nothing = np.zeros(0)
         return Diagnosis(subject, tuple(findings), (("all else", "no readable photo"),), (), nothing, nothing, ())
-    places = connectivity.choose_pairs(facts)
+    places = choose_pairs(facts)
     if subject.scene is not None:
         places = sorted({*places, *nearest_pairs(_frames(subject.scene, facts))})
 
@@ -117,7 +164,7 @@ def compare_all(
 
 def _second_look(photos: Sequence[PhotoFacts], pairs: list[Pair], focals_px: Sequence[float]) -> list[Pair]:
     """Return the pairs after comparing a few disconnected photos with the rest again, using all features."""
-    apart = connectivity.apart(len(photos), pairs)
+    apart = geometry.apart(len(photos), pairs)
     if not 0 < len(apart) <= max(3, len(photos) // 10):
         return pairs
     again = []
@@ -139,8 +186,8 @@ def judged(
     """
     checks = Checks()
     unknown = np.full(len(photos), np.nan)
-    lack = checks.run("lacking detail", lambda: quality.lacking_detail(photos, pairs), otherwise=unknown)
-    lighter, redder = checks.run("stops", lambda: quality.stops(photos, pairs), otherwise=(unknown, unknown))
+    missing = checks.run("lacking detail", lambda: quality.lacking_detail(photos, pairs), otherwise=unknown)
+    brighter, redder = checks.run("stops", lambda: quality.stops(photos, pairs), otherwise=(unknown, unknown))
     planned: list[tuple[str, Callable[[], Finding | None]]] = [
         ("readable photos", lambda: inventory.readable(unreadable, len(photos))),
         ("number of photos", lambda: inventory.enough(len(photos))),
@@ -149,9 +196,9 @@ def judged(
         ("focal length", lambda: _focal_length(subject, photos)),
         ("orientation", lambda: inventory.orientation(photos)),
         ("duplicates", lambda: inventory.duplicates(photos, pairs)),
-        ("sharpness", lambda: quality.sharpness(photos, lack)),
+        ("sharpness", lambda: quality.sharpness(photos, missing)),
         ("texture", lambda: quality.texture(photos)),
-        ("exposure", lambda: quality.exposure(photos, lighter)),
+        ("exposure", lambda: quality.exposure(photos, brighter)),
         ("white balance", lambda: quality.white_balance(photos, redder)),
         ("clipping", lambda: quality.clipping(photos)),
     ]
@@ -165,7 +212,7 @@ def judged(
 
     if len(photos) > 1:
         turning = checks.run("turning object", lambda: geometry.turning_object(pairs), otherwise=None)
-        planned.append(("connectivity", lambda: connectivity.connectivity(photos, pairs)))
+        planned.append(("connectivity", lambda: geometry.connectivity(photos, pairs)))
         if all(photo.is_panorama for photo in photos):
             reason = "not supported for panoramas; nerfcli poses checks that the camera moved"
             not_checked.append(("moving content, movement, depth relief", reason))
@@ -203,7 +250,7 @@ def judged(
         found += checks.run("files of the scene", lambda: camera_layout.check_scene_files(of_scene), otherwise=[])
     not_checked += [(name, f"could not be computed: {why}") for name, why in checks.not_computed.items()]
     findings = tuple(finding for finding in found if finding is not None)
-    return Diagnosis(subject, findings, tuple(not_checked), tuple(photos), lack, lighter, tuple(pairs))
+    return Diagnosis(subject, findings, tuple(not_checked), tuple(photos), missing, brighter, tuple(pairs))
 
 
 def _focal_length(subject: ExaminedCapture, photos: Sequence[PhotoFacts]) -> Finding:
@@ -239,16 +286,15 @@ def content(diagnosis: Diagnosis) -> dict[str, object]:
     """Return the diagnosis as plain values, for JSON."""
     photos = []
     for index, photo in enumerate(diagnosis.photos):
-        lack, lighter = float(diagnosis.lack[index]), float(diagnosis.lighter[index])
         photos.append(
             {
                 "name": photo.name,
                 "width": photo.exif.width,
                 "height": photo.exif.height,
                 "features": len(photo.features.pixels),
-                "lacking_detail": None if np.isnan(lack) else round(lack, 3),
-                "stops": None if np.isnan(lighter) else round(lighter, 3),
-                "mean": None if np.isnan(photo.exposure.mean) else round(photo.exposure.mean, 4),
+                "lacking_detail": _rounded(float(diagnosis.missing_detail[index]), 3),
+                "stops": _rounded(float(diagnosis.exposure_stops[index]), 3),
+                "mean": _rounded(photo.exposure.mean, 4),
                 "white": round(photo.exposure.white, 4),
                 "black": round(photo.exposure.black, 4),
             }
@@ -265,3 +311,7 @@ def content(diagnosis: Diagnosis) -> dict[str, object]:
             if pair.linked
         ],
     }
+
+
+def _rounded(value: float, digits: int) -> float | None:
+    return None if np.isnan(value) else round(value, digits)

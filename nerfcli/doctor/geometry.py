@@ -1,20 +1,66 @@
-"""Check from pairs, without poses: does the camera move enough for depth, is the scene flat, does anything move?"""
+"""Check from pairs, without poses: do matches connect all photos, does the camera move enough for depth, is the scene
+flat, does anything move?
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from nerfcli.doctor.compared_pairs import FEWEST_PAIRS, Pair
-from nerfcli.doctor.moving import Patch
+from nerfcli.doctor.compared_pairs import FEWEST_PAIRS, Pair, Patch
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
+from nerfcli.matching.graph import connected_groups
 from nerfcli.matching.stationary import LEAST_FRACTION, together
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
+from nerfcli.poses.model.reasons import FEW_MATCHES
 
 # Baseline over depth: 0.1 is an angle of 6 degrees between two rays to the same point.
 BASELINE_LOOK, BASELINE_BAD = 0.08, 0.03
 _FLAT_LOOK = 0.8
+
+
+def apart(count: int, pairs: Sequence[Pair]) -> set[int]:
+    """Return the photos outside the largest connected group."""
+    parts = connected_groups(range(count), [(pair.first, pair.second) for pair in pairs if pair.linked])
+    return {photo for part in parts[1:] for photo in part}
+
+
+def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
+    """Check whether matches connect all photos, and which photos are only weakly connected."""
+    linked = [pair for pair in pairs if pair.linked]
+    parts = connected_groups(range(len(photos)), [(pair.first, pair.second) for pair in linked])
+    loose = [photo for part in parts[1:] for photo in part]
+    best, partners = np.zeros(len(photos), dtype=int), np.zeros(len(photos), dtype=int)
+    for pair in linked:
+        for photo in (pair.first, pair.second):
+            best[photo] = max(best[photo], pair.inliers)
+            partners[photo] += 1
+    remarks = [(photos[i].name, _apart_text(i, parts)) for i in loose]
+    weak = [
+        i
+        for i in sorted(parts[0], key=lambda photo: (best[photo], partners[photo]))
+        if len(photos) > 2 and (best[i] < FEW_MATCHES or partners[i] < 2) and i not in loose
+    ]
+    remarks += [(photos[i].name, f"{several(partners[i], 'partner')}, best {best[i]} matches") for i in weak]
+    fraction = len(parts[0]) / len(photos)
+    verdict = worst([GOOD if len(parts) == 1 else BAD if fraction < 0.9 else LOOK, LOOK if weak else GOOD])
+    sizes = " + ".join(str(len(part)) for part in parts[:6]) + (" + ..." if len(parts) > 6 else "")
+    summary = (
+        f"{len(parts)} parts without matches between them: {sizes}" if len(parts) > 1 else "all photos are connected"
+    )
+    if weak:
+        summary += f"; {several(len(weak), 'photo')} only weakly"
+    return Finding(
+        "connectivity",
+        verdict,
+        summary,
+        fraction,
+        f"fraction of photos in the largest part: look below 1, bad below 0.9; per photo: look below {FEW_MATCHES} "
+        f"matches with its best partner or fewer than 2 partners",
+        "" if verdict == GOOD else "add photos in between, so that each overlaps its neighbours by two thirds",
+        tuple(remarks),
+    )
 
 
 def baselines(count: int, pairs: Sequence[Pair]) -> np.ndarray:
@@ -143,3 +189,8 @@ def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, 
     height = min(one[3], other[3]) - max(one[1], other[1])
     smaller = min((box[2] - box[0]) * (box[3] - box[1]) for box in (one, other))
     return width > 0 and height > 0 and width * height >= smaller / 3
+
+
+def _apart_text(photo: int, parts: Sequence[Sequence[int]]) -> str:
+    mine = next(part for part in parts if photo in part)
+    return "matches no other photo" if len(mine) == 1 else f"in a part of {len(mine)} photos"

@@ -122,7 +122,7 @@ def _photo_html(index: int, diagnosis: Diagnosis) -> str:
 
 
 def _charts_html(diagnosis: Diagnosis) -> str:
-    photos = diagnosis.photos
+    photos, missing, brighter = diagnosis.photos, diagnosis.missing_detail, diagnosis.exposure_stops
     if len(photos) < 2:
         return ""
     names = [photo.name for photo in photos]
@@ -132,12 +132,12 @@ def _charts_html(diagnosis: Diagnosis) -> str:
             "Relative detail",
             "Each bar is a photo, ordered by name. Below 0 it shows less detail than the others; coloured below "
             f"{-BLURRED:g} (half an octave is a blur of about 1 px at 1600 px).",
-            _bars(names, -diagnosis.lack, marked=diagnosis.lack > BLURRED, unit="octaves"),
+            _bars(names, -missing, marked=missing > BLURRED, unit="octaves"),
         ),
         (
             "Relative brightness",
             "Brightness of the same points relative to the other photos, in stops.",
-            _bars(names, diagnosis.lighter, marked=np.abs(diagnosis.lighter) > STOPS_LOOK / 2, unit="stops"),
+            _bars(names, brighter, marked=np.abs(brighter) > STOPS_LOOK / 2, unit="stops"),
         ),
         (
             "Which photos match",

@@ -46,18 +46,18 @@ def lacking_detail(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> np.nd
     return np.where((backing >= FEWEST_PAIRS) & ~np.isnan(both), both, alone - _TYPICAL_ERROR)
 
 
-def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
-    """Check for photos that are blurred relative to the others, and for softness of the whole capture."""
+def sharpness(photos: Sequence[PhotoFacts], missing: np.ndarray) -> Finding:
+    """Check for photos that are blurred relative to the others, by their missing detail, and for softness of all."""
     own = np.array([photo.sharpness.detail for photo in photos])
     ratios = np.array([photo.sharpness.direction_ratio for photo in photos])
     usual = float(np.median(ratios))
     blank = np.isnan(own)
-    smeared = (ratios > _SMEARED * usual) & (lack > _SMEARED_LACK)
-    blurred = ~blank & ((lack > BLURRED) | smeared)
-    very = ~blank & (lack > VERY_BLURRED)
+    smeared = (ratios > _SMEARED * usual) & (missing > _SMEARED_LACK)
+    blurred = ~blank & ((missing > BLURRED) | smeared)
+    very = ~blank & (missing > VERY_BLURRED)
     flagged = [
-        (photos[i].name, f"{100 * 2 ** -lack[i]:.0f} % of the usual detail{', smeared' if smeared[i] else ''}")
-        for i in np.argsort(-np.nan_to_num(lack, nan=-9))
+        (photos[i].name, f"{100 * 2 ** -missing[i]:.0f} % of the usual detail{', smeared' if smeared[i] else ''}")
+        for i in np.argsort(-np.nan_to_num(missing, nan=-9))
         if blurred[i]
     ]
     middle = float(np.median(own[~blank])) if (~blank).any() else float("nan")
@@ -113,14 +113,14 @@ def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarr
     places = [(pair.first, pair.second) for pair in linked]
     # A uniform change in brightness comes from the camera; highlights and shadows come from the scene.
     trust = np.array([pair.inliers / (0.05 + np.nan_to_num(pair.stops_spread)) for pair in linked])
-    lighter, _ = potentials(len(photos), places, np.array([pair.stops for pair in linked]), trust=trust)
-    redder, _ = potentials(len(photos), places, np.array([pair.redder for pair in linked]), trust=trust)
-    return lighter, redder
+    brighter, _ = potentials(len(photos), places, np.array([pair.stops for pair in linked]), trust=trust)
+    redder, _ = potentials(len(photos), places, np.array([pair.red_blue_stops for pair in linked]), trust=trust)
+    return brighter, redder
 
 
-def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
+def exposure(photos: Sequence[PhotoFacts], brighter: np.ndarray) -> Finding:
     """Check whether the same points are about equally bright in all photos; reports the exposures in EXIF."""
-    spread, verdict, off = _differences(lighter, look=STOPS_LOOK, bad=STOPS_BAD)
+    spread, verdict, off = _differences(brighter, look=STOPS_LOOK, bad=STOPS_BAD)
     settings = [
         float(np.log2(photo.exif.exposure_seconds * photo.exif.iso))
         for photo in photos
@@ -149,7 +149,7 @@ def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
         spread,
         f"look from {STOPS_LOOK:g} stop, bad from {STOPS_BAD:g}",
         "" if verdict == GOOD else advice,
-        tuple((photos[i].name, f"{lighter[i]:+.1f} stops") for i in off) if verdict != GOOD else (),
+        tuple((photos[i].name, f"{brighter[i]:+.1f} stops") for i in off) if verdict != GOOD else (),
     )
 
 

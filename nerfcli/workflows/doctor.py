@@ -6,9 +6,8 @@ import cv2
 
 from nerfcli.atomic import refuse_read_only
 from nerfcli.captures.calibration import read_calibration
-from nerfcli.doctor.examination import Diagnosis, estimated_seconds, examine
+from nerfcli.doctor.examination import Diagnosis, estimated_seconds, examine, find_subject
 from nerfcli.doctor.page import refuse_foreign, write_page
-from nerfcli.doctor.photo_list import find_subject
 from nerfcli.errors import UserError
 from nerfcli.notices import Notify, Progress, no_progress, silent
 
