@@ -15,8 +15,7 @@ from nerfcli.errors import UserError
 from nerfcli.evaluate import depth_errors
 from nerfcli.evaluate.depth_errors import measure_depth_errors, surface_tracks
 from nerfcli.matching.stereo import DenseDepth
-from nerfcli.matching.tracks import Tracks
-from nerfcli.matching.triangulation import triangulate
+from nerfcli.matching.tracks import Tracks, triangulate
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest

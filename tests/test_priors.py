@@ -22,8 +22,7 @@ from nerfcli.errors import UserError
 from nerfcli.kernels import reference
 from nerfcli.matching.camera_check import CameraCheck
 from nerfcli.matching.correspondences import SharedFeatures, chosen_pairs
-from nerfcli.matching.tracks import Tracks
-from nerfcli.matching.triangulation import triangulate
+from nerfcli.matching.tracks import Tracks, triangulate
 from nerfcli.photos.loading import load_photos
 from nerfcli.training.loop import train
 from nerfcli.training.losses import distance_losses

@@ -17,8 +17,7 @@ from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.captures.capture import Capture
 from nerfcli.matching.correspondences import chosen_pairs, match
 from nerfcli.matching.features import Matches
-from nerfcli.matching.tracks import Tracks, indices_by_value, tracks_of_matches
-from nerfcli.matching.triangulation import triangulate
+from nerfcli.matching.tracks import Tracks, indices_by_value, tracks_of_matches, triangulate
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.training.extent import Extent, choose_extent, lacks_depth
 from nerfcli.training.runs.settings import TrainSettings

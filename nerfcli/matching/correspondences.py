@@ -13,8 +13,7 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.layout import centres_of, views_of
 from nerfcli.matching.features import Features, Matches, find_features, mutual_matches
-from nerfcli.matching.tracks import Tracks, tracks_of_matches
-from nerfcli.matching.triangulation import SAME_SIDE_COS
+from nerfcli.matching.tracks import SAME_SIDE_COS, Tracks, tracks_of_matches
 from nerfcli.photos.loading import LoadedPhoto
 
 # Photos are reduced to this longer side to find features, so that it takes seconds.

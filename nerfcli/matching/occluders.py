@@ -15,7 +15,7 @@ import numpy as np
 from nerfcli.cameras.rigid import apply, inverse
 from nerfcli.matching.sky import LONGER_SIDE_PX, MOST_DIFFERENCE, OTHERS, WINDOW_PX
 from nerfcli.matching.stereo import DenseDepth
-from nerfcli.matching.triangulation import MOST_POINTS
+from nerfcli.matching.tracks import MOST_POINTS
 from nerfcli.photos.loading import LoadedPhoto
 
 # Two depths at the same place are of one surface if they differ by less than this fraction. Depths with larger expected

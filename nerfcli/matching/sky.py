@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 
 from nerfcli.matching.exposures import FEWEST_PIXELS
-from nerfcli.matching.tracks import Tracks
-from nerfcli.matching.triangulation import MOST_POINTS, triangulate
+from nerfcli.matching.tracks import MOST_POINTS, Tracks, triangulate
 from nerfcli.photos.loading import LoadedPhoto
 
 # Size at which photos are compared, and number of other photos that each is compared with.

@@ -16,8 +16,7 @@ from nerfcli.matching.forward_stereo import forward_depths
 from nerfcli.matching.panorama_faces import FACES, Faces
 from nerfcli.matching.sideways_stereo import sideways_depths
 from nerfcli.matching.stereo_view import BLOCK_PX, FEWEST_SHARED, View, seen_by, view_of
-from nerfcli.matching.tracks import Tracks
-from nerfcli.matching.triangulation import LEAST_ANGLE_RAD, MOST_POINTS, SAME_SIDE_COS, triangulate
+from nerfcli.matching.tracks import LEAST_ANGLE_RAD, MOST_POINTS, SAME_SIDE_COS, Tracks, triangulate
 from nerfcli.photos.loading import LoadedPhoto
 
 # Photos that each photo is matched with, and how many of them have to agree on a depth.

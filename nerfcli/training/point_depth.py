@@ -10,8 +10,7 @@ from torch import Tensor
 
 from nerfcli.cameras.rigid import Similarity, apply, inverse
 from nerfcli.matching.stereo import DenseDepth
-from nerfcli.matching.tracks import Tracks, indices_by_value
-from nerfcli.matching.triangulation import triangulate
+from nerfcli.matching.tracks import Tracks, indices_by_value, triangulate
 from nerfcli.training.pool import PixelBatch, PixelPool
 
 # One pixel at a known distance is drawn per this many other pixels.

@@ -19,7 +19,7 @@ from nerfcli.captures.model_tracks import tracks_of_model
 from nerfcli.errors import UserError, reason_of
 from nerfcli.matching.camera_check import CameraCheck, check_cameras
 from nerfcli.matching.correspondences import SharedFeatures
-from nerfcli.matching.triangulation import triangulate
+from nerfcli.matching.tracks import triangulate
 from nerfcli.memory import default_memory_limit
 from nerfcli.photos.exif import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.training.evidence import Evidence
