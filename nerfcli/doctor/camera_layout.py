@@ -45,16 +45,12 @@ def spread(scene: Capture) -> Finding:
     if far:
         summary += f"; {several(len(far), 'camera')} far from the others"
         advice = "check these poses: wrong ones ruin training; estimate poses again without these photos"
-    return Finding(
-        "camera spread",
-        verdict,
-        summary,
-        ratio,
+    threshold = (
         f"camera spread / depth: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}; a camera: look from "
-        f"{FARTHEST:g} times the median distance",
-        advice,
-        tuple((scene.frames[i].name, f"{distances[i] / typical:.0f} times the median distance") for i in far),
+        f"{FARTHEST:g} times the median distance"
     )
+    remarks = tuple((scene.frames[i].name, f"{distances[i] / typical:.0f} times the median distance") for i in far)
+    return Finding("camera spread", verdict, summary, ratio, threshold, advice, remarks)
 
 
 def directions(scene: Capture) -> Finding:
@@ -74,24 +70,17 @@ def directions(scene: Capture) -> Finding:
     if looks_in and span < _AROUND_DEG:
         span = max(span, float(np.ptp(elevation)))
         verdict = verdict_below(span, look=_SPAN_LOOK, bad=_SPAN_BAD)
-        return Finding(
-            "directions",
-            verdict,
-            f"cameras in front of the scene, within {span:.0f} degrees; {high}",
-            span,
-            f"span: look below {_SPAN_LOOK:g} degrees, bad below {_SPAN_BAD:g}",
-            "" if verdict == GOOD else "add photos from farther left, right, above and below",
-        )
+        summary = f"cameras in front of the scene, within {span:.0f} degrees; {high}"
+        threshold = f"span: look below {_SPAN_LOOK:g} degrees, bad below {_SPAN_BAD:g}"
+        advice = "" if verdict == GOOD else "add photos from farther left, right, above and below"
+        return Finding("directions", verdict, summary, span, threshold, advice)
     widest = float(gaps.max())
     verdict = BAD if looks_in and widest >= _GAP_BAD else LOOK if looks_in and widest >= _GAP_LOOK else GOOD
-    return Finding(
-        "directions",
-        verdict,
-        f"cameras {'around the scene' if looks_in else 'looking outwards'}, widest gap {widest:.0f} degrees; {high}",
-        widest,
-        f"gap around the scene: look from {_GAP_LOOK:g} degrees, bad from {_GAP_BAD:g}",
-        "" if verdict == GOOD else "add photos in the gap: the scene is unknown from there",
-    )
+    layout = "around the scene" if looks_in else "looking outwards"
+    summary = f"cameras {layout}, widest gap {widest:.0f} degrees; {high}"
+    threshold = f"gap around the scene: look from {_GAP_LOOK:g} degrees, bad from {_GAP_BAD:g}"
+    advice = "" if verdict == GOOD else "add photos in the gap: the scene is unknown from there"
+    return Finding("directions", verdict, summary, widest, threshold, advice)
 
 
 def focal_lengths(scene: Capture) -> Finding:
@@ -103,20 +92,15 @@ def focal_lengths(scene: Capture) -> Finding:
     ]
     fractions = [frame.camera.focal_px / max(frame.camera.width, frame.camera.height) for frame in scene.frames]
     summary = f"{np.median(fractions):.2f} times the longer side, from the scene"
-    if stretched:
-        summary += f"; {several(len(stretched), 'photo')} whose {stretched[0][1]}"
-    return Finding(
-        "focal length",
-        LOOK if stretched else GOOD,
-        summary,
-        apart[0][0],
-        f"difference along x and y: look from {100 * _ASPECT_LOOK:g} %",
+    threshold = f"difference along x and y: look from {100 * _ASPECT_LOOK:g} %"
+    if not stretched:
+        return Finding("focal length", GOOD, summary, apart[0][0], threshold)
+    summary += f"; {several(len(stretched), 'photo')} whose {stretched[0][1]}"
+    advice = (
         "pixels of nearly all cameras are square: unless these photos were stretched, the calibration is wrong; "
         "estimate poses with nerfcli poses and compare held-out photos"
-        if stretched
-        else "",
-        tuple(stretched),
     )
+    return Finding("focal length", LOOK, summary, apart[0][0], threshold, advice, tuple(stretched))
 
 
 def points(scene: Capture) -> Finding | None:
@@ -127,15 +111,13 @@ def points(scene: Capture) -> Finding | None:
     counts = {image.name: int((image.point_ids >= 0).sum()) for image in read_model(model).images}
     few = sorted((count, name) for name, count in counts.items() if count < FEW_FEATURES)
     middle = float(np.median(list(counts.values()))) if counts else 0.0
-    return Finding(
-        "points",
-        LOOK if few else GOOD,
-        f"{middle:.0f} 3D points in the median photo" + (f", {several(len(few), 'photo')} with few" if few else ""),
-        middle,
-        f"per photo: look below {FEW_FEATURES}",
-        "their poses are uncertain: check renderings from there" if few else "",
-        tuple((name, several(count, "point")) for count, name in few),
-    )
+    summary, threshold = f"{middle:.0f} 3D points in the median photo", f"per photo: look below {FEW_FEATURES}"
+    if not few:
+        return Finding("points", GOOD, summary, middle, threshold)
+    summary += f", {several(len(few), 'photo')} with few"
+    advice = "their poses are uncertain: check renderings from there"
+    remarks = tuple((name, several(count, "point")) for count, name in few)
+    return Finding("points", LOOK, summary, middle, threshold, advice, remarks)
 
 
 def intrinsics(scene: Capture) -> Finding | None:
@@ -153,14 +135,11 @@ def intrinsics(scene: Capture) -> Finding | None:
     accuracy = f"focal length ± {focal:.2g} %"
     if borders_px:
         accuracy += f", distortion ± {max(borders_px):.2g} px at the corners"
-    return Finding(
-        "intrinsics",
-        LOOK if weak else GOOD,
-        f"intrinsics are weakly determined: {accuracy}" if weak else accuracy,
-        focal,
-        "standard deviation: look from 1 % of the focal length, or 0.5 % of half the image diagonal",
-        "use nerfcli poses --intrinsics, or add photos from more directions and distances" if weak else "",
-    )
+    threshold = "standard deviation: look from 1 % of the focal length, or 0.5 % of half the image diagonal"
+    if not weak:
+        return Finding("intrinsics", GOOD, accuracy, focal, threshold)
+    advice = "use nerfcli poses --intrinsics, or add photos from more directions and distances"
+    return Finding("intrinsics", LOOK, f"intrinsics are weakly determined: {accuracy}", focal, threshold, advice)
 
 
 def check_scene_files(scene: Capture) -> list[Finding]:
@@ -169,35 +148,20 @@ def check_scene_files(scene: Capture) -> list[Finding]:
     total = len(missing) + len(scene.frames)
     masked = [frame.name for frame in scene.frames if frame.mask is not None]
     unmasked = [(frame.name, "no mask") for frame in scene.frames if frame.mask is None] if masked else []
-    metres = scene.unit == "metre"
-    return [
-        Finding(
-            "missing photos",
-            BAD if len(missing) > 0.5 * total else LOOK if missing else GOOD,
-            f"{len(missing)} of {several(total, 'listed photo')} missing" if missing else "none",
-            len(missing),
-            "look from 1, bad from half of them",
-            "put them back, or continue with the others" if missing else "",
-            tuple((name, "missing") for name in missing),
-        ),
-        Finding(
-            "masks",
-            LOOK if unmasked else GOOD,
-            f"{len(masked)} of {several(len(scene.frames), 'photo')} have a mask" if masked else "none",
-            len(masked),
-            "look if only some photos have a mask",
-            "give all photos a mask, or none" if unmasked else "",
-            tuple(unmasked),
-        ),
-        Finding(
-            "unit",
-            GOOD,
-            "lengths are in metres" if metres else "no metric scale: depth maps are in scene units, not metres",
-            None,
-            "for information",
-            "" if metres else "for metres: nerfcli convert with --scale gps, --distance or --markers",
-        ),
-    ]
+    verdict = BAD if len(missing) > 0.5 * total else LOOK if missing else GOOD
+    summary = f"{len(missing)} of {several(total, 'listed photo')} missing" if missing else "none"
+    advice = "put them back, or continue with the others" if missing else ""
+    remarks, threshold = tuple((name, "missing") for name in missing), "look from 1, bad from half of them"
+    of_photos = Finding("missing photos", verdict, summary, len(missing), threshold, advice, remarks)
+    summary = f"{len(masked)} of {several(len(scene.frames), 'photo')} have a mask" if masked else "none"
+    verdict, advice = (LOOK, "give all photos a mask, or none") if unmasked else (GOOD, "")
+    threshold = "look if only some photos have a mask"
+    of_masks = Finding("masks", verdict, summary, len(masked), threshold, advice, tuple(unmasked))
+    summary, advice = "lengths are in metres", ""
+    if scene.unit != "metre":
+        summary = "no metric scale: depth maps are in scene units, not metres"
+        advice = "for metres: nerfcli convert with --scale gps, --distance or --markers"
+    return [of_photos, of_masks, Finding("unit", GOOD, summary, None, "for information", advice)]
 
 
 def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
@@ -208,17 +172,11 @@ def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
     metres = east_north_up(positions)
     extent = np.ptp(metres[:, :2], axis=0)
     widest = float(extent.max())
-    use = "may be enough for a metric scale" if widest > _GPS_WIDE else "too close together for a metric scale"
-    return Finding(
-        "GPS",
-        GOOD,
-        f"{several(len(positions), 'photo')} within {extent[0]:.0f} m x {extent[1]:.0f} m: {use}",
-        widest,
-        "for information",
-        ""
-        if widest > _GPS_WIDE
-        else "GPS errors are about 5 m outdoors and tens of metres indoors; use a known distance for metres",
-    )
+    summary = f"{several(len(positions), 'photo')} within {extent[0]:.0f} m x {extent[1]:.0f} m: "
+    if widest > _GPS_WIDE:
+        return Finding("GPS", GOOD, f"{summary}may be enough for a metric scale", widest, "for information")
+    advice = "GPS errors are about 5 m outdoors and tens of metres indoors; use a known distance for metres"
+    return Finding("GPS", GOOD, f"{summary}too close together for a metric scale", widest, "for information", advice)
 
 
 def _depths(scene: Capture) -> np.ndarray:

@@ -51,16 +51,12 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
     )
     if weak:
         summary += f"; {several(len(weak), 'photo')} only weakly"
-    return Finding(
-        "connectivity",
-        verdict,
-        summary,
-        fraction,
+    threshold = (
         f"fraction of photos in the largest part: look below 1, bad below 0.9; per photo: look below {FEW_MATCHES} "
-        f"matches with its best partner or fewer than 2 partners",
-        "" if verdict == GOOD else "add photos in between, so that each overlaps its neighbours by two thirds",
-        tuple(remarks),
+        f"matches with its best partner or fewer than 2 partners"
     )
+    advice = "" if verdict == GOOD else "add photos in between, so that each overlaps its neighbours by two thirds"
+    return Finding("connectivity", verdict, summary, fraction, threshold, advice, tuple(remarks))
 
 
 def baselines(count: int, pairs: Sequence[Pair]) -> np.ndarray:
@@ -92,17 +88,12 @@ def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | N
         summary = f"the camera only turned or hardly moved: median baseline / depth {middle:.3f}"
     elif fraction > 0.1:
         summary += f"; {several(len(standing), 'photo')} without sideways movement to any other"
-    return Finding(
-        "movement",
-        verdict,
-        summary,
-        middle,
-        f"baseline / depth with the best partner: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}",
-        ""
-        if verdict == GOOD
-        else "step sideways between photos by a tenth of the distance to the scene; turning shows no depth",
-        tuple((photos[i].name, f"baseline / depth {largest[i]:.3f}") for i in standing) if verdict != GOOD else (),
-    )
+    threshold = f"baseline / depth with the best partner: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}"
+    if verdict == GOOD:
+        return Finding("movement", GOOD, summary, middle, threshold)
+    advice = "step sideways between photos by a tenth of the distance to the scene; turning shows no depth"
+    remarks = tuple((photos[i].name, f"baseline / depth {largest[i]:.3f}") for i in standing)
+    return Finding("movement", verdict, summary, middle, threshold, advice, remarks)
 
 
 def flatness(pairs: Sequence[Pair]) -> Finding | None:
@@ -111,17 +102,14 @@ def flatness(pairs: Sequence[Pair]) -> Finding | None:
     if len(moved) < FEWEST_PAIRS:
         return None
     fraction = float(np.mean([views.flat for views in moved]))
-    verdict = LOOK if fraction >= _FLAT_LOOK else GOOD
-    return Finding(
-        "depth relief",
-        verdict,
-        f"{100 * fraction:.0f} % of {len(moved)} pairs with movement show only a single plane",
-        fraction,
-        f"look from {_FLAT_LOOK:g}",
+    summary = f"{100 * fraction:.0f} % of {len(moved)} pairs with movement show only a single plane"
+    threshold = f"look from {_FLAT_LOOK:g}"
+    if fraction < _FLAT_LOOK:
+        return Finding("depth relief", GOOD, summary, fraction, threshold)
+    advice = (
         "a flat scene does not determine the focal length: include objects at other distances, or give --intrinsics"
-        if verdict == LOOK
-        else "",
     )
+    return Finding("depth relief", LOOK, summary, fraction, threshold, advice)
 
 
 def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
@@ -143,22 +131,18 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
             width, height = photos[photo].features.size
             across, down = 100 * (left + right) / 2 / width, 100 * (top + bottom) / 2 / height
             stays = ", fixed in the image" if patch.still else ""
-            moving_photos.append(
-                (patch.matches, photos[photo].name, f"at {across:.0f} % across, {down:.0f} % down{stays}"),
-            )
+            where = f"at {across:.0f} % across, {down:.0f} % down{stays}"
+            moving_photos.append((patch.matches, photos[photo].name, where))
+    threshold = "look from 1 photo, bad from half of them"
+    if not moving_photos:
+        return Finding("moving content", GOOD, "none found", 0.0, threshold)
     fraction = len(moving_photos) / len(photos)
     advice = "mask it: moving objects become fog, and disturb poses"
     if still:
         advice += "; content fixed in the image is a watermark, a strap, or the background of a turntable"
-    return Finding(
-        "moving content",
-        BAD if fraction > 0.5 else LOOK if moving_photos else GOOD,
-        f"independent movement in {several(len(moving_photos), 'photo')}" if moving_photos else "none found",
-        fraction,
-        "look from 1 photo, bad from half of them",
-        advice if moving_photos else "",
-        tuple((name, what) for _, name, what in sorted(moving_photos, reverse=True)),
-    )
+    summary = f"independent movement in {several(len(moving_photos), 'photo')}"
+    remarks = tuple((name, what) for _, name, what in sorted(moving_photos, reverse=True))
+    return Finding("moving content", BAD if fraction > 0.5 else LOOK, summary, fraction, threshold, advice, remarks)
 
 
 def turning_object(pairs: Sequence[Pair]) -> Finding | None:
@@ -171,16 +155,16 @@ def turning_object(pairs: Sequence[Pair]) -> Finding | None:
     motions = replace(motions, moved=motions.moved + others)
     if not motions.found:
         return None
-    return Finding(
-        "turning object",
-        LOOK,
+    summary = (
         f"an object moves in front of a static background, as on a turntable: {motions.two} of "
-        f"{motions.two + motions.still + motions.moved} pairs show both motions",
-        motions.fraction,
-        f"look if {100 * LEAST_FRACTION:g} % of the pairs with a moving object also show a static background",
-        "nerfcli poses creates masks of the object and uses only its motion; if it finds none, give --masks that are "
-        "white on the object, or use a plain cloth as background",
+        f"{motions.two + motions.still + motions.moved} pairs show both motions"
     )
+    threshold = f"look if {100 * LEAST_FRACTION:g} % of the pairs with a moving object also show a static background"
+    advice = (
+        "nerfcli poses creates masks of the object and uses only its motion; if it finds none, give --masks that are "
+        "white on the object, or use a plain cloth as background"
+    )
+    return Finding("turning object", LOOK, summary, motions.fraction, threshold, advice)
 
 
 def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:

@@ -28,15 +28,12 @@ def readable(unreadable: Mapping[str, str], count: int) -> Finding:
     """Check whether all files can be read; `count` is the number of readable ones."""
     bad = len(unreadable)
     total = max(bad + count, 1)
-    return Finding(
-        "files",
-        BAD if bad >= 0.1 * total and bad else LOOK if bad else GOOD,
-        f"{bad} of {several(total, 'photo')} cannot be read" if bad else f"all {several(count, 'photo')} can be read",
-        bad,
-        "look from 1, bad from 10 % of the photos",
-        "convert these files to JPEG, copy them again, or remove them" if bad else "",
-        tuple(unreadable.items()),
-    )
+    threshold = "look from 1, bad from 10 % of the photos"
+    if not bad:
+        return Finding("files", GOOD, f"all {several(count, 'photo')} can be read", 0, threshold)
+    summary, verdict = f"{bad} of {several(total, 'photo')} cannot be read", BAD if bad >= 0.1 * total else LOOK
+    advice = "convert these files to JPEG, copy them again, or remove them"
+    return Finding("files", verdict, summary, bad, threshold, advice, tuple(unreadable.items()))
 
 
 def enough(count: int) -> Finding:
@@ -47,14 +44,8 @@ def enough(count: int) -> Finding:
         LOOK: "more photos with two-thirds overlap give better results",
         BAD: "take more photos from other positions: 20 or more with two-thirds overlap work well",
     }
-    return Finding(
-        "count",
-        verdict,
-        several(count, "readable photo"),
-        count,
-        f"look below {ENOUGH_PHOTOS}, bad below {MIN_PHOTOS}",
-        advice[verdict],
-    )
+    threshold = f"look below {ENOUGH_PHOTOS}, bad below {MIN_PHOTOS}"
+    return Finding("count", verdict, several(count, "readable photo"), count, threshold, advice[verdict])
 
 
 def size(photos: Sequence[PhotoFacts]) -> Finding:
@@ -63,17 +54,12 @@ def size(photos: Sequence[PhotoFacts]) -> Finding:
     smallest = min(longer)
     sizes = Counter(f"{photo.exif.width} x {photo.exif.height}" for photo in photos)
     listed = ", ".join(f"{text} ({number})" for text, number in sizes.most_common(3))
+    listed += f" and {len(sizes) - 3} other sizes" if len(sizes) > 3 else ""
     verdict = verdict_below(smallest, look=SMALL_PX, bad=SMALL_PX // 2)
     small = [(photo.name, f"{side} px") for photo, side in zip(photos, longer, strict=True) if side < SMALL_PX]
-    return Finding(
-        "size",
-        verdict,
-        listed + (f" and {len(sizes) - 3} other sizes" if len(sizes) > 3 else ""),
-        smallest,
-        f"longer side: look below {SMALL_PX} px, bad below {SMALL_PX // 2} px",
-        "" if verdict == GOOD else "use the original files, not previews or downloads from a messenger",
-        tuple(sorted(small, key=lambda item: item[1])),
-    )
+    threshold = f"longer side: look below {SMALL_PX} px, bad below {SMALL_PX // 2} px"
+    advice = "" if verdict == GOOD else "use the original files, not previews or downloads from a messenger"
+    return Finding("size", verdict, listed, smallest, threshold, advice, tuple(sorted(small, key=lambda item: item[1])))
 
 
 def cameras(photos: Sequence[PhotoFacts]) -> Finding:
@@ -98,17 +84,10 @@ def cameras(photos: Sequence[PhotoFacts]) -> Finding:
         kinds = f"up to {kinds} in each of {len(folders)} folders"
     if most == 1:
         kinds = "one camera" if len(folders) == 1 else f"one camera in each of {len(folders)} folders"
-    return Finding(
-        "cameras",
-        verdict,
-        f"{kinds}{'; most photos' if most > 1 else ''}: {'; '.join(dict.fromkeys(main))}",
-        most,
-        "combinations: look from 2, bad from one per four photos",
-        ""
-        if verdict == GOOD
-        else "use one lens and one zoom setting, without cropping; each combination is calibrated separately",
-        tuple(others),
-    )
+    summary = f"{kinds}{'; most photos' if most > 1 else ''}: {'; '.join(dict.fromkeys(main))}"
+    threshold = "combinations: look from 2, bad from one per four photos"
+    advice = "use one lens and one zoom setting, without cropping; each combination is calibrated separately"
+    return Finding("cameras", verdict, summary, most, threshold, "" if verdict == GOOD else advice, tuple(others))
 
 
 def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
@@ -130,18 +109,14 @@ def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
         summary = "in EXIF in millimetres, without the size of the sensor; structure from motion will estimate it"
     else:
         summary = "not in EXIF; structure from motion will estimate it"
-    return Finding(
-        "focal length",
-        LOOK if doubtful else GOOD,
-        summary,
-        len(doubtful),
-        "look from 1 photo whose EXIF is for another aspect ratio",
+    threshold = "look from 1 photo whose EXIF is for another aspect ratio"
+    if not doubtful:
+        return Finding("focal length", GOOD, summary, 0, threshold)
+    advice = (
         "use the original files, or give --intrinsics: EXIF's focal length is not used, and a crop may shift the "
         "principal point"
-        if doubtful
-        else "",
-        tuple(doubtful),
     )
+    return Finding("focal length", LOOK, summary, len(doubtful), threshold, advice, tuple(doubtful))
 
 
 def orientation(photos: Sequence[PhotoFacts]) -> Finding:
@@ -153,18 +128,13 @@ def orientation(photos: Sequence[PhotoFacts]) -> Finding:
     kind = "portrait" if fewer is portrait else "landscape"
     tags = ", ".join(f"{tag} ({number})" for tag, number in sorted(turned.items()))
     by_tag = any(tag >= 5 for tag in turned)  # of these, width and height are swapped
-    advice = (
+    why = (
         "nerfcli turns photos upright; other programs may ignore the tag" if by_tag else "the two get separate cameras"
     )
-    return Finding(
-        "orientation",
-        LOOK if fewer else GOOD,
-        f"{len(portrait)} portrait, {len(landscape)} landscape; EXIF orientation {tags}",
-        len(fewer),
-        "look from 1 photo with another orientation",
-        f"nothing to do: {advice}" if fewer else "",
-        tuple((name, kind) for name in fewer),
-    )
+    summary = f"{len(portrait)} portrait, {len(landscape)} landscape; EXIF orientation {tags}"
+    threshold, advice = "look from 1 photo with another orientation", f"nothing to do: {why}" if fewer else ""
+    remarks = tuple((name, kind) for name in fewer)
+    return Finding("orientation", LOOK if fewer else GOOD, summary, len(fewer), threshold, advice, remarks)
 
 
 def duplicates(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
@@ -187,18 +157,14 @@ def duplicates(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
             exact += 1
         elif pair.shift < _SAME_PLACE and likeness > _ALIKE:
             remarks[other.name] = f"nearly the same as {one.name}"
+    threshold = "look from 1 duplicate file or 10 % from the same place, bad from 30 % of the photos"
+    if not remarks:
+        return Finding("duplicates", GOOD, "none", 0, threshold)
     fraction = len(remarks) / len(photos)
-    return Finding(
-        "duplicates",
-        verdict_above(fraction, look=1e-9, bad=0.3) if exact or fraction > 0.1 else GOOD,
-        f"{exact} exact duplicates, {len(remarks) - exact} taken from the same place as another" if remarks else "none",
-        len(remarks),
-        "look from 1 duplicate file or 10 % from the same place, bad from 30 % of the photos",
-        "remove them: they cost time, and a held-out photo is no test if its duplicate is used for training"
-        if remarks
-        else "",
-        tuple(remarks.items()),
-    )
+    verdict = verdict_above(fraction, look=1e-9, bad=0.3) if exact or fraction > 0.1 else GOOD
+    summary = f"{exact} exact duplicates, {len(remarks) - exact} taken from the same place as another"
+    advice = "remove them: they cost time, and a held-out photo is no test if its duplicate is used for training"
+    return Finding("duplicates", verdict, summary, len(remarks), threshold, advice, tuple(remarks.items()))
 
 
 def _camera_groups(photos: Sequence[PhotoFacts]) -> dict[str, list[str]]:

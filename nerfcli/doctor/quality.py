@@ -71,37 +71,24 @@ def sharpness(photos: Sequence[PhotoFacts], missing: np.ndarray) -> Finding:
     if whole != GOOD:
         parts.append("all photos are soft, as if upscaled or out of focus")
         advice.append("train with --downscale 2 or use sharper originals")
-    return Finding(
-        "sharpness",
-        verdict,
-        "; ".join(parts) or "no photo is blurred compared with the others",
-        fraction,
-        f"detail: look below {100 * 2 ** (-BLURRED):.0f} % of the usual detail, bad from 30 % of the photos",
-        "; ".join(advice),
-        tuple(flagged),
-    )
+    summary = "; ".join(parts) or "no photo is blurred compared with the others"
+    threshold = f"detail: look below {100 * 2 ** (-BLURRED):.0f} % of the usual detail, bad from 30 % of the photos"
+    return Finding("sharpness", verdict, summary, fraction, threshold, "; ".join(advice), tuple(flagged))
 
 
 def texture(photos: Sequence[PhotoFacts]) -> Finding:
     """Check whether the photos have enough features to match."""
-    poor = [
-        (
-            photo.name,
-            f"{len(photo.features.pixels)} features, texture on {100 * photo.sharpness.textured:.0f} % of the image",
-        )
-        for photo in photos
-        if len(photo.features.pixels) < 150
-    ]
-    fraction = len(poor) / len(photos)
-    return Finding(
-        "texture",
-        verdict_above(fraction, look=1e-9, bad=0.3),
-        f"{several(len(poor), 'photo')} with very few features" if poor else "enough in every photo",
-        fraction,
-        "look from 1 photo with fewer than 150 features, bad from 30 % of the photos",
-        "step back, or include textured objects" if poor else "",
-        tuple(sorted(poor, key=lambda item: int(item[1].split()[0]))),
+    threshold = "look from 1 photo with fewer than 150 features, bad from 30 % of the photos"
+    poor = sorted((photo for photo in photos if len(photo.features.pixels) < 150), key=lambda p: len(p.features.pixels))
+    if not poor:
+        return Finding("texture", GOOD, "enough in every photo", 0.0, threshold)
+    fraction, summary = len(poor) / len(photos), f"{several(len(poor), 'photo')} with very few features"
+    remarks = tuple(
+        (p.name, f"{len(p.features.pixels)} features, texture on {100 * p.sharpness.textured:.0f} % of the image")
+        for p in poor
     )
+    verdict, advice = verdict_above(fraction, look=1e-9, bad=0.3), "step back, or include textured objects"
+    return Finding("texture", verdict, summary, fraction, threshold, advice, remarks)
 
 
 def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
@@ -132,40 +119,34 @@ def exposure(photos: Sequence[PhotoFacts], brighter: np.ndarray) -> Finding:
         seen = "no matches to compare brightness"
     if np.isnan(spread) and len(settings) > 1:
         verdict = verdict_above(float(np.ptp(settings)), look=STOPS_LOOK, bad=STOPS_BAD)
-    fixed = len(settings) == len(photos) and np.ptp(settings) < 0.1
+    threshold = f"look from {STOPS_LOOK:g} stop, bad from {STOPS_BAD:g}"
+    if verdict == GOOD:
+        return Finding("exposure", GOOD, seen + text, spread, threshold)
     advice = (
         "fix the exposure in the camera and take all photos in one session; highlights and moving shadows have the "
         "same effect"
     )
-    if fixed:
+    if len(settings) == len(photos) and np.ptp(settings) < 0.1:
         advice = (
             "the camera settings are constant, so the lighting changes or surfaces are shiny: avoid lamps and your "
             "shadow"
         )
-    return Finding(
-        "exposure",
-        verdict,
-        seen + text,
-        spread,
-        f"look from {STOPS_LOOK:g} stop, bad from {STOPS_BAD:g}",
-        "" if verdict == GOOD else advice,
-        tuple((photos[i].name, f"{brighter[i]:+.1f} stops") for i in off) if verdict != GOOD else (),
-    )
+    remarks = tuple((photos[i].name, f"{brighter[i]:+.1f} stops") for i in off)
+    return Finding("exposure", verdict, seen + text, spread, threshold, advice, remarks)
 
 
 def white_balance(photos: Sequence[PhotoFacts], redder: np.ndarray) -> Finding:
     """Check whether the same points have the same colour in all photos."""
     spread, verdict, off = _differences(redder, look=_BALANCE_LOOK, bad=_BALANCE_BAD)
-    seen = f"the red/blue ratio differs by up to {spread:.2f} stops at the same points"
-    return Finding(
-        "white balance",
-        verdict,
-        "no matches to compare colours" if np.isnan(spread) else seen,
-        spread,
-        f"look from {_BALANCE_LOOK:g} stops, bad from {_BALANCE_BAD:g}",
-        "" if verdict == GOOD else "fix the white balance in the camera; avoid coloured light",
-        tuple((photos[i].name, f"{redder[i]:+.2f} stops redder") for i in off) if verdict != GOOD else (),
-    )
+    summary = f"the red/blue ratio differs by up to {spread:.2f} stops at the same points"
+    if np.isnan(spread):
+        summary = "no matches to compare colours"
+    threshold = f"look from {_BALANCE_LOOK:g} stops, bad from {_BALANCE_BAD:g}"
+    if verdict == GOOD:
+        return Finding("white balance", GOOD, summary, spread, threshold)
+    advice = "fix the white balance in the camera; avoid coloured light"
+    remarks = tuple((photos[i].name, f"{redder[i]:+.2f} stops redder") for i in off)
+    return Finding("white balance", verdict, summary, spread, threshold, advice, remarks)
 
 
 def _differences(values: np.ndarray, *, look: float, bad: float) -> tuple[float, str, list[int]]:
@@ -192,21 +173,17 @@ def clipping(photos: Sequence[PhotoFacts]) -> Finding:
             verdict = verdict_below(light.mean, look=_DARK, bad=_VERY_DARK)
             flagged.append((_DARK - light.mean, photo.name, f"dark: mean level {255 * light.mean:.0f} of 255"))
         verdicts.append(verdict)
-    fraction = len(flagged) / len(photos)
-    return Finding(
-        "clipping",
-        BAD if verdicts.count(BAD) > 0.3 * len(photos) else LOOK if flagged else GOOD,
-        f"{several(len(flagged), 'photo')} of {len(photos)} with large pure white or black areas, or dark"
-        if flagged
-        else "little",
-        fraction,
+    threshold = (
         f"per photo: look from {100 * CLIPPED_LOOK:g} % of its pixels, bad from {100 * CLIPPED_BAD:g} %; all: bad "
-        "from 30 % of the photos",
-        "expose so that the subject is neither; such areas cannot be matched (in a background this is fine)"
-        if flagged
-        else "",
-        tuple((name, what) for _, name, what in sorted(flagged, key=lambda item: -item[0])),
+        "from 30 % of the photos"
     )
+    if not flagged:
+        return Finding("clipping", GOOD, "little", 0.0, threshold)
+    verdict = BAD if verdicts.count(BAD) > 0.3 * len(photos) else LOOK
+    summary = f"{several(len(flagged), 'photo')} of {len(photos)} with large pure white or black areas, or dark"
+    advice = "expose so that the subject is neither; such areas cannot be matched (in a background this is fine)"
+    remarks = tuple((name, what) for _, name, what in sorted(flagged, key=lambda item: -item[0]))
+    return Finding("clipping", verdict, summary, len(flagged) / len(photos), threshold, advice, remarks)
 
 
 def potentials(
