@@ -32,12 +32,13 @@ from nerfcli.doctor.examination import (
     find_subject,
     judged,
 )
-from nerfcli.doctor.page import page_html, refuse_foreign
+from nerfcli.doctor.page import page_html
 from nerfcli.doctor.photo_facts import PhotoFacts, Source, measure_sharpness, read_photo
 from nerfcli.errors import UserError
 from nerfcli.matching.features import LOOSE_RATIO, mutual_matches
 from nerfcli.matching.graph import connected_groups
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding
+from nerfcli.pages.page import Mark, refuse_foreign
 from nerfcli.photos.exif import Exif
 
 ONE = 3  # the number of the photo that is spoilt
@@ -514,12 +515,12 @@ def test_the_page_needs_nothing_else_and_shows_each_photo_once(clean):
 def test_only_a_page_of_the_same_capture_is_replaced(clean, tmp_path):
     page = tmp_path / "page.html"
     page.write_text(page_html(clean.diagnosis()), encoding="utf-8")
-    refuse_foreign(page, clean.folder)
+    refuse_foreign(page, Mark("doctor", clean.folder), about="capture")
     with pytest.raises(UserError, match="not a page of this capture"):
-        refuse_foreign(page, tmp_path)
+        refuse_foreign(page, Mark("doctor", tmp_path), about="capture")
     page.write_text("mine")
     with pytest.raises(UserError, match="not a page of this capture"):
-        refuse_foreign(page, clean.folder)
+        refuse_foreign(page, Mark("doctor", clean.folder), about="capture")
 
 
 def test_the_same_photos_give_the_same_findings(clean, tmp_path):

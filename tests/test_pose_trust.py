@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Lens, Noise, Scene, View
 
 from nerfcli.cameras.alignment import align
-from nerfcli.matching.graph import Bottlenecks, connected_groups, consistent_groups
+from nerfcli.matching.graph import bottlenecks, connected_groups, consistent_groups
 from nerfcli.poses.engine import attempts, mapping, remap
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import register_photos
@@ -797,10 +797,10 @@ def test_models_with_nothing_in_common_stay_apart(solved: Solved, tmp_path: Path
 
 def test_the_bottleneck_is_the_weakest_join_of_the_strongest_chain():
     """By hand: the chain 1-2-3 holds with 5, the direct join only with 2; photo 4 is joined to photo 5 alone."""
-    chains = Bottlenecks([1, 2, 3, 4, 5], [(1, 2, 9.0), (2, 3, 5.0), (1, 3, 2.0), (4, 5, 1.0)])
-    assert chains.between(1, 3) == chains.between(3, 1) == 5
-    assert chains.between(1, 2) == 9
-    assert chains.between(1, 4) == 0
+    chain = bottlenecks([1, 2, 3, 4, 5], [(1, 2, 9.0), (2, 3, 5.0), (1, 3, 2.0), (4, 5, 1.0)])
+    assert chain(1, 3) == chain(3, 1) == 5
+    assert chain(1, 2) == 9
+    assert chain(1, 4) == 0
     assert connected_groups([1, 2, 3, 4, 5], [(1, 2), (2, 3), (1, 3), (4, 5)]) == [[1, 2, 3], [4, 5]]
 
 

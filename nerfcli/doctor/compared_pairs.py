@@ -13,12 +13,10 @@ import cv2
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, PhotoFeatures
+from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts
 from nerfcli.matching.agreement import epipolar_px, fundamental_matrix
 from nerfcli.matching.features import LOOSE_RATIO, mutual_matches
 from nerfcli.matching.stationary import Motions, in_place, motions
-from nerfcli.photos.exif import Exif
-from nerfcli.photos.focal_evidence import focal_evidence, usual_focal_px
 from nerfcli.poses.engine.retrieval import alike, likeness
 from nerfcli.poses.input.pairs import ALL_ALIKE_UP_TO
 from nerfcli.poses.model.two_views import panorama_inliers
@@ -169,6 +167,7 @@ def compare(
     count = int(agree.sum())
     if count < LEAST_MATCHES:
         return Pair(*numbers, count)
+    step = -(-count // 200)  # at most 200 matches, evenly chosen, are enough for a median
     same_size = agree & (np.abs(np.log2(other.scales[b] / one.scales[a])) < _SAME_SIZE_OCTAVES)
     stops_at_matches, red_blue_stops = (other.light[b[agree]] - one.light[a[agree]]).T
     stops = _median(stops_at_matches)
@@ -190,16 +189,8 @@ def compare(
         views=views,
         patches=patches,
         motions=still,
-        agreeing=_some(x[agree], y[agree]),
+        agreeing=(x[agree][::step].copy(), y[agree][::step].copy()),
     )
-
-
-def focal_px(features: PhotoFeatures, exif: Exif) -> float:
-    """Return the focal length at the feature-detection size: from EXIF, else a typical value."""
-    known_px = focal_evidence(exif).focal_px
-    if known_px is None:
-        return usual_focal_px(*features.size)
-    return max(features.size) * (known_px / max(exif.width, exif.height))
 
 
 def estimate_motion(
@@ -251,12 +242,6 @@ def moving_patches(x: np.ndarray, y: np.ndarray, agree: np.ndarray, *, within_px
             shift = np.median(np.linalg.norm(y[members] - x[members], axis=1))
             found.append(Patch(_box(x[members]), _box(y[members]), len(members), bool(shift < _MOTION_PX / 2)))
     return tuple(found)
-
-
-def _some(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most 200 of the matches, evenly chosen: enough for a median."""
-    kept = slice(None, None, -(-len(x) // 200))
-    return x[kept].copy(), y[kept].copy()
 
 
 def _median(values: np.ndarray) -> float:

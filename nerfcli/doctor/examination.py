@@ -13,11 +13,12 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import recognised
 from nerfcli.captures.loading import load_scene
 from nerfcli.doctor import camera_layout, geometry, inventory, quality
-from nerfcli.doctor.compared_pairs import Pair, choose_pairs, compare, focal_px, pair_count
+from nerfcli.doctor.compared_pairs import Pair, choose_pairs, compare, pair_count
 from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, Source, read_all
 from nerfcli.doctor.pose_agreement import misplaced_groups, nearest_pairs, pair_errors, poses_by_matches
 from nerfcli.errors import UserError, in_shell
 from nerfcli.pages.findings import Finding, as_json, worst
+from nerfcli.photos.focal_evidence import focal_evidence, usual_focal_px
 from nerfcli.photos.images import list_photos, list_unreadable, name_in, where_photos_may_be
 from nerfcli.poses.judge.checks import Checks
 
@@ -184,7 +185,7 @@ def judged(
 
     A check that raises is listed as not made; the other checks still run.
     """
-    checks = Checks()
+    checks, scene = Checks(), subject.scene
     unknown = np.full(len(photos), np.nan)
     missing = checks.run("lacking detail", lambda: quality.lacking_detail(photos, pairs), otherwise=unknown)
     brighter, redder = checks.run("stops", lambda: quality.stops(photos, pairs), otherwise=(unknown, unknown))
@@ -193,7 +194,7 @@ def judged(
         ("number of photos", lambda: inventory.enough(len(photos))),
         ("size", lambda: inventory.size(photos)),
         ("cameras", lambda: inventory.cameras(photos)),
-        ("focal length", lambda: _focal_length(subject, photos)),
+        ("focal length", lambda: camera_layout.focal_lengths(scene) if scene else inventory.focal_length(photos)),
         ("orientation", lambda: inventory.orientation(photos)),
         ("duplicates", lambda: inventory.duplicates(photos, pairs)),
         ("sharpness", lambda: quality.sharpness(photos, missing)),
@@ -230,31 +231,26 @@ def judged(
         not_checked.append(("connectivity, movement, moving content", "a single photo is not enough"))
     planned.append(("GPS", lambda: camera_layout.gps(photos)))
     found = [checks.run(name, compute, otherwise=None) for name, compute in planned]
-    if subject.scene is None:
+    if scene is None:
         not_checked.append(("directions", "needs poses: run nerfcli poses, then nerfcli doctor on the scene"))
     else:
-        of_scene = subject.scene
-        frames = _frames(of_scene, photos)
+        frames = _frames(scene, photos)
         # The background does not turn with the object, so its matches say nothing about the poses.
         compared = pairs if turning is None else []
         errors = checks.run("epipolar errors", lambda: pair_errors(frames, photos, compared), otherwise=[])
         planned = [
-            ("spread of cameras", lambda: camera_layout.spread(of_scene)),
-            ("directions", lambda: camera_layout.directions(of_scene)),
-            ("points", lambda: camera_layout.points(of_scene)),
-            ("intrinsics", lambda: camera_layout.intrinsics(of_scene)),
+            ("spread of cameras", lambda: camera_layout.spread(scene)),
+            ("directions", lambda: camera_layout.directions(scene)),
+            ("points", lambda: camera_layout.points(scene)),
+            ("intrinsics", lambda: camera_layout.intrinsics(scene)),
             ("poses", lambda: found_or_noted("poses", poses_by_matches(photos, errors))),
             ("places", lambda: misplaced_groups(frames, photos, errors, pairs)),
         ]
         found += [checks.run(name, compute, otherwise=None) for name, compute in planned]
-        found += checks.run("files of the scene", lambda: camera_layout.check_scene_files(of_scene), otherwise=[])
+        found += checks.run("files of the scene", lambda: camera_layout.check_scene_files(scene), otherwise=[])
     not_checked += [(name, f"could not be computed: {why}") for name, why in checks.not_computed.items()]
     findings = tuple(finding for finding in found if finding is not None)
     return Diagnosis(subject, findings, tuple(not_checked), tuple(photos), missing, brighter, tuple(pairs))
-
-
-def _focal_length(subject: ExaminedCapture, photos: Sequence[PhotoFacts]) -> Finding:
-    return inventory.focal_length(photos) if subject.scene is None else camera_layout.focal_lengths(subject.scene)
 
 
 def _frames(scene: Capture, photos: Sequence[PhotoFacts]) -> list[Frame]:
@@ -264,7 +260,7 @@ def _frames(scene: Capture, photos: Sequence[PhotoFacts]) -> list[Frame]:
 
 
 def _focals_px(subject: ExaminedCapture, photos: Sequence[PhotoFacts], calibration: Calibration | None) -> list[float]:
-    """Return focal lengths at the feature-detection size, of the given or the scene's cameras, else by `focal_px`."""
+    """Return focal lengths at the feature-detection size: of given cameras or the scene's, from EXIF, or typical."""
     if calibration is not None:
         paths = {source.name: source.path for source in subject.sources}
         pictures = [
@@ -275,7 +271,11 @@ def _focals_px(subject: ExaminedCapture, photos: Sequence[PhotoFacts], calibrati
     elif subject.scene is not None:
         cameras = [frame.camera for frame in _frames(subject.scene, photos)]
     else:
-        return [focal_px(photo.features, photo.exif) for photo in photos]
+        known = [(photo.features.size, photo.exif, focal_evidence(photo.exif).focal_px) for photo in photos]
+        return [
+            usual_focal_px(*size) if px is None else max(size) * (px / max(exif.width, exif.height))
+            for size, exif, px in known
+        ]
     return [
         camera.focal_px * max(photo.features.size) / max(camera.width, camera.height)
         for photo, camera in zip(photos, cameras, strict=True)

@@ -30,25 +30,27 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
     """Check whether matches connect all photos, and which photos are only weakly connected."""
     linked = [pair for pair in pairs if pair.linked]
     parts = connected_groups(range(len(photos)), [(pair.first, pair.second) for pair in linked])
-    loose = [photo for part in parts[1:] for photo in part]
     best, partners = np.zeros(len(photos), dtype=int), np.zeros(len(photos), dtype=int)
     for pair in linked:
         for photo in (pair.first, pair.second):
             best[photo] = max(best[photo], pair.inliers)
             partners[photo] += 1
-    remarks = [(photos[i].name, _apart_text(i, parts)) for i in loose]
+    remarks = [
+        (photos[i].name, "matches no other photo" if len(part) == 1 else f"in a part of {len(part)} photos")
+        for part in parts[1:]
+        for i in part
+    ]
     weak = [
         i
         for i in sorted(parts[0], key=lambda photo: (best[photo], partners[photo]))
-        if len(photos) > 2 and (best[i] < FEW_MATCHES or partners[i] < 2) and i not in loose
+        if len(photos) > 2 and (best[i] < FEW_MATCHES or partners[i] < 2)
     ]
     remarks += [(photos[i].name, f"{several(partners[i], 'partner')}, best {best[i]} matches") for i in weak]
     fraction = len(parts[0]) / len(photos)
     verdict = worst([GOOD if len(parts) == 1 else BAD if fraction < 0.9 else LOOK, LOOK if weak else GOOD])
     sizes = " + ".join(str(len(part)) for part in parts[:6]) + (" + ..." if len(parts) > 6 else "")
-    summary = (
-        f"{len(parts)} parts without matches between them: {sizes}" if len(parts) > 1 else "all photos are connected"
-    )
+    separate = f"{len(parts)} parts without matches between them: {sizes}"
+    summary = separate if len(parts) > 1 else "all photos are connected"
     if weak:
         summary += f"; {several(len(weak), 'photo')} only weakly"
     threshold = (
@@ -173,8 +175,3 @@ def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, 
     height = min(one[3], other[3]) - max(one[1], other[1])
     smaller = min((box[2] - box[0]) * (box[3] - box[1]) for box in (one, other))
     return width > 0 and height > 0 and width * height >= smaller / 3
-
-
-def _apart_text(photo: int, parts: Sequence[Sequence[int]]) -> str:
-    mine = next(part for part in parts if photo in part)
-    return "matches no other photo" if len(mine) == 1 else f"in a part of {len(mine)} photos"

@@ -9,7 +9,6 @@ from string import Template
 import numpy as np
 
 from nerfcli.doctor.examination import Diagnosis
-from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.doctor.quality import BLURRED, STOPS_LOOK
 from nerfcli.errors import several
 from nerfcli.pages import page
@@ -17,24 +16,6 @@ from nerfcli.pages.findings import BAD, GOOD, LOOK, VERDICTS, Finding, worst
 from nerfcli.pages.page import data_uri, picture_rule, png_bytes
 
 _WORDS = {GOOD: "good", LOOK: "worth a look", BAD: "fix this first"}
-
-
-def write_page(diagnosis: Diagnosis, path: Path) -> None:
-    """Write the page, atomically.
-
-    Raises:
-        UserError: it cannot be written.
-    """
-    page.write_page(page_html(diagnosis), path)
-
-
-def refuse_foreign(path: Path, capture: Path) -> None:
-    """Raise unless the path is free or holds an earlier page of this capture.
-
-    Raises:
-        UserError: there is something else at the path.
-    """
-    page.refuse_foreign(path, _mark(capture), about="capture")
 
 
 def page_html(diagnosis: Diagnosis) -> str:
@@ -58,27 +39,20 @@ def page_html(diagnosis: Diagnosis) -> str:
         charts=_charts_html(diagnosis),
         grid="\n".join(_photo_html(index, diagnosis) for index in range(len(photos))),
     )
-    thumbnails = "\n".join(_thumbnail_rule(index, photo) for index, photo in enumerate(photos))
+    # Pictures are in rules of the style, so that a photo shown twice is stored once.
+    rules = (picture_rule(f"p{index}", data_uri(photo.thumbnail, "jpeg")) for index, photo in enumerate(photos))
+    thumbnails = "\n".join(rules)
     return page.page_html(
         title=_title(diagnosis.subject.path),
-        mark=_mark(diagnosis.subject.path),
+        mark=page.Mark("doctor", diagnosis.subject.path),
         style=f"{_STYLE}{thumbnails}\n",
         body=body,
     )
 
 
-def _mark(capture: Path) -> page.Mark:
-    return page.Mark("doctor", capture)
-
-
 def _title(capture: Path) -> str:
     folder = capture.resolve()
     return f"{folder.parent.name}/{folder.name}" if folder.name in ("images", "photos") else folder.name
-
-
-def _thumbnail_rule(index: int, photo: PhotoFacts) -> str:
-    """Return a CSS rule that contains the picture, so that a photo shown twice is stored once."""
-    return picture_rule(f"p{index}", data_uri(photo.thumbnail, "jpeg"))
 
 
 def _finding_html(finding: Finding, number: dict[str, int]) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from nerfcli.errors import UserError
 from nerfcli.matching.features import find_features
+from nerfcli.pages.page import jpeg_bytes
 from nerfcli.photos.colours import linear_light
 from nerfcli.photos.exif import Exif, read_exif
 from nerfcli.photos.focal_evidence import with_digital_zoom
@@ -175,7 +176,7 @@ def read_photo(source: Source, most_features: int) -> PhotoFacts:
         name=source.name,
         exif=exif,
         digest=digest,
-        thumbnail=_jpeg(_shrunk(small, 160)),
+        thumbnail=jpeg_bytes(small, longest_px=160),
         tiny=_tiny(small_grey),
         sharpness=sharp,
         exposure=measure_brightness(rgb, used),
@@ -197,16 +198,15 @@ def measure_sharpness(grey: np.ndarray) -> tuple[Sharpness, np.ndarray]:
     local = 0.5 * np.log2(np.maximum(fine_power - _NOISE_LEVELS**2, 1e-3) / np.maximum(coarse_power, 1e-3))
     local[~textured] = np.nan
     tiles = [
-        (float(np.median(tile[~np.isnan(tile)])), row, column)
-        for row, line in enumerate(np.array_split(local, _TILES, axis=0))
-        for column, tile in enumerate(np.array_split(line, _TILES, axis=1))
+        float(np.median(tile[~np.isnan(tile)]))
+        for line in np.array_split(local, _TILES, axis=0)
+        for tile in np.array_split(line, _TILES, axis=1)
         if tile.size and np.mean(~np.isnan(tile)) > 0.3
     ]
     fraction = len(tiles) / _TILES**2
     if len(tiles) < 6:
         return Sharpness(float("nan"), 1.0, fraction), local
-    detail = float(np.percentile([tile[0] for tile in tiles], 75))
-    return Sharpness(detail, _direction_ratio(fine, coarse, textured), fraction), local
+    return Sharpness(float(np.percentile(tiles, 75)), _direction_ratio(fine, coarse, textured), fraction), local
 
 
 def measure_brightness(rgb: np.ndarray, used: np.ndarray) -> Brightness:
@@ -263,12 +263,6 @@ def _tiny(grey: np.ndarray) -> np.ndarray:
     tiny -= tiny.mean()
     norm = float(np.linalg.norm(tiny))
     return tiny / norm if norm > side else np.zeros_like(tiny)
-
-
-def _jpeg(rgb: np.ndarray) -> bytes:
-    encoded, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
-    assert encoded
-    return data.tobytes()
 
 
 def _direction_ratio(fine: np.ndarray, coarse: np.ndarray, textured: np.ndarray) -> float:

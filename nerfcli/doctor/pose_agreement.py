@@ -80,8 +80,23 @@ def pair_errors(frames: Sequence[Frame], photos: Sequence[PhotoFacts], pairs: Se
     An error is at most the distance by which the pose moves the point in the picture, so pairs with little parallax
     have small errors, however uncertain the direction of their baseline is. `frames` are in the order of `photos`.
     """
-    found = (_compared_with_poses(pair, frames, photos) for pair in pairs)
-    return [error for error in found if error is not None]
+    errors = []
+    for pair in pairs:
+        if not pair.linked or pair.agreeing is None:
+            continue
+        rays, focals_px = [], []
+        for index, pixels in zip((pair.first, pair.second), pair.agreeing, strict=True):
+            camera, (width, height) = frames[index].camera, photos[index].features.size
+            scaled = pixels * (camera.width / width, camera.height / height)
+            rays.append(rays_of([camera], np.zeros(len(pixels), dtype=np.int64), scaled))
+            focals_px.append(camera.focal_px * width / camera.width)
+        second_from_first = rigid.inverse(frames[pair.second].world_from_cam) @ frames[pair.first].world_from_cam
+        found = agreement(rays[0], rays[1], second_from_first, focal_px=float(np.mean(focals_px)))
+        if found.count:
+            behind = np.sum(found.behind & (found.parallax_px > _LEAST_PARALLAX_PX)) > 0.5 * found.count
+            error_px = float(np.nanmedian(np.abs(found.sampson_px)))
+            errors.append(PairError(pair.first, pair.second, pair.inliers, error_px, bool(behind)))
+    return errors
 
 
 def poses_by_matches(photos: Sequence[PhotoFacts], errors: Sequence[PairError]) -> Finding | None:
@@ -193,24 +208,6 @@ def _strongest(errors: Sequence[PairError], count: int) -> list[list[float]]:
             if pair.matches >= FEW_MATCHES and len(of_photo[index]) < _STRONGEST:
                 of_photo[index].append(pair.error_px)
     return of_photo
-
-
-def _compared_with_poses(pair: Pair, frames: Sequence[Frame], photos: Sequence[PhotoFacts]) -> PairError | None:
-    """Return how well the matches of a pair fit the poses; None without any, or if the cameras see none of them."""
-    if not pair.linked or pair.agreeing is None:
-        return None
-    rays, focals_px = [], []
-    for index, pixels in zip((pair.first, pair.second), pair.agreeing, strict=True):
-        camera, (width, height) = frames[index].camera, photos[index].features.size
-        scaled = pixels * (camera.width / width, camera.height / height)
-        rays.append(rays_of([camera], np.zeros(len(pixels), dtype=np.int64), scaled))
-        focals_px.append(camera.focal_px * width / camera.width)
-    second_from_first = rigid.inverse(frames[pair.second].world_from_cam) @ frames[pair.first].world_from_cam
-    found = agreement(rays[0], rays[1], second_from_first, focal_px=float(np.mean(focals_px)))
-    if not found.count:
-        return None
-    behind = np.sum(found.behind & (found.parallax_px > _LEAST_PARALLAX_PX)) > 0.5 * found.count
-    return PairError(pair.first, pair.second, pair.inliers, float(np.nanmedian(np.abs(found.sampson_px))), bool(behind))
 
 
 def _strangers(group: Sequence[int], main: set[int], neighbours: Sequence[tuple[int, int]]) -> int:

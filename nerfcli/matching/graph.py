@@ -4,10 +4,9 @@ The strength of the join of two photos is the number of their matches. A chain o
 join; the bottleneck of two photos is the strongest chain between them.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -44,21 +43,16 @@ def spanning_tree(photos: Sequence[int], joins: Iterable[Join]) -> Iterator[tupl
             groups.update(dict.fromkeys(second, first))
 
 
-class Bottlenecks:
-    """Strengths of the strongest chains between photos, along given joins (photo, photo, strength)."""
-
-    def __init__(self, photos: Sequence[int], joins: Iterable[Join]) -> None:
-        self._index = {photo: index for index, photo in enumerate(photos)}
-        self._strengths: NDArray[np.float64] = np.zeros((len(photos), len(photos)))
-        # The join that first brings two groups together is their bottleneck.
-        for (_, _, strength), *groups in spanning_tree(photos, joins):
-            first, second = ([self._index[photo] for photo in group] for group in groups)
-            self._strengths[np.ix_(first, second)] = strength
-            self._strengths[np.ix_(second, first)] = strength
-
-    def between(self, one: int, other: int) -> float:
-        """Return the strength of the strongest chain between two photos, 0 without any."""
-        return float(self._strengths[self._index[one], self._index[other]])
+def bottlenecks(photos: Sequence[int], joins: Iterable[Join]) -> Callable[[int, int], float]:
+    """Return a function of two photos: the strength of the strongest chain of joins between them, 0 without any."""
+    index = {photo: place for place, photo in enumerate(photos)}
+    strengths = np.zeros((len(photos), len(photos)))
+    # The join that first brings two groups together is their bottleneck.
+    for (_, _, strength), *groups in spanning_tree(photos, joins):
+        first, second = ([index[photo] for photo in group] for group in groups)
+        strengths[np.ix_(first, second)] = strength
+        strengths[np.ix_(second, first)] = strength
+    return lambda one, other: float(strengths[index[one], index[other]])
 
 
 def consistent_groups(photos: Sequence[int], joins: Iterable[Join]) -> list[list[int]]:

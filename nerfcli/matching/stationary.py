@@ -170,7 +170,7 @@ def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
     within = still_px(size)
     stays, shift = in_place(x, y, size)
     moves = np.linalg.norm(y - x - shift, axis=1) > _MOVED * within
-    fundamental, agree = _geometry(x[moves], y[moves], within)
+    fundamental, agree = fundamental_matrix(x[moves], y[moves], within_px=within, least=_LEAST_MATCHES)
     moves[moves] = agree
     agreeing = float("nan")
     if stays.any() and agree.any():
@@ -214,8 +214,4 @@ def _common(x: np.ndarray, y: np.ndarray, *, one: np.ndarray, other: np.ndarray,
     chosen = np.concatenate(
         [np.flatnonzero(which)[np.linspace(0, which.sum() - 1, count).astype(int)] for which in (one, other)]
     )
-    return _geometry(x[chosen], y[chosen], within)[0]
-
-
-def _geometry(x: np.ndarray, y: np.ndarray, within: float) -> tuple[np.ndarray, np.ndarray]:
-    return fundamental_matrix(x, y, within_px=within, least=_LEAST_MATCHES)
+    return fundamental_matrix(x[chosen], y[chosen], within_px=within, least=_LEAST_MATCHES)[0]

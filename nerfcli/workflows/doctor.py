@@ -7,9 +7,10 @@ import cv2
 from nerfcli.atomic import refuse_read_only
 from nerfcli.captures.calibration import read_calibration
 from nerfcli.doctor.examination import Diagnosis, estimated_seconds, examine, find_subject
-from nerfcli.doctor.page import refuse_foreign, write_page
+from nerfcli.doctor.page import page_html
 from nerfcli.errors import UserError
 from nerfcli.notices import Notify, Progress, no_progress, silent
+from nerfcli.pages.page import Mark, refuse_foreign, write_page
 
 
 def examine_capture(
@@ -37,13 +38,13 @@ def examine_capture(
     if page.is_dir():
         raise UserError(f"{page} is a folder", "give a file name for the page with -o")
     if not overwrite:
-        refuse_foreign(page, path)
+        refuse_foreign(page, Mark("doctor", path), about="capture")
     refuse_read_only(page)
     count = len(subject.sources)
     notify(f"{path}: {count} photos, about {_time(estimated_seconds(count, threads))}")
     cv2.setNumThreads(1)  # photos and pairs are processed in parallel; OpenCV's threads would only wait for each other
     diagnosis = examine(subject, threads=threads, progress=progress, calibration=calibration)
-    write_page(diagnosis, page)
+    write_page(page_html(diagnosis), page)
     return diagnosis
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from nerfcli.matching.graph import Bottlenecks, connected_groups, spanning_tree
+from nerfcli.matching.graph import bottlenecks, connected_groups, spanning_tree
 from nerfcli.poses.model.two_views import LEAST_ANGLE_DEG, PairAgreement, VerifiedPair, agreements
 
 # A pair with fewer may be wrong even if no other pair joins its photos.
@@ -84,12 +84,12 @@ def without_photos(model: pycolmap.Reconstruction, photos: Iterable[int] = ()) -
 
 def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[PairAgreement]) -> list[Contradiction]:
     """Return pairs that contradict a model, more than half as strong as the chain that supports it, strongest first."""
-    chains = Bottlenecks(
+    chain_between = bottlenecks(
         sorted(model.reg_image_ids()), [(a.one, a.other, a.matches * a.fraction) for a in found if not a.contradicts]
     )
     pairs = []
     for a in sorted((a for a in found if a.contradicts), key=lambda a: -a.matches):
-        chain = chains.between(a.one, a.other)
+        chain = chain_between(a.one, a.other)
         if a.matches > _RIVAL_STRENGTH * chain:
             pairs.append(Contradiction(model.image(a.one).name, model.image(a.other).name, a.matches, chain))
     return pairs
