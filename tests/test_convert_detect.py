@@ -163,6 +163,20 @@ def test_the_epipolar_error_is_the_distance_in_pixels():
     np.testing.assert_allclose(errors, 3 / np.sqrt(2), rtol=2e-3)
 
 
+def test_photos_from_one_place_are_judged_by_their_rays():
+    """Without a baseline there is no epipolar plane, but turning the axes turns the rays of a match apart."""
+    turns = np.random.default_rng(3).normal(scale=0.15, size=(4, 3))
+    poses = np.stack([rigid.from_parts(rigid.rotation_from_vector(turn), np.array([5.0, 1.0, 2.0])) for turn in turns])
+    points = np.random.default_rng(0).uniform((-9, -9, 30), (9, 9, 50), (50, 3)) + poses[0, :3, 3]
+    seen = [PINHOLE.project(rigid.apply(rigid.inverse(pose), points))[0] for pose in poses]
+    pairs = [Matches((first, first + 1), (seen[first], seen[first + 1])) for first in range(3)]
+    evidence = MatchEvidence(pairs, dict.fromkeys(range(4), PINHOLE), 4)
+    directions = evidence.directions(Convention("opencv"))
+    assert evidence.errors_px(directions, poses).max() < 1e-8
+    for wrong in (poses @ opencv_from_axes("opengl"), rigid.inverse(poses)):
+        assert np.median(evidence.errors_px(directions, wrong)) > 5
+
+
 def test_points_alone_identify_axes(tmp_path):
     capture = replace(misread(capture_of([PINHOLE]), Convention("opencv"), "opengl"), observations=None)
     found = detect(capture, axes="opengl", progress=silent)

@@ -188,8 +188,7 @@ class MatchEvidence:
         second_from_first = (rigid.inverse(world_from_cam[seconds]) @ world_from_cam[firsts])[self.groups]
         found = agreement(first, second, second_from_first, focal_px=focal_px)
         behind = found.behind & (found.parallax_px > _LEAST_PARALLAX_PX)
-        still = ~second_from_first[:, :3, 3].any(axis=1)
-        return np.where(behind | still | np.isnan(found.sampson_px), np.inf, np.abs(found.sampson_px))
+        return np.where(behind | np.isnan(found.sampson_px), np.inf, np.abs(found.sampson_px))
 
 
 class FrustumEvidence:
