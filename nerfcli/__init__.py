@@ -9,7 +9,8 @@ nerfcli` is fast.
 # the first compression (a PNG, a TIFF, an npz) aborts the process.
 import zlib  # noqa: F401
 
-__version__ = "0.1.0"
+from nerfcli.version import __version__ as __version__
+
 __all__ = [
     "estimate_poses",
     "evaluate_run",

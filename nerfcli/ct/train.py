@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nerfcli import __version__
 from nerfcli.atomic import clear_leftovers
 from nerfcli.ct.baselines import filtered_back_projection, filtered_misfit, logarithms
 from nerfcli.ct.calibrate import air_factors, beside_object, detector_tilt, found_noise
@@ -38,6 +37,7 @@ from nerfcli.exclusive import exclusive
 from nerfcli.machine import thread_count
 from nerfcli.memory import default_memory_limit
 from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.version import __version__
 
 # Largest fraction of the time budget for estimates before the fit, and of the time left for the coarse start.
 CHOICE_FRACTION, COARSE_FRACTION = 0.25, 0.1

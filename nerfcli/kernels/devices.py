@@ -6,7 +6,8 @@ from typing import Any
 
 import torch
 
-from nerfcli import __version__, kernels
+from nerfcli import kernels
+from nerfcli.version import __version__
 
 
 def describe_machine(processors: int) -> dict[str, Any]:

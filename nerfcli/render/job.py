@@ -9,7 +9,6 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from nerfcli import __version__
 from nerfcli.atomic import read_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
@@ -17,6 +16,7 @@ from nerfcli.render.coverage import DepthMap
 from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.files.film import check_encoders
 from nerfcli.render.outputs import ExportSettings
+from nerfcli.version import __version__
 
 DESCRIPTION = "render.json"
 _IN_WORDS = {"levels": "16-bit levels", "video": "videos"}

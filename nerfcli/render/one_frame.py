@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli import __version__
 from nerfcli.cameras.frame import Frame
 from nerfcli.field.background import Background, SphereBackground
 from nerfcli.photos.images import write_png
@@ -24,6 +23,7 @@ from nerfcli.render.pictures import RenderedPicture, straight_rgba
 from nerfcli.render.renderable import Renderable
 from nerfcli.render.tracing import TOLERANCE
 from nerfcli.render.unfinished import UnfinishedFrames
+from nerfcli.version import __version__
 
 
 def with_coverage(

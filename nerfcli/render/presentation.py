@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli import __version__
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.render.files.depth_files import read_map
 from nerfcli.render.files.depth_pictures import KEY, DepthMeta
@@ -17,6 +16,7 @@ from nerfcli.render.files.film import write_video
 from nerfcli.render.files.preview import COLOURS, preview, quantiles
 from nerfcli.render.job import RenderJob
 from nerfcli.render.outputs import MEASURED, meaning_of
+from nerfcli.version import __version__
 
 
 def write_previews(

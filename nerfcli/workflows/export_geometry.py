@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerfcli import __version__
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import look_at
 from nerfcli.errors import UserError
@@ -22,6 +21,7 @@ from nerfcli.ply import write_ply
 from nerfcli.render.coverage import coverage_and_parallax
 from nerfcli.render.model import Model
 from nerfcli.training.runs.run import Run
+from nerfcli.version import __version__
 
 FORMAT = "nerfcli geometry 1"
 FRAME = "of the scene, as its cameras have it"

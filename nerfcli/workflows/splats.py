@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nerfcli import __version__
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.evaluate.protocol import HeldOutPhoto
@@ -27,6 +26,7 @@ from nerfcli.splats.start import count_for, gaussians_of_field
 from nerfcli.splats.state import RunSplats, load_splat_state, save_splats
 from nerfcli.training.runs.files import SPLATS
 from nerfcli.training.runs.run import Run
+from nerfcli.version import __version__
 from nerfcli.workflows.export_geometry import y_up_from_scene
 
 FORMAT = "nerfcli splat file 1"

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli import __version__
 from nerfcli.atomic import write_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
@@ -24,6 +23,7 @@ from nerfcli.captures.holdout import default_split
 from nerfcli.captures.stored_pixels import UPRIGHT
 from nerfcli.errors import UserError, in_shell
 from nerfcli.photos.masks import find_mask
+from nerfcli.version import __version__
 
 SCENE_FILE = "scene.json"
 MODEL_FOLDER = "sparse/0"

@@ -8,7 +8,6 @@ from string import Template
 
 import numpy as np
 
-from nerfcli import __version__
 from nerfcli.evaluate.report.drawings import Curve, curves, from_above
 from nerfcli.evaluate.report.overview import overview_html
 from nerfcli.evaluate.report.run_facts import RunFacts, captures_of, mismatches_of, scenes_of, warnings_of
@@ -36,6 +35,7 @@ from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.depth_pictures import DepthMeta
 from nerfcli.render.files.preview import coloured
 from nerfcli.sealed import digest
+from nerfcli.version import __version__
 
 # With more runs than this, curves share colours.
 COLOURS = 6

@@ -8,7 +8,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from nerfcli import __version__
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import photo_folder, recognised
 from nerfcli.captures.formats.run_cameras import MEND
@@ -19,6 +18,7 @@ from nerfcli.sealed import read_sealed, write_sealed
 from nerfcli.training.runs.components import Components, Selection
 from nerfcli.training.runs.files import CONFIG
 from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.version import __version__
 
 
 @dataclass(frozen=True)
