@@ -17,7 +17,7 @@ FOLDERS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 # A part is a folder of nerfcli, a subfolder of `poses`, or a module beside the folders.
 # The part on the left may import those on the right, which all stand above it.
 ROOTS = {
-    *("errors", "atomic", "sealed", "exclusive", "memory", "interrupts", "child", "distributed", "machine", "notices"),
+    *("errors", "atomic", "exclusive", "memory", "interrupts", "child", "distributed", "machine", "notices"),
     *("ply", "version", "__init__"),
 }
 MAY_IMPORT: dict[str, set[str]] = {

@@ -10,8 +10,7 @@ from frame_rays import frame_rays
 from test_training_rays import BARREL, CPU, FISHEYE, SIMILARITY, numbered_photo, ring
 
 from nerfcli.cameras.camera import Camera, by_lens
-from nerfcli.training.bearings import BearingTables
-from nerfcli.training.pool import PixelPool
+from nerfcli.training.pool import BearingTables, PixelPool
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.storage import IN_MEMORY, needs_of
 

@@ -16,17 +16,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nerfcli.bench import measurement
-from nerfcli.bench.measurement import FINER, is_busy, measure_renderings, processor_name, smaller
-from nerfcli.bench.results import Point, pareto, spread, table_of
-from nerfcli.bench.settings import (
+from nerfcli.bench.measurement import (
+    FINER,
     SHORTEST_TRAINING_SECONDS,
     RenderSetting,
     TrainSetting,
     affordable,
     as_text,
+    is_busy,
+    measure_renderings,
+    processor_name,
     render_settings,
+    smaller,
     train_settings,
 )
+from nerfcli.bench.results import Point, pareto, spread, table_of
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts

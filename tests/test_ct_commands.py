@@ -13,6 +13,7 @@ from ellipsoids import attenuation_of_voxels, bean
 from test_reconstruct import cone, scan_of
 from typer.testing import CliRunner
 
+from nerfcli.atomic import read_sealed, write_sealed
 from nerfcli.cli import app
 from nerfcli.ct.export import VolumeFile, export_scan, read_volume, write_volume
 from nerfcli.ct.grid import VoxelGrid, centred_grid
@@ -26,7 +27,6 @@ from nerfcli.ct.train import train_scan
 from nerfcli.errors import UserError
 from nerfcli.interrupts import Terminated
 from nerfcli.photos.images import read_image
-from nerfcli.sealed import read_sealed, write_sealed
 
 
 def call(*arguments: str | Path) -> tuple[int, str, str]:

@@ -36,11 +36,10 @@ from nerfcli.render.one_frame import with_coverage
 from nerfcli.render.pictures import render_picture
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.runs.run import Run
-from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_rows
+from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_rows, seen_cells
 from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import PagePhotos
 from nerfcli.viewer.proof import HEIGHT, WIDTH, Proof, make_proof
-from nerfcli.viewer.seen_cells import seen_cells
 from nerfcli.workflows import photo_depths
 from nerfcli.workflows.export import export_run
 

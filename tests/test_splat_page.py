@@ -11,9 +11,8 @@ from browser import Browser, find_browser
 from PIL import Image
 
 from nerfcli.cameras.rigid import apply, inverse, look_at
-from nerfcli.splats.files import read_splats
+from nerfcli.splats.files import read_splats, write_splat_page
 from nerfcli.splats.gaussians import Gaussians, basis
-from nerfcli.splats.page import write_splat_page
 
 WORLD_FROM_CAM = look_at(np.array([1.0, -0.8, -4.0]), np.array([0.3, 0.1, 0.2]), np.array([0.0, -1.0, 0.0]))
 FOV_DEG, BACKGROUND = 50.0, (1.0, 0.6, 0.2)

@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.atomic import atomic_path
+from nerfcli.atomic import atomic_path, read_sealed, write_sealed
 from nerfcli.ct.grid import VoxelGrid
 from nerfcli.ct.likelihood import with_noise
 from nerfcli.ct.recognise import DESCRIPTION, MEASUREMENT, is_reconstruction
 from nerfcli.ct.scan import Scan, array_digest, load_scan, read_array
 from nerfcli.errors import UserError
-from nerfcli.sealed import read_sealed, write_sealed
 
 VOLUME = "volume.npy"
 MARKS = "marks.npy"

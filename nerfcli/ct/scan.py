@@ -12,11 +12,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from nerfcli.atomic import atomic_folder
+from nerfcli.atomic import atomic_folder, read_sealed, write_sealed
 from nerfcli.ct.geometry import Beam, ScanGeometry, from_vectors
 from nerfcli.ct.recognise import MEASUREMENT, SCENE_FILE
 from nerfcli.errors import UserError
-from nerfcli.sealed import read_sealed, write_sealed
 
 FORMAT = "nerfcli scan 1"
 

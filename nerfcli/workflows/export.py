@@ -13,11 +13,10 @@ from nerfcli.pages.page import write_page
 from nerfcli.photos.loading import pinhole_frame
 from nerfcli.render.model import Model
 from nerfcli.training.runs.run import Run
-from nerfcli.viewer.packing import pack_model
+from nerfcli.viewer.packing import pack_model, seen_cells
 from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import page_photos
 from nerfcli.viewer.proof import make_proof
-from nerfcli.viewer.seen_cells import seen_cells
 from nerfcli.workflows.export_geometry import export_mesh, export_points
 from nerfcli.workflows.photo_depths import photo_depths
 from nerfcli.workflows.splats import SplatSettings, export_splats

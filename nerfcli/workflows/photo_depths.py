@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from nerfcli.atomic import atomic_path
+from nerfcli.atomic import atomic_path, digest, read_sealed, write_sealed
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError, several
 from nerfcli.evaluate.depth_errors import measure_depth_errors
@@ -20,7 +20,6 @@ from nerfcli.photos.masks import read_mask
 from nerfcli.render.coverage import MAX_SIZE, STEEPEST_DEG, DepthMap, depth_maps, small_frame
 from nerfcli.render.depth_errors import STRATA, DepthErrors
 from nerfcli.render.model import Model
-from nerfcli.sealed import digest, read_sealed, write_sealed
 from nerfcli.training.runs.files import DEPTH_ERRORS, PHOTO_DEPTHS
 from nerfcli.training.runs.run import Run
 

@@ -16,11 +16,9 @@ from nerfcli.interrupts import deferred_interrupts
 from nerfcli.notices import Notify, Progress, part_of, silent
 from nerfcli.photos.loading import LoadedPhoto, load_photos, pinhole_of
 from nerfcli.render.model import Model
-from nerfcli.splats.beside import pictures_beside, share_of_pictures
-from nerfcli.splats.files import read_splats, write_splats
+from nerfcli.splats.files import read_splats, write_splat_page, write_splats
 from nerfcli.splats.gaussians import rows_of
-from nerfcli.splats.page import write_splat_page
-from nerfcli.splats.refine import Refinement, refine, splat_photos
+from nerfcli.splats.refine import Refinement, pictures_beside, refine, share_of_pictures, splat_photos
 from nerfcli.splats.render import SplatScene, near_of
 from nerfcli.splats.start import count_for, gaussians_of_field
 from nerfcli.splats.state import RunSplats, load_splat_state, save_splats

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from nerfcli.atomic import SEAL, read_sealed, write_sealed
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import Format
 from nerfcli.errors import UserError
-from nerfcli.sealed import SEAL, read_sealed, write_sealed
 
 CAMERAS = "cameras.json"
 # Hint for a damaged file of a run.

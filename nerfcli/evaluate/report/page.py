@@ -8,14 +8,18 @@ from string import Template
 
 import numpy as np
 
+from nerfcli.atomic import digest
 from nerfcli.evaluate.report.drawings import Curve, curves, from_above
-from nerfcli.evaluate.report.overview import overview_html
 from nerfcli.evaluate.report.run_facts import RunFacts, captures_of, mismatches_of, scenes_of, warnings_of
 from nerfcli.evaluate.report.tables import (
     capture_html,
+    last_logged,
     ledger_html,
+    metric,
     numbers_html,
     photos_html,
+    registered,
+    render_time,
     selection_html,
     settings_html,
 )
@@ -29,13 +33,49 @@ from nerfcli.evaluate.report.views import (
     depth_range,
 )
 from nerfcli.pages import page
-from nerfcli.pages.page import data_uri, jpeg_bytes
+from nerfcli.pages.page import data_uri, fitted, jpeg_bytes
 from nerfcli.photos.colours import levels_of
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.depth_pictures import DepthMeta
 from nerfcli.render.files.preview import coloured
-from nerfcli.sealed import digest
 from nerfcli.version import __version__
+
+_COLUMNS = (
+    ("photos", lambda run: str(len(run.frames.train) + len(run.frames.test))),
+    ("poses found", registered),
+    ("PSNR, dB", metric("psnr", "{:.2f}")),
+    ("SSIM", metric("ssim", "{:.4f}")),
+    ("training, s", last_logged("seconds", "{:.1f}")),
+    ("s per picture", render_time("{:.2f}")),
+    ("warnings", lambda run: str(sum(1 for _ in warnings_of(run)))),
+)
+
+
+def overview_html(runs: Sequence[RunFacts], looks: Sequence[Sequence[HeldOutRenderings]]) -> str:
+    """Format a table with a row for each run; its thumbnail is the photo with the median PSNR beside its rendering."""
+    headings = "".join(f"<th{_aligned(name)}><button>{name}</button></th>" for name in ("run", *dict(_COLUMNS)))
+    rows = "".join(
+        f"<tr><td>{_thumbnails(look)}</td><td>{escape(run.label)}</td>"
+        + "".join(f"<td class=number>{escape(read(run))}</td>" for _, read in _COLUMNS)
+        + "</tr>"
+        for run, look in zip(runs, looks, strict=True)
+    )
+    table = f"<table class=sortable><thead><tr><th></th>{headings}</tr></thead><tbody>{rows}</tbody></table>"
+    return f'<h2>Captures</h2><p>Click a heading to sort.</p><div class="wide">{table}</div>'
+
+
+def _aligned(name: str) -> str:
+    return "" if name == "run" else " class=number"
+
+
+def _thumbnails(look: Sequence[HeldOutRenderings]) -> str:
+    if not look:
+        return ""
+    view = sorted(look, key=lambda view: view.psnr)[len(look) // 2]
+    both = np.hstack([fitted(view.photo, 120), fitted(view.picture, 120)])
+    source = data_uri(jpeg_bytes(both), "jpeg")
+    return f'<img class="thumbnail" alt="{escape(view.name)} and its rendering" src="{source}">'
+
 
 # With more runs than this, curves share colours.
 COLOURS = 6

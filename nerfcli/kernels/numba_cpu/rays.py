@@ -1,15 +1,121 @@
 """Steps along rays and the cells that they cross: building blocks of `visible`; and `ray_indices`."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numba
 import numpy as np
 import torch
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
 from torch import Tensor
 
-from nerfcli.kernels.numba_cpu.steps import steps_in_ball, steps_in_cube
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.vector import LANES
+from nerfcli.kernels.numba_cpu.vector import (
+    FLOAT,
+    FLOATS,
+    INTS,
+    LANES,
+    LONG,
+    floats,
+    in_all_lanes,
+    ints,
+    of_each,
+    vector_at,
+)
+
+_ONE_BIT = ir.VectorType(ir.IntType(1), LANES)
+
+
+def _larger(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
+
+
+def _smaller(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
+
+
+def _unit_cube(builder: Any, points: list[Any]) -> list[Any]:
+    return [builder.fadd(builder.fmul(along, floats(0.5)), floats(0.5)) for along in points]
+
+
+def _ball(builder: Any, points: list[Any]) -> list[Any]:
+    x, y, z = (builder.fmul(along, along) for along in points)
+    square = builder.fadd(builder.fadd(x, y), z)
+    norm = of_each(builder, "llvm.sqrt", _larger(builder, square, floats(1.0)))
+    shrink = builder.fdiv(builder.fsub(floats(2.0), builder.fdiv(floats(1.0), norm)), norm)
+    scale = builder.fmul(shrink, floats(0.25))
+    return [builder.fadd(builder.fmul(along, scale), floats(0.5)) for along in points]
+
+
+def _cells(builder: Any, coordinates: list[Any], side: Any) -> Any:
+    """Return indices of cells in a grid, -1 outside; coordinates are clamped first, as distant ones would overflow."""
+    zero, one = floats(0.0), floats(1.0)
+    scale = in_all_lanes(builder, builder.sitofp(side, FLOAT), FLOATS)
+    line = in_all_lanes(builder, side, INTS)
+    last = builder.sub(line, ints(1))
+    inside, places = ir.Constant(_ONE_BIT, [1] * LANES), []
+    for along in coordinates:
+        within = _smaller(builder, _larger(builder, along, zero), one)
+        inside = builder.and_(inside, builder.fcmp_ordered("==", within, along))
+        place = builder.fptosi(builder.fmul(within, scale), INTS)
+        places.append(builder.select(builder.icmp_signed("<", place, last), place, last))
+    column, row, layer = places
+    cell = builder.add(builder.mul(builder.add(builder.mul(layer, line), row), line), column)
+    return builder.select(inside, cell, ints(-1))
+
+
+def _steps(cube_of: Callable[[Any, list[Any]], list[Any]]) -> Any:
+    """Return an intrinsic (origins, directions, ray, edges, shift, first, side, places, cells), on flat arrays.
+
+    Edge k of the ray is edges[k] + shift * (edges[k + 1] - edges[k]). It writes the coordinates of the midpoints of 16
+    intervals from number `first` on to places[axis * 16 + i], and their cells in a grid of `side` to cells[i].
+    """
+
+    @intrinsic
+    def steps(
+        typing_context: Any, origins: Any, directions: Any, ray: Any, edges: Any, shift: Any, first: Any, side: Any,
+        places: Any, cells: Any,
+    ) -> Any:  # fmt: skip
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            def data(which: int) -> Any:
+                return context.make_array(signature.args[which])(context, builder, args[which]).data
+
+            ray, first = (context.cast(builder, args[i], signature.args[i], types.intp) for i in (2, 5))
+            side = context.cast(builder, args[6], signature.args[6], types.int32)
+            one, begin = ir.Constant(LONG, 1), builder.mul(ray, ir.Constant(LONG, 3))
+
+            def of_ray(which: int, axis: int) -> Any:
+                place = builder.gep(data(which), [builder.add(begin, ir.Constant(LONG, axis))])
+                return in_all_lanes(builder, builder.load(place), FLOATS)
+
+            near, middle, far = (
+                builder.load(vector_at(builder, data(3), first, one, count, FLOATS), align=4) for count in range(3)
+            )
+            jitter = in_all_lanes(builder, args[4], FLOATS)
+            start, end = (
+                builder.fadd(low, builder.fmul(jitter, builder.fsub(high, low)))
+                for low, high in ((near, middle), (middle, far))
+            )
+            t = builder.fmul(builder.fadd(start, end), floats(0.5))
+            points = [builder.fadd(of_ray(0, axis), builder.fmul(of_ray(1, axis), t)) for axis in range(3)]
+            coordinates = cube_of(builder, points)
+            zero = ir.Constant(LONG, 0)
+            for axis, along in enumerate(coordinates):
+                builder.store(along, vector_at(builder, data(7), zero, ir.Constant(LONG, LANES), axis, FLOATS), align=4)
+            builder.store(_cells(builder, coordinates, side), vector_at(builder, data(8), zero, one, 0, INTS), align=4)
+            return context.get_dummy_value()
+
+        return types.none(origins, directions, ray, edges, shift, first, side, places, cells), generate
+
+    return steps
+
+
+# See `_steps`; one for each of `CONTRACTIONS`.
+steps_in_cube = _steps(_unit_cube)
+steps_in_ball = _steps(_ball)
+
 
 # Steps of a ray that are processed together.
 CHUNK = LANES

@@ -8,13 +8,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from nerfcli.atomic import read_sealed, write_sealed
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import photo_folder, recognised
 from nerfcli.captures.formats.run_cameras import MEND
 from nerfcli.captures.loading import fingerprint
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, in_shell
-from nerfcli.sealed import read_sealed, write_sealed
 from nerfcli.training.runs.components import Components, Selection
 from nerfcli.training.runs.files import CONFIG
 from nerfcli.training.runs.settings import TrainSettings
