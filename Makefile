@@ -16,8 +16,8 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: .venv/installed
 	$(BIN)/nerfcli run sample_scenes/desk/images -o demo --budget 90s --downscale 2
 	@printf '%s\n' '' 'Have a look at:' \
-	    '  demo/run/renders/orbit-conditional-z/rgb.mp4     a flight around the desk' \
-	    '  demo/run/renders/orbit-conditional-z/depth.mp4   the same flight in depth' \
+	    '  demo/run/renders/orbit-conditional-z-splats/rgb.mp4     a flight around the desk' \
+	    '  demo/run/renders/orbit-conditional-z-splats/depth.mp4   the same flight in depth' \
 	    '  demo/run/renders/test-conditional-z/             held-out views: rgb/, depth/, opacity/' \
 	    '  demo/run/metrics.json                            how close these are to the photos' \
 	    '  demo/scene/poses_report.json                     what became of each photo'
