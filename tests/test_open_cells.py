@@ -13,6 +13,7 @@ from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.kernels import March, Rays, numba_cpu, reference
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.open_cells import FINE_SIDE, OCCUPANCY_SIDE, REFRESH_EVERY, REFRESH_TURNS, OpenCells
+from nerfcli.training.schedule import THRESHOLD
 
 CPU = torch.device("cpu")
 MARCHING = Marching(0.1, 10.0, 0.05, 0.0)
@@ -27,8 +28,6 @@ class Size:
 
 class Slab:
     """A field of optical depth 1 per step up to x = 1/2 of the unit cube, and empty beyond; its own medium."""
-
-    closing_steps = 1
 
     def __init__(self, detailed: bool = True):
         self.settings = Size(detailed=detailed)
@@ -47,7 +46,7 @@ def cells_of(field: Any) -> OpenCells:
 
 def refresh(cells: OpenCells, step: int) -> None:
     generator = torch.Generator().manual_seed(step)
-    cells.refresh(step, fraction=1.0, detail=1.0, marching=MARCHING, generator=generator)
+    cells.refresh(step, threshold=THRESHOLD, detail=1.0, marching=MARCHING, generator=generator)
 
 
 def visit(cells: OpenCells, where: tuple[int, int, int], depth: float) -> None:

@@ -25,12 +25,13 @@ from nerfcli.matching.correspondences import SharedFeatures, chosen_pairs
 from nerfcli.matching.tracks import Tracks, triangulate
 from nerfcli.photos.loading import load_photos
 from nerfcli.training.loop import train
-from nerfcli.training.losses import distance_losses
-from nerfcli.training.point_depth import PointRays, fading, point_depths
+from nerfcli.training.losses import emerging_losses
+from nerfcli.training.point_depth import PointRays, point_depths
 from nerfcli.training.pool import PixelPool
 from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.schedule import point_weight
 from nerfcli.training.selection.selection import Facts
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
@@ -175,13 +176,9 @@ def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
     assert len(PointRays([of_points], pool).added_to(pool.draw(3, generator), generator).distances) == 1
 
 
-def likelihood(depth_loss: torch.Tensor) -> torch.Tensor:
-    return distance_losses(depth_loss, fraction=0.0)
-
-
 def test_the_loss_of_distances_is_a_log_likelihood_with_a_bounded_slope():
     depth_loss = torch.tensor([0.0, 1e-9, 0.3, 0.999, 1.0], dtype=torch.float64, requires_grad=True)
-    losses = distance_losses(depth_loss, fraction=0.1)
+    losses = emerging_losses(depth_loss)
     for off, loss in zip(depth_loss.tolist(), losses.tolist(), strict=True):
         with mpmath.workdps(40):
             expected = mpmath.mpf("1.1") * mpmath.log(mpmath.mpf("1.1") / (mpmath.mpf("1.1") - mpmath.mpf(off)))
@@ -189,12 +186,12 @@ def test_the_loss_of_distances_is_a_log_likelihood_with_a_bounded_slope():
     losses.sum().backward()
     assert depth_loss.grad is not None
     assert depth_loss.grad[[0, -1]].tolist() == pytest.approx([1.0, 11.0])
-    assert torch.autograd.gradcheck(likelihood, (depth_loss[1:4].detach().requires_grad_(),))
+    assert torch.autograd.gradcheck(emerging_losses, (depth_loss[1:4].detach().requires_grad_(),))
 
 
 def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
     gradients = []
-    for loss in (torch.clone, likelihood):
+    for loss in (torch.clone, emerging_losses):
         log_density = torch.tensor([-30.0, -12.0, -30.0], dtype=torch.float64, requires_grad=True)
         offsets, lengths = torch.tensor([0, 3]), torch.full((3,), 0.1, dtype=torch.float64)
         weights, transmittance = reference.interval_weights(log_density.exp(), lengths, offsets)
@@ -207,29 +204,25 @@ def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
 
 
 def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(capture, tmp_path, monkeypatch):
-    depth_loss = torch.tensor([0.25, 1.0])
-    assert torch.equal(distance_losses(depth_loss, fraction=0.29), likelihood(depth_loss))
-    assert torch.equal(distance_losses(depth_loss, fraction=0.3), depth_loss)
-    # A training passes on its fraction of the budget.
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
-    fitting, fractions = prepared.fitting(), []
+    fitting, emerging = prepared.fitting(), []
 
-    def recorded(depth_loss: torch.Tensor, *, fraction: float) -> torch.Tensor:
-        fractions.append(fraction)
-        return distance_losses(depth_loss, fraction=fraction)
+    def recorded(depth_loss: torch.Tensor) -> torch.Tensor:
+        emerging.append(fraction)
+        return emerging_losses(depth_loss)
 
-    monkeypatch.setattr("nerfcli.training.fitting.distance_losses", recorded)
-    for fraction in (0.0, 0.29, 0.31, 0.9):
+    monkeypatch.setattr("nerfcli.training.fitting.emerging_losses", recorded)
+    for fraction in (0.0, 0.29, 0.3, 0.9):
         fitting.advance(fraction)
-    assert fractions == [0.0, 0.29, 0.31, 0.9]
+    assert emerging == [0.0, 0.29]
 
 
 def test_points_fade_out():
-    wide = [fading(fraction, step=5000, parallax=1.0) for fraction in (0.0, 0.25, 1.0, 1.5)]
+    wide = [point_weight(progress, step=5000, parallax=1.0) for progress in (0.0, 0.25, 1.0, 1.5)]
     assert wide == [1.0, 0.75, 0.0, 0.0]
     # With a narrow baseline, also by 800 / step.
-    assert [fading(0.5, step=step, parallax=0.5) for step in (0, 800, 3200)] == [0.5, 0.5, 0.125]
+    assert [point_weight(0.5, step=step, parallax=0.5) for step in (0, 800, 3200)] == [0.5, 0.5, 0.125]
 
 
 @pytest.mark.parametrize(("parallax", "weight"), [(1.0, 0.5), (0.5, 0.125)])
@@ -241,14 +234,13 @@ def test_points_of_a_narrow_baseline_fade_with_the_steps_of_a_training(
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
     losses = []
     for value in (0.0, 4.0):
-        monkeypatch.setattr(
-            "nerfcli.training.fitting.distance_losses", lambda off, *, fraction, value=value: 0 * off + value
-        )
+        monkeypatch.setattr("nerfcli.training.schedule.EMERGING_ENDS", 1.0)
+        monkeypatch.setattr("nerfcli.training.fitting.emerging_losses", lambda off, value=value: 0 * off + value)
         fitting = prepared.fitting()
         assert fitting.points is not None
         trusted = [replace(points, trust=torch.ones_like(points.trust)) for points in fitting.points.sets]
         fitting.points = PointRays(trusted, prepared.pool)
-        fitting.step, fitting.parallax = 3200, parallax
+        fitting.step, fitting.schedule = 3200, replace(fitting.schedule, parallax=parallax)
         losses.append(fitting.advance(0.5).loss)
     assert losses[1] - losses[0] == pytest.approx(0.1 * weight * 4.0, rel=1e-4)
 

@@ -10,7 +10,8 @@ from nerfcli.field.voxel_field import VoxelFieldSettings
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.training.strides import DETAILED_STEPS, RaySteps, halvings
+from nerfcli.training.schedule import DETAILED_STEPS, stride
+from nerfcli.training.strides import RaySteps, halvings
 
 BALL = Marching(near=0.5, far=300.0, shortest_step=1 / 256, growth=1 / 128)
 CUBE = Marching(near=0.5, far=4.0, shortest_step=1 / 128, growth=0.0)
@@ -52,7 +53,7 @@ def test_steps_are_halved_until_they_are_shorter_than_two_cells_at_most_twice(ma
 def test_steps_begin_eight_times_as_long_as_those_of_the_capture_and_end_with_a_quarter(fraction, step, multiple):
     marching = Marching(near=1.0, far=3.0, shortest_step=1 / 128, growth=0.0)
     steps = RaySteps(marching, grid(1024, contraction="none"), parallax=1.0, device=torch.device("cpu"))
-    edges = steps.edges(fraction, step)
+    edges = steps.edges(stride(fraction, step))
     torch.testing.assert_close(edges.diff(), torch.full_like(edges[1:], multiple / 128), rtol=1e-4, atol=0)
     assert edges[0] == 1.0
     assert len(edges) - 1 <= steps.most + 1
@@ -61,9 +62,9 @@ def test_steps_begin_eight_times_as_long_as_those_of_the_capture_and_end_with_a_
 def test_pictures_of_detailed_fields_have_at_most_half_of_the_steps_of_the_capture():
     for settings, part in ((grid(4096), 1 / 4), (grid(1024), 1 / 2), (grid(800), 1 / 2), (grid(4096, log2_rows=16), 1)):
         steps = RaySteps(BALL, settings, parallax=1.0, device=torch.device("cpu"))
-        assert steps.render_steps(1.0, DETAILED_STEPS) == BALL.stretched(part)
+        assert steps.render_steps(stride(1.0, DETAILED_STEPS)) == BALL.stretched(part)
         # A training that ends before it gets to the shortest steps has not learned what they would show.
-        assert steps.render_steps(1.0, DETAILED_STEPS // 2) == BALL.stretched(max(part, 1 / 2))
+        assert steps.render_steps(stride(1.0, DETAILED_STEPS // 2)) == BALL.stretched(max(part, 1 / 2))
 
 
 def test_a_training_sees_the_parallax_of_its_capture(spheres, tmp_path):

@@ -40,10 +40,11 @@ from nerfcli.training.extent import Extent
 from nerfcli.training.fitting import Fitting
 from nerfcli.training.loop import train
 from nerfcli.training.pool import PixelPool
-from nerfcli.training.refinement import LAST_FRACTION, LENS_RATE, PoseRefinement, Refinement, rate_at
+from nerfcli.training.refinement import LENS_RATE, PoseRefinement, Refinement
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.files import STATE
 from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.schedule import CAMERAS_END, camera_plan
 from nerfcli.workflows.describe_run import camera_moves
 
 seeds = st.integers(0, 2**32 - 1)
@@ -241,7 +242,7 @@ def test_a_step_of_poses_leaves_no_mean_and_far_cameras_see_moves_less(small):
     assert poses is not None
     given = poses.poses()
     gradients = torch.randn(90, 6, generator=generator, dtype=torch.float64) + 1.0
-    poses.step(gradients, torch.full((90,), 0.5, dtype=torch.float64), torch.arange(90) % 3, 0.3, rate=1.0)
+    poses.step(gradients, torch.full((90,), 0.5, dtype=torch.float64), torch.arange(90) % 3, camera_plan(0.3), rate=1.0)
     assert np.abs(poses.poses() - given).max() > 1e-4
     rest = mean_similarity(given, poses.poses())
     assert np.linalg.norm(vector_from_rotation(rest.rotation)) < 1e-5  # to first order
@@ -397,7 +398,7 @@ def test_poses_are_damped_less_and_less_and_fixed_once_the_fault_is_found(monkey
     refinement = PoseRefinement(random_poses(np.random.default_rng(0), 4), [Camera.pinhole(40, 30, 40.0)] * 4)
     fractions = (0.11, 0.2, 0.21, 0.35, 0.5, 0.8, 0.97)
     for fraction in fractions:
-        refinement.step(*NO_RAYS, fraction, rate=1.0)
+        refinement.step(*NO_RAYS, camera_plan(fraction), rate=1.0)
     damping, holding = ([one[name] for one in calls] for name in ("damping", "holding"))
     assert damping[:2] == pytest.approx([1.0, 1.0])
     assert damping[-2:] == pytest.approx([0.1, 0.1])
@@ -413,7 +414,7 @@ def test_poses_go_by_the_rate_of_the_whole_way(monkeypatch):
     ways = []
     for rate in (1.0, 0.1):
         refinement = PoseRefinement(random_poses(np.random.default_rng(0), 4), [Camera.pinhole(40, 30, 40.0)] * 4)
-        refinement.step(*NO_RAYS, 0.5, rate=rate)
+        refinement.step(*NO_RAYS, camera_plan(0.5), rate=rate)
         ways.append(refinement.motions.numpy() - np.eye(4))
     assert np.abs(ways[0]).max() > 1e-8
     np.testing.assert_allclose(ways[1], 0.1 * ways[0], atol=1e-13)
@@ -441,14 +442,14 @@ def test_a_step_of_all_hands_each_part_what_it_needs(small, monkeypatch):
     monkeypatch.setattr(
         refinement.poses,
         "step",
-        lambda slopes, losses, photos, fraction, *, rate: given.update(slopes=slopes, rate=rate),
+        lambda slopes, losses, photos, plan, *, rate: given.update(slopes=slopes, rate=rate),
     )
     numbers = torch.arange(50)
     drawn = refinement.refine_cameras(pool.rays_of(numbers))
     drawn = drawn._replace(origins=drawn.origins.requires_grad_(), directions=drawn.directions.requires_grad_())
     losses = (drawn.origins + drawn.directions).square().sum(-1)
     losses.mean().backward()
-    refinement.step(drawn, losses.detach(), 0.3, factor=0.5)
+    refinement.step(drawn, losses.detach(), camera_plan(0.3), factor=0.5)
     rays_now = refinement.poses.poses()[:, :3, :3]
     np.testing.assert_allclose(given["turns"], rays_now)
     assert (given["rate"], given["lens_rate"]) == (0.5, pytest.approx(0.5 * LENS_RATE))
@@ -458,10 +459,10 @@ def test_a_step_of_all_hands_each_part_what_it_needs(small, monkeypatch):
 
 def test_rates_rise_from_nothing_and_end_at_nothing():
     fractions = np.linspace(0, 1, 201)
-    rates = np.array([rate_at(fraction) for fraction in fractions])
+    rates = np.array([camera_plan(fraction).rate for fraction in fractions])
     assert rates.max() == 1.0
     assert (rates[[0, -1]] == 0).all()
-    assert (rates[fractions >= LAST_FRACTION] == 0).all()
+    assert (rates[fractions >= CAMERAS_END] == 0).all()
     assert np.abs(np.diff(rates)).max() < 0.11
 
 

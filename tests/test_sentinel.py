@@ -22,6 +22,7 @@ from nerfcli.training.fitting import Fitting
 from nerfcli.training.loop import train
 from nerfcli.training.runs.log import read_log
 from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.schedule import StepPlan
 from nerfcli.training.sentinel import replay
 from nerfcli.training.watch import FirstBad, is_finite
 
@@ -65,8 +66,8 @@ def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_fa
 def test_a_failure_is_passed_with_smaller_steps_and_counted(views, tmp_path, monkeypatch):
     rate = Fitting.learning_rate
 
-    def poisoned(self: Fitting, fraction: float) -> float:
-        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, fraction)
+    def poisoned(self: Fitting, plan: StepPlan) -> float:
+        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, plan)
 
     monkeypatch.setattr(Fitting, "learning_rate", poisoned)
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
@@ -88,11 +89,11 @@ def test_the_way_back_is_exact(views, tmp_path, monkeypatch):
     # After the rollback, training equals one whose learning rate is halved from the snapshot on.
     rate = Fitting.learning_rate
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
-    monkeypatch.setattr(Fitting, "learning_rate", lambda self, fraction: rate(self, fraction) * (self.step < 4 or 0.5))
+    monkeypatch.setattr(Fitting, "learning_rate", lambda self, plan: rate(self, plan) * (self.step < 4 or 0.5))
     fit(views, tmp_path / "known")
 
-    def poisoned(self: Fitting, fraction: float) -> float:
-        return math.inf if self.step == 6 and self.rollbacks == 0 else rate(self, fraction)
+    def poisoned(self: Fitting, plan: StepPlan) -> float:
+        return math.inf if self.step == 6 and self.rollbacks == 0 else rate(self, plan)
 
     monkeypatch.setattr(Fitting, "learning_rate", poisoned)
     fit(views, tmp_path / "found")
@@ -132,8 +133,8 @@ def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, t
     monkeypatch.setattr(NumbaBackend, "deterministic", False)
     rate = Fitting.learning_rate
 
-    def poisoned(self: Fitting, fraction: float) -> float:
-        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, fraction)
+    def poisoned(self: Fitting, plan: StepPlan) -> float:
+        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, plan)
 
     with monkeypatch.context() as patched:
         patched.setattr(Fitting, "learning_rate", poisoned)

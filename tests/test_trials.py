@@ -35,7 +35,7 @@ def start(trials) -> Iterator[TrialStart]:
     """A start early in a schedule, without closing cells: within a few dozen steps they would leave nothing to see."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nerfcli.training.selection.trials.FORK_FRACTION", 0.02)
-        patch.setattr("nerfcli.training.open_cells.CLOSING_FRACTION", 1e9)
+        patch.setattr("nerfcli.training.schedule.CLOSING_ENDS", 1e9)
         yield trials.begin(Components(view=0), steps=20)
 
 
@@ -106,9 +106,8 @@ def test_a_trial_has_its_cameras_learn_from_the_fork_on(trials, start, monkeypat
 def test_the_learning_rate_falls_by_half_a_cosine_after_its_warm_up(trials):
     """Values by hand: from 0.01 to 0.001, the mean of both halfway."""
     fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
-    assert fitting.learning_rate(0.0) == pytest.approx(0.01 / 50)
-    fitting.step = 1000
-    rates = [fitting.learning_rate(fraction) for fraction in (0.0, 0.25, 0.5, 1.0, 1.5)]
+    assert fitting.schedule.learning_rate(0.0, step=0) == pytest.approx(0.01 / 50)
+    rates = [fitting.schedule.learning_rate(progress, step=1000) for progress in (0.0, 0.25, 0.5, 1.0, 1.5)]
     assert rates == pytest.approx([0.01, 0.001 + 0.009 * (0.5 + 0.125**0.5), 0.0055, 0.001, 0.001])
 
 
@@ -127,7 +126,7 @@ def test_large_tables_have_their_levels_by_steps(trials, monkeypatch, rows_of_la
     """In tables that count as large, half of 4 steps open all 8 levels, even at fraction 0 of a budget, and their rows
     move; but learned cameras keep the field coarse at first."""
     monkeypatch.setattr("nerfcli.field.hash_field.DETAILED_LOG2_ROWS", rows_of_large)
-    monkeypatch.setattr("nerfcli.training.fitting.LARGE_TABLE_STEPS", 4)
+    monkeypatch.setattr("nerfcli.training.schedule.LARGE_TABLE_STEPS", 4)
     fitting = trials._fitting(Components(view=0, cameras=cameras), seed=0, log_gains=None, cameras_from=0.0)
     fresh = fitting.field.rows().detach().clone()
     moved = []
@@ -160,7 +159,7 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
     exif = np.zeros(len(album.photos))
     trials = Trials(album.photos, everywhere, settings=SETTINGS, exif=exif, colours=album.colours)
     fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
-    monkeypatch.setattr(fitting.ray_steps, "edges", lambda fraction, step: torch.linspace(0.1, 1.4, 14))
+    monkeypatch.setattr(fitting.ray_steps, "edges", lambda stride: torch.linspace(0.1, 1.4, 14))
     sigma = 0.1
 
     class Fog:

@@ -8,13 +8,11 @@ from nerfcli.field.background import SphereBackground
 from nerfcli.field.exposure import Exposure
 from nerfcli.training.losses import over_background
 from nerfcli.training.pool import PixelBatch, Pool
-from nerfcli.training.refinement import Refinement, rate_at
+from nerfcli.training.refinement import Refinement
 from nerfcli.training.runs.components import LEARNED_BACKGROUNDS, Components
 
 # Learning rates as multiples of the field's: at lower ones, short trainings come only a part of the way.
 BACKGROUND_RATE, EXPOSURE_RATE = 5.0, 2.0
-# A field whose cameras learn gets its detail later, see `Appearance.fraction_of_detail`.
-DETAIL_DELAY = 0.125
 # At or above this level, a photo tells only that the light was at least that bright.
 SATURATED = 254.5 / 255
 # A ray with less opacity has no meaningful colour of its own.
@@ -80,13 +78,6 @@ class Appearance(nn.Module):
         learned = [(list(part.parameters()), rate) for part, rate in rates if part is not None]
         return [(tensors, rate) for tensors, rate in learned if tensors[0].requires_grad]
 
-    def fraction_of_detail(self, fraction: float) -> float:
-        """Return the fraction of the budget whose detail the field may have.
-
-        Cameras find their poses in a coarse field; a fine field learns to show each photo from its wrong pose.
-        """
-        return fraction if self.cameras is None else (1.0 - DETAIL_DELAY) * fraction - DETAIL_DELAY
-
     def gradients(self) -> dict[str, Tensor]:
         """Return by name the gradients of the parameters that have one."""
         return {name: tensor.grad for name, tensor in self.named_parameters() if tensor.grad is not None}
@@ -95,10 +86,10 @@ class Appearance(nn.Module):
         """Return the same pixels, with the rays of the current cameras."""
         return drawn if self.cameras is None else self.cameras.refine_cameras(drawn)
 
-    def with_learning_rays(self, drawn: PixelBatch, fraction: float) -> PixelBatch:
-        """Return the same as `refined`, with rays that collect gradients while cameras learn."""
+    def with_learning_rays(self, drawn: PixelBatch, rate: float) -> PixelBatch:
+        """Return the same as `refine_cameras`, with rays that collect gradients where the rate of cameras is not 0."""
         refined = self.refine_cameras(drawn)
-        if self.cameras is None or rate_at(fraction) == 0.0:
+        if self.cameras is None or rate == 0.0:
             return refined
         return refined._replace(
             origins=refined.origins.clone().requires_grad_(), directions=refined.directions.clone().requires_grad_()

@@ -66,7 +66,7 @@ class Checkpoints:
         return Model(
             fitting.field,
             cells.coarse if fitting.appearance.sky is None else cells.visited,
-            fitting.ray_steps.render_steps(fitting.largest_fraction, fitting.step),
+            fitting.ray_steps.render_steps(fitting.plan.stride),
             fitting.appearance.background or alone,
             prepared.extent.training_from_scene,
             self._scene.unit,

@@ -15,12 +15,13 @@ from nerfcli.kernels import March, Rays, Targets
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.appearance import Appearance
 from nerfcli.training.delayed import Delayed
-from nerfcli.training.losses import colour_losses, distance_losses
+from nerfcli.training.losses import colour_losses, emerging_losses
 from nerfcli.training.open_cells import OpenCells
 from nerfcli.training.optimiser import FieldOptimiser, PartsOptimiser
-from nerfcli.training.point_depth import PointRays, fading
+from nerfcli.training.point_depth import PointRays
 from nerfcli.training.pool import PixelBatch, Pool
 from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.schedule import Schedule, StepPlan
 from nerfcli.training.strides import RaySteps
 from nerfcli.training.watch import UNWATCHED, NonFiniteError, Watch
 
@@ -39,10 +40,6 @@ SKY_WEIGHT = 0.1
 ROUGHNESS_WEIGHT = 1e-6
 # With more rays in a step than this, rows decay less where photos have alpha, see `Fitting.row_decay`.
 DECAY_RAYS = 4000
-# The warm-up ends by this fraction of the budget at the latest, however few steps that is.
-WARMUP_FRACTION = 0.1
-# After this many steps, fields of long trainings, with large tables, have the detail that other fields have at the end.
-LARGE_TABLE_STEPS = 400
 
 
 @dataclass(frozen=True)
@@ -61,7 +58,7 @@ class Fitting:
         marching, contraction, parallax: of the extent; see `RaySteps` for the steps along rays.
         log_gains: (photos, 3) logarithms of the photos' initial exposures, NaN where unknown.
         log_focal: logarithm of the initial factor of focal lengths, if these are learned.
-        cameras_from: the fraction of the budget after which cameras learn.
+        cameras_from: the progress after which cameras learn, see `Schedule`.
         points: pixels whose distance is known.
         sky: (pixels,) bool, the pixels of the pool that show a sky to be learned; None if none are known.
         size: of the field; by default, `sizes.chosen_size` for the settings and the pool.
@@ -85,7 +82,7 @@ class Fitting:
         device = pool.colours.device
         torch.manual_seed(settings.seed)
         self.pool = pool
-        self.marching, self.parallax = marching, parallax
+        self.marching = marching
         self.settings = settings
         self.step = 0
         # The largest fraction of any budget so far: a training resumed with a larger budget begins at a smaller one.
@@ -107,7 +104,14 @@ class Fitting:
         gains = torch.full((len(pool.first_pixel), 3), torch.nan) if log_gains is None else log_gains
         self.points = points
         self.appearance = Appearance(self.components, pool, log_gains=gains, log_focal=log_focal)
-        self._cameras_from = cameras_from
+        self.schedule = Schedule(
+            settings,
+            parallax,
+            learns_cameras=self.appearance.cameras is not None,
+            cameras_from=cameras_from,
+            has_large_table=self.field.settings.detailed,
+            closing_steps=self.field.closing_steps,
+        )
         self.cells = OpenCells(self.field, device)
         if sky is not None:
             self.appearance.init_background_from_sky(sky)
@@ -128,7 +132,7 @@ class Fitting:
         """Take one optimiser step.
 
         Args:
-            fraction: of the budget that is used, in [0, 1]; it determines the learning rate.
+            fraction: of the budget that is used, in [0, 1], see `Schedule.at`.
             watch: observes the tensors of the step, and the state before and after it.
 
         Raises:
@@ -138,11 +142,10 @@ class Fitting:
         self.in_step = True
         watch.state(self.state)
         self.largest_fraction = max(self.largest_fraction, fraction)
-        of_cameras = max(0.0, fraction - self._cameras_from) / (1.0 - self._cameras_from)
-        drawn = self.appearance.with_learning_rays(self.draw(fraction), of_cameras)
+        plan = self.schedule.at(fraction, step=self.step, furthest=self.largest_fraction)
+        drawn = self.appearance.with_learning_rays(self.draw(plan), plan.cameras.rate)
         rays = len(drawn.origins)
-        edges = self.ray_steps.edges(fraction, self.step)
-        loss, losses, samples = self._loss(drawn, edges=edges, fraction=fraction, watch=watch)
+        loss, losses, samples = self._loss(drawn, plan, watch=watch)
         self.optimiser.zero_grad()
         self.parts_optimiser.zero_grad()
         if samples > 0:
@@ -150,30 +153,35 @@ class Fitting:
         samples = self._add_up_gradients(drawn, samples)
         losses = distributed.whole(losses, rays)
         value = self._finite_loss(loss, drawn, watch)
-        rate = self.learning_rate(fraction)
+        rate = self.learning_rate(plan)
         self.step += 1
         self.optimiser.step(self.step, rate, decay=self.row_decay(rays))
         self.parts_optimiser.step(rate)
         if self.appearance.cameras is not None:
-            self.appearance.cameras.step(drawn, losses, of_cameras, factor=self.rate_factor)
+            self.appearance.cameras.step(drawn, losses, plan.cameras, factor=self.rate_factor)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         watch.state(self.state)
         self.in_step = False
         return StepResult(loss=value, samples=samples, rays=rays)
 
-    def draw(self, fraction: float) -> PixelBatch:
+    @property
+    def plan(self) -> StepPlan:
+        """The plan at the largest progress so far, for pictures of the field."""
+        return self.schedule.at(self.largest_fraction, step=self.step, furthest=self.largest_fraction)
+
+    def draw(self, plan: StepPlan) -> PixelBatch:
         """Return the pixels of the next step; refresh the open cells first if it is time."""
         settings = self.settings
         self.cells.refresh(
             self.step,
-            fraction=self.largest_fraction,
-            detail=self._detail,
+            threshold=plan.threshold,
+            detail=plan.detail,
             marching=self.marching,
             generator=self.generator,
         )
         rays = min(self._most_rays, max(64, round(settings.samples_at(self.step) / max(1.0, self.samples_per_ray))))
         drawn = self.pool.draw(rays, self.generator)
-        if self.points is None or fraction >= 1.0:
+        if self.points is None or plan.point_weight == 0.0:
             return drawn
         return self.points.added_to(drawn, self.generator)
 
@@ -182,13 +190,9 @@ class Fitting:
         self.rate_factor /= 2
         self.rollbacks += 1
 
-    def learning_rate(self, fraction: float) -> float:
-        """Return the learning rate: linear warm-up, then half a cosine from the first to the final rate."""
-        settings = self.settings
-        left = 0.5 * (1.0 + math.cos(math.pi * min(1.0, fraction)))
-        rate = settings.final_learning_rate + left * (settings.learning_rate - settings.final_learning_rate)
-        warmup = min(1.0, max((self.step + 1) / settings.warmup_steps, fraction / WARMUP_FRACTION))
-        return self.rate_factor * warmup * rate
+    def learning_rate(self, plan: StepPlan) -> float:
+        """Return the learning rate of a step, halved by every call of `smaller_steps` so far."""
+        return self.rate_factor * plan.learning_rate
 
     def row_decay(self, rays: int) -> float:
         """Return the weight decay of rows beside the mean loss of a step's rays.
@@ -199,7 +203,7 @@ class Fitting:
         """
         return self.field.row_decay * (min(1.0, DECAY_RAYS / rays) if self.pool.has_alpha else 1.0)
 
-    def _loss(self, whole: PixelBatch, *, edges: Tensor, fraction: float, watch: Watch) -> tuple[Tensor, Tensor, int]:
+    def _loss(self, whole: PixelBatch, plan: StepPlan, *, watch: Watch) -> tuple[Tensor, Tensor, int]:
         """Return the loss that this process's rays contribute to that of the whole step, the colour loss of each of
         these rays, and their number of samples.
         """
@@ -207,10 +211,11 @@ class Fitting:
         drawn = PixelBatch(*(distributed.own(rows, count) for rows in whole))
         jitter = distributed.own(torch.rand(count, generator=self.generator, device=device), count)
         background = distributed.own(self.appearance.behind(count, self.generator), count)
+        edges = self.ray_steps.edges(plan.stride)
         seen = self.field.backend.render_rays(
             Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
             self._march(edges, self.cells.at(self.step))._replace(least_weight=LEAST_WEIGHT),
-            self.field.medium(self._detail),
+            self.field.medium(plan.detail),
             Targets(self.ray_steps.nearest if components.near else None, bool(components.distortion), drawn.distances),
             background=background,
             table_grad=self.optimiser.table_grad,
@@ -223,8 +228,8 @@ class Fitting:
         if components.distortion:
             loss = loss + components.distortion * (seen.distortion.sum() / count)
         if len(whole.distances):
-            losses_of_distances = drawn.trust * distance_losses(seen.depth_loss, fraction=fraction)
-            weight = components.points * fading(fraction, step=self.step, parallax=self.parallax)
+            of_distances = emerging_losses(seen.depth_loss) if plan.are_emerging else seen.depth_loss
+            losses_of_distances, weight = drawn.trust * of_distances, components.points * plan.point_weight
             loss = loss + weight * (losses_of_distances.sum() / len(whole.distances))
         if self.appearance.sky is not None:
             opacity = (1.0 - seen.transmittance) * self.appearance.sky[drawn.numbers]
@@ -241,7 +246,7 @@ class Fitting:
         """Return the model's and the photos' colours of pixels, both (N, 3) sRGB, alpha on white."""
         drawn = self.appearance.refine_cameras(drawn)
         behind = torch.full_like(drawn.origins, 1.0 if self.pool.has_alpha else 0.0)
-        edges = self.ray_steps.edges(self.largest_fraction, self.step)
+        edges = self.ray_steps.edges(self.plan.stride)
         rendered, transmittance = self._seen(drawn, edges=edges, behind=behind)
         return self.appearance.compared(rendered, transmittance, drawn, behind=behind)
 
@@ -249,7 +254,7 @@ class Fitting:
     def light_from_beyond(self, drawn: PixelBatch, *, distance: float) -> Tensor:
         """Return the fraction of each pixel's light, (N,), that comes from beyond a distance in the current field."""
         drawn = self.appearance.refine_cameras(drawn)
-        edges = self.ray_steps.edges(self.largest_fraction, self.step)
+        edges = self.ray_steps.edges(self.plan.stride)
         near = edges[: max(2, int(torch.searchsorted(edges, distance, right=True)))]
         return self._seen(drawn, edges=near, behind=torch.zeros_like(drawn.origins))[1]
 
@@ -259,19 +264,10 @@ class Fitting:
         seen = self.field.backend.render_rays(
             Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
             self._march(edges, self.cells.coarse),
-            self.field.medium(self._detail),
+            self.field.medium(self.plan.detail),
             background=behind,
         )
         return seen.rgb, seen.transmittance
-
-    @property
-    def _detail(self) -> float:
-        """Fraction of the budget whose detail the field has; cameras that learn late do not delay it."""
-        if self._cameras_from > 0.0:
-            return self.largest_fraction
-        if self.appearance.cameras is None and self.field.settings.detailed:
-            return min(1.0, max(self.largest_fraction, self.step / LARGE_TABLE_STEPS))
-        return self.appearance.fraction_of_detail(self.largest_fraction)
 
     def _march(self, edges: Tensor, occupied: Tensor) -> March:
         return March(edges, occupied, self.field.settings.contraction, DEEPEST)

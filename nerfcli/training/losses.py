@@ -4,9 +4,6 @@ import torch
 from torch import Tensor
 
 HUBER_DELTA = 0.1
-# Until this fraction of the budget, known distances are a log likelihood, which keeps thin surfaces. If it lasts until
-# the end, it puts matter in the wrong place where few photos look.
-EMERGING_FRACTION = 0.3
 # Fraction of the light on target at which the slope of this likelihood is half of its largest.
 FAINT = 0.1
 
@@ -24,8 +21,8 @@ def colour_losses(rendered: Tensor, measured: Tensor) -> Tensor:
     return losses.mean(-1) / HUBER_DELTA
 
 
-def distance_losses(depth_loss: Tensor, *, fraction: float) -> Tensor:
-    """Return the negative log likelihood of known distances, or from 30 % of the budget on, `depth_loss` itself.
+def emerging_losses(depth_loss: Tensor) -> Tensor:
+    """Return the negative log likelihood of known distances, which lets thin surfaces emerge.
 
     (1 + c) log((1 + c) / (1 + c - off target)),  c = 0.1
 
@@ -34,14 +31,11 @@ def distance_losses(depth_loss: Tensor, *, fraction: float) -> Tensor:
 
     Args:
         depth_loss: (K,) in [0, 1], see `kernels.RaySums`.
-        fraction: of the budget that is used.
 
     Returns:
         (K,) The likelihood is 0, with a slope of 1, where all light is absorbed at the known distance, and
         (1 + c) log(1 + 1 / c), with a slope of 1 + 1 / c, where none is. Differentiable.
     """
-    if fraction >= EMERGING_FRACTION:
-        return depth_loss
     most = 1.0 + FAINT
     return -most * torch.log1p(-depth_loss / most)
 

@@ -7,6 +7,7 @@ from torch.nn.functional import max_pool3d
 from nerfcli import distributed
 from nerfcli.field.interface import Field
 from nerfcli.render.trained_field import Marching
+from nerfcli.training.schedule import FIRST_THRESHOLD
 
 # Contracted radius 2 is infinity; cells at the grid's corners, beyond it, are mapped to this radius.
 LARGEST_RADIUS = 1e6
@@ -109,11 +110,6 @@ class Occupancy:
 OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8
 REFRESH_TURNS = 8
-# Rays skip cells whose optical depth per step is below this threshold: hardly any at first, when all of space is thin
-# fog and surfaces are not known; then more and more, so that surfaces have to become compact.
-FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
-# The final threshold is reached by this fraction of the budget at the latest, however few steps that is.
-CLOSING_FRACTION = 0.3
 # Detailed fields also have a fine grid. At a refresh, the optical depth of a visited cell decays, unless the samples
 # there were larger. Rays then sample all cells that the coarse grid leaves open, so that closed fine ones can reopen.
 FINE_SIDE = 2 * OCCUPANCY_SIDE
@@ -160,7 +156,7 @@ class OpenCells:
         self,
         step: int,
         *,
-        fraction: float,
+        threshold: float,
         detail: float,
         marching: Marching,
         generator: torch.Generator,
@@ -168,7 +164,7 @@ class OpenCells:
         """Update the open cells from the field, every few steps.
 
         Args:
-            fraction: of the budget that is used, in [0, 1].
+            threshold: optical depth per step below which cells are closed.
             detail: of the field, see `Field.medium`.
             generator: source of the random points of the coarse grid.
         """
@@ -192,8 +188,7 @@ class OpenCells:
             before = depths[visited]
             depths[visited] = torch.where(before.isinf(), 0.0, before * DECAY).maximum(cell_depths[visited])
             cell_depths[visited] = UNVISITED
-        closed = min(1.0, max(step / self._field.closing_steps, fraction / CLOSING_FRACTION))
-        self._open(FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed)
+        self._open(threshold)
 
     def _open(self, threshold: float) -> None:
         self.coarse, least = self._occupancy.above(threshold), self._occupancy.least(threshold)

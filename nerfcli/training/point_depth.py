@@ -19,8 +19,6 @@ PIXELS_PER_POINT = 8
 HALF_ERROR_PX = 1.0
 # Expected relative error of a stereo distance at which its pixel has half the weight.
 HALF_ERROR = 0.05
-# With a narrow baseline, known distances are less accurate than what the field has learned after this many steps.
-NARROW_STEPS = 800
 
 
 @dataclass(frozen=True)
@@ -121,17 +119,3 @@ def _usable(numbers: np.ndarray, distances: np.ndarray, trust: np.ndarray, *, po
     device = pool.colours.device
     known = (torch.from_numpy(values).to(device, torch.float32) for values in (distances, trust))
     return PointDepths(torch.from_numpy(numbers).to(device), *known).among(pool)
-
-
-def fading(fraction: float, *, step: int, parallax: float) -> float:
-    """Return the weight of known distances at a fraction of the budget, linear from 1 to 0.
-
-    With a narrow baseline, the weight is also multiplied by min(1, 800 / step).
-
-    Once there are surfaces, photos tell more; but without points, haze before them comes back where few photos look.
-
-    Args:
-        parallax: of the capture, see `Extent`; below 1 with a narrow baseline.
-    """
-    part = NARROW_STEPS / max(step, NARROW_STEPS) if parallax < 1.0 else 1.0
-    return part * max(0.0, 1.0 - fraction)

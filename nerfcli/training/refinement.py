@@ -18,6 +18,7 @@ from nerfcli.cameras.rigid import from_parts, inverse, transform_from_twist, vec
 from nerfcli.training.camera_optimiser import NewtonSteps, WhitenedAdam, whitening, without_mean
 from nerfcli.training.delayed import Delayed, on_device_of
 from nerfcli.training.pool import PixelBatch, Pool
+from nerfcli.training.schedule import CameraPlan
 
 # Least distance of a camera from the origin of the training frame, about which its points are.
 _LEAST_DISTANCE = 0.2
@@ -25,28 +26,6 @@ _LEAST_DISTANCE = 0.2
 LENS_RATE = 3e-4
 # Radians by which a step of a pose moves the picture, at most.
 _FARTHEST_STEP = 2e-3
-# Fractions of the budget. Until the first there is fog, from which cameras learn nothing; until the second, the rate
-# rises. From the third to the fourth it falls to the last rate: the steps' noise averages out and the field can settle.
-FIRST_FRACTION, FULL_FRACTION, FALLING_FRACTION, LAST_FRACTION, LAST_RATE = 0.1, 0.15, 0.5, 0.98, 0.03
-# Rotations and translations look much alike, and an early field confuses them: poorly determined changes are damped
-# strongly at first, and less between these fractions of the budget.
-DAMPING_FRACTIONS, DAMPINGS = (0.2, 0.8), (1.0, 0.1)
-# Cameras are held from the first fraction on, see `NewtonSteps.change`; before, it is not clear which errors they have.
-HOLDING_FRACTIONS, HOLDINGS = (0.2, 0.5), (1e-3, 0.05)
-
-
-def rate_at(fraction: float) -> float:
-    """Return the learning rate of cameras at a fraction of the budget: linear warm-up, constant, exponential decay."""
-    if not FIRST_FRACTION < fraction < LAST_FRACTION:
-        return 0.0
-    if fraction < FULL_FRACTION:
-        return (fraction - FIRST_FRACTION) / (FULL_FRACTION - FIRST_FRACTION)
-    return _between(fraction, (FALLING_FRACTION, LAST_FRACTION), (1.0, LAST_RATE))
-
-
-def _between(fraction: float, fractions: tuple[float, float], values: tuple[float, float]) -> float:
-    """Return the first value up to the first fraction, the second from the second on, exponential in between."""
-    return float(np.exp(np.interp(fraction, fractions, np.log(values))))
 
 
 class PoseRefinement(nn.Module):
@@ -105,7 +84,7 @@ class PoseRefinement(nn.Module):
         gradients: Tensor,
         losses: Tensor,
         photos: Tensor,
-        fraction: float,
+        plan: CameraPlan,
         *,
         rate: float,
     ) -> None:
@@ -114,7 +93,7 @@ class PoseRefinement(nn.Module):
         Args:
             gradients, losses: of each ray's own loss.
             photos: (R,) the photo index of each ray.
-            fraction: of the budget.
+            plan: damping and holding of the step.
             rate: fraction of the full Newton step, in [0, 1].
         """
         so_far = self.motions.numpy()
@@ -122,8 +101,8 @@ class PoseRefinement(nn.Module):
         twists = rate * self.newton.change(
             self.newton.learn(gradients, losses, photos),
             torch.from_numpy(so_far),
-            damping=_between(fraction, DAMPING_FRACTIONS, DAMPINGS),
-            holding=_between(fraction, HOLDING_FRACTIONS, HOLDINGS) if fraction > HOLDING_FRACTIONS[0] else 0.0,
+            damping=plan.damping,
+            holding=plan.holding,
         )
         seen = (twists[:, None] @ self.picture @ twists[..., None])[..., 0].sqrt()  # (P, 1) radians
         twists = (twists * (_FARTHEST_STEP / seen.clamp_min(_FARTHEST_STEP))).numpy()
@@ -258,18 +237,18 @@ class Refinement(nn.Module):
         return drawn._replace(origins=origins, directions=directions)
 
     @torch.no_grad()
-    def step(self, drawn: PixelBatch, losses: Tensor, fraction: float, *, factor: float) -> None:
+    def step(self, drawn: PixelBatch, losses: Tensor, plan: CameraPlan, *, factor: float) -> None:
         """Take one step against the gradients of the mean loss over rays.
 
         On a GPU, the gradients are those of the previous step.
 
         Args:
-            drawn: the rays, from `refined`, with gradients.
+            drawn: the rays, from `refine_cameras`, with gradients.
             losses: (R,) the loss of each ray.
-            fraction: of the budget, for `rate_at`.
+            plan: how cameras learn in this step.
             factor: of the learning rate.
         """
-        by_origin, by_direction, rate = drawn.origins.grad, drawn.directions.grad, factor * rate_at(fraction)
+        by_origin, by_direction, rate = drawn.origins.grad, drawn.directions.grad, factor * plan.rate
         if rate == 0.0 or by_origin is None or by_direction is None:
             return
         sent = (self._pool.photo_of(drawn.numbers), drawn.numbers, losses, drawn.directions, by_origin, by_direction)
@@ -286,7 +265,7 @@ class Refinement(nn.Module):
             by_lens = self.lenses.gradient(numbers, photos, turns=turns, by_direction=by_direction)
         if self.poses is not None:
             by_pose = self.poses.gradients(directions, photos, by_origin=by_origin, by_direction=by_direction)
-            self.poses.step(len(by_pose) * by_pose, losses, photos, fraction, rate=rate)
+            self.poses.step(len(by_pose) * by_pose, losses, photos, plan, rate=rate)
         if self.lenses is not None and by_lens is not None:
             self.lenses.step(by_lens, LENS_RATE * rate)
 

@@ -147,7 +147,7 @@ class Sentinel:
         fitting = self._fitting
         tensors, description = fitting.state()
         before = {name: tensor.clone() for name, tensor in tensors.items()}
-        drawn = fitting.draw(fraction)
+        drawn = fitting.draw(fitting.schedule.at(fraction, step=fitting.step, furthest=fitting.largest_fraction))
         batch = {
             **drawn._asdict(),
             "first_pixel": fitting.pool.first_pixel,
@@ -170,7 +170,7 @@ class Sentinel:
             "pixels": [list(pixel) for pixel in pixels],
             "settings": fitting.settings.to_json(),
             "marching": vars(fitting.marching),
-            "parallax": fitting.parallax,
+            "parallax": fitting.schedule.parallax,
             "cameras": [camera.to_json() for camera in fitting.pool.cameras],
             "state": description,
         }

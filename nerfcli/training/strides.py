@@ -1,4 +1,4 @@
-"""Length of the steps along rays in the course of a training."""
+"""The steps along the rays of a training, and of pictures of its field."""
 
 import torch
 from torch import Tensor
@@ -8,12 +8,8 @@ from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import cube_side
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.normalisation import NEAR_PER_POINT
+from nerfcli.training.schedule import SHORTEST
 
-# Until this fraction of the budget, steps along rays are this many times as long as those of the capture: the initial
-# fog has no detail. Short trainings do not reach the detail and learn more from more rays: their fractions are those of
-# this many steps.
-STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (0.5, 1))
-DETAILED_STEPS = 2500
 # Detailed fields end with shorter steps, halved until they are shorter than this many cells of the finest level as seen
 # from other cameras: along a ray, a surface is at least as thick as a step, which blurs its edges in their pictures.
 CELLS_PER_STEP = 2.0
@@ -43,22 +39,17 @@ class RaySteps:
         """Largest number of steps of a ray."""
         return len(self._edges) - 2
 
-    def edges(self, fraction: float, step: int) -> Tensor:
-        """Return the edges of the steps, see `Marching.edges`, at a fraction of the budget and at step `step`."""
-        return self._edges[:: self._stride(fraction, step)].contiguous()
+    def edges(self, stride: int) -> Tensor:
+        """Return the edges of the steps, see `Marching.edges`, for `StepPlan.stride`."""
+        return self._edges[:: stride * self._halved or 1].contiguous()
 
-    def render_steps(self, fraction: float, step: int) -> Marching:
+    def render_steps(self, stride: int) -> Marching:
         """Return the steps of pictures of the field: those of the training so far, at most those of the capture.
 
         Pictures of detailed fields have at most half of the capture's, with which the training had more rays.
         """
-        shortest = self._halved if self._stride(fraction, step) == 1 else 1
+        shortest = self._halved if stride == SHORTEST else 1
         return self._marching.stretched(1 / max(2, shortest)) if self._detailed else self._marching
-
-    def _stride(self, fraction: float, step: int) -> int:
-        """Return how many of the shortest steps make one."""
-        fraction = min(fraction, step / DETAILED_STEPS)
-        return next((stride * self._halved for until, stride in STRIDES if fraction <= until), 1)
 
 
 def halvings(marching: Marching, settings: FieldSettings, parallax: float) -> int:

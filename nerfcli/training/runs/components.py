@@ -42,7 +42,7 @@ class Components:
         cameras: camera parameters of the training photos that are trained with the field: "poses"; "focal", the focal
             length of each lens; "all", both and radial distortion; or "fixed", none. See `refinement`.
         masks: meaning of black in masks: "ignore", not used; or "empty", empty space, as with alpha.
-        points: weight of known distances, see `training.losses.distance_losses`.
+        points: weight of known distances, see `training.losses.emerging_losses`.
         stereo: whether the points include pixels of training photos with a depth from stereo matching, see
             `matching.stereo`.
         near: whether gradients near a camera are scaled down; see `reference.scale_gradients`.
