@@ -1,6 +1,7 @@
-"""The schedule of a training: everything that changes with the progress of a training, and nothing else reads it.
+"""The schedule of a training: what its steps do at which progress; the step, rays, cells and cameras read it.
 
 Progress is the used fraction of the budget, in [0, 1]. Where a number of steps decides as well, it stands beside it.
+Elsewhere are the levels that a detail opens (`HashField`), and the samples of a step by its number (`TrainSettings`).
 """
 
 from dataclasses import dataclass
