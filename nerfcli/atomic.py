@@ -1,4 +1,4 @@
-"""Files and folders that are written completely or not at all.
+"""Files and folders that are written completely or not at all; JSON with a digest of its content.
 
 Everything is written under a hidden name beside its destination and renamed when complete, so that a killed
 command or a full disk leaves nothing behind that a later command would take for a result.

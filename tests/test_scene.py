@@ -123,7 +123,9 @@ def test_a_colmap_model_of_photos_stored_lying_is_turned_upright(tmp_path, model
     shutil.copytree(model, tmp_path / "sparse/0")
     for name in NAMES:
         write_image(tmp_path / "images" / name, orientation=6 if name == NAMES[0] else 1)
-    turned, plain = load_scene(tmp_path).frames[:2]
+    loaded = load_scene(tmp_path)
+    assert loaded.pixels == "upright"
+    turned, plain = loaded.frames[:2]
     assert (turned.camera.width, turned.camera.height) == (48, 64)
     assert (plain.camera.width, plain.camera.height) == (64, 48)
     write_image(tmp_path / "images" / NAMES[0])

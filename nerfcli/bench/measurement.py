@@ -1,4 +1,4 @@
-"""Measure the settings of a bench: renderings of a run in interleaved rounds, or trainings of a scene one by one.
+"""The settings of a bench and their measurement: renderings in interleaved rounds, or trainings one by one.
 
 Every rendering setting renders the same held-out photos. A first round renders the pictures from which errors are
 computed, and warms up; its times do not count. Every later round times all settings in a different order, so that a

@@ -1,1 +1,1 @@
-"""Conversion between formats of captures: formats, losses, conventions."""
+"""Captures: their formats, loading, held-out photos, conversion, conventions and metric scale."""

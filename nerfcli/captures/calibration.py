@@ -1,4 +1,4 @@
-"""Known intrinsics, assigned to photos by name, else by size."""
+"""Known intrinsics: read from a file of cameras, and assigned to photos by name, else by size."""
 
 import hashlib
 import json

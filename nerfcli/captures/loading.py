@@ -17,7 +17,7 @@ from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.holdout import default_split, names_held_out
 from nerfcli.captures.orientation import counted, rescaling
-from nerfcli.captures.stored_pixels import measure_of, upright
+from nerfcli.captures.stored_pixels import UPRIGHT, measure_of, upright
 from nerfcli.errors import UserError, in_shell
 from nerfcli.photos.masks import masks_inside
 
@@ -117,6 +117,7 @@ def with_photos_on_disk(path: Path, form: Format, found: Path, capture: Capture)
         missing=(*(frames[index].name for index in order if index not in fitted), *capture.missing),
         depth_bounds=None if capture.depth_bounds is None else capture.depth_bounds[kept],
         observations=None,
+        pixels=UPRIGHT,
         rescaled=counted(rescaling(frames[index].camera, frame.camera) for index, frame in fitted.items()),
         provenance=capture.provenance or {"from": form.name},
     )

@@ -1,4 +1,4 @@
-"""Similarity of a rendered picture to a photo: PSNR, SSIM.
+"""Similarity of a rendered picture to a photo: PSNR, SSIM, LPIPS where it is installed, and with colours aligned.
 
 Colours are sRGB in [0, 1], as float or rounded to 8 bits. Pixels that do not count (masked, or without a ray) are
 left out entirely: from PSNR pixel by pixel, from SSIM with every window that contains one.

@@ -1,4 +1,4 @@
-"""Depths of a field as seen by the cameras of its photos, from which surfaces and points are made."""
+"""Depths of a field in the views of its photos, from which surfaces and points are made, and colours of surfaces."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Extent of the photos' subject, and the resolution at which the photos show it."""
+"""Settings of an extracted surface, the extent of the photos' subject, and the resolution at which they show it."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""HTML page around the content of a command: head, common style, origin; and writing the page."""
+"""HTML page around the content of a command: head, common style, origin, tables, pictures inside; and writing it."""
 
 import base64
 import hashlib

@@ -1,1 +1,1 @@
-"""Photos for training and evaluation: their pixels, masks and exposures."""
+"""Photos and videos as files: pixels, EXIF, masks, panoramas; and photos loaded for training."""

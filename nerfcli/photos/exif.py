@@ -1,4 +1,4 @@
-"""EXIF of photos: what it says about the camera, its lens, the time and place of the shot."""
+"""EXIF of photos: what it says about the camera, its lens, the exposure, the time and place of the shot."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Load photos for training: read them, turn them upright, downscale them and apply their masks."""
+"""Load photos for training: read, turn upright, downscale, apply masks; and the undistorted views of their cameras."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Files of splats by their suffix."""
+"""Files of splats by their suffix, and the page with a viewer and splats inside."""
 
 import base64
 import gzip

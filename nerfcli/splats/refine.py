@@ -1,4 +1,4 @@
-"""Refinement of Gaussians on training photos: Adam on the mean absolute error of one photo after another."""
+"""Refinement of Gaussians on training photos and pictures of the field: Adam on one picture after another."""
 
 import time
 from collections.abc import Callable, Sequence

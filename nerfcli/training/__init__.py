@@ -1,1 +1,1 @@
-"""The training step and its parts: losses, optimiser, learned cameras, extent, point depth."""
+"""Training: evidence and selection of components, the step and its schedule, the loop, checkpoints, the run folder."""

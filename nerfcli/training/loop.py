@@ -1,4 +1,4 @@
-"""The training of a scene from photos to checkpoint, within a budget of time or steps."""
+"""The training of a scene from photos to checkpoint, within a budget of time or steps; masks of what is left out."""
 
 import resource
 import shutil

@@ -1,4 +1,4 @@
-"""The grid cells that training rays sample."""
+"""The grid cells that training rays sample, and the occupancy of the field that opens and closes them."""
 
 import torch
 from torch import Tensor

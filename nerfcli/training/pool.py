@@ -1,4 +1,4 @@
-"""Training photos in memory, and random pixels of them with their rays."""
+"""Training photos in memory, and random pixels of them with their rays, by tables of bearings."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,4 @@
-"""Describe a run or a file of tensors as plain values: settings, decisions, metrics."""
+"""Describe a run or a file of tensors as plain values: settings, decisions, metrics, how far cameras have moved."""
 
 from collections.abc import Sequence
 from dataclasses import asdict

@@ -135,6 +135,8 @@ def render_splats(
         UserError: the file cannot be read, the cameras are those of a run, or an output needs training photos.
     """
     path, cores = Path(file), thread_count(threads)
+    if not path.is_file():
+        raise UserError(f"there is no {path}", "give a .ply or .spz of splats")
     if views.cameras in ("test", "train", *PATHS):
         raise UserError(
             f"{path} has no cameras, so --cameras {views.cameras} is not known",

@@ -1,4 +1,4 @@
-"""Optional parts of a model and of its training, each chosen independently.
+"""Optional parts of a model and of its training, each chosen independently, and the decisions about them.
 
 A component is a field of `Components`. `CHOICES` gives for each component the value that switches it off, the value
 that `--with NAME` stands for, and the values that `--with NAME=VALUE` allows.

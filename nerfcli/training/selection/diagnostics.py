@@ -1,4 +1,4 @@
-"""Diagnostics from the residuals of a short training, which suggest components to try."""
+"""Diagnostics from the residuals of a short training, which suggest components to try, and the colours of its sky."""
 
 import math
 from collections.abc import Callable
