@@ -147,4 +147,4 @@ def test_merging_ends_at_its_limit(job: Job, tmp_path: Path):
         )
         sizes[seconds] = [model.num_reg_images() for model in merged]
     assert sizes == {-1.0: [5, 4], 1e9: [8]}
-    assert said == ["merging: 2 of 2 sub-models are left after -1 s"]
+    assert said == ["merging: 1 of 2 sub-models are left after -1 s"]

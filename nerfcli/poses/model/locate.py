@@ -9,7 +9,9 @@ Source: 2D-3D matching as in Sattler et al. 2011 (ICCV), with the ratio test bet
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pycolmap
@@ -95,30 +97,28 @@ def locate_photos(
     attempts: dict[int, LocationAttempt] = {}
     left = sorted(image_ids)
     files = dict(zip(job.image_ids, job.files, strict=True))
-    with pycolmap.Database.open(job.database) as database:
+    with pycolmap.Database.open(job.database) as database, ThreadPoolExecutor(job.threads) as pool:
         rounds = 3  # a placed photo may make it possible to place others
         total = rounds * len(left)
         placed_before: list[int] = []
         for turn in range(rounds):
             model_points = known_points(grown, database)
             fresh = np.isin(model_points.photos, placed_before)
+            photos = [photo_features(grown, database, image_id) for image_id in left]
+            try_one = partial(
+                _try_to_place, model_points=model_points, fresh=fresh if turn > 0 else None, seed=job.seed
+            )
             placed_now = []
-            for number, image_id in enumerate(left):
+            results = zip(left, photos, pool.map(try_one, left, photos), strict=True)
+            for number, (image_id, photo, (placed, attempt)) in enumerate(results):
                 report("locate", turn * len(image_ids) + number, total)
-                photo = photo_features(grown, database, image_id)
-                if photo is None:
-                    attempts[image_id] = LocationAttempt(image_id, refused="its camera is unknown")
+                attempts[image_id] = attempt or attempts[image_id]
+                if photo is None or placed is None:
                     continue
-                if turn > 0 and resembling(photo, model_points.descriptors[fresh]) < _LEAST_VOTES:
-                    continue
-                placed, attempts[image_id] = _place(photo, model_points, seed=job.seed)
-                if placed is not None:
-                    place(
-                        grown, photo.camera, placed.pose, image_id=image_id, name=files[image_id], pixels=photo.pixels
-                    )
-                    for feature, point in zip(placed.features, model_points.ids[placed.points], strict=True):
-                        grown.add_observation(int(point), pycolmap.TrackElement(image_id, int(feature)))
-                    placed_now.append(image_id)
+                place(grown, photo.camera, placed.pose, image_id=image_id, name=files[image_id], pixels=photo.pixels)
+                for feature, point in zip(placed.features, model_points.ids[placed.points], strict=True):
+                    grown.add_observation(int(point), pycolmap.TrackElement(image_id, int(feature)))
+                placed_now.append(image_id)
             left = [image_id for image_id in left if image_id not in placed_now]
             if not left or not placed_now:
                 break
@@ -174,6 +174,17 @@ def _doubt(model: pycolmap.Reconstruction, image_id: int, pairs: Sequence[Verifi
     own = [pair for pair in pairs if image_id in (pair.one, pair.other)]
     against = [agreement for agreement in agreements(model, own) if agreement.contradicts]
     return f"{against[0].matches} verified matches contradict its pose" if against else ""
+
+
+def _try_to_place(
+    image_id: int, photo: PhotoFeatures | None, *, model_points: KnownPoints, fresh: NDArray[np.bool_] | None, seed: int
+) -> tuple[_Placed | None, LocationAttempt | None]:
+    """Return a photo's pose, or None, and the record; None if it resembles too few of the points that are `fresh`."""
+    if photo is None:
+        return None, LocationAttempt(image_id, refused="its camera is unknown")
+    if fresh is not None and resembling(photo, model_points.descriptors[fresh]) < _LEAST_VOTES:
+        return None, None
+    return _place(photo, model_points, seed=seed)
 
 
 def _place(photo: PhotoFeatures, model_points: KnownPoints, *, seed: int) -> tuple[_Placed | None, LocationAttempt]:

@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +27,17 @@ from nerfcli.poses.model.projection import Array, is_ahead, offsets_px
 from nerfcli.poses.model.reasons import MIN_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, count_matches, read_verified_pairs
 
-# Until all models are merged: rounds of triangulation, and the relative change of the cost at which adjustments end.
-_REFINEMENTS, _TOLERANCE = 2, 1e-4
+# Until all models are merged, adjustments end at this relative change of the cost; then there are so many rounds of
+# triangulation.
+_TOLERANCE, _REFINEMENTS = 1e-4, 2
+
+
+@dataclass(frozen=True)
+class _Aligned:
+    """A model, and the similarity that moves it into the frame of another; None if too few points agree."""
+
+    model: pycolmap.Reconstruction
+    first_from_model: pycolmap.Sim3d | None
 
 
 @dataclass(frozen=True)
@@ -52,9 +62,9 @@ def merge_models(
     report: Callable[[str, int, int], None] = lambda stage, done, total: None,
     tell: Callable[[str], None] = lambda text: None,
 ) -> list[pycolmap.Reconstruction]:
-    """Return the models, largest first, each merged with an earlier one if they have enough in common.
+    """Return the models, largest first, each merged with those smaller ones that have enough in common with it.
 
-    If all photos of a model are in a larger one, it is dropped.
+    All that align with a model are merged with it at once. If all photos of a model are in a larger one, it is dropped.
 
     Args:
         models: of one database, largest first; they are not changed.
@@ -65,33 +75,30 @@ def merge_models(
     """
     pairs = read_verified_pairs(database, min_matches=1)
     tracks = _matched_keypoints(database)
+    with pycolmap.Database.open(database) as opened:
+        cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions(min_num_matches=MIN_MATCHES))
+    join = partial(_join, cache=cache, pairs=pairs, threads=threads, fixed=fixed)
     merged: list[pycolmap.Reconstruction] = []
-    joined_once: set[int] = set()
+    left = list(models)
     start = time.perf_counter()
-    for number, model in enumerate(models):
-        report("merge", number, len(models))
-        if time.perf_counter() - start > seconds:
-            merged.extend(models[number:])
-            tell(f"merging: {len(models) - number} of {len(models)} sub-models are left after {duration(seconds)}")
-            break
-        if any(set(model.reg_image_ids()) <= set(base.reg_image_ids()) for base in merged):
-            continue  # it has no further photos
-        for index, base in enumerate(merged):
-            common = common_points(base, model, tracks)
-            similarity = align(base, common, seed=seed)
-            if similarity is None:
-                continue
-            joined = _joined(base, model, similarity, database, output=output, threads=threads, fixed=fixed)
-            if _holds(joined, base, pairs):
-                merged[index] = joined
-                joined_once.add(index)
-                break
-        else:
-            merged.append(model)
-    for index in joined_once:
-        refine_model(merged[index], threads=threads, fixed=fixed)
+    while left:
+        base, left = left[0], left[1:]
+        aligned: list[_Aligned] | None = None
+        while aligned is None or aligned:
+            known = set(base.reg_image_ids())
+            left = [model for model in left if not known.issuperset(model.reg_image_ids())]
+            report("merge", len(models) - len(left) - 1, len(models))
+            if time.perf_counter() - start > seconds:
+                tell(f"merging: {len(left)} of {len(models)} sub-models are left after {duration(seconds)}")
+                return _largest_first([*merged, base, *left])
+            found = [_Aligned(model, align(base, common_points(base, model, tracks), seed=seed)) for model in left]
+            base, aligned = join(base, [one for one in found if one.first_from_model is not None])
+            left = [model for model in left if not any(model is one.model for one in aligned)]
+        if not any(base is model for model in models):
+            base = _triangulated_again(base, database, output=output, threads=threads, fixed=fixed)
+        merged.append(base)
     report("merge", len(models), len(models))
-    return sorted(merged, key=lambda model: -model.num_reg_images())
+    return _largest_first(merged)
 
 
 def common_points(
@@ -162,49 +169,85 @@ def _fits(first: pycolmap.Reconstruction, common: CommonPoints, first_from_secon
     return fits
 
 
-def _joined(
-    first: pycolmap.Reconstruction,
-    second: pycolmap.Reconstruction,
-    first_from_second: pycolmap.Sim3d,
-    database: Path,
+def _join(
+    base: pycolmap.Reconstruction,
+    aligned: Sequence[_Aligned],
     *,
-    output: Path,
+    cache: pycolmap.DatabaseCache,
+    pairs: Sequence[VerifiedPair],
     threads: int,
     fixed: Sequence[int],
-) -> pycolmap.Reconstruction:
-    """Merge the photos of both in the frame of the first, triangulate again from all matches, and adjust roughly."""
-    moved = pycolmap.Reconstruction(second)
-    moved.transform(first_from_second)
-    joined = pycolmap.Reconstruction(first)
-    for photo in sorted(set(second.reg_image_ids()) - set(first.reg_image_ids())):
-        image = moved.image(photo)
-        camera = second.camera(image.camera_id)
+) -> tuple[pycolmap.Reconstruction, Sequence[_Aligned]]:
+    """Return the base with the photos of all models that agree with it, in its frame, and these models.
+
+    While the matches of a model with the others disagree with the joined one, the worst is left out.
+    """
+    while aligned:
+        joined = pycolmap.Reconstruction(base)
+        owners = dict.fromkeys(base.reg_image_ids(), -1)
+        for number, one in enumerate(aligned):
+            moved = pycolmap.Reconstruction(one.model)
+            moved.transform(one.first_from_model)
+            owners = dict.fromkeys(moved.reg_image_ids(), number) | owners
+            _add(joined, moved, {photo for photo, owner in owners.items() if owner == number})
+        _merge_tracks(joined, cache)
+        held_out.adjust(joined, threads=threads, fixed=fixed, tolerance=_TOLERANCE)
+        held_out.drop_misfits(joined)
+        agreeing = [
+            _agreeing_fraction(joined, {photo for photo, owner in owners.items() if owner == number}, pairs)
+            for number in range(len(aligned))
+        ]
+        worst = int(np.argmin(agreeing))
+        if agreeing[worst] > 1 / 2:
+            return joined, aligned
+        aligned = [one for number, one in enumerate(aligned) if number != worst]
+    return base, aligned
+
+
+def _add(joined: pycolmap.Reconstruction, model: pycolmap.Reconstruction, photos: set[int]) -> None:
+    """Add these photos of a model in the same frame, and the points that at least two of them see."""
+    for photo in sorted(photos):
+        image = model.image(photo)
+        camera = model.camera(image.camera_id)
         place(joined, camera, image.cam_from_world(), image_id=photo, name=image.name, pixels=pixels_of(image))
+    for point in model.points3D.values():
+        seen = [element for element in point.track.elements if element.image_id in photos]
+        if len(seen) > 1:
+            joined.add_point3D(point.xyz, pycolmap.Track(seen))
+
+
+def _merge_tracks(model: pycolmap.Reconstruction, cache: pycolmap.DatabaseCache) -> None:
+    """Join points that matches connect, and add observations to points, in place."""
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    mapper.complete_and_merge_tracks(pycolmap.IncrementalTriangulatorOptions())
+    mapper.end_reconstruction(discard=False)
+
+
+def _triangulated_again(
+    model: pycolmap.Reconstruction, database: Path, *, output: Path, threads: int, fixed: Sequence[int]
+) -> pycolmap.Reconstruction:
+    """Return the model with points from all matches, adjusted until it converges."""
     output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads, extract_colors=False, ba_global_max_refinements=_REFINEMENTS
     )
-    joined = pycolmap.triangulate_points(
-        joined,
-        database,
-        output,
-        output,
-        clear_points=True,
-        options=options,
-        refine_intrinsics=not fixed,
+    model = pycolmap.triangulate_points(
+        model, database, output, output, clear_points=True, options=options, refine_intrinsics=not fixed
     )
-    held_out.adjust(joined, threads=threads, fixed=fixed, tolerance=_TOLERANCE)
-    held_out.drop_misfits(joined)
-    return joined
+    refine_model(model, threads=threads, fixed=fixed)
+    return model
 
 
-def _holds(joined: pycolmap.Reconstruction, first: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair]) -> bool:
-    """Return whether the matches between the old photos and the new ones agree with the joined model."""
-    old = set(first.reg_image_ids())
-    between = [pair for pair in pairs if (pair.one in old) != (pair.other in old)]
-    found = agreements(joined, between)
-    matches = sum(a.matches for a in found)
-    return matches > 0 and sum(a.matches * a.fraction for a in found) > matches / 2
+def _agreeing_fraction(model: pycolmap.Reconstruction, photos: set[int], pairs: Sequence[VerifiedPair]) -> float:
+    """Return the fraction of the matches between these photos and the others that agree with the model; 0 for none."""
+    between = [pair for pair in pairs if (pair.one in photos) != (pair.other in photos)]
+    found = agreements(model, between)
+    return sum(a.matches * a.fraction for a in found) / max(sum(a.matches for a in found), 1)
+
+
+def _largest_first(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    return sorted(models, key=lambda model: -model.num_reg_images())
 
 
 def _matched_keypoints(database: Path) -> dict[tuple[int, int], NDArray[np.int64]]:
