@@ -196,6 +196,38 @@ def walk(count: int, lens: Lens, *, radius: float = 5.0) -> list[View]:
     return [View(lens, looking_at(radius * d, (radius + 1) * d)) for d in directions]
 
 
+def town(count: int, lens: Lens, *, seed: int, blocks: int = 4) -> tuple[list[View], Scene]:
+    """Return a walk around each of `blocks` x `blocks` houses in turn, and the points of their walls.
+
+    Houses are 8 m wide and 4 m high, streets 6 m. The camera looks ahead at the house, and sees others behind it.
+    """
+    rng = np.random.default_rng(seed)
+    pitch, half = 14.0, 4.0
+    centres = pitch * np.array([[x, y, 0.0] for x in range(blocks) for y in range(blocks)])
+    outward = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])
+    along = np.roll(outward, -1, axis=0)
+    points, normals = [], []
+    for middle in centres:
+        for out, side in zip(outward, along, strict=True):
+            across = rng.uniform(-half, half, (400, 1))
+            heights = rng.uniform(-2, 2, (400, 1)) * [0.0, 0.0, 1.0]
+            points.append(middle + out * rng.uniform(half - 0.3, half, (400, 1)) + side * across + heights)
+            normals.append(np.tile(out, (400, 1)))
+
+    def place(house: int, turn: float) -> Array:
+        side, far = int(4 * (turn % 1)), pitch * (4 * turn % 1 - 0.5)
+        return centres[house] + outward[side] * pitch / 2 + along[side] * far
+
+    views = []
+    for index in range(count):
+        house, turn = divmod(index * len(centres) / count, 1.0)
+        middle = centres[int(house)]
+        ahead = middle + np.clip(place(int(house), turn + 0.12) - middle, -half, half)
+        centre = place(int(house), turn) + rng.normal(scale=0.05, size=3)
+        views.append(View(lens, looking_at(centre, ahead)))
+    return views, Scene(np.vstack(points), np.vstack(normals), np.arange(400 * 4 * len(centres)))
+
+
 def above(count: int, lens: Lens, *, seed: int, height: float = 5.0, tilt: float = 0.0) -> list[View]:
     """Return photos towards -z from a grid at about one height, as from a drone.
 

@@ -37,6 +37,7 @@ from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model import merging
 from nerfcli.poses.model.intrinsics import convert_camera
+from nerfcli.poses.model.locate import LocationAttempt
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs, rotation_errors
 
 pytestmark = pytest.mark.usefixtures("_quiet")
@@ -342,10 +343,12 @@ def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(
         return models
 
     monkeypatch.setattr(attempts, "map_photos", without_two)
+    monkeypatch.setattr(attempts, "locate_photos", lambda model, job, **options: (model, []))
     monkeypatch.setattr(attempts, "_MANY_PHOTOS", 10)
     notes: list[str] = []
     mapped = map_with_fallbacks(job, lambda *progress: None, notes.append)
-    assert [attempt["what"] for attempt in mapped.attempts][:2] == ["default thresholds", "lower angles"]
+    located = "remaining photos one by one, from the 3D points they see"
+    assert [attempt["what"] for attempt in mapped.attempts][:3] == ["default thresholds", located, "lower angles"]
     assert not any("start from" in attempt["what"] for attempt in mapped.attempts)
     # By the plan, 10 photos take 0.09 + 10 * 0.0005 s each.
     assert "not trying other starts, which take about 1 s each: most photos are registered" in notes
@@ -749,6 +752,27 @@ def test_the_search_of_larger_pictures_is_worth_what_is_missing(
     assert any(note.startswith(words) for note in notes)
 
 
+def test_single_photos_are_located_before_costlier_attempts(solved: Solved, monkeypatch: pytest.MonkeyPatch):
+    """Eight of ten photos are mapped. With the other two located, nothing else is tried; without, much is."""
+    model = pycolmap.Reconstruction(solved.model)
+    for image_id in (9, 10):
+        model.deregister_frame(model.image(image_id).frame_id)
+    monkeypatch.setattr(attempts, "map_photos", lambda *arguments, **options: [model])
+    tried = {}
+    for grown in (solved.model, model):
+        placed = [LocationAttempt(i, refused="" if grown is solved.model else "too few votes") for i in (9, 10)]
+        monkeypatch.setattr(
+            attempts, "locate_photos", lambda *arguments, grown=grown, placed=placed, **o: (grown, placed)
+        )
+        found = map_with_fallbacks(solved.job, lambda *progress: None)
+        tried[found.models[0].num_reg_images()] = [attempt["what"] for attempt in found.attempts]
+    one_by_one = "remaining photos one by one, from the 3D points they see"
+    assert tried[10] == ["default thresholds", one_by_one]
+    assert len(tried[8]) > 3
+    assert tried[8][:2] == tried[10]
+    assert tried[8].count(one_by_one) == 1  # not again from the same points
+
+
 def test_pairs_of_perspective_photos_ask_for_no_fisheye(solved: Solved):
     assert detect_fisheyes(solved.job) is None
 
@@ -766,10 +790,8 @@ def test_sub_models_are_merged_where_they_overlap(solved: Solved, tmp_path: Path
     reports: list[tuple[str, int, int]] = []
     merged = merging.merge_models(
         [first, second],
-        solved.job.database,
+        solved.job,
         output=tmp_path / "merged",
-        seed=0,
-        threads=1,
         report=lambda stage, done, total: reports.append((stage, done, total)),
     )
     assert reports == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
@@ -783,6 +805,23 @@ def test_sub_models_are_merged_where_they_overlap(solved: Solved, tmp_path: Path
         assert np.degrees((relative[0].rotation * relative[1].rotation.inverse()).angle()) < 0.3
 
 
+def test_a_model_that_the_matches_contradict_is_left_out_when_several_are_joined(solved: Solved):
+    """Photos 7 and 8 in the right place, 9 and 10 moved by the radius of the ring: only the former are added."""
+    base, right, wrong = (pycolmap.Reconstruction(solved.model) for _ in range(3))
+    for model, kept in ((base, range(1, 7)), (right, (7, 8)), (wrong, (9, 10))):
+        for image_id in set(range(1, 11)) - set(kept):
+            model.deregister_frame(model.image(image_id).frame_id)
+    radius = np.linalg.norm(base.image(1).projection_center())
+    shift = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([0.0, 0.0, radius]))
+    given = [merging._Aligned(wrong, shift), merging._Aligned(right, pycolmap.Sim3d())]
+    with pycolmap.Database.open(solved.job.database) as database:
+        cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions(min_num_matches=15))
+    pairs = read_verified_pairs(solved.job.database, min_matches=1)
+    joined, taken = merging._join(base, given, job=solved.job, cache=cache, pairs=pairs)
+    assert taken == given[1:]
+    assert sorted(joined.reg_image_ids()) == list(range(1, 9))
+
+
 def test_models_with_nothing_in_common_stay_apart(solved: Solved, tmp_path: Path):
     first = pycolmap.Reconstruction(solved.model)
     second = pycolmap.Reconstruction(solved.model)
@@ -791,7 +830,7 @@ def test_models_with_nothing_in_common_stay_apart(solved: Solved, tmp_path: Path
         model.deregister_frame(model.image(image_id).frame_id)
     for point_id in sorted(second.point3D_ids()):
         second.delete_point3D(point_id)
-    merged = merging.merge_models([second, first], solved.job.database, output=tmp_path / "m", seed=0, threads=1)
+    merged = merging.merge_models([second, first], solved.job, output=tmp_path / "m")
     assert sorted(model.num_reg_images() for model in merged) == [3, 7]
 
 

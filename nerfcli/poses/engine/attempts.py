@@ -67,6 +67,8 @@ def map_with_fallbacks(job: Job, report: Report, tell: Tell = lambda text: None)
         attempts.tell_results()
         tell("not trying anything else: the camera turned on the spot")
         return attempts.result()
+    if attempts.placed_fraction() >= _FEW_FRACTION:  # cheaper than any other way to place the last few
+        locate_single_photos(attempts)
     for reason, fallback in FALLBACKS:
         if reason(attempts) and attempts.has_time():
             fallback(attempts)
@@ -88,6 +90,7 @@ class MappingAttempts:
         self.report = report
         self.tell = tell
         self._with_features = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
+        self.located_from: list[pycolmap.Reconstruction] = []  # the models whose other photos were tried one by one
         self._results_told = 0
         self._announced = ""
         self._cut_short: list[str] = []
@@ -162,11 +165,8 @@ class MappingAttempts:
         if len(models) > 1:
             merged = merge_models(
                 models,
-                job.database,
+                job,
                 output=Path(job.folder) / f"merged_{number}",
-                seed=job.seed,
-                threads=job.threads,
-                fixed=job.fixed_cameras,
                 seconds=mapper_limit_seconds(self.photos),
                 report=self.report,
                 tell=self._cut,
@@ -333,7 +333,7 @@ def locate_single_photos(attempts: MappingAttempts) -> None:
     what = "remaining photos one by one, from the 3D points they see"
     models, job = attempts.best.models, attempts.best.job
     left = left_out(models[0], job) if models else []
-    if not 0 < len(left) <= _MOST_SINGLE_PHOTOS:
+    if not 0 < len(left) <= _MOST_SINGLE_PHOTOS or attempts.best.models is attempts.located_from:
         return
     attempts.announce(what)
     grown, located = locate_photos(models[0], job, image_ids=left, report=attempts.report)
@@ -344,6 +344,7 @@ def locate_single_photos(attempts: MappingAttempts) -> None:
     attempts.record[-1]["photos"] = [{"name": names[one.image_id], **asdict(one)} for one in located]
     if placed:
         attempts.best = replace(attempts.best, located=placed)
+    attempts.located_from = attempts.best.models
 
 
 def _without_exif(job: Job) -> Job:

@@ -130,9 +130,9 @@ def limit_seconds(planned: float) -> float:
     return max(10 * planned, LEAST_LIMIT_SECONDS)
 
 
-def checking_seconds(photos: int) -> float:
-    """Estimate the CPU seconds to check the poses of this many photos."""
-    return 2 + photos * 0.08
+def checking_seconds(photos: int, *, matches: float = 2000.0) -> float:
+    """Estimate the seconds to check the poses of this many photos, with so many verified matches for each."""
+    return (1 + photos * (0.04 + photos * 0.0002)) * (matches / 2000.0) ** 0.5
 
 
 class TimeEstimate:
@@ -170,7 +170,8 @@ class TimeEstimate:
             self._seconds["match"] *= done / max(self._plan.features, 1)
             stage, done, total = self._at
         elif stage == "matches":
-            self._seconds["map"] = self._planned["map"] = mapping_seconds(self._plan.photos, matches=done)
+            for name, seconds in (("map", mapping_seconds), ("check", checking_seconds)):
+                self._seconds[name] = self._planned[name] = seconds(self._plan.photos, matches=done)
             stage, done, total = self._at
         self._at = (stage, done, total)
         if stage in _SEARCH_FACTORS:

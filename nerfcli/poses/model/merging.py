@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from nerfcli.cameras.alignment import align as similarity
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import duration
+from nerfcli.poses.input.job import Job
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.held_out import MAPPER
 from nerfcli.poses.model.intrinsics import refine_model
@@ -34,10 +35,10 @@ _TOLERANCE, _REFINEMENTS = 1e-4, 2
 
 @dataclass(frozen=True)
 class _Aligned:
-    """A model, and the similarity that moves it into the frame of another; None if too few points agree."""
+    """A model, and the similarity that moves it into the frame of another."""
 
     model: pycolmap.Reconstruction
-    first_from_model: pycolmap.Sim3d | None
+    base_from_model: pycolmap.Sim3d
 
 
 @dataclass(frozen=True)
@@ -52,12 +53,9 @@ class CommonPoints:
 
 def merge_models(
     models: Sequence[pycolmap.Reconstruction],
-    database: Path,
+    job: Job,
     *,
     output: Path,
-    seed: int,
-    threads: int,
-    fixed: Sequence[int] = (),
     seconds: float = math.inf,
     report: Callable[[str, int, int], None] = lambda stage, done, total: None,
     tell: Callable[[str], None] = lambda text: None,
@@ -67,35 +65,37 @@ def merge_models(
     All that align with a model are merged with it at once. If all photos of a model are in a larger one, it is dropped.
 
     Args:
-        models: of one database, largest first; they are not changed.
+        models: of the job's database, largest first; they are not changed.
         output: a folder for temporary files of pycolmap.
         seconds: time after which the remaining models are not merged.
         report: called with ("merge", models done, models in all).
         tell: called with what was cut short, if anything was.
     """
-    pairs = read_verified_pairs(database, min_matches=1)
-    tracks = _matched_keypoints(database)
-    with pycolmap.Database.open(database) as opened:
+    pairs = read_verified_pairs(job.database, min_matches=1)
+    tracks = _matched_keypoints(job.database)
+    with pycolmap.Database.open(job.database) as opened:
         cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions(min_num_matches=MIN_MATCHES))
-    join = partial(_join, cache=cache, pairs=pairs, threads=threads, fixed=fixed)
+    join = partial(_join, job=job, cache=cache, pairs=pairs)
     merged: list[pycolmap.Reconstruction] = []
     left = list(models)
     start = time.perf_counter()
     while left:
         base, left = left[0], left[1:]
-        aligned: list[_Aligned] | None = None
-        while aligned is None or aligned:
+        grows = True
+        while grows:
             known = set(base.reg_image_ids())
             left = [model for model in left if not known.issuperset(model.reg_image_ids())]
             report("merge", len(models) - len(left) - 1, len(models))
             if time.perf_counter() - start > seconds:
                 tell(f"merging: {len(left)} of {len(models)} sub-models are left after {duration(seconds)}")
                 return _largest_first([*merged, base, *left])
-            found = [_Aligned(model, align(base, common_points(base, model, tracks), seed=seed)) for model in left]
-            base, aligned = join(base, [one for one in found if one.first_from_model is not None])
-            left = [model for model in left if not any(model is one.model for one in aligned)]
+            similarities = [align(base, common_points(base, model, tracks), seed=job.seed) for model in left]
+            aligned = [_Aligned(model, s) for model, s in zip(left, similarities, strict=True) if s is not None]
+            base, taken = join(base, aligned)
+            left = [model for model in left if not any(model is one.model for one in taken)]
+            grows = bool(taken)
         if not any(base is model for model in models):
-            base = _triangulated_again(base, database, output=output, threads=threads, fixed=fixed)
+            base = _triangulated_again(base, job, output=output)
         merged.append(base)
     report("merge", len(models), len(models))
     return _largest_first(merged)
@@ -173,10 +173,9 @@ def _join(
     base: pycolmap.Reconstruction,
     aligned: Sequence[_Aligned],
     *,
+    job: Job,
     cache: pycolmap.DatabaseCache,
     pairs: Sequence[VerifiedPair],
-    threads: int,
-    fixed: Sequence[int],
 ) -> tuple[pycolmap.Reconstruction, Sequence[_Aligned]]:
     """Return the base with the photos of all models that agree with it, in its frame, and these models.
 
@@ -187,11 +186,11 @@ def _join(
         owners = dict.fromkeys(base.reg_image_ids(), -1)
         for number, one in enumerate(aligned):
             moved = pycolmap.Reconstruction(one.model)
-            moved.transform(one.first_from_model)
+            moved.transform(one.base_from_model)
             owners = dict.fromkeys(moved.reg_image_ids(), number) | owners
             _add(joined, moved, {photo for photo, owner in owners.items() if owner == number})
         _merge_tracks(joined, cache)
-        held_out.adjust(joined, threads=threads, fixed=fixed, tolerance=_TOLERANCE)
+        held_out.adjust(joined, threads=job.threads, fixed=job.fixed_cameras, tolerance=_TOLERANCE)
         held_out.drop_misfits(joined)
         agreeing = [
             _agreeing_fraction(joined, {photo for photo, owner in owners.items() if owner == number}, pairs)
@@ -224,18 +223,22 @@ def _merge_tracks(model: pycolmap.Reconstruction, cache: pycolmap.DatabaseCache)
     mapper.end_reconstruction(discard=False)
 
 
-def _triangulated_again(
-    model: pycolmap.Reconstruction, database: Path, *, output: Path, threads: int, fixed: Sequence[int]
-) -> pycolmap.Reconstruction:
+def _triangulated_again(model: pycolmap.Reconstruction, job: Job, *, output: Path) -> pycolmap.Reconstruction:
     """Return the model with points from all matches, adjusted until it converges."""
     output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions(
-        num_threads=threads, extract_colors=False, ba_global_max_refinements=_REFINEMENTS
+        num_threads=job.threads, extract_colors=False, ba_global_max_refinements=_REFINEMENTS
     )
     model = pycolmap.triangulate_points(
-        model, database, output, output, clear_points=True, options=options, refine_intrinsics=not fixed
+        model,
+        job.database,
+        output,
+        output,
+        clear_points=True,
+        options=options,
+        refine_intrinsics=not job.fixed_cameras,
     )
-    refine_model(model, threads=threads, fixed=fixed)
+    refine_model(model, threads=job.threads, fixed=job.fixed_cameras)
     return model
 
 
