@@ -8,7 +8,7 @@ order of float32 sums.
 
 import atexit
 import io
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any, TypeVar
@@ -74,19 +74,46 @@ def own(rows: Tensor, total: int) -> Tensor:
     return rows[(rank() - (total - len(rows))) % count() :: count()].contiguous()
 
 
-def whole(own_rows: Tensor, total: int) -> Tensor:
-    """Return the rows of all processes, from what `own` has returned in each of a total."""
+def add_up_step(
+    losses: Mapping[str, Tensor],
+    of_rays: Tensor,
+    samples: int,
+    *,
+    rays: int,
+    leaves: Iterable[Tensor],
+    table_grad: Tensor | None,
+) -> tuple[dict[str, Tensor], Tensor, int]:
+    """Add up what all processes have found in a step; return the losses, the numbers of all rays and of samples.
+
+    Args:
+        losses: this process's contributions (), by name.
+        of_rays: a number for each of its rays, see `own`.
+        samples: number of its samples.
+        rays: number of the rays of all processes.
+        leaves: tensors whose gradients are added up in place; a process none of whose rays has a sample contributes 0.
+        table_grad: a further gradient, added up in place.
+    """
     if count() == 1:
-        return own_rows
-    rows = own_rows.new_zeros(total, *own_rows.shape[1:])
-    rows[rank() :: count()] = own_rows
-    add_up(rows)
-    return rows
+        return dict(losses), of_rays, samples
+    numbers = torch.stack([*losses.values(), torch.tensor(samples).to(of_rays)])
+    every = of_rays.new_zeros(rays, *of_rays.shape[1:])
+    every[rank() :: count()] = of_rays
+    _add_up(numbers)
+    _add_up(every)
+    *added, total = numbers
+    if total > 0:
+        learning = [leaf for leaf in leaves if leaf.requires_grad]
+        for leaf in learning:
+            leaf.grad = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+        _add_up(*(leaf.grad for leaf in learning if leaf.grad is not None))
+        if table_grad is not None:
+            _add_up(table_grad)
+    return dict(zip(losses, added, strict=True)), every, int(total)
 
 
-def add_up(*tensors: Tensor) -> None:
+def _add_up(*tensors: Tensor) -> None:
     """Replace tensors of one type by their sums over all processes, identical to the bit in each."""
-    if count() == 1 or not tensors:
+    if not tensors:
         return
     with _lost_processes_reported():
         if len(tensors) == 1:
@@ -96,25 +123,6 @@ def add_up(*tensors: Tensor) -> None:
         dist.all_reduce(joined)
     for tensor, part in zip(tensors, joined.split([tensor.numel() for tensor in tensors]), strict=True):
         tensor.copy_(part.view_as(tensor))
-
-
-def add_up_gradients(leaves: Iterable[Tensor]) -> None:
-    """Add up gradients; a process none of whose rays has a sample contributes 0."""
-    if count() == 1:
-        return
-    gradients = []
-    for leaf in leaves:
-        if leaf.requires_grad:
-            leaf.grad = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
-            gradients.append(leaf.grad)
-    add_up(*gradients)
-
-
-def total(number: int) -> int:
-    """Return the sum of a number over all processes."""
-    summed = torch.tensor(number)
-    add_up(summed)
-    return int(summed)
 
 
 def keep_largest(tensor: Tensor) -> None:

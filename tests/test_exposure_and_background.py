@@ -22,7 +22,7 @@ from nerfcli.photos.exif import log_exposures, mean_log_exposure, relative_log_e
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import render_picture
-from nerfcli.training import fitting
+from nerfcli.training import schedule
 from nerfcli.training.appearance import Appearance
 from nerfcli.training.checkpoints import Checkpoints, Totals
 from nerfcli.training.loop import Progress, train
@@ -30,6 +30,7 @@ from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.preparation import EarlierDecisions, prepare
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.step import light_from_beyond
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
 LEARNED = Components(background="sphere", exposure="learned")
@@ -237,13 +238,13 @@ def test_a_background_begins_with_the_colour_of_the_sky():
 def test_light_of_the_sky_does_not_end_before_it(capture, tmp_path, monkeypatch):
     prepared = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
     passed, sky = [], torch.ones(len(prepared.pool.colours), dtype=torch.bool)
-    for weight in (0.0, fitting.SKY_WEIGHT):
-        monkeypatch.setattr(fitting, "SKY_WEIGHT", weight)
+    for weight in (0.0, schedule.SKY_WEIGHT):
+        monkeypatch.setattr(schedule, "SKY_WEIGHT", weight)
         training = replace(prepared, sky=sky).fitting()
         for step in range(60):
             training.advance(step / 60)
         drawn = prepared.pool.draw(64, torch.Generator().manual_seed(0))
-        passed.append(float(training.light_from_beyond(drawn, distance=math.inf).mean()))
+        passed.append(float(light_from_beyond(training, drawn, training.plan, distance=math.inf).mean()))
     assert 1.0 - passed[1] < 0.7 * (1.0 - passed[0])
 
 

@@ -31,6 +31,7 @@ from nerfcli.training.optimiser import FieldOptimiser
 from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.step import row_decay
 
 DEFAULTS = Components()
 SMALL: dict[str, FieldSettings] = {
@@ -301,17 +302,17 @@ def training_of_two_photos(
 def test_decay_shrinks_with_the_rays_of_a_step_only_where_photos_have_alpha(
     has_alpha, spheres: Capture, monkeypatch: pytest.MonkeyPatch
 ):
-    """The law of `Fitting.row_decay`, and what the optimiser gets in a step of all rays that there may be."""
+    """The law of `row_decay`, and what the optimiser gets in a step of all rays that there may be."""
     training = training_of_two_photos(spheres, has_alpha=has_alpha, log2_rows=8)
     full = training.field.row_decay
     assert full > 0
-    assert [training.row_decay(rays) for rays in (1, 4000)] == [full, full]
-    assert training.row_decay(16000) == (full / 4 if has_alpha else full)
+    assert [row_decay(training, rays) for rays in (1, 4000)] == [full, full]
+    assert row_decay(training, 16000) == (full / 4 if has_alpha else full)
     given: list[float] = []
     monkeypatch.setattr(training.optimiser, "step", lambda number, rate, *, decay: given.append(decay))
     rays = training.advance(0.5).rays
     assert rays > 8000
-    assert given == [training.row_decay(rays)]
+    assert given == [row_decay(training, rays)]
 
 
 @pytest.mark.parametrize(("log2_rows", "most"), [(6, 16), (8, 32)])

@@ -212,7 +212,7 @@ def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(c
         emerging.append(fraction)
         return emerging_losses(depth_loss)
 
-    monkeypatch.setattr("nerfcli.training.fitting.emerging_losses", recorded)
+    monkeypatch.setattr("nerfcli.training.step.emerging_losses", recorded)
     for fraction in (0.0, 0.29, 0.3, 0.9):
         fitting.advance(fraction)
     assert emerging == [0.0, 0.29]
@@ -235,7 +235,7 @@ def test_points_of_a_narrow_baseline_fade_with_the_steps_of_a_training(
     losses = []
     for value in (0.0, 4.0):
         monkeypatch.setattr("nerfcli.training.schedule.EMERGING_ENDS", 1.0)
-        monkeypatch.setattr("nerfcli.training.fitting.emerging_losses", lambda off, value=value: 0 * off + value)
+        monkeypatch.setattr("nerfcli.training.step.emerging_losses", lambda off, value=value: 0 * off + value)
         fitting = prepared.fitting()
         assert fitting.points is not None
         trusted = [replace(points, trust=torch.ones_like(points.trust)) for points in fitting.points.sets]

@@ -50,22 +50,22 @@ atexit.register(gc.freeze)  # as in `nerfcli.__main__`
 sys.path.insert(0, {tests!r})
 from test_ranks import SPHERES, SMALL, VARIANTS, settings_with, torch, train_until
 from nerfcli import distributed
-from nerfcli.training.fitting import Fitting
-from nerfcli.training import sentinel
+from nerfcli.training import fitting, sentinel
 
 # After all that the program does at its end: threads that still listen would abort some processes, one in four.
 atexit.register(lambda: print("joined" if torch.distributed.is_initialized() else "parted"))
 for number, (components, (steps, last)) in enumerate(VARIANTS.items()):
     train_until(last, Path({folder!r}) / str(number), settings_with(components, steps))
 
-backward = Fitting._add_up_gradients
+in_one_process = fitting.step
 
-def poisoned(self, drawn, samples):
-    if distributed.rank() == 1 and self.step == 7 and self.rollbacks == 0:
-        self.field.weights[0].grad.fill_(math.nan)
-    return backward(self, drawn, samples)
+def poisoned(state, *args):
+    losses = in_one_process(state, *args)
+    if distributed.rank() == 1 and state.step == 7 and state.rollbacks == 0:
+        state.field.weights[0].grad.fill_(math.nan)
+    return losses
 
-Fitting._add_up_gradients = poisoned
+fitting.step = poisoned
 sentinel.SNAPSHOT_EVERY = 4
 train_until(12, Path({folder!r}) / "poisoned", SMALL)
 """

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -16,15 +17,12 @@ from nerfcli.kernels import numba_cpu
 from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 from nerfcli.render.model import load_model, save_model
 from nerfcli.render.pictures import render_picture
-from nerfcli.training import sentinel
+from nerfcli.training import fitting, sentinel, step
 from nerfcli.training.delayed import Delayed
-from nerfcli.training.fitting import Fitting
 from nerfcli.training.loop import train
 from nerfcli.training.runs.log import read_log
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.training.schedule import StepPlan
-from nerfcli.training.sentinel import replay
-from nerfcli.training.watch import FirstBad, is_finite
+from nerfcli.training.sentinel import FirstBad, is_finite, replay
 
 FEW = TrainSettings(
     budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, threads=2
@@ -48,6 +46,15 @@ def weights(run: Path) -> dict[str, bytes]:
     return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
 
 
+def with_rate_factors(factor_at: Callable[[fitting.Fitting], float]) -> Callable[..., None]:
+    """Return the update of a step whose learning rate is multiplied by a factor for its state."""
+
+    def update(state: fitting.Fitting, *args: Any, rate_factor: float) -> None:
+        step.update(state, *args, rate_factor=rate_factor * factor_at(state))
+
+    return update
+
+
 def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_failure(views, tmp_path):
     # Adam's first step has the length of the learning rate, whatever the gradient: weights of 1e12 to the fifth power.
     with pytest.raises(UserError, match=r"colour of samples is not finite at step 2: \d+ of \d+ numbers") as caught:
@@ -64,12 +71,8 @@ def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_fa
 
 
 def test_a_failure_is_passed_with_smaller_steps_and_counted(views, tmp_path, monkeypatch):
-    rate = Fitting.learning_rate
-
-    def poisoned(self: Fitting, plan: StepPlan) -> float:
-        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, plan)
-
-    monkeypatch.setattr(Fitting, "learning_rate", poisoned)
+    poisoned = with_rate_factors(lambda state: math.nan if state.step == 7 and state.rollbacks == 0 else 1.0)
+    monkeypatch.setattr(fitting, "update", poisoned)
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
     reported = fit(views, tmp_path / "run")
     (line,) = [line for line in reported if "continuing from step" in line]
@@ -87,15 +90,11 @@ def test_a_failure_is_passed_with_smaller_steps_and_counted(views, tmp_path, mon
 
 def test_the_way_back_is_exact(views, tmp_path, monkeypatch):
     # After the rollback, training equals one whose learning rate is halved from the snapshot on.
-    rate = Fitting.learning_rate
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
-    monkeypatch.setattr(Fitting, "learning_rate", lambda self, plan: rate(self, plan) * (self.step < 4 or 0.5))
+    monkeypatch.setattr(fitting, "update", with_rate_factors(lambda state: 1.0 if state.step < 4 else 0.5))
     fit(views, tmp_path / "known")
-
-    def poisoned(self: Fitting, plan: StepPlan) -> float:
-        return math.inf if self.step == 6 and self.rollbacks == 0 else rate(self, plan)
-
-    monkeypatch.setattr(Fitting, "learning_rate", poisoned)
+    poisoned = with_rate_factors(lambda state: math.inf if state.step == 6 and state.rollbacks == 0 else 1.0)
+    monkeypatch.setattr(fitting, "update", poisoned)
     fit(views, tmp_path / "found")
     assert weights(tmp_path / "found") == weights(tmp_path / "known")
 
@@ -131,13 +130,9 @@ def test_a_fault_that_does_not_come_back_changes_nothing(bad_call, on_gpu, views
 def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, tmp_path, monkeypatch):
     """A fault that does not come back is put down to a device that does not repeat its results."""
     monkeypatch.setattr(NumbaBackend, "deterministic", False)
-    rate = Fitting.learning_rate
-
-    def poisoned(self: Fitting, plan: StepPlan) -> float:
-        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, plan)
-
+    poisoned = with_rate_factors(lambda state: math.nan if state.step == 7 and state.rollbacks == 0 else 1.0)
     with monkeypatch.context() as patched:
-        patched.setattr(Fitting, "learning_rate", poisoned)
+        patched.setattr(fitting, "update", poisoned)
         patched.setattr(sentinel, "SNAPSHOT_EVERY", 4)
         reported = fit(views, tmp_path / "poisoned")
     (line,) = [line for line in reported if "continuing from step" in line]

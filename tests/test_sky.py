@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from nerfcli.field.background import SphereBackground
-from nerfcli.training.fitting import ROUGHNESS_WEIGHT
 from nerfcli.training.losses import colour_losses
 from nerfcli.training.optimiser import Adam
+from nerfcli.training.schedule import ROUGHNESS_WEIGHT
 from nerfcli.training.selection.diagnostics import explained_by_direction, paint
 
 PHOTOS = 12

@@ -19,8 +19,9 @@ from nerfcli.memory import default_memory_limit, resident_bytes
 from nerfcli.photos.images import downscale, write_png
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
 from nerfcli.training import preparation
+from nerfcli.training.appearance import over_background
 from nerfcli.training.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
-from nerfcli.training.losses import colour_losses, over_background
+from nerfcli.training.losses import colour_losses
 from nerfcli.training.normalisation import (
     box_frame,
     contracted_frame,

@@ -18,6 +18,7 @@ from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.selection.diagnostics import diagnose
 from nerfcli.training.selection.trials import Trials, TrialStart
+from nerfcli.training.step import light_from_beyond
 from nerfcli.training.storage import IN_MEMORY
 
 SETTINGS = TrainSettings(budget_seconds=None, steps=100, first_samples_per_step=2**11, threads=1)
@@ -177,7 +178,7 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
             return self.density(coordinates), torch.zeros_like(coordinates)
 
     monkeypatch.setattr(fitting.field, "medium", lambda detail: Fog())
-    found = fitting.light_from_beyond(trials._pool.rays_of(torch.arange(50)), distance=distance + 0.01)
+    found = light_from_beyond(fitting, trials._pool.rays_of(torch.arange(50)), fitting.plan, distance=distance + 0.01)
     assert found.tolist() == pytest.approx([math.exp(-sigma * (min(distance, 1.4) - 0.2))] * 50, rel=1e-5)
 
 

@@ -6,7 +6,6 @@ from torch import Tensor, nn
 from nerfcli.errors import UserError
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.exposure import Exposure
-from nerfcli.training.losses import over_background
 from nerfcli.training.pool import PixelBatch, Pool
 from nerfcli.training.refinement import Refinement
 from nerfcli.training.runs.components import LEARNED_BACKGROUNDS, Components
@@ -129,6 +128,18 @@ class Appearance(nn.Module):
         own = (rendered - transmittance[:, None] * behind).clamp_min(0.0) / opacity.clamp_min(LEAST_OPACITY)
         own = _up_to_white(self.exposure(own, photos), drawn.colours)
         return opacity * own + transmittance[:, None] * behind, measured
+
+
+def over_background(colours: Tensor, background: Tensor) -> Tensor:
+    """Return measured colours over `background` (R, 3): alpha * rgb + (1 - alpha) * background for RGBA.
+
+    Args:
+        colours: (R, 3) or (R, 4) with straight alpha.
+    """
+    if colours.shape[-1] == 3:
+        return colours
+    alpha = colours[:, 3:]
+    return alpha * colours[:, :3] + (1.0 - alpha) * background
 
 
 def _up_to_white(rendered: Tensor, colours: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from nerfcli.training.preparation import EarlierDecisions, Prepared
 from nerfcli.training.runs.config import read_config
 from nerfcli.training.runs.files import FIELD, STATE
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.training.watch import that_must_be_finite
+from nerfcli.training.sentinel import that_must_be_finite
 
 STATE_FORMAT = "nerfcli training 2"
 # Photos without alpha fill the frame; behind the field is black, and little of it shows through.

@@ -203,7 +203,7 @@ def _run(
     """
     settings = fitting.settings
     last_saved = totals.seconds
-    loss = 0.0
+    losses: dict[str, float] = {}
     logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
 
     def speeds() -> tuple[float, float]:
@@ -216,7 +216,8 @@ def _run(
         entry: LogEntry = {
             "step": fitting.step,
             "seconds": round(totals.seconds, 3),
-            "loss": loss,
+            "loss": sum(losses.values()),
+            "losses": losses,
             "samples": totals.samples,
             "rays": totals.rays,
             "samples_per_second": round(samples_per_second),
@@ -235,9 +236,9 @@ def _run(
             totals.seconds += distributed.largest(time.perf_counter() - began)
             totals.samples += result.samples
             totals.rays += result.rays
-            loss = result.loss
+            losses = result.losses
             fraction = _fraction(settings, fitting.step, totals)
-            on_progress(Progress(fraction, fitting.step, totals.seconds, loss, speeds()[0]))
+            on_progress(Progress(fraction, fitting.step, totals.seconds, result.loss, speeds()[0]))
             checkpoint_due = totals.seconds - last_saved >= CHECKPOINT_SECONDS
             if checkpoint_due or (waypoints and fraction >= waypoints[0]):
                 sentinel.settle()

@@ -4,11 +4,13 @@ Progress is the used fraction of the budget, in [0, 1]. Where a number of steps 
 Elsewhere are the levels that a detail opens (`HashField`), and the samples of a step by its number (`TrainSettings`).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import cos, pi
 
 import numpy as np
 
+from nerfcli.training.runs.components import LEARNED_BACKGROUNDS, Components
 from nerfcli.training.runs.settings import TrainSettings
 
 # Learning rate: the warm-up ends by this progress at the latest, however few steps that is.
@@ -31,6 +33,8 @@ FIRST_THRESHOLD, THRESHOLD, CLOSING_ENDS = 3e-4, 1e-2, 0.3
 EMERGING_ENDS = 0.3
 # With a narrow baseline, known distances are less accurate than what the field has learned after this many steps.
 NARROW_STEPS = 800
+# Weights of the opacity of rays that see the sky, and of the roughness of a learned background.
+SKY_WEIGHT, ROUGHNESS_WEIGHT = 0.1, 1e-6
 # Cameras: until the first progress there is fog, from which cameras learn nothing; until the second, the rate rises.
 # From the third to the fourth it falls to the last rate: the steps' noise averages out and the field can settle.
 CAMERAS_START, CAMERAS_FULL, CAMERAS_FALL, CAMERAS_END, LAST_CAMERA_RATE = 0.1, 0.15, 0.5, 0.98, 0.03
@@ -55,20 +59,25 @@ class StepPlan:
     """What a step does at its progress.
 
     Args:
+        step: number of steps before it.
+        samples: target number of samples.
         learning_rate: of the field.
         detail: of the field, see `Field.medium`.
         stride: length of the steps along rays, as a multiple of those of the capture; `SHORTEST` for the shortest.
         threshold: optical depth per step below which cells are closed.
-        point_weight: of known distances, as a multiple of their component; 0 where no more are drawn.
+        weights: of the losses that count, by their names in `losses.LOSSES`; no pixels at known distances are drawn
+            without a weight for "points".
         are_emerging: whether known distances are a log likelihood, see `emerging_losses`.
         cameras: how cameras learn.
     """
 
+    step: int
+    samples: float
     learning_rate: float
     detail: float
     stride: int
     threshold: float
-    point_weight: float
+    weights: Mapping[str, float]
     are_emerging: bool
     cameras: CameraPlan
 
@@ -104,11 +113,13 @@ class Schedule:
         """
         closed = min(1.0, max(step / self.closing_steps, furthest / CLOSING_ENDS))
         return StepPlan(
+            step=step,
+            samples=self.settings.samples_at(step),
             learning_rate=self.learning_rate(progress, step),
             detail=self.detail(furthest, step),
             stride=stride(progress, step),
             threshold=FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed,
-            point_weight=point_weight(progress, step, self.parallax),
+            weights=loss_weights(self.settings.components, point_weight(progress, step, self.parallax)),
             are_emerging=progress < EMERGING_ENDS,
             cameras=camera_plan(max(0.0, progress - self.cameras_from) / (1.0 - self.cameras_from)),
         )
@@ -135,8 +146,24 @@ def stride(progress: float, step: int) -> int:
     return next((stride for until, stride in STRIDES if progress <= until), SHORTEST)
 
 
+def loss_weights(components: Components, point_weight: float) -> dict[str, float]:
+    """Return `StepPlan.weights`.
+
+    Args:
+        point_weight: of known distances, as a multiple of their component.
+    """
+    weights = {
+        "colour": 1.0,
+        "distortion": components.distortion,
+        "points": components.points * point_weight,
+        "sky": SKY_WEIGHT if components.background == "sphere" else 0.0,
+        "roughness": ROUGHNESS_WEIGHT if components.background in LEARNED_BACKGROUNDS else 0.0,
+    }
+    return {name: weight for name, weight in weights.items() if weight}
+
+
 def point_weight(progress: float, step: int, parallax: float) -> float:
-    """Return `StepPlan.point_weight`: linear from 1 to 0, and with a narrow baseline also times min(1, 800 / step).
+    """Return the weight of known distances: linear from 1 to 0, with a narrow baseline also times min(1, 800 / step).
 
     Once there are surfaces, photos tell more; but without points, haze before them comes back where few photos look.
     """

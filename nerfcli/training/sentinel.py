@@ -11,7 +11,7 @@ would not help, and the training simply continues.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +27,67 @@ from nerfcli.render.trained_field import Marching
 from nerfcli.training.fitting import Fitting, StepResult
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.training.watch import BadTensor, FirstBad, NonFiniteError, is_finite, that_must_be_finite
+from nerfcli.training.step import NonFiniteError, Watch
 
 FAILURE_FORMAT = "nerfcli failure 1"
 FAILURES = "failure-*.safetensors"
 SNAPSHOT_EVERY = 256
 MOST_ROLLBACKS = 3
+
+
+@dataclass(frozen=True)
+class BadTensor:
+    """A tensor that is not finite.
+
+    Args:
+        name: what it is: "density of samples", "gradient of weights.0".
+        count, total: how many of its numbers are not finite, and how many it has.
+        rays: numbers of the rays of the batch that the bad numbers belong to; empty where they belong to no ray.
+    """
+
+    name: str
+    count: int
+    total: int
+    rays: tuple[int, ...]
+
+
+class FirstBad(Watch):
+    """Looks at every number of every tensor, and remembers the first tensor that is not finite."""
+
+    def __init__(self) -> None:
+        self.found: BadTensor | None = None
+
+    def state(self, give: Callable[[], tuple[dict[str, Tensor], Any]]) -> None:
+        for name, tensor in that_must_be_finite(give()[0]).items():
+            self.values(name.removeprefix("field."), tensor)
+
+    def values(self, name: str, tensor: Tensor, rays: Tensor | None = None) -> None:
+        """Look at a tensor; `rays` (N,) are the rays that its rows belong to."""
+        if self.found is not None or is_finite(tensor):
+            return
+        bad = ~tensor.detach().isfinite()
+        which: Tensor = torch.empty(0)
+        if rays is not None:
+            which = rays[bad.reshape(len(bad), -1).any(1)].unique()
+        self.found = BadTensor(name, int(bad.sum()), bad.numel(), tuple(which.long().tolist()))
+
+    def rows(self, name: str, tensor: Tensor, rays: Tensor) -> None:
+        self.values(name, tensor, rays)
+        if tensor.requires_grad:
+            tensor.register_hook(lambda gradient: self.values(f"gradient of {name}", gradient, rays))
+
+
+def that_must_be_finite(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors of a state that must be finite; cells that no step has evaluated yet have infinite density."""
+    return {name: tensor for name, tensor in state.items() if name not in ("optical_depth", "fine_depth")}
+
+
+def is_finite(tensor: Tensor) -> bool:
+    """Return whether all values of a tensor are finite, without a temporary of its size."""
+    if tensor.numel() == 0 or not tensor.is_floating_point():
+        return True
+    smallest, largest = tensor.detach().aminmax()
+    return bool((smallest.isfinite() & largest.isfinite()).item())
 
 
 class Sentinel:
@@ -49,20 +104,20 @@ class Sentinel:
         self._pool = pool
         self._run = run
         self._notify = notify
-        self._fractions: list[float] = []  # budget fractions of the steps since the copy
+        self._progress: list[float] = []  # progress of the steps since the copy
         self._tensors, self._description = _copied(*fitting.state())
 
-    def advance(self, fraction: float) -> StepResult:
+    def advance(self, progress: float) -> StepResult:
         """Take one step, see `Fitting.advance`; after a failure, it may be the repetition of an earlier one.
 
         Raises:
             UserError: numbers become non-finite despite smaller steps, exit code 5.
         """
-        self._fractions.append(fraction)
+        self._progress.append(progress)
         try:
-            if len(self._fractions) > SNAPSHOT_EVERY:
-                self._take_snapshot(fraction)
-            return self._fitting.advance(fraction)
+            if len(self._progress) > SNAPSHOT_EVERY:
+                self._take_snapshot(progress)
+            return self._fitting.advance(progress)
         except NonFiniteError:
             return self._recover()
 
@@ -77,7 +132,7 @@ class Sentinel:
         except NonFiniteError:
             self._recover()
 
-    def _take_snapshot(self, fraction: float) -> None:
+    def _take_snapshot(self, progress: float) -> None:
         self._fitting.settle()
         tensors, description = self._fitting.state()
         if not all(map(is_finite, that_must_be_finite(tensors).values())):
@@ -90,7 +145,7 @@ class Sentinel:
             self._description = description
         else:  # Adam has no moments before its first step
             self._tensors, self._description = _copied(tensors, description)
-        self._fractions = [fraction]
+        self._progress = [progress]
 
     def _go_back(self) -> None:
         self._fitting.restore(*_copied(self._tensors, self._description))
@@ -102,10 +157,10 @@ class Sentinel:
         deterministic = fitting.field.backend.deterministic
         before = self._tensors, self._description
         done, bad, result = 0, None, None
-        while bad is None and done < len(self._fractions):
+        while bad is None and done < len(self._progress):
             if not deterministic:  # this state cannot be reproduced
                 before = _copied(*fitting.state())
-            result, bad = _watched_step(fitting, self._fractions[done])
+            result, bad = _watched_step(fitting, self._progress[done])
             bad = _first_of_all(bad)
             done += 1
         if bad is None:
@@ -122,9 +177,9 @@ class Sentinel:
             return result
         fitting.restore(*_copied(*before))
         if deterministic:
-            for fraction in self._fractions[: done - 1]:
-                fitting.advance(fraction)
-        path, text = self._keep(self._fractions[done - 1], bad)
+            for progress in self._progress[: done - 1]:
+                fitting.advance(progress)
+        path, text = self._keep(self._progress[done - 1], bad)
         self._go_back()
         if fitting.rollbacks == MOST_ROLLBACKS:
             raise UserError(
@@ -139,15 +194,15 @@ class Sentinel:
             f"{fitting.rollbacks} of {MOST_ROLLBACKS} retries); {path} has the state before the failure"
         )
         self._description = fitting.state()[1]  # a later failure keeps these smaller steps
-        first, self._fractions = self._fractions[0], []
+        first, self._progress = self._progress[0], []
         return self.advance(first)
 
-    def _keep(self, fraction: float, bad: BadTensor) -> tuple[Path, str]:
+    def _keep(self, progress: float, bad: BadTensor) -> tuple[Path, str]:
         """Save the state before a step with its batch; return the path and a description of the failure to come."""
         fitting = self._fitting
         tensors, description = fitting.state()
         before = {name: tensor.clone() for name, tensor in tensors.items()}
-        drawn = fitting.draw(fitting.schedule.at(fraction, step=fitting.step, furthest=fitting.largest_fraction))
+        drawn = fitting.draw(fitting.schedule.at(progress, step=fitting.step, furthest=fitting.furthest))
         batch = {
             **drawn._asdict(),
             "first_pixel": fitting.pool.first_pixel,
@@ -166,7 +221,7 @@ class Sentinel:
             "format": FAILURE_FORMAT,
             "message": text,
             "tensor": bad.name,
-            "share": fraction,
+            "share": progress,
             "pixels": [list(pixel) for pixel in pixels],
             "settings": fitting.settings.to_json(),
             "marching": vars(fitting.marching),
@@ -232,11 +287,11 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
     return description, _watched_step(fitting, description["share"])[1]
 
 
-def _watched_step(fitting: Fitting, fraction: float) -> tuple[StepResult | None, BadTensor | None]:
+def _watched_step(fitting: Fitting, progress: float) -> tuple[StepResult | None, BadTensor | None]:
     """Take a step that checks every number; return its result and the first tensor that is not finite."""
     watch = FirstBad()
     try:
-        result = fitting.advance(fraction, watch)
+        result = fitting.advance(progress, watch)
     except NonFiniteError:
         # If no number is bad, the numbers are so large that their sum is.
         return None, watch.found or BadTensor("sum of the gradients", 1, 1, ())

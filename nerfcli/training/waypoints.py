@@ -21,7 +21,7 @@ from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.held_out_exposure import log_gains_of
 from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.render.tracing import render_rays
-from nerfcli.training.losses import over_background
+from nerfcli.training.appearance import over_background
 from nerfcli.training.pool import PixelPool, load_album
 from nerfcli.training.preparation import Prepared
 from nerfcli.training.runs.log import add_to_log

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from html import escape
-from typing import Any
+from typing import Any, Literal
 
 from nerfcli.evaluate.report.run_facts import RunFacts, captures_of
 from nerfcli.pages.page import table
@@ -70,7 +70,9 @@ def _number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
-def last_logged(key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
+def last_logged(
+    key: Literal["seconds", "step", "peak_memory_bytes"], form: str, scale: float = 1.0
+) -> Callable[[RunFacts], str]:
     """Return a formatter of the last logged value; it gives "" if there is none."""
     return lambda run: form.format(run.log[-1][key] / scale) if run.log and key in run.log[-1] else ""
 

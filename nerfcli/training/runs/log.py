@@ -15,13 +15,14 @@ from nerfcli.training.runs.files import LOG
 class LogEntry(TypedDict):
     """A line of the log: totals since the start, and speeds since the previous line.
 
-    Lines of earlier versions may lack entries that are not in `_REQUIRED`. Only the lines of waypoints have
-    `heldout_psnr`.
+    `losses` are the weighted terms of `loss` by name, see `training.losses`. Lines of earlier versions may lack what
+    is not in `_REQUIRED`; only the lines of waypoints have `heldout_psnr`.
     """
 
     step: int
     seconds: float
     loss: float
+    losses: NotRequired[dict[str, float]]
     samples: int
     rays: int
     peak_memory_bytes: int

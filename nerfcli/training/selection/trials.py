@@ -28,6 +28,7 @@ from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import FEWEST_LOG2_ROWS, TrainSettings
 from nerfcli.training.selection.diagnostics import Diagnostics, diagnose, paint
+from nerfcli.training.step import compare, light_from_beyond
 from nerfcli.training.storage import IN_MEMORY, PhotoStorage
 
 JUDGED_PIXELS = 8192
@@ -166,14 +167,14 @@ class Trials:
             return None
         drawn = self._pool.draw(JUDGED_PIXELS, fitting.generator)
         with torch.no_grad():
-            rendered, measured = fitting.compare(drawn)
+            rendered, measured = compare(fitting, drawn, fitting.plan)
         reach = self._extent.reach
         signs = diagnose(
             rendered,
             measured,
             self._pool.photo_of(drawn.numbers),
             directions=drawn.directions,
-            from_beyond=fitting.light_from_beyond(drawn, distance=math.inf if reach is None else reach),
+            from_beyond=light_from_beyond(fitting, drawn, fitting.plan, distance=math.inf if reach is None else reach),
             count=len(self._counts),
         )
         tensors, description = fitting.state()
@@ -261,7 +262,7 @@ class Trials:
     def _errors(self, fitting: Fitting) -> np.ndarray:
         """Return the sums of squared differences of the judged pixels, (photos,)."""
         fitting.settle()
-        rendered, measured = fitting.compare(self._judged)
+        rendered, measured = compare(fitting, self._judged, fitting.plan)
         errors = (rendered.clamp(0.0, 1.0) - measured).square().sum(-1).double().cpu().numpy()
         return np.bincount(self._photos, errors, len(self._counts))
 
