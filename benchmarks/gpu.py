@@ -172,7 +172,7 @@ def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[
     from nerfcli.kernels.triton_cuda.backend import TritonBackend
     from nerfcli.photos.loading import load_photos
     from nerfcli.training.extent import choose_extent
-    from nerfcli.training.fitting import Fitting
+    from nerfcli.training.fitting import Fitting, TrainingInputs
     from nerfcli.training.pool import PixelPool
     from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 
@@ -192,7 +192,7 @@ def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[
     extent = choose_extent(captured, settings, fills_frame=all(photo.pixels.shape[-1] == 3 for photo in photos))
     pool = PixelPool(photos, extent.training_from_scene, device)
     marching = extent.marching.stretched(20.0) if dry else extent.marching
-    fitting = Fitting(pool, marching, contraction=extent.contraction, settings=settings)
+    fitting = Fitting(TrainingInputs(settings, replace(extent, marching=marching), pool))
     fitting.field.backend = TritonBackend(device)
     return fitting, extent.training_from_scene
 

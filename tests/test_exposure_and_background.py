@@ -25,6 +25,7 @@ from nerfcli.render.pictures import render_picture
 from nerfcli.training import schedule
 from nerfcli.training.appearance import Appearance
 from nerfcli.training.checkpoints import Checkpoints, Totals
+from nerfcli.training.fitting import Fitting
 from nerfcli.training.loop import Progress, train
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.preparation import EarlierDecisions, prepare
@@ -127,9 +128,9 @@ def test_known_exposures_keep_their_differences_while_the_others_are_learned(cap
     """Two of the three training photos are known, with exposures that they do not have."""
     components = Components(exposure="matched", masks="empty")
     settings = replace(SHORT, components=components, steps=60)
-    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    inputs = prepare(capture, settings, run=tmp_path, notify=lambda text: None)
     given = torch.tensor([[0.9, 0.6, 0.3], [-0.9, -0.6, -0.3], [math.nan] * 3])
-    training = replace(prepared, log_gains=given).fitting()
+    training = Fitting(replace(inputs, log_gains=given))
     assert training.appearance.exposure is not None
     assert training.appearance.exposure.log_gains()[2].tolist() == [0.0] * 3
     for step in range(60):
@@ -139,7 +140,7 @@ def test_known_exposures_keep_their_differences_while_the_others_are_learned(cap
     assert (found[2] - found[:2].mean(0)).abs().min() > 0.01
     assert found.mean(0).abs().max() < 1e-6
     # All of it is restored when a training is resumed.
-    again = replace(prepared, log_gains=given).fitting()
+    again = Fitting(replace(inputs, log_gains=given))
     again.restore(*training.state())
     assert again.appearance.exposure is not None
     assert torch.equal(again.appearance.exposure.log_gains(), training.appearance.exposure.log_gains())
@@ -151,10 +152,11 @@ def test_a_resumed_training_keeps_the_exposures_that_auto_has_fixed(capture, tmp
     monkeypatch.setattr("nerfcli.training.evidence.dense_depths", lambda *photos, **options: [])
     monkeypatch.setattr("nerfcli.training.evidence.matched_log_gains", lambda photos, dense: found)
     settings, notes = replace(SHORT, model="auto", components=Components()), []
-    first = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    first = prepare(capture, SHORT, run=tmp_path, notify=lambda text: None)
     begun = EarlierDecisions(first.extent, Components(exposure="matched"), None)
-    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=begun, notify=notes.append)
-    np.testing.assert_array_equal(prepared.log_gains.numpy(), found)
+    inputs = prepare(capture, settings, run=tmp_path, begun=begun, notify=notes.append)
+    assert inputs.log_gains is not None
+    np.testing.assert_array_equal(inputs.log_gains.numpy(), found)
     assert "matched pixels give the exposure of 2 of 3 photos; the others are learned" in notes
 
 
@@ -236,26 +238,27 @@ def test_a_background_begins_with_the_colour_of_the_sky():
 
 
 def test_light_of_the_sky_does_not_end_before_it(capture, tmp_path, monkeypatch):
-    prepared = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
-    passed, sky = [], torch.ones(len(prepared.pool.colours), dtype=torch.bool)
+    inputs = prepare(capture, SHORT, run=tmp_path, notify=lambda text: None)
+    inputs = replace(inputs, extent=inputs.extent.before("sphere", sky_known=False))  # few steps clear a short way
+    passed, sky = [], torch.ones(len(inputs.pool.colours), dtype=torch.bool)
     for weight in (0.0, schedule.SKY_WEIGHT):
         monkeypatch.setattr(schedule, "SKY_WEIGHT", weight)
-        training = replace(prepared, sky=sky).fitting()
+        training = Fitting(replace(inputs, sky=sky))
         for step in range(60):
             training.advance(step / 60)
-        drawn = prepared.pool.draw(64, torch.Generator().manual_seed(0))
+        drawn = inputs.pool.draw(64, torch.Generator().manual_seed(0))
         passed.append(float(light_from_beyond(training, drawn, training.plan, distance=math.inf).mean()))
     assert 1.0 - passed[1] < 0.7 * (1.0 - passed[0])
 
 
 def test_space_that_no_training_ray_has_reached_is_empty_before_a_known_sky(capture, tmp_path):
     detailed = replace(SHORT, log2_rows=DETAILED_LOG2_ROWS)
-    prepared = prepare(capture, detailed, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
-    for sky in (None, torch.ones(len(prepared.pool.colours), dtype=torch.bool)):
-        training = replace(prepared, sky=sky).fitting()
+    inputs = prepare(capture, detailed, run=tmp_path, notify=lambda text: None)
+    for sky in (None, torch.ones(len(inputs.pool.colours), dtype=torch.bool)):
+        training = Fitting(replace(inputs, sky=sky))
         for step in range(3):
             training.advance(step / 3)
-        model = Checkpoints(tmp_path, training, Totals(), prepared=prepared, scene=capture).model()
+        model = Checkpoints(tmp_path, training, Totals(), inputs=inputs, scene=capture).model()
         assert torch.equal(model.occupied, training.cells.coarse if sky is None else training.cells.visited)
         assert bool(model.occupied.all()) == (sky is None)
         assert model.occupied.any()
@@ -263,8 +266,8 @@ def test_space_that_no_training_ray_has_reached_is_empty_before_a_known_sky(capt
 
 def test_directions_without_pixels_take_the_colours_of_their_neighbours(capture, tmp_path):
     """No direction reads the middle of the grid, so only the roughness penalty lowers an outlying vertex there."""
-    prepared = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
-    training = prepared.fitting()
+    inputs = prepare(capture, SHORT, run=tmp_path, notify=lambda text: None)
+    training = Fitting(inputs)
     assert training.appearance.background is not None
     logits = training.appearance.background.logits
     logits.data[:, 16, 16, 16] = 1.0

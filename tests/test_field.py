@@ -132,14 +132,16 @@ def test_a_fresh_field_is_a_thin_grey_fog():
     assert (rgb.mean(0) - 0.5).abs().max() < 0.25
 
 
-@pytest.mark.parametrize(("fraction", "learning"), [(None, 6), (0.0, 4), (0.24, 4), (0.26, 5), (0.5, 6), (1.0, 6)])
-def test_fine_levels_learn_later(fraction, learning):
-    """Of 6 levels, 4 learn from the start and the others open one by one until half of the budget; a field read from a
-    file has all. Levels that do not learn have no gradient, nor do the weights that read them."""
+@pytest.mark.parametrize(
+    ("detail", "learning"), [(None, 6), (-0.1, 3), (0.0, 4), (0.49, 4), (0.51, 5), (1.0, 6), (2.0, 6)]
+)
+def test_fine_levels_learn_later(detail, learning):
+    """Of 6 levels, 4 learn from the start and the others open one by one with the detail; a field read from a file has
+    all. Levels that do not learn have no gradient, nor do the weights that read them."""
     field = HashField(HashFieldSettings(contraction="none", levels=6, log2_rows=8, coarsest=4, finest=64, width=16))
-    detail = {} if fraction is None else {"detail": fraction}
+    given = {} if detail is None else {"detail": detail}
     directions = torch.nn.functional.normalize(torch.randn(5, 3), dim=-1)
-    density, rgb = radiance_of(field, torch.rand(50, 3), directions, torch.arange(50) // 10, **detail)
+    density, rgb = radiance_of(field, torch.rand(50, 3), directions, torch.arange(50) // 10, **given)
     (density.sum() + rgb.sum()).backward()
     by_weight = field.weights[0].grad
     assert field.table.grad is not None

@@ -26,7 +26,8 @@ from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.render.trained_field import Marching
 from nerfcli.training import fitting
-from nerfcli.training.fitting import Fitting
+from nerfcli.training.extent import Extent
+from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.optimiser import FieldOptimiser
 from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.components import Components
@@ -295,7 +296,8 @@ def training_of_two_photos(
         budget_seconds=None, steps=9, log2_rows=log2_rows, first_samples_per_step=2**20, samples_per_step=2**20,
         components=components,
     )  # fmt: skip
-    return Fitting(pool, Marching(near, 4.0, 0.5, 0.0), contraction="none", settings=settings)
+    extent = Extent("none", Similarity.identity(), Marching(near, 4.0, 0.5, 0.0))
+    return Fitting(TrainingInputs(settings, extent, pool))
 
 
 @pytest.mark.parametrize("has_alpha", [True, False])

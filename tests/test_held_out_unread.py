@@ -21,7 +21,7 @@ from nerfcli.captures.loading import load_scene
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.matching.sky import sky_masks
 from nerfcli.photos.images import read_image, write_png
-from nerfcli.training import evidence, loop, preparation, waypoints
+from nerfcli.training import evidence, loop, schedule, waypoints
 from nerfcli.training.loop import train
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.files import FIELD
@@ -106,7 +106,8 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_no_held_out_photo_is_opened_before_the_training_is_over(case, capture, opened, tmp_path, monkeypatch):
     monkeypatch.setattr(selection, "FEWEST_STEPS", 1)
-    monkeypatch.setattr(preparation, "SEARCH_FRACTION", 1.0)
+    monkeypatch.setattr(schedule, "FEWEST_STEPS", 1)
+    monkeypatch.setattr(schedule, "SEARCH_FRACTION", 1.0)
     until_then: list[str] = []
     measure = waypoints.measure_waypoints
 
@@ -138,7 +139,8 @@ def test_no_held_out_photo_is_opened_before_the_training_is_over(case, capture, 
 @pytest.mark.parametrize("case", ["default", "auto"])
 def test_the_field_does_not_depend_on_what_is_in_held_out_photos(case, capture, tmp_path, monkeypatch):
     monkeypatch.setattr(selection, "FEWEST_STEPS", 1)
-    monkeypatch.setattr(preparation, "SEARCH_FRACTION", 1.0)
+    monkeypatch.setattr(schedule, "FEWEST_STEPS", 1)
+    monkeypatch.setattr(schedule, "SEARCH_FRACTION", 1.0)
     # A budget in steps gives trials of equal length; seconds would differ.
     chosen = settings(*CASES[case])
     fit(load_scene(capture), tmp_path / "run", chosen)

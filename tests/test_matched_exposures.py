@@ -1,18 +1,13 @@
 """Exposures from pixels that photos have in common, on photos whose gains are known."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
-from test_stereo import OFFSETS, PINHOLE, photo, tracks, truth
+from test_stereo import OFFSETS, PINHOLE, photo, truth
 
 from nerfcli.matching.exposures import matched_log_gains
 from nerfcli.matching.stereo import DenseDepth
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.training.evidence import Evidence
-from nerfcli.training.runs.components import Components
-from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.evidence import Evidence, confirmed_by_exif
 
 GAINS = np.array([[0.0, 0.1, -0.1], [0.4, 0.4, 0.4], [-0.5, -0.4, -0.3], [0.1, -0.1, 0.0]])
 NOTHING = DenseDepth(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
@@ -73,11 +68,9 @@ def test_exposures_count_where_exif_confirms_them(exif, is_kept, monkeypatch):
     gains = [-0.6, 0.6, -0.3, 0.3, 0.0, 0.1]
     photos = [exposed(photo(0.12 * k, contrast=1.5), np.full(3, gain)) for k, gain in enumerate(gains)]
     monkeypatch.setattr("nerfcli.training.evidence.log_exposures", lambda frames: np.array(exif))
-    shared: Any = SimpleNamespace(tracks=tracks(photos))
-    album, extent, pool = SimpleNamespace(photos=photos), SimpleNamespace(training_from_scene=None), None
-    evidence = Evidence(shared, album, pool, extent, TrainSettings(), lambda text: None)  # type: ignore[arg-type]
-    assert np.isfinite(evidence.log_gains).all() == is_kept
-    assert evidence.exposure_spread == pytest.approx(np.std(gains) if is_kept else 0.0, abs=0.03)
-    asked = TrainSettings(components=Components(exposure="matched"))
-    evidence = Evidence(shared, album, pool, extent, asked, lambda text: None)  # type: ignore[arg-type]
-    assert evidence.log_gains.mean(1) == pytest.approx(np.array(gains) - np.mean(gains), abs=0.03)
+    found = matched_log_gains(photos, [depth(one) for one in photos])
+    assert found.mean(1) == pytest.approx(np.array(gains) - np.mean(gains), abs=0.03)
+    confirmed = confirmed_by_exif(found, photos)
+    assert np.isfinite(confirmed).all() == is_kept
+    spread = Evidence(may_match=True, log_gains=confirmed).exposure_spread
+    assert spread == pytest.approx(np.std(gains) if is_kept else 0.0, abs=0.03)

@@ -21,7 +21,8 @@ from nerfcli.matching.occluders import occluder_masks
 from nerfcli.matching.stereo import DenseDepth
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.training import preparation
+from nerfcli.training import preparation, schedule
+from nerfcli.training.fitting import TrainingInputs
 from nerfcli.training.loop import train
 from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.components import Components
@@ -193,8 +194,7 @@ def test_a_pool_draws_no_pixel_that_is_left_out(is_masked):
     used = generator.random((150, 200)) < 0.5 if is_masked else None
     photos = [replace(one, used=used) for one in walls()[:2]]
     left_out = [generator.random((150, 200)) < 0.3, np.zeros((150, 200), bool)]
-    pool = PixelPool(photos, SAME, torch.device("cpu"))
-    pool.leave_out(left_out)
+    pool = PixelPool(photos, SAME, torch.device("cpu")).without(left_out)
     wanted = [~mask if used is None else used & ~mask for mask in left_out]
     whole = PixelPool(
         [replace(one, used=mask) for one, mask in zip(photos, wanted, strict=True)], SAME, torch.device("cpu")
@@ -205,7 +205,7 @@ def test_a_pool_draws_no_pixel_that_is_left_out(is_masked):
     drawn = pool.numbers(2000, torch.Generator().manual_seed(0))
     assert np.concatenate([mask.ravel() for mask in wanted])[drawn.numpy()].all()
     with pytest.raises(UserError, match="no pixels are left"):
-        pool.leave_out([np.ones((150, 200), bool)] * 2)
+        pool.without([np.ones((150, 200), bool)] * 2)
 
 
 def test_the_walls_are_as_far_away_as_their_planes():
@@ -238,10 +238,9 @@ def capture(tmp_path: Path) -> Capture:
 def test_a_training_leaves_out_what_it_finds_and_writes_masks(capture, tmp_path, monkeypatch, model):
     """With auto, the trials are without these pixels, too."""
     monkeypatch.setattr(selection, "FEWEST_STEPS", 1)
-    seen: list[list[LoadedPhoto]] = []
-    monkeypatch.setattr(
-        preparation, "Trials", lambda photos, *rest, **named: seen.append(photos) or Trials(photos, *rest, **named)
-    )
+    monkeypatch.setattr(schedule, "FEWEST_STEPS", 1)
+    seen: list[TrainingInputs] = []
+    monkeypatch.setattr(preparation, "Trials", lambda inputs: seen.append(inputs) or Trials(inputs))
     chosen = TrainSettings(
         budget_seconds=None, steps=40, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, model=model,
         components=Components(occluders=model == "default"),
@@ -256,8 +255,8 @@ def test_a_training_leaves_out_what_it_finds_and_writes_masks(capture, tmp_path,
     assert left_out[~disc].mean() < 0.05
     assert any(note.startswith("occluders: ") and "in 1 of 6 photos" in note for note in notes)
     if model == "auto":
-        (photos,) = seen
-        assert [one.used is not None and not one.used.all() for one in photos] == [False, True, *[False] * 4]
-        assert photos[1].used is not None
-        np.testing.assert_array_equal(photos[1].used, ~left_out)
+        (inputs,) = seen
+        used = inputs.pool.is_usable(torch.arange(6 * 300 * 400)).numpy().reshape(6, 300, 400)
+        assert used[[0, 2, 3, 4, 5]].all()
+        np.testing.assert_array_equal(used[1], ~left_out)
         assert Run(tmp_path / "run").config.components.occluders

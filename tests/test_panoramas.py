@@ -18,7 +18,6 @@ from nerfcli.cameras.alignment import align
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.loading import load_scene
-from nerfcli.captures.model_tracks import tracks_of_model
 from nerfcli.doctor.compared_pairs import compare
 from nerfcli.doctor.photo_facts import Source, read_all
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
@@ -36,6 +35,7 @@ from nerfcli.poses.model import held_out
 from nerfcli.poses.model.cameras import group_by_given, group_photos
 from nerfcli.poses.model.projection import is_ahead, offsets_px, panorama_camera, projected, px_per_radian
 from nerfcli.poses.model.two_views import VerifiedPair, panorama_inliers, rays
+from nerfcli.training.evidence import tracks_of_model
 from nerfcli.training.runs.run import load_run
 from nerfcli.workflows.poses import given_intrinsics
 from nerfcli.workflows.render import render_run

@@ -17,17 +17,17 @@ from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats.colmap import write_colmap_binary
 from nerfcli.captures.formats.scene_folder import MODEL_FOLDER, save
 from nerfcli.captures.loading import load_scene
-from nerfcli.captures.model_tracks import tracks_of_model
 from nerfcli.errors import UserError
 from nerfcli.kernels import reference
 from nerfcli.matching.camera_check import CameraCheck
 from nerfcli.matching.correspondences import SharedFeatures, chosen_pairs
 from nerfcli.matching.tracks import Tracks, triangulate
 from nerfcli.photos.loading import load_photos
+from nerfcli.training.evidence import point_depths, tracks_of_model
+from nerfcli.training.fitting import Fitting
 from nerfcli.training.loop import train
 from nerfcli.training.losses import emerging_losses
-from nerfcli.training.point_depth import PointRays, point_depths
-from nerfcli.training.pool import PixelPool
+from nerfcli.training.pool import PixelPool, PointRays
 from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
@@ -128,7 +128,7 @@ def test_missing_points_that_were_requested_are_an_error(spheres, tmp_path):
     alone = replace(spheres, frames=spheres.train_frames[:1], test_names=frozenset())
     settings = TrainSettings(budget_seconds=None, steps=1, downscale=8, components=Components(points=0.1))
     with pytest.raises(UserError, match="no 3D point could be triangulated"):
-        prepare(alone, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+        prepare(alone, settings, run=tmp_path, notify=lambda text: None)
 
 
 def test_light_off_its_target_counts_by_how_far_it_is():
@@ -205,8 +205,8 @@ def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
 
 def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(capture, tmp_path, monkeypatch):
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
-    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
-    fitting, emerging = prepared.fitting(), []
+    inputs = prepare(capture, settings, run=tmp_path, notify=lambda text: None)
+    fitting, emerging = Fitting(inputs), []
 
     def recorded(depth_loss: torch.Tensor) -> torch.Tensor:
         emerging.append(fraction)
@@ -231,15 +231,15 @@ def test_points_of_a_narrow_baseline_fade_with_the_steps_of_a_training(
 ):
     """Half of the budget and four times 800 steps: a loss of 4 for each distance adds 4 times its weight."""
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
-    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    inputs = prepare(capture, settings, run=tmp_path, notify=lambda text: None)
     losses = []
     for value in (0.0, 4.0):
         monkeypatch.setattr("nerfcli.training.schedule.EMERGING_ENDS", 1.0)
         monkeypatch.setattr("nerfcli.training.step.emerging_losses", lambda off, value=value: 0 * off + value)
-        fitting = prepared.fitting()
+        fitting = Fitting(inputs)
         assert fitting.points is not None
         trusted = [replace(points, trust=torch.ones_like(points.trust)) for points in fitting.points.sets]
-        fitting.points = PointRays(trusted, prepared.pool)
+        fitting.points = PointRays(trusted, inputs.pool)
         fitting.step, fitting.schedule = 3200, replace(fitting.schedule, parallax=parallax)
         losses.append(fitting.advance(0.5).loss)
     assert losses[1] - losses[0] == pytest.approx(0.1 * weight * 4.0, rel=1e-4)
@@ -276,10 +276,10 @@ def test_training_takes_all_of_them_at_once(capture, tmp_path):
 def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
     settings = TrainSettings(budget_seconds=None, steps=10, model="auto")
     reported: list[str] = []
-    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=reported.append)
-    assert prepared.settings.components == Components(points=0.1)
-    assert prepared.points is not None
-    assert [len(depths.numbers) for depths in prepared.points.sets] == [3]
+    inputs = prepare(capture, settings, run=tmp_path, notify=reported.append)
+    assert inputs.settings.components == Components(points=0.1)
+    assert inputs.points is not None
+    assert [len(depths.numbers) for depths in inputs.points.sets] == [3]
     assert "points=0.1: kept, 3 pixels see a 3D point at a known distance" in reported
 
 
@@ -290,8 +290,8 @@ def test_a_short_training_does_not_wait_for_photos_to_be_compared(capture, tmp_p
     )
     without_model = replace(capture, root=tmp_path / "elsewhere")
     settings = TrainSettings(**limit, model="auto")
-    prepared = prepare(without_model, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
-    assert prepared.settings.components == Components()
+    inputs = prepare(without_model, settings, run=tmp_path, notify=lambda text: None)
+    assert inputs.settings.components == Components()
 
 
 @pytest.mark.parametrize("cameras", ["focal", "all", "poses", "fixed"])
@@ -299,14 +299,14 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
     """With requested components and no search; refining poses alone leaves lenses as they are."""
     check = CameraCheck(-0.019, 0.0006, (0.26, 0.14), 900)
     facts = Facts("hash", has_alpha=False, has_exif=False, cameras=check, fixed=("cameras",))
-    monkeypatch.setattr("nerfcli.training.preparation._facts", lambda *positional, **of_points: facts)
+    monkeypatch.setattr("nerfcli.training.preparation._facts", lambda *args: facts)
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(cameras=cameras), model="default")
     reported: list[str] = []
-    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=reported.append)
+    inputs = prepare(capture, settings, run=tmp_path, notify=reported.append)
     learns = cameras in ("focal", "all")
-    assert prepared.log_focal == (check.log_focal if learns else 0.0)
+    assert inputs.log_focal == (check.log_focal if learns else 0.0)
     assert any("suggest a focal length 1.88 %" in line for line in reported) == learns
-    refined = prepared.fitting().appearance.cameras
+    refined = Fitting(inputs).appearance.cameras
     if learns:
         assert refined is not None
         assert refined.lenses is not None

@@ -5,9 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from nerfcli.cameras.rigid import Similarity
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.voxel_field import VoxelFieldSettings
 from nerfcli.render.trained_field import Marching
+from nerfcli.training.extent import Extent
+from nerfcli.training.fitting import Fitting
 from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import DETAILED_STEPS, stride
@@ -15,6 +18,12 @@ from nerfcli.training.strides import RaySteps, halvings
 
 BALL = Marching(near=0.5, far=300.0, shortest_step=1 / 256, growth=1 / 128)
 CUBE = Marching(near=0.5, far=4.0, shortest_step=1 / 128, growth=0.0)
+
+CPU = torch.device("cpu")
+
+
+def extent_of(marching: Marching) -> Extent:
+    return Extent("l2", Similarity.identity(), marching)
 
 
 def grid(finest: int, *, log2_rows: int = 17, contraction: str = "l2") -> HashFieldSettings:
@@ -52,7 +61,7 @@ def test_steps_are_halved_until_they_are_shorter_than_two_cells_at_most_twice(ma
 )  # fmt: skip
 def test_steps_begin_eight_times_as_long_as_those_of_the_capture_and_end_with_a_quarter(fraction, step, multiple):
     marching = Marching(near=1.0, far=3.0, shortest_step=1 / 128, growth=0.0)
-    steps = RaySteps(marching, grid(1024, contraction="none"), parallax=1.0, device=torch.device("cpu"))
+    steps = RaySteps(extent_of(marching), grid(1024, contraction="none"), CPU)
     edges = steps.edges(stride(fraction, step))
     torch.testing.assert_close(edges.diff(), torch.full_like(edges[1:], multiple / 128), rtol=1e-4, atol=0)
     assert edges[0] == 1.0
@@ -61,7 +70,7 @@ def test_steps_begin_eight_times_as_long_as_those_of_the_capture_and_end_with_a_
 
 def test_pictures_of_detailed_fields_have_at_most_half_of_the_steps_of_the_capture():
     for settings, part in ((grid(4096), 1 / 4), (grid(1024), 1 / 2), (grid(800), 1 / 2), (grid(4096, log2_rows=16), 1)):
-        steps = RaySteps(BALL, settings, parallax=1.0, device=torch.device("cpu"))
+        steps = RaySteps(extent_of(BALL), settings, CPU)
         assert steps.render_steps(stride(1.0, DETAILED_STEPS)) == BALL.stretched(part)
         # A training that ends before it gets to the shortest steps has not learned what they would show.
         assert steps.render_steps(stride(1.0, DETAILED_STEPS // 2)) == BALL.stretched(max(part, 1 / 2))
@@ -70,10 +79,10 @@ def test_pictures_of_detailed_fields_have_at_most_half_of_the_steps_of_the_captu
 def test_a_training_sees_the_parallax_of_its_capture(spheres, tmp_path):
     # Steps of 2 sqrt(3) / 512 in a cube of side 2 are 3.46 cells long where 1024 fit along its side.
     settings = TrainSettings(budget_seconds=None, steps=10, log2_rows=17, model="default")
-    prepared = prepare(spheres, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
-    assert prepared.extent.parallax == 1.0
+    inputs = prepare(spheres, settings, run=tmp_path, notify=lambda text: None)
+    assert inputs.extent.parallax == 1.0
     most = []
     for parallax in (1.0, 0.5):
-        seen = replace(prepared, extent=replace(prepared.extent, parallax=parallax)).fitting()
+        seen = Fitting(replace(inputs, extent=replace(inputs.extent, parallax=parallax)))
         most.append(seen.ray_steps.most)
     assert most[0] == pytest.approx(2 * most[1], abs=2)

@@ -37,7 +37,7 @@ from nerfcli.training.camera_optimiser import (
     without_mean,
 )
 from nerfcli.training.extent import Extent
-from nerfcli.training.fitting import Fitting
+from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.loop import train
 from nerfcli.training.pool import PixelPool
 from nerfcli.training.refinement import LENS_RATE, PoseRefinement, Refinement
@@ -524,7 +524,7 @@ def test_displaced_cameras_return_to_their_places_in_a_trained_field(spheres, sp
         budget_seconds=None, steps=20, samples_per_step=2**13, threads=2, log2_rows=14,
         components=Components(cameras="poses"), learning_rate=1e-30, final_learning_rate=1e-30,
     )  # fmt: skip
-    fitting = Fitting(pool, extent.marching, contraction=extent.contraction, settings=settings)
+    fitting = Fitting(TrainingInputs(settings, extent, pool))
     cameras = fitting.appearance.cameras
     assert cameras is not None
     tensors |= {f"parts.{name}": value.clone() for name, value in fitting.appearance.state_dict().items()}

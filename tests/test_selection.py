@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.matching.camera_check import CameraCheck
+from nerfcli.training.evidence import may_use_points
 from nerfcli.training.runs.components import Components, Decision, Selection
+from nerfcli.training.schedule import MOST_START_STEPS, REMOVAL_FRACTION, Budget
 from nerfcli.training.selection.diagnostics import Diagnostics
 from nerfcli.training.selection.race import (
     CLEAR_ERRORS,
@@ -21,20 +23,15 @@ from nerfcli.training.selection.race import (
     MOST_LOSS_DB,
     NO_TIME,
     ONCE,
-    REMOVAL_FRACTION,
     SEED_DB,
-    SearchBudget,
+    Purse,
     judge_evidence,
     judge_one,
     judge_removal,
     judge_supported,
 )
 from nerfcli.training.selection.selection import (
-    MOST_START_STEPS,
     Facts,
-    is_worth_a_search,
-    may_use_points,
-    may_use_stereo,
     proposals,
     removals,
     rules,
@@ -221,15 +218,13 @@ class Scripted:
         self.begun: list[Components] = []
         self.from_psnr: set[float] = set()
 
-    def begin(
-        self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0
-    ) -> TrialStart | None:
+    def begin(self, components: Components, budget: Budget, *, fewest: int = 0) -> TrialStart | None:
         self.begun.append(components)
-        if steps < fewest:
+        assert budget.steps is not None
+        if budget.steps < fewest:
             return None
-        return TrialStart(
-            {}, {}, 1.0, replace(trial(20.0 + self.gain(components)), steps=steps), signs(self.spread, self.far)
-        )
+        done = replace(trial(20.0 + self.gain(components)), steps=budget.steps)
+        return TrialStart({}, {}, 1.0, done, signs(self.spread, self.far))
 
     def go_on(self, start: TrialStart, components: Components, *, seed: int, steps: int) -> Trial:
         self.requested.append((components, seed, steps))
@@ -238,7 +233,7 @@ class Scripted:
 
 
 def chosen_by(scripted: Scripted, *, steps: int = 4000, facts: Facts = FITTED):
-    return select(scripted, Components(), facts, seconds=None, steps=steps)  # type: ignore[arg-type]
+    return select(scripted, Components(), facts, Budget(None, steps))  # type: ignore[arg-type]
 
 
 def test_what_gains_is_in_the_model_what_does_not_is_not_and_seeds_are_paired():
@@ -290,11 +285,10 @@ def test_points_are_not_tried_where_the_user_decides_alpha_is_given_or_there_are
 @pytest.mark.parametrize(("misses", "tells"), [(0.3, True), (0.7, False)])
 def test_points_are_used_only_where_the_cameras_fit(misses, tells):
     facts = replace(FITTED, cameras=CameraCheck(0.0, 0.001, (misses, misses), 1000))
-    assert may_use_points(Components(), facts) is tells
-    assert may_use_points(Components(), FITTED)
-    assert not may_use_points(Components(cameras="poses"), FITTED)
-    assert not may_use_points(Components(), replace(FITTED, fixed=("points",)))
-    assert may_use_points(Components(points=0.2), replace(facts, fixed=("points",)))
+    components, _ = with_evidence(Components(), replace(facts, points=7))
+    assert components.points == (0.1 if tells else 0.0)
+    assert with_evidence(Components(cameras="poses"), POINTED)[0].points == 0.0
+    assert may_use_points(Components(points=0.2), ("points",), has_alpha=True, cameras=facts.cameras)
 
 
 @pytest.mark.parametrize(("far", "kept"), [(0.05, False), (0.15, True)])
@@ -360,10 +354,10 @@ def test_too_few_steps_are_not_spent():
 
 
 def test_short_trainings_are_not_searched_for():
-    assert not is_worth_a_search(9.0, None)
-    assert is_worth_a_search(60.0, None)
-    assert not is_worth_a_search(None, 3000)
-    assert is_worth_a_search(None, 5000)
+    assert not Budget(9.0, None).allows_trials
+    assert Budget(60.0, None).allows_trials
+    assert not Budget(None, 3000).allows_trials
+    assert Budget(None, 5000).allows_trials
 
 
 def test_a_decision_says_in_words_what_was_and_what_was_not_tried():
@@ -437,7 +431,7 @@ def test_poses_with_which_features_surely_miss_are_refined_without_a_trial(error
 def test_poses_that_are_decided_on_learn_in_no_trial():
     scripted = Scripted(lambda c: 0.5 * (c.exposure == "learned"))
     facts = replace(FITTED, cameras_known=None, cameras=CameraCheck(0.0, math.inf, (2.3, 2.3), 900))
-    chosen = select(scripted, Components(cameras="poses"), facts, seconds=None, steps=4000)  # type: ignore[arg-type]
+    chosen = select(scripted, Components(cameras="poses"), facts, Budget(None, 4000))  # type: ignore[arg-type]
     assert chosen.components == Components(cameras="poses", exposure="learned", view=0)
     assert {model.cameras for model in (*scripted.begun, *(model for model, _, _ in scripted.requested))} == {"fixed"}
 
@@ -508,11 +502,11 @@ def test_of_values_that_gain_as_much_the_plainest_is_kept():
 
 
 def test_leaving_out_may_not_use_up_a_limit_of_time_but_may_use_up_steps():
-    purse = SearchBudget(100.0, None)
+    purse = Purse(Budget(100.0, None))
     assert purse.can_afford(3, of_steps=0, seconds_each=30.0)
     assert not purse.can_afford(3, of_steps=0, seconds_each=30.0, fraction_of_time=REMOVAL_FRACTION)
     assert purse.can_afford(1, of_steps=0, seconds_each=60.0, fraction_of_time=REMOVAL_FRACTION)
-    assert SearchBudget(None, 100).can_afford(2, of_steps=50, seconds_each=math.inf, fraction_of_time=REMOVAL_FRACTION)
+    assert Purse(Budget(None, 100)).can_afford(2, of_steps=50, seconds_each=math.inf, fraction_of_time=REMOVAL_FRACTION)
 
 
 @pytest.mark.parametrize(("gain", "kept"), [(0.04, True), (-0.04, True), (-0.3, False)])
@@ -565,10 +559,6 @@ def test_depths_of_stereo_matching_come_with_evidence_and_as_the_user_says():
     assert with_evidence(Components(points=0.3), replace(facts, fixed=("points",)))[0] == replace(both, points=0.3)
     assert with_evidence(Components(), replace(facts, fixed=("points",)))[0] == Components()
     assert with_evidence(Components(), replace(facts, fixed=("stereo",)))[0] == Components(points=0.1)
-    assert may_use_stereo(Components(), facts, has_time=True)
-    assert not may_use_stereo(Components(), facts, has_time=False)
-    assert not may_use_stereo(Components(), replace(facts, points=0), has_time=True)
-    assert may_use_stereo(Components(stereo=True), replace(facts, fixed=("stereo",)), has_time=False)
 
 
 def test_exposures_are_kept_on_evidence():

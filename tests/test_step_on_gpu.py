@@ -25,9 +25,9 @@ from nerfcli.kernels.triton_cuda.backend import TritonBackend
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.trained_field import Marching
 from nerfcli.training import pool as pools
-from nerfcli.training.fitting import Fitting
-from nerfcli.training.point_depth import PointDepths, PointRays
-from nerfcli.training.pool import PixelPool
+from nerfcli.training.extent import Extent
+from nerfcli.training.fitting import Fitting, TrainingInputs
+from nerfcli.training.pool import PixelPool, PointDepths, PointRays
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
 
@@ -146,10 +146,8 @@ def test_a_step_waits_once_for_the_device(components, most, waits, spheres: Capt
     pool = PixelPool(opaque, Similarity(1.0, np.eye(3), np.zeros(3)), GPU)
     settings = TrainSettings(budget_seconds=None, steps=40, components=components, device="cuda", samples_per_step=2**9)
     depths = [PointDepths(*(torch.zeros(9, device=GPU).to(t) for t in (torch.int64, torch.float32, torch.float32)))]
-    fitting = Fitting(
-        pool, Marching(0.1, 4.0, 0.05, 0.0), contraction="l2", settings=settings,
-        points=PointRays(depths, pool) if components.points else None,
-    )  # fmt: skip
+    extent = Extent("l2", Similarity.identity(), Marching(0.1, 4.0, 0.05, 0.0))
+    fitting = Fitting(TrainingInputs(settings, extent, pool, points=PointRays(depths, pool)))
     fitting.field.backend = TritonBackend(GPU)
     for step in range(20):
         before = len(waits.lines)

@@ -13,7 +13,7 @@ from nerfcli.cameras.rigid import Similarity, rotation_from_vector
 from nerfcli.matching.stereo import LONGER_SIDE_PX, SECONDS_PER_PIXEL, DenseDepth, affordable_side_px, dense_depths
 from nerfcli.matching.tracks import Tracks
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.training.point_depth import stereo_depths
+from nerfcli.training.evidence import stereo_depths
 from nerfcli.training.pool import PixelPool
 
 PINHOLE = Camera.pinhole(200, 150, 180.0)

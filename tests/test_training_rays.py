@@ -463,7 +463,7 @@ def test_a_limit_of_memory_is_that_of_the_gpu(monkeypatch, tmp_path):
     monkeypatch.setattr(preparation, "needs_of", lambda *given, **named: needed)
     settings = TrainSettings(steps=1, device="cuda:1")
     with pytest.raises(UserError, match="in addition to the photos, but the limit is"):
-        prepare(scene_of(ring()), settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+        prepare(scene_of(ring()), settings, run=tmp_path, notify=lambda text: None)
 
 
 def test_a_full_disk_is_reported_before_anything_is_written(tmp_path):

@@ -10,34 +10,40 @@ import numpy as np
 import pytest
 import torch
 
+from nerfcli.captures.capture import Capture
 from nerfcli.field.exposure import exposed
+from nerfcli.photos.loading import load_photos
 from nerfcli.training.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
-from nerfcli.training.fitting import Fitting
-from nerfcli.training.pool import load_album
+from nerfcli.training.fitting import Fitting, TrainingInputs
+from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.schedule import Budget
 from nerfcli.training.selection.diagnostics import diagnose
 from nerfcli.training.selection.trials import Trials, TrialStart
 from nerfcli.training.step import light_from_beyond
-from nerfcli.training.storage import IN_MEMORY
 
 SETTINGS = TrainSettings(budget_seconds=None, steps=100, first_samples_per_step=2**11, threads=1)
 
 
 @pytest.fixture(scope="module")
 def trials(spheres) -> Trials:
-    album = load_album(spheres.train_frames, factor=4, threads=1, storage=IN_MEMORY)
-    extent = choose_extent(spheres, SETTINGS, fills_frame=False)
-    return Trials(album.photos, extent, settings=SETTINGS, exif=np.zeros(len(album.photos)), colours=album.colours)
+    return Trials(inputs_of(spheres))
+
+
+def inputs_of(scene: Capture) -> TrainingInputs:
+    extent = choose_extent(scene, SETTINGS, fills_frame=False)
+    photos = load_photos(scene.train_frames, factor=4, threads=1)
+    return TrainingInputs(SETTINGS, extent, PixelPool(photos, extent.training_from_scene, torch.device("cpu")))
 
 
 @pytest.fixture(scope="module")
 def start(trials) -> Iterator[TrialStart]:
     """A start early in a schedule, without closing cells: within a few dozen steps they would leave nothing to see."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nerfcli.training.selection.trials.FORK_FRACTION", 0.02)
+        patch.setattr("nerfcli.training.selection.trials.FORK_PROGRESS", 0.02)
         patch.setattr("nerfcli.training.schedule.CLOSING_ENDS", 1e9)
-        yield trials.begin(Components(view=0), steps=20)
+        yield trials.begin(Components(view=0), Budget(None, 20))
 
 
 def test_what_begins_late_changes_nothing_at_first(trials, start):
@@ -75,19 +81,19 @@ def test_a_start_takes_longer_for_the_fewest_steps_but_twice_as_long_at_most(tri
     """A clock on which every step takes a second."""
     gone = clock(monkeypatch, itertools.repeat(1.0))
     for fewest, steps in ((0, 10), (7, 10), (14, 14)):
-        assert trials.begin(Components(), steps=1000, seconds=10.0, fewest=fewest).steps == steps
-    assert trials.begin(Components(), steps=1000, seconds=10.0, fewest=24) is None
+        assert trials.begin(Components(), Budget(10.0, 1000), fewest=fewest).steps == steps
+    assert trials.begin(Components(), Budget(10.0, 1000), fewest=24) is None
     assert gone[-1] == 20
-    assert trials.begin(Components(), steps=5, seconds=10.0, fewest=50) is None
+    assert trials.begin(Components(), Budget(10.0, 5), fewest=50) is None
     assert gone[-1] == 5
 
 
 def test_a_start_that_cannot_come_to_the_fewest_steps_ends_at_once(trials, monkeypatch):
     """Steps take a second, except that every fifth takes ten, as under other load on the machine."""
     gone = clock(monkeypatch, itertools.cycle([1.0, 1.0, 1.0, 1.0, 10.0]))
-    assert trials.begin(Components(), steps=1000, seconds=100.0, fewest=260) is None
+    assert trials.begin(Components(), Budget(100.0, 1000), fewest=260) is None
     assert gone[-1] == 10
-    assert trials.begin(Components(), steps=1000, seconds=100.0, fewest=240) is None
+    assert trials.begin(Components(), Budget(100.0, 1000), fewest=240) is None
     assert gone[-1] > 60  # at first the fewest steps seem possible
 
 
@@ -112,9 +118,10 @@ def test_the_learning_rate_falls_by_half_a_cosine_after_its_warm_up(trials):
     assert rates == pytest.approx([0.01, 0.001 + 0.009 * (0.5 + 0.125**0.5), 0.0055, 0.001, 0.001])
 
 
-def test_trials_have_the_small_tables_of_short_trainings(trials, monkeypatch):
+def test_trials_have_the_small_tables_of_short_trainings(spheres):
     for given, used in ((18, 16), (8, 8)):
-        monkeypatch.setattr(trials, "_settings", replace(trials._settings, log2_rows=given))
+        inputs = inputs_of(spheres)
+        trials = Trials(replace(inputs, settings=replace(SETTINGS, log2_rows=given)))
         fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
         assert fitting.field.settings.to_json()["log2_rows"] == used
 
@@ -155,10 +162,8 @@ def test_cameras_learn_from_the_fork_on(trials, start):
 def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkeypatch, distance):
     """Closed form for fog of density sigma: exp(-sigma t), where t is the distance from the middle of the first step to
     the middle of the last step before the given distance."""
-    album = load_album(spheres.train_frames, factor=4, threads=1, storage=IN_MEMORY)
-    everywhere = replace(choose_extent(spheres, SETTINGS, fills_frame=False), contraction="l2")
-    exif = np.zeros(len(album.photos))
-    trials = Trials(album.photos, everywhere, settings=SETTINGS, exif=exif, colours=album.colours)
+    inputs = inputs_of(spheres)
+    trials = Trials(replace(inputs, extent=replace(inputs.extent, contraction="l2")))
     fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
     monkeypatch.setattr(fitting.ray_steps, "edges", lambda stride: torch.linspace(0.1, 1.4, 14))
     sigma = 0.1
@@ -184,12 +189,9 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
 
 def test_trials_use_the_lens_found_before(spheres):
     """Matches give focal lengths 5 % longer: learned lenses start from these, so their rays are closer together."""
-    album = load_album(spheres.train_frames, factor=4, threads=1, storage=IN_MEMORY)
-    extent = choose_extent(spheres, SETTINGS, fills_frame=False)
-    exif = np.zeros(len(album.photos))
-    trials = Trials(album.photos, extent, settings=SETTINGS, exif=exif, log_focal=math.log(1.05), colours=album.colours)
+    trials = Trials(replace(inputs_of(spheres), log_focal=math.log(1.05)))
     fitting = trials._fitting(Components(cameras="focal"), seed=0, log_gains=None, cameras_from=0.0)
-    drawn = trials._pool.rays_of(torch.tensor([0, album.photos[0].pixels.shape[1] - 1]))
+    drawn = trials._pool.rays_of(torch.tensor([0, trials._pool.cameras[0].width - 1]))
 
     def width(directions: torch.Tensor) -> float:
         axis = trials._pool.poses[0, :3, 2].to(directions)
@@ -203,7 +205,7 @@ def test_trials_use_the_lens_found_before(spheres):
 
 def test_blocks_that_judge_are_not_learned_from(trials):
     drawn = trials._pool.draw(20_000, torch.Generator().manual_seed(0)).numbers
-    assert not set(drawn.tolist()) & set(trials._judged.numbers.tolist())
+    assert not set(drawn.tolist()) & set(trials._scored.numbers.tolist())
 
 
 def test_the_brightness_of_photos_is_found_among_highlights_and_noise():
@@ -239,7 +241,7 @@ def test_the_field_ends_where_a_background_begins(trials):
     """It ends beyond the unit ball, seen from the farthest camera; without a learned background, or with pixels that
     show the sky, it is unchanged.
     """
-    extent = replace(trials._extent, reach=2.0 + BALLS_BEFORE_BACKGROUND)
+    extent = replace(trials._inputs.extent, reach=2.0 + BALLS_BEFORE_BACKGROUND)
     ended = extent.before("sphere", sky_known=False)
     assert ended.marching.far == min(extent.marching.far, 3.5)
     assert replace(extent, reach=1e9).before("sphere", sky_known=False).marching == extent.marching
@@ -248,4 +250,4 @@ def test_the_field_ends_where_a_background_begins(trials):
     assert Extent.from_json(extent.to_json()).to_json() == extent.to_json()
     assert ended.before("constant", sky_known=False).to_json() == ended.to_json()
     # Photos with alpha: it is already bounded.
-    assert trials._extent.before("sphere", sky_known=False) is trials._extent
+    assert trials._inputs.extent.before("sphere", sky_known=False) is trials._inputs.extent

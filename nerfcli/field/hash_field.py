@@ -13,12 +13,12 @@ from nerfcli.kernels import HashGrid, reference, spherical_harmonics
 # Outputs of the density network, the log density first; all of them are inputs of the colour network.
 GEOMETRY = 16
 HARMONICS = 16
-# Number of levels that learn from the start, and fraction of the budget after which all levels do.
-FIRST_LEVELS, ALL_LEVELS_FRACTION = 4, 0.5
+# Number of levels that learn from the start of a training.
+FIRST_LEVELS = 4
 # Trainings of smaller tables are too short to learn the details.
 DETAILED_LOG2_ROWS = 17
 # Weight decay. Values in rows are about 0.1; in steps of some thousand rays, their gradients have a median of 2e-8 to
-# 5e-8, a root mean square of 1e-5. See `Fitting.row_decay` for more rays.
+# 5e-8, a root mean square of 1e-5. See `training.step.row_decay` for more rays.
 ROW_DECAY = 1e-6
 
 
@@ -112,10 +112,15 @@ class HashField(Field):
         self.weights[2][:, GEOMETRY + (degree + 1) ** 2 :] = 0.0
 
 
+def learning_levels(detail: float, levels: int) -> int:
+    """Return how many of the levels learn, the coarsest first; see `Field.medium`."""
+    first = min(FIRST_LEVELS, levels)
+    return min(levels, max(1, first + math.floor((levels - first) * detail)))
+
+
 def _resolutions_at(detail: float, resolutions: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the resolutions of the levels that learn at a fraction of the budget, and 0 for later levels."""
-    first = min(FIRST_LEVELS, len(resolutions))
-    learning = max(1, first + math.floor((len(resolutions) - first) * detail / ALL_LEVELS_FRACTION))
+    """Return the resolutions of the levels that learn with a detail, and 0 for the others."""
+    learning = learning_levels(detail, len(resolutions))
     return tuple(side if level < learning else 0 for level, side in enumerate(resolutions))
 
 

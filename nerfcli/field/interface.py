@@ -89,8 +89,8 @@ class Field(nn.Module, abc.ABC):
         """Return the medium that backends render.
 
         Args:
-            detail: fraction of the training budget at which a field has the details to include; 1 for all, below 0 for
-                fewer than at the start. Details left out are as in an untrained field: nothing visible.
+            detail: fraction of the details that a training adds, which the field includes; 1 or more for all, below 0
+                for fewer than at the start. Details left out are as in an untrained field: nothing visible.
         """
         return self
 

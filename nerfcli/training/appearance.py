@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from nerfcli.errors import UserError
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.exposure import Exposure
-from nerfcli.training.pool import PixelBatch, Pool
+from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.refinement import Refinement
 from nerfcli.training.runs.components import LEARNED_BACKGROUNDS, Components
 
@@ -31,7 +31,7 @@ class Appearance(nn.Module):
         UserError: a background is to be learned behind photos with alpha.
     """
 
-    def __init__(self, components: Components, pool: Pool, *, log_gains: Tensor, log_focal: float = 0.0):
+    def __init__(self, components: Components, pool: PixelPool, *, log_gains: Tensor, log_focal: float = 0.0):
         super().__init__()
         device = pool.colours.device
         kind = components.background

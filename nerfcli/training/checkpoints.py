@@ -19,8 +19,8 @@ from nerfcli.photos.exif import log_exposures
 from nerfcli.render.held_out_exposure import exif_slope, gains_between, gains_beyond_exif
 from nerfcli.render.model import Model, save_model
 from nerfcli.training.extent import Extent
-from nerfcli.training.fitting import Fitting
-from nerfcli.training.preparation import EarlierDecisions, Prepared
+from nerfcli.training.fitting import Fitting, TrainingInputs
+from nerfcli.training.preparation import EarlierDecisions
 from nerfcli.training.runs.config import read_config
 from nerfcli.training.runs.files import FIELD, STATE
 from nerfcli.training.runs.settings import TrainSettings
@@ -47,31 +47,31 @@ class Checkpoints:
 
     Args:
         fitting, totals: read when a checkpoint is written.
-        prepared: the data that the fitting was made from.
+        inputs: what the fitting began from.
         scene: gives the unit of length.
     """
 
-    def __init__(self, run: Path, fitting: Fitting, totals: Totals, *, prepared: Prepared, scene: Capture):
+    def __init__(self, run: Path, fitting: Fitting, totals: Totals, *, inputs: TrainingInputs, scene: Capture):
         self._run, self._fitting, self._totals = run, fitting, totals
-        self._prepared, self._scene = prepared, scene
+        self._inputs, self._scene = inputs, scene
 
     def model(self) -> Model:
         """Return the current field as a model.
 
         Where the sky is known, it is shown instead of the fog that is left where no training ray has come.
         """
-        fitting, prepared = self._fitting, self._prepared
+        fitting, inputs = self._fitting, self._inputs
         cells = fitting.cells
-        alone = ALPHA_BACKGROUND if prepared.pool.has_alpha else OPAQUE_BACKGROUND
+        alone = ALPHA_BACKGROUND if inputs.pool.has_alpha else OPAQUE_BACKGROUND
         return Model(
             fitting.field,
             cells.coarse if fitting.appearance.sky is None else cells.visited,
             fitting.ray_steps.render_steps(fitting.plan.stride),
             fitting.appearance.background or alone,
-            prepared.extent.training_from_scene,
+            inputs.extent.training_from_scene,
             self._scene.unit,
             self._scene.unit_source,
-            log_exposure=prepared.log_exposure,
+            log_exposure=inputs.log_exposure,
             **self._held_out_exposures(),
         )
 
@@ -86,7 +86,7 @@ class Checkpoints:
         log_gains = exposure.log_gains().detach().cpu().double().numpy()
         found = {"exposures": gains_between(places, log_gains, wanted)}
         slope = 1.0
-        if self._prepared.log_exposure is not None:
+        if self._inputs.log_exposure is not None:
             slope = exif_slope(places, log_gains, self._exif)
             found["beyond_exif"] = gains_beyond_exif(places, log_gains, self._exif, wanted, slope=slope)
         by_name = {
@@ -105,7 +105,7 @@ class Checkpoints:
         refinement = self._fitting.appearance.cameras
         if refinement is None:
             return given
-        return refinement.frames(*given, scale=self._prepared.extent.training_from_scene.scale)
+        return refinement.frames(*given, scale=self._inputs.extent.training_from_scene.scale)
 
     def write_cameras(self) -> None:
         """Write RUN/cameras.json."""
@@ -121,7 +121,7 @@ class Checkpoints:
         if distributed.rank() > 0:
             return
         tensors, description = self._fitting.state()
-        extent = self._prepared.extent.to_json()
+        extent = self._inputs.extent.to_json()
         description |= {"format": STATE_FORMAT, "extent": extent, "totals": vars(self._totals)}
         writing = [self._write_field, lambda: save_tensors(self._run / STATE, tensors, description)]
         # The process may be killed between the two. The state is all that resuming needs and must never be ahead of the

@@ -1,175 +1,304 @@
-"""Evidence from the training photos before training: known distances, exposures, the sky, what hides surfaces."""
+"""Evidence from the training photos before training: cameras, sky, known distances, exposures, what hides surfaces."""
 
 import time
-from collections.abc import Callable
-from dataclasses import replace
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli.cameras.rigid import Similarity, apply, inverse
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.colmap import find_model, parse_colmap
+from nerfcli.errors import reason_of
+from nerfcli.matching.camera_check import CameraCheck, check_cameras
 from nerfcli.matching.correspondences import SharedFeatures
 from nerfcli.matching.exposures import matched_log_gains
 from nerfcli.matching.occluders import occluder_masks
-from nerfcli.matching.sky import PointsBefore, points_before, sky_masks
+from nerfcli.matching.sky import points_before, sky_masks
 from nerfcli.matching.stereo import LEAST_SIDE_PX, DenseDepth, affordable_side_px, dense_depths
+from nerfcli.matching.tracks import Tracks, indices_by_value, triangulate, world_rays
 from nerfcli.photos.exif import log_exposures
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.held_out_exposure import exif_slope
 from nerfcli.training.extent import Extent
-from nerfcli.training.point_depth import PointDepths, point_depths, stereo_depths
-from nerfcli.training.pool import Album, PixelPool
+from nerfcli.training.pool import Album, PixelPool, PointDepths
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.training.selection.selection import LEAST_SKY_FRACTION
+from nerfcli.training.schedule import Budget
 
-# Fraction of the budget that stereo matching may take.
-STEREO_FRACTION = 0.06
 # Fewer photos with EXIF exposures cannot confirm the matched ones.
 FEWEST_EXIF = 5
+# If a larger fraction of pixels looks like a sky, there is one.
+LEAST_SKY_FRACTION = 0.05
+# Cameras with an epipolar error below this are as good as the features: structure from motion leaves 0.1 to 0.4.
+LEAST_MISS_PX = 0.6
+# Reprojection error at which a point has half the weight, in pixels of the training photo.
+HALF_ERROR_PX = 1.0
+# Expected relative error of a stereo distance at which its pixel has half the weight.
+HALF_ERROR = 0.05
+# Values of "cameras" with which focal lengths are learned.
+LEARN_FOCAL = ("focal", "all")
 
 
+@dataclass
 class Evidence:
-    """Depth, exposures and sky, estimated from the training photos alone, each on first use.
+    """What the training photos tell; None, 0 or False where it is not needed or not known.
 
     Args:
-        shared: features and points of the photos.
-        album, pool: the photos, and their pixels in the training frame.
-        extent: of the field.
-        settings: of the training; its budget determines the size of the pictures that are matched.
+        may_match: whether the budget allows to match the photos.
+        cameras: the cameras against matched features.
+        sky_fraction: fraction of the pixels that look like a sky, see `matching.sky`; 0 if that is enough for one, but
+            3D points are in front.
+        sky_confirmed: whether these are enough for a sky, and 3D points are everywhere else.
+        sky: (pixels,) bool, the pixels of the pool that look like a sky; None if they are too few to be one.
+        track_depths: of points from structure from motion, or of matched features.
+        stereo_depths: from stereo matching.
+        log_gains: (photos, 3) logarithms of exposures from pixels that several photos share; NaN where unknown.
+        occluders: for each photo the mask (H, W) of pixels where something hides a surface that other photos see.
+        seconds: that each took, by name.
     """
 
-    def __init__(
-        self,
-        shared: SharedFeatures,
-        album: Album,
-        pool: PixelPool,
-        extent: Extent,
-        settings: TrainSettings,
-        notify: Callable[[str], None],
-    ):
-        self.shared, self.album, self.pool, self.settings = shared, album, pool, settings
-        self.extent, self.notify = extent, notify
-        self.stereo_seconds = 0.0
-        budget = settings.budget_seconds
-        # A training by steps must give the same result on all machines: without a time budget, ignore the threads.
-        seconds, threads = (60.0, 1) if budget is None else (STEREO_FRACTION * budget, settings.threads)
-        self.side_px = affordable_side_px(album.photos, seconds=seconds, threads=threads)
+    may_match: bool
+    cameras: CameraCheck | None = None
+    sky_fraction: float = 0.0
+    sky_confirmed: bool = False
+    sky: Tensor | None = None
+    track_depths: PointDepths | None = None
+    stereo_depths: PointDepths | None = None
+    log_gains: np.ndarray | None = None
+    occluders: list[np.ndarray] | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
 
-    @cached_property
-    def track_depths(self) -> PointDepths:
-        """Depths of points from structure from motion, or of matched features."""
-        return point_depths(self.shared.tracks, self.pool, self.extent.training_from_scene)
-
-    @cached_property
-    def _dense(self) -> list[DenseDepth]:
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Note the seconds that something takes."""
         began = time.perf_counter()
-        found = dense_depths(
-            self.album.photos,
-            self.shared.tracks,
-            longer_side_px=self.side_px or LEAST_SIDE_PX,
-            threads=self.settings.threads,
-        )
-        self.stereo_seconds += time.perf_counter() - began
-        return found
+        yield
+        self.seconds[name] = time.perf_counter() - began
 
-    @cached_property
-    def _matched_log_gains(self) -> np.ndarray:
-        dense = self._dense
-        began = time.perf_counter()
-        found = matched_log_gains(self.album.photos, dense)
-        self.stereo_seconds += time.perf_counter() - began
-        return found
-
-    @cached_property
-    def log_gains(self) -> np.ndarray:
-        """Logarithms of exposures from pixels that several photos share, (photos, 3); NaN where unknown.
-
-        All are NaN if EXIF does not confirm them: surfaces that look brighter from one side differ between photos just
-        as exposures do, and their differences add up along a ring of cameras. Only a user who asks for
-        exposure=matched gets them without EXIF.
-        """
-        found = self._matched_log_gains
-        if self.settings.components.exposure == "matched":
-            return found
-        exif = log_exposures([photo.frame for photo in self.album.photos])
-        measured = np.isfinite(found).all(1) & np.isfinite(exif)
-        if measured.sum() < FEWEST_EXIF or exif_slope(np.flatnonzero(measured), found[measured], exif[measured]) == 0.0:
-            return np.full_like(found, np.nan)
-        return found
-
-    def matched_gains_or(self, others: Tensor) -> Tensor:
-        """Return `log_gains` (photos, 3), with the values of `others` where unknown."""
-        measured = torch.from_numpy(self.log_gains).to(others)
-        return torch.where(measured.isfinite(), measured, others)
+    @property
+    def stereo_seconds(self) -> float:
+        """Seconds that stereo matching and what is found with it took."""
+        return sum(self.seconds.get(name, 0.0) for name in ("stereo", "exposures", "occluders"))
 
     @property
     def exposure_spread(self) -> float:
-        """Standard deviation of the photos' log brightness in matched pixels; 0 if nothing is known."""
+        """Standard deviation of the photos' log brightness in pixels that they share; 0 if nothing is known."""
+        if self.log_gains is None:
+            return 0.0
         measured = self.log_gains[np.isfinite(self.log_gains).all(1)]
         return float(measured.mean(1).std()) if len(measured) else 0.0
-
-    @cached_property
-    def _sky_masks(self) -> list[np.ndarray]:
-        return sky_masks(self.album.photos, threads=self.settings.threads)
-
-    @cached_property
-    def _points_before_sky(self) -> PointsBefore:
-        # Tracks from matches would have two photos each.
-        return points_before(self._sky_masks, self.album.photos, self.shared.of_model)
-
-    @cached_property
-    def sky_fraction(self) -> float:
-        """Fraction of the pixels that look like a sky; 0 if that is enough for one, but 3D points are in front."""
-        found = sum(int(mask.sum()) for mask in self._sky_masks) / sum(mask.size for mask in self._sky_masks)
-        return 0.0 if found > LEAST_SKY_FRACTION and self._points_before_sky.refute else found
-
-    @property
-    def sky_confirmed(self) -> bool:
-        """Whether these pixels are enough for a sky, and 3D points are everywhere else."""
-        return self.sky_fraction > LEAST_SKY_FRACTION and self._points_before_sky.confirm
-
-    @cached_property
-    def sky(self) -> Tensor | None:
-        """Pixels of the pool that look like a sky, (pixels,) bool; None if they are too few to be one."""
-        if self.sky_fraction <= LEAST_SKY_FRACTION:
-            return None
-        return torch.from_numpy(np.concatenate([mask.ravel() for mask in self._sky_masks])).to(self.pool.colours.device)
-
-    @cached_property
-    def occluders(self) -> list[np.ndarray]:
-        """Masks (H, W) of the photos' pixels where something hides a surface that other photos see."""
-        dense, gains, skies = self._dense, self._matched_log_gains, self._sky_masks
-        began = time.perf_counter()
-        found = occluder_masks(self.album.photos, dense, skies, gains, threads=self.settings.threads)
-        self.stereo_seconds += time.perf_counter() - began
-        return found
 
     @property
     def occluded_fraction(self) -> float:
         """Fraction of the pixels that `occluders` contain."""
-        return sum(int(mask.sum()) for mask in self.occluders) / sum(mask.size for mask in self.occluders)
+        return 0.0 if self.occluders is None else _fraction(self.occluders)
+
+
+@dataclass(frozen=True)
+class TrainingPhotos:
+    """The training photos of a scene: their pixels, and the features that they share."""
+
+    scene: Capture
+    album: Album
+    shared: SharedFeatures
 
     @property
-    def photos_without_occluders(self) -> list[LoadedPhoto]:
-        """The photos, with `used` False where there are occluders."""
-        return [
-            replace(photo, used=~mask if photo.used is None else photo.used & ~mask)
-            for photo, mask in zip(self.album.photos, self.occluders, strict=True)
-        ]
+    def lacks_points(self) -> bool:
+        """Whether no 3D points tell about the cameras, and photos that fill the frame can."""
+        return self.album.fills_frame and len(self.scene.points) == 0
 
-    @cached_property
-    def stereo_depths(self) -> PointDepths:
-        """Depths from stereo matching."""
-        found = stereo_depths(self._dense, self.pool, self.extent.training_from_scene)
-        self.notify(
-            f"stereo matching: the depth of {len(found.numbers)} pixels of the training photos, "
-            f"{self.stereo_seconds:.1f} s"
-        )
+
+def may_use_points(
+    requested: Components, fixed: tuple[str, ...], *, has_alpha: bool, cameras: CameraCheck | None
+) -> bool:
+    """Return whether triangulated points may be used for depth supervision.
+
+    The cameras must fit. With alpha, which tells where space is empty, points help only at first: on lego they cost
+    half a decibel, through the time that their rays take.
+    """
+    if "points" in fixed:
+        return bool(requested.points)
+    fit = cameras is None or cameras.misses_px[0] < LEAST_MISS_PX
+    return fit and requested.cameras == "fixed" and not has_alpha
+
+
+def collect_evidence(
+    photos: TrainingPhotos,
+    pool: PixelPool,
+    extent: Extent,
+    *,
+    settings: TrainSettings,
+    is_new: bool,
+    notify: Callable[[str], None],
+) -> Evidence:
+    """Return what the components need, each step with what the steps before it have found.
+
+    Args:
+        settings: their components; with model="auto", what is open is not decided yet unless it is `fixed`.
+        is_new: whether this training begins now, so that open components and focal lengths are decided.
+    """
+    album, shared, wanted, fixed = photos.album.photos, photos.shared, settings.components, settings.fixed
+    budget, threads = Budget.of(settings), settings.threads
+    selects = is_new and settings.model == "auto"
+    found = Evidence(may_match=budget.allows_matching(shared.matching_seconds))
+
+    if found.may_match and photos.lacks_points and (selects or (is_new and wanted.cameras in LEARN_FOCAL)):
+        with found.timed("cameras"):
+            found.cameras = _camera_check(photos, notify)
+
+    skies: list[np.ndarray] = []
+    if wanted.background == "sphere" or (selects and "background" not in fixed and not pool.has_alpha):
+        with found.timed("sky"):
+            skies = sky_masks(album, threads=threads)
+            _find_sky(found, skies, photos, device=pool.colours.device)
+
+    points_are_open = selects and may_use_points(wanted, fixed, has_alpha=pool.has_alpha, cameras=found.cameras)
+    if wanted.points or (points_are_open and (shared.of_model.count or found.may_match)):
+        with found.timed("points"):
+            found.track_depths = point_depths(shared.tracks, pool, extent.training_from_scene)
+
+    seconds, cores = budget.of_stereo(threads)
+    side_px = affordable_side_px(album, seconds=seconds, threads=cores)
+    has_points = found.track_depths is not None and len(found.track_depths.numbers) > 0
+    stereo_is_open = points_are_open and has_points and (wanted.stereo if "stereo" in fixed else bool(side_px))
+    with_exposures = wanted.exposure == "matched" or (wanted.exposure == "learned" and wanted.stereo) or stereo_is_open
+    with_occluders = wanted.occluders or (stereo_is_open and "occluders" not in fixed)
+    with_depths = wanted.stereo or stereo_is_open
+    if not (with_exposures or with_occluders or with_depths):
         return found
+    with found.timed("stereo"):
+        dense = dense_depths(album, shared.tracks, longer_side_px=side_px or LEAST_SIDE_PX, threads=threads)
+    if with_depths:
+        found.stereo_depths = stereo_depths(dense, pool, extent.training_from_scene)
+        count = len(found.stereo_depths.numbers)
+        notify(f"stereo matching: the depth of {count} pixels of the training photos, {found.seconds['stereo']:.1f} s")
 
-    def depths_for(self, components: Components) -> list[PointDepths]:
-        """Return the sets of depths that a model with points uses."""
-        found = [self.track_depths, self.stereo_depths] if components.stereo else [self.track_depths]
-        return [depths.among(self.pool) for depths in found]
+    with found.timed("exposures"):
+        log_gains = matched_log_gains(album, dense)
+        if with_exposures:
+            # Those that a user asks for need no confirmation.
+            found.log_gains = log_gains if wanted.exposure == "matched" else confirmed_by_exif(log_gains, album)
+
+    if with_occluders:
+        skies = skies or sky_masks(album, threads=threads)
+        with found.timed("occluders"):
+            found.occluders = occluder_masks(album, dense, skies, log_gains, threads=threads)
+    return found
+
+
+def tracks_of_model(scene: Capture, photos: Sequence[LoadedPhoto]) -> Tracks:
+    """Return the observations of these photos in the scene's COLMAP model; empty without such a model.
+
+    Neither the observations in held-out photos are read nor the 3D positions of points, which depend on them.
+    """
+    folder = find_model(scene.root)
+    capture = parse_colmap(folder) if folder is not None else None
+    parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))]
+    if capture is not None and capture.observations is not None:
+        seen = capture.observations
+        index_of = {frame.name: index for index, frame in enumerate(capture.frames)}
+        of_frame = indices_by_value(np.where(seen.point_index >= 0, seen.frame_index, -1), len(capture.frames))
+        for number, photo in enumerate(photos):
+            index = index_of.get(photo.frame.name)
+            if index is None:
+                continue
+            frame, own = capture.frames[index], of_frame[index]
+            # The loaded photo may be downscaled or rotated: observations are in pixels of the model's own camera.
+            rays = world_rays(frame.camera.bearings(seen.pixels[own]), frame.world_from_cam)
+            parts.append((np.full(len(own), number), seen.point_index[own], rays))
+    return Tracks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
+    """Return the usable pixels that see a triangulated point; empty if there are none.
+
+    trust = 1 / (1 + (reprojection error / 1 px)^2), in pixels of the training photos
+
+    Args:
+        tracks: of features in the pool's photos.
+    """
+    surface = triangulate(pool.frames, tracks)
+    kept = np.flatnonzero(np.isfinite(surface.misses_px))
+    numbers = np.full(len(kept), -1)
+    by_photo = indices_by_value(tracks.photos[kept], len(pool.frames))
+    for photo, (frame, own) in enumerate(zip(pool.frames, by_photo, strict=True)):
+        points = surface.points[tracks.points[kept[own]]]
+        pixels, valid = frame.camera.project(apply(inverse(frame.world_from_cam), points))
+        width, height = frame.camera.width, frame.camera.height
+        shown = valid & (pixels >= 0).all(1) & (pixels < (width, height)).all(1)
+        column, row = np.floor(pixels[shown]).astype(np.int64).T
+        numbers[own[shown]] = int(pool.first_pixel[photo]) + row * width + column
+    inside = numbers >= 0
+    kept = kept[inside]
+    centres = np.array([frame.centre for frame in pool.frames])[tracks.photos[kept]]
+    distances = np.linalg.norm(surface.points[tracks.points[kept]] - centres, axis=1) * training_from_scene.scale
+    trust = 1.0 / (1.0 + (surface.misses_px[kept] / HALF_ERROR_PX) ** 2)
+    return _usable(numbers[inside], distances, trust, pool=pool)
+
+
+def stereo_depths(dense: Sequence[DenseDepth], pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
+    """Return the usable pixels of a pool whose depth is known from stereo matching.
+
+    trust = 1 / (1 + (error / 5 %)^2)
+
+    Args:
+        dense: the stereo depths of each photo of the pool.
+    """
+    widths = [frame.camera.width for frame in pool.frames]
+    firsts = pool.first_pixel.tolist()
+    numbers = [first + depth.pixels @ (1, width) for first, width, depth in zip(firsts, widths, dense, strict=True)]
+    distances = np.concatenate([depth.distances for depth in dense]) * training_from_scene.scale
+    trust = 1.0 / (1.0 + np.square(np.concatenate([depth.errors for depth in dense]) / HALF_ERROR))
+    return _usable(np.concatenate(numbers), distances, trust, pool=pool)
+
+
+def _usable(numbers: np.ndarray, distances: np.ndarray, trust: np.ndarray, *, pool: PixelPool) -> PointDepths:
+    device = pool.colours.device
+    known = (torch.from_numpy(values).to(device, torch.float32) for values in (distances, trust))
+    return PointDepths(torch.from_numpy(numbers).to(device), *known).among(pool)
+
+
+def _camera_check(photos: TrainingPhotos, notify: Callable[[str], None]) -> CameraCheck | None:
+    """Check the cameras against matched features; None, with a note, if the check cannot be computed."""
+    try:
+        return check_cameras(photos.album.photos, photos.shared.matched)
+    except Exception as error:
+        notify(f"could not check the cameras against matched features: {reason_of(error)}")
+        return None
+
+
+def _find_sky(found: Evidence, skies: list[np.ndarray], photos: TrainingPhotos, *, device: torch.device) -> None:
+    """Fill in what masks (H, W) of pixels that look like a sky tell."""
+    found.sky_fraction = _fraction(skies)
+    if found.sky_fraction <= LEAST_SKY_FRACTION:
+        return
+    # Tracks from matches would have two photos each.
+    before = points_before(skies, photos.album.photos, photos.shared.of_model)
+    if before.refute:
+        found.sky_fraction = 0.0
+        return
+    found.sky_confirmed = before.confirm
+    found.sky = torch.from_numpy(np.concatenate([mask.ravel() for mask in skies])).to(device)
+
+
+def confirmed_by_exif(log_gains: np.ndarray, photos: Sequence[LoadedPhoto]) -> np.ndarray:
+    """Return exposures from shared pixels, (photos, 3); all NaN if EXIF does not confirm them.
+
+    Surfaces that look brighter from one side differ between photos just as exposures do, and their differences add up
+    along a ring of cameras.
+    """
+    exif = log_exposures([photo.frame for photo in photos])
+    measured = np.isfinite(log_gains).all(1) & np.isfinite(exif)
+    places = np.flatnonzero(measured)
+    if len(places) < FEWEST_EXIF or exif_slope(places, log_gains[measured], exif[measured]) == 0.0:
+        return np.full_like(log_gains, np.nan)
+    return log_gains
+
+
+def _fraction(masks: list[np.ndarray]) -> float:
+    """Return the fraction of the pixels that masks contain."""
+    return sum(int(mask.sum()) for mask in masks) / sum(mask.size for mask in masks)

@@ -1,9 +1,11 @@
 """One training: the field, its occupancy and its optimiser, advanced step by step."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,17 +13,18 @@ from nerfcli import distributed
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import chosen_size, fresh_field
-from nerfcli.render.trained_field import Marching
 from nerfcli.training.appearance import Appearance
 from nerfcli.training.delayed import Delayed
+from nerfcli.training.extent import Extent
 from nerfcli.training.losses import LOSSES
 from nerfcli.training.open_cells import OpenCells
 from nerfcli.training.optimiser import FieldOptimiser, PartsOptimiser
-from nerfcli.training.point_depth import PointRays
-from nerfcli.training.pool import PixelBatch, Pool
+from nerfcli.training.pool import PixelBatch, PixelPool, PointRays
+from nerfcli.training.runs.components import Selection
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import Schedule, StepPlan
 from nerfcli.training.step import UNWATCHED, Batch, NonFiniteError, StepLosses, Watch, step, update
+from nerfcli.training.storage import IN_MEMORY, PhotoStorage
 from nerfcli.training.strides import RaySteps
 
 # Rays of a step, at most. The optimiser takes longer with larger tables, for any number of rays: there is one more ray
@@ -43,71 +46,89 @@ class StepResult:
         return sum(self.losses.values())
 
 
+@dataclass(frozen=True)
+class TrainingInputs:
+    """What a training begins from, see `preparation.prepare`. The settings' components decide what of it they use.
+
+    Args:
+        settings: with the components that were chosen.
+        extent: of the field.
+        pool: the training pixels and their rays.
+        log_gains: (photos, 3) logarithms of the photos' initial exposures, NaN where unknown; None if all are.
+        log_focal: logarithm of the initial factor of focal lengths, if these are learned.
+        points: pixels whose distance is known; None if there are none.
+        sky: (pixels,) bool, the pixels of the pool that look like a sky; None if none are known.
+        factor: photos are averaged over squares of this side in pixels.
+        storage: where arrays of the size of the photos are kept.
+        selection: result of the automatic selection of components; None if there was none.
+        log_exposure: mean log exposure of the training photos by EXIF, to which those in `log_gains` are relative; None
+            if unknown or not used.
+        occluders: for each photo of the pool the mask (height, width) bool of the pixels that are left out because
+            something hides a surface there; None if the components keep them.
+        seconds: of the budget, that evidence and trials took, by name.
+    """
+
+    settings: TrainSettings
+    extent: Extent
+    pool: PixelPool
+    log_gains: Tensor | None = None
+    log_focal: float = 0.0
+    points: PointRays | None = None
+    sky: Tensor | None = None
+    factor: int = 1
+    storage: PhotoStorage = IN_MEMORY
+    selection: Selection | None = None
+    log_exposure: float | None = None
+    occluders: list[np.ndarray] | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
 class Fitting:
     """The state of a training. On a CPU, the same seed and thread count give the same numbers, step for step.
 
     Args:
-        marching, contraction, parallax: of the extent; see `RaySteps` for the steps along rays.
-        log_gains: (photos, 3) logarithms of the photos' initial exposures, NaN where unknown.
-        log_focal: logarithm of the initial factor of focal lengths, if these are learned.
         cameras_from: the progress after which cameras learn, see `Schedule`.
-        points: pixels whose distance is known.
-        sky: (pixels,) bool, the pixels of the pool that show a sky to be learned; None if none are known.
-        size: of the field; by default, `sizes.chosen_size` for the settings and the pool.
+        size: of the field; by default, `kinds.chosen_size` for the settings and the pool.
     """
 
-    def __init__(
-        self,
-        pool: Pool,
-        marching: Marching,
-        *,
-        contraction: str,
-        parallax: float = 1.0,
-        settings: TrainSettings,
-        log_gains: Tensor | None = None,
-        log_focal: float = 0.0,
-        cameras_from: float = 0.0,
-        points: PointRays | None = None,
-        sky: Tensor | None = None,
-        size: FieldSettings | None = None,
-    ):
-        device = pool.colours.device
+    def __init__(self, inputs: TrainingInputs, *, cameras_from: float = 0.0, size: FieldSettings | None = None):
+        pool, settings = inputs.pool, inputs.settings
+        components, device = settings.components, pool.colours.device
         torch.manual_seed(settings.seed)
-        self.pool = pool
-        self.marching = marching
-        self.settings = settings
+        self.pool, self.settings, self.components = pool, settings, components
+        sky = inputs.sky if components.background == "sphere" else None
+        self.extent = inputs.extent.before(components.background, sky_known=sky is not None)
         self.step = 0
         # The largest progress of any budget so far: a training resumed with a larger budget begins at a smaller one.
         self.furthest = 0.0
-        self.components = settings.components
         if size is None:
             size = chosen_size(
                 settings.field,
                 hash_grid=HashFieldSettings(
-                    contraction=contraction,
+                    contraction=self.extent.contraction,
                     log2_rows=settings.chosen_log2_rows,
-                    view_degree=self.components.view,
-                    antialias=self.components.antialias,
+                    view_degree=components.view,
+                    antialias=components.antialias,
                 ),
                 footprint=pool.footprint,
                 memory_bytes=settings.field_memory_bytes,
             )
         self.field = fresh_field(size).to(device)
-        gains = torch.full((len(pool.first_pixel), 3), torch.nan) if log_gains is None else log_gains
-        self.points = points
-        self.appearance = Appearance(self.components, pool, log_gains=gains, log_focal=log_focal)
+        self.points = inputs.points if components.points else None
+        gains = inputs.log_gains
+        gains = torch.full((len(pool.first_pixel), 3), torch.nan) if gains is None else gains
+        self.appearance = Appearance(components, pool, log_gains=gains, log_focal=inputs.log_focal)
         self.schedule = Schedule(
             settings,
-            parallax,
-            learns_cameras=self.appearance.cameras is not None,
-            cameras_from=cameras_from,
+            self.extent.parallax,
+            cameras_from,
             has_large_table=self.field.settings.detailed,
             closing_steps=self.field.closing_steps,
         )
         self.cells = OpenCells(self.field, device)
         if sky is not None:
             self.appearance.init_background_from_sky(sky)
-        self.ray_steps = RaySteps(marching, self.field.settings, parallax=parallax, device=device)
+        self.ray_steps = RaySteps(self.extent, self.field.settings, device)
         rows = self.field.rows()
         most_rays = MOST_RAYS if rows is None else max(MOST_RAYS, rows.shape[-2] // ROWS_PER_RAY)
         self._most_rays = most_rays if device.type == "cpu" else max(most_rays, settings.samples_per_step // 4)
@@ -157,7 +178,7 @@ class Fitting:
             self.step,
             threshold=plan.threshold,
             detail=plan.detail,
-            marching=self.marching,
+            marching=self.extent.marching,
             generator=self.generator,
         )
         rays = min(self._most_rays, max(64, round(plan.samples / max(1.0, self.samples_per_ray))))

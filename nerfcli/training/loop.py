@@ -20,15 +20,16 @@ from nerfcli.field.kinds import field_bytes
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.photos.masks import write_masks
 from nerfcli.training.checkpoints import Checkpoints, Totals, decisions_of, restore
-from nerfcli.training.fitting import Fitting
-from nerfcli.training.preparation import Prepared, prepare
+from nerfcli.training.fitting import Fitting, TrainingInputs
+from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.components import Selection
 from nerfcli.training.runs.config import RunConfig, write_config
 from nerfcli.training.runs.files import FIELD, LOG, STATE
 from nerfcli.training.runs.log import LogEntry, append_log, cut_log
 from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.schedule import WAYPOINTS, Budget
 from nerfcli.training.sentinel import FAILURES, Sentinel
-from nerfcli.training.waypoints import FRACTIONS, forget_waypoints, keep_waypoint, measure_waypoints
+from nerfcli.training.waypoints import forget_waypoints, keep_waypoint, measure_waypoints
 
 # Folder of a run, named like the component that leaves pixels out.
 OCCLUDERS = "occluders"
@@ -116,8 +117,8 @@ def train(
     rows = settings.log2_rows or (saved[1]["field"].get("log2_rows") if saved is not None else None)
     with_all_threads = replace(settings, threads=sum(distributed.gathered(settings.threads)))
     settings = replace(settings, log2_rows=rows or with_all_threads.chosen_log2_rows)
-    prepared = prepare(scene, settings, run=run, memory_bytes=memory_bytes, begun=begun, notify=notify)
-    fitting = prepared.fitting()
+    inputs = prepare(scene, settings, run=run, memory_bytes=memory_bytes, begun=begun, notify=notify)
+    fitting = Fitting(inputs)
     notify(f"field: {fitting.field.settings.size_text}; {field_bytes(fitting.field) / 1e6:.2f} MB")
     if saved is not None:
         totals = restore(fitting, run, *saved)
@@ -125,23 +126,24 @@ def train(
         forget_waypoints(run, after=fitting.step)
         notify(f"resumed at step {fitting.step}, {totals.seconds:.1f} s")
     else:
-        totals = Totals(seconds=prepared.seconds, searched=prepared.seconds)
+        searched = sum(inputs.seconds.values())
+        totals = Totals(seconds=searched, searched=searched)
         _clear(run)
-    if prepared.occluders is not None:
-        named = zip(prepared.pool.frames, prepared.occluders, strict=True)
+    if inputs.occluders is not None:
+        named = zip(inputs.pool.frames, inputs.occluders, strict=True)
         write_left_out(run, {frame.name: ~mask for frame, mask in named}, notify=notify)
-    selection = prepared.selection if begun is None else begun.selection
-    _describe(scene, run, settings, prepared, selection=selection)
-    checkpoints = Checkpoints(run, fitting, totals, prepared=prepared, scene=scene)
+    selection = inputs.selection if begun is None else begun.selection
+    _describe(scene, run, settings, inputs, selection=selection)
+    checkpoints = Checkpoints(run, fitting, totals, inputs=inputs, scene=scene)
     checkpoints.write_cameras()
-    sentinel = Sentinel(fitting, prepared.pool, run=run, notify=notify)
+    sentinel = Sentinel(fitting, run=run, notify=notify)
     distributed.gathered(None)  # wait until all processes have loaded their photos
     with deferred_interrupts() as interrupts:
 
         def after_step(progress: Progress) -> None:
             with distributed.interrupted_together():
                 on_progress(progress)
-                prepared.storage.release_pages()
+                inputs.storage.release_pages()
                 interrupts.raise_if_pending()
 
         try:
@@ -159,7 +161,7 @@ def train(
     if fitting.rollbacks:
         notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
     if distributed.rank() == 0:
-        measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)
+        measure_waypoints(checkpoints.frames()[1], run, inputs, notify=notify)
 
 
 def _clear(run: Path) -> None:
@@ -175,14 +177,14 @@ def _clear(run: Path) -> None:
 
 
 def _describe(
-    scene: Capture, run: Path, requested: TrainSettings, prepared: Prepared, *, selection: Selection | None
+    scene: Capture, run: Path, requested: TrainSettings, inputs: TrainingInputs, *, selection: Selection | None
 ) -> None:
     """Write RUN/config.json."""
     described = RunConfig.describing(
         scene,
         requested,
-        factor=prepared.factor,
-        contraction=prepared.extent.contraction,
+        factor=inputs.factor,
+        contraction=inputs.extent.contraction,
         selection=selection,
     )
     write_config(run, described)
@@ -201,7 +203,6 @@ def _run(
 
     The clock is stopped while waypoints and checkpoints are written.
     """
-    settings = fitting.settings
     last_saved = totals.seconds
     losses: dict[str, float] = {}
     logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
@@ -228,23 +229,28 @@ def _run(
         append_log(run, entry)
         logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
 
-    waypoints = [fraction for fraction in FRACTIONS if fraction > _fraction(settings, fitting.step, totals)]
+    budget = Budget.of(fitting.settings)
+
+    def progress() -> float:
+        return budget.progress(fitting.step, totals.seconds, before=totals.searched)
+
+    waypoints = [waypoint for waypoint in WAYPOINTS if waypoint > progress()]
     try:
-        while (fraction := _fraction(settings, fitting.step, totals)) < 1.0:
+        while (now := progress()) < 1.0:
             began = time.perf_counter()
-            result = sentinel.advance(fraction)
+            result = sentinel.advance(now)
             totals.seconds += distributed.largest(time.perf_counter() - began)
             totals.samples += result.samples
             totals.rays += result.rays
             losses = result.losses
-            fraction = _fraction(settings, fitting.step, totals)
-            on_progress(Progress(fraction, fitting.step, totals.seconds, result.loss, speeds()[0]))
+            now = progress()
+            on_progress(Progress(now, fitting.step, totals.seconds, result.loss, speeds()[0]))
             checkpoint_due = totals.seconds - last_saved >= CHECKPOINT_SECONDS
-            if checkpoint_due or (waypoints and fraction >= waypoints[0]):
+            if checkpoint_due or (waypoints and now >= waypoints[0]):
                 sentinel.settle()
-                fraction = _fraction(settings, fitting.step, totals)
-            if waypoints and fraction >= waypoints[0]:
-                waypoints = [later for later in waypoints if later > fraction]
+                now = progress()
+            if waypoints and now >= waypoints[0]:
+                waypoints = [later for later in waypoints if later > now]
                 keep_waypoint(run, fitting.step, checkpoints.model())
                 log()
             elif totals.seconds - logged_seconds >= 1.0:
@@ -256,14 +262,6 @@ def _run(
         # An interrupt may come before the last steps are logged, and a resumed training may have no step left to log.
         if totals.seconds > logged_seconds:
             log()
-
-
-def _fraction(settings: TrainSettings, step: int, totals: Totals) -> float:
-    """Return the used fraction of the budget: the larger of that of time, without the search, and that of steps."""
-    left = settings.budget_seconds - totals.searched if settings.budget_seconds else 0.0
-    by_time = (totals.seconds - totals.searched) / left if left > 0 else 0.0
-    by_steps = step / settings.steps if settings.steps else 0.0
-    return min(1.0, max(by_time, by_steps))
 
 
 def peak_memory_bytes() -> int:

@@ -2,8 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -180,28 +182,8 @@ class PixelBatch(NamedTuple):
     trust: Tensor
 
 
-class Pool(Protocol):
-    """Source of training pixels: photos with cameras and poses (P, 4, 4), in the training frame."""
-
-    colours: Tensor
-    first_pixel: Tensor
-    footprint: float
-    cones: Tensor
-    poses: Tensor
-    cameras: tuple[Camera, ...]
-
-    @property
-    def has_alpha(self) -> bool:
-        """True if the colours have four channels."""
-        ...
-
-    def draw(self, count: int, generator: torch.Generator) -> PixelBatch:
-        """Draw `count` random pixels, with replacement."""
-        ...
-
-    def photo_of(self, numbers: Tensor) -> Tensor:
-        """Return the photo index of each pixel (N,)."""
-        ...
+# One pixel at a known distance is drawn per this many other pixels.
+PIXELS_PER_POINT = 8
 
 
 def pixel_footprint(frames: Sequence[Frame], training_from_scene: Similarity) -> float:
@@ -268,8 +250,8 @@ class PixelPool:
 
         self._use(usable, storage)
 
-    def leave_out(self, masks: Sequence[np.ndarray], *, storage: PhotoStorage = IN_MEMORY) -> None:
-        """Do not draw the pixels of masks (H, W) bool, one per photo, from now on.
+    def without(self, masks: Sequence[np.ndarray], *, storage: PhotoStorage = IN_MEMORY) -> "PixelPool":
+        """Return a pool that does not draw the pixels of masks (H, W) bool, one per photo; all else is shared.
 
         Raises:
             UserError: no pixel would be left.
@@ -286,7 +268,9 @@ class PixelPool:
             before[earlier[begin:end] - firsts[index]] = True
             return kept & before
 
-        self._use(usable, storage)
+        other = copy(self)
+        other._use(usable, storage)
+        return other
 
     def _use(self, usable: Callable[[int], np.ndarray], storage: PhotoStorage) -> None:
         """List the usable pixels; `usable` gives those of a photo by its index, (pixels of the photo,) bool."""
@@ -343,6 +327,57 @@ class PixelPool:
         photo = int(self.photo_of(torch.tensor(number, device=self.first_pixel.device)))
         row, column = divmod(number - int(self.first_pixel[photo]), self.cameras[photo].width)
         return self.frames[photo].name, column, row
+
+
+@dataclass(frozen=True)
+class PointDepths:
+    """Pixels at known distances: M of them.
+
+    Args:
+        numbers: (M,) int64, pixels of the pool.
+        distances: (M,) along their rays, training frame.
+        trust: (M,) in (0, 1].
+    """
+
+    numbers: Tensor
+    distances: Tensor
+    trust: Tensor
+
+    def among(self, pool: PixelPool) -> "PointDepths":
+        """Select the pixels that are usable in a pool."""
+        return self._chosen(pool.is_usable(self.numbers))
+
+    def joined(self, other: "PointDepths") -> "PointDepths":
+        """Return the pixels of both."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return PointDepths(*(torch.cat(pair) for pair in pairs))
+
+    def draw(self, count: int, generator: torch.Generator) -> "PointDepths":
+        """Draw `count` of these pixels at random, with replacement."""
+        device = self.numbers.device
+        return self._chosen(torch.randint(len(self.numbers), (count,), generator=generator, device=device))
+
+    def _chosen(self, which: Tensor) -> "PointDepths":
+        return PointDepths(self.numbers[which], self.distances[which], self.trust[which])
+
+
+class PointRays:
+    """Pixels at known distances that are added to each step.
+
+    Args:
+        sets: of pixels; the same number is drawn from each set, whatever its size. Empty sets are dropped.
+    """
+
+    def __init__(self, sets: Sequence[PointDepths], pool: PixelPool):
+        self.sets = [depths for depths in sets if len(depths.numbers)]
+        self._pool = pool
+
+    def added_to(self, drawn: PixelBatch, generator: torch.Generator) -> PixelBatch:
+        """Append pixels at known distances to those in `drawn`. Their colours count like all others."""
+        count = max(1, len(drawn.numbers) // PIXELS_PER_POINT // len(self.sets))
+        chosen = reduce(PointDepths.joined, [depths.draw(count, generator) for depths in self.sets])
+        both = self._pool.rays_of(torch.cat([drawn.numbers, chosen.numbers]))
+        return both._replace(distances=chosen.distances, trust=chosen.trust)
 
 
 def _one_after_another(photos: Sequence[LoadedPhoto]) -> np.ndarray:

@@ -17,7 +17,7 @@ from nerfcli.cameras.lens_change import FOCAL, bearings_by_change, changeable, c
 from nerfcli.cameras.rigid import from_parts, inverse, transform_from_twist, vector_from_rotation
 from nerfcli.training.camera_optimiser import NewtonSteps, WhitenedAdam, whitening, without_mean
 from nerfcli.training.delayed import Delayed, on_device_of
-from nerfcli.training.pool import PixelBatch, Pool
+from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.schedule import CameraPlan
 
 # Least distance of a camera from the origin of the training frame, about which its points are.
@@ -121,7 +121,7 @@ class LensRefinement(nn.Module):
         log_focal: initial value of "focal".
     """
 
-    def __init__(self, pool: Pool, names: tuple[str, ...], log_focal: float):
+    def __init__(self, pool: PixelPool, names: tuple[str, ...], log_focal: float):
         super().__init__()
         lenses = list(by_lens(pool.cameras).values())
         self._cameras = tuple(camera for lens in lenses for camera in lens)
@@ -215,7 +215,7 @@ class Refinement(nn.Module):
         log_focal: logarithm of the initial factor of focal lengths, if these are learned.
     """
 
-    def __init__(self, kind: str, pool: Pool, log_focal: float = 0.0):
+    def __init__(self, kind: str, pool: PixelPool, log_focal: float = 0.0):
         super().__init__()
         self._pool = pool
         self._given = pool.poses.double().cpu().numpy()

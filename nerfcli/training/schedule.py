@@ -1,10 +1,10 @@
-"""The schedule of a training: what its steps do at which progress; the step, rays, cells and cameras read it.
+"""The schedule of a training: how its budget is used, and what its steps do at which progress.
 
 Progress is the used fraction of the budget, in [0, 1]. Where a number of steps decides as well, it stands beside it.
-Elsewhere are the levels that a detail opens (`HashField`), and the samples of a step by its number (`TrainSettings`).
+Everything that depends on either reads it here. `nerfcli train SCENE --dry-run` shows it as a table.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import cos, pi
 
@@ -13,12 +13,29 @@ import numpy as np
 from nerfcli.training.runs.components import LEARNED_BACKGROUNDS, Components
 from nerfcli.training.runs.settings import TrainSettings
 
+# Before the first step, of the budget: stereo matching may take this fraction, and the selection of components this
+# one. A training by steps must give the same result on all machines: its stereo takes what 60 s on one thread allow.
+STEREO_FRACTION, SEARCH_FRACTION, STEREO_SECONDS = 0.06, 0.15, 60.0
+# Of the selection: photos may be matched for this fraction, and the start that all trials continue takes this one.
+MATCHING_FRACTION, START_FRACTION = 0.5, 0.2
+# A start with fewer steps tells nothing, and one with more no more. No machine takes the fewest in less time than this,
+# and a vain attempt would cost the training time.
+FEWEST_STEPS, MOST_START_STEPS, LEAST_START_SECONDS = 120, 250, 0.3
+# A removal of a component saves only a little time in the training: its trials have to end within this fraction of the
+# selection's time, and may take this one: 2 % of the training.
+REMOVAL_FRACTION, REMOVAL_COST = 0.65, 0.13
+# The start of trials ends at this progress of a short training of its own, and trials continue from there to its end.
+FORK_PROGRESS = 0.6
+# The schedule is shown at these values of progress.
+SHOWN = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9, 1.0)
+# The field is kept at these values of progress, and measured on held-out pixels when the training is over.
+WAYPOINTS = (0.25, 0.5, 0.75, 1.0)
 # Learning rate: the warm-up ends by this progress at the latest, however few steps that is.
 WARMUP_ENDS = 0.1
-# Detail: after this many steps, fields of long trainings, with large tables, have the detail that other fields have at
-# the end. A field whose cameras learn gets its detail later: cameras find their poses in a coarse field; a fine one
-# learns to show each photo from its wrong pose.
-LARGE_TABLE_STEPS, DETAIL_DELAY = 400, 0.125
+# Detail: a field has all of it after this progress; those of long trainings, with large tables, after half of this many
+# steps. A field whose cameras learn gets it later: cameras find their poses in a coarse field; a fine one learns to
+# show each photo from its wrong pose.
+DETAILED_PROGRESS, LARGE_TABLE_STEPS, DETAIL_DELAY = 0.5, 400, 0.125
 # Steps along rays: until this progress, they are this many times as long as those of the capture, and then the
 # shortest: the initial fog has no detail. Short trainings do not reach the detail and learn more from more rays: their
 # progress is that of this many steps.
@@ -43,6 +60,59 @@ CAMERAS_START, CAMERAS_FULL, CAMERAS_FALL, CAMERAS_END, LAST_CAMERA_RATE = 0.1, 
 DAMPING_PROGRESS, DAMPINGS = (0.2, 0.8), (1.0, 0.1)
 # Cameras are held from the first value on, see `NewtonSteps.change`; before, it is not clear which errors they have.
 HOLDING_PROGRESS, HOLDINGS = (0.2, 0.5), (1e-3, 0.05)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Seconds and steps that may be used; None for no limit."""
+
+    seconds: float | None
+    steps: int | None
+
+    @classmethod
+    def of(cls, settings: TrainSettings) -> "Budget":
+        """Return the budget of a training."""
+        return cls(settings.budget_seconds, settings.steps)
+
+    def progress(self, step: int, seconds: float, *, before: float = 0.0) -> float:
+        """Return the used fraction: the larger of that of steps and that of time.
+
+        Args:
+            step: number of steps so far.
+            seconds: used so far.
+            before: seconds of these that were used before the first step.
+        """
+        left = self.seconds - before if self.seconds else 0.0
+        by_time = (seconds - before) / left if left > 0 else 0.0
+        by_steps = step / self.steps if self.steps else 0.0
+        return min(1.0, max(by_time, by_steps))
+
+    def of_stereo(self, threads: int) -> tuple[float, int]:
+        """Return the seconds that stereo matching may take, and the threads that it is assumed to have."""
+        return (STEREO_SECONDS, 1) if self.seconds is None else (STEREO_FRACTION * self.seconds, threads)
+
+    def of_search(self, used: float = 0.0) -> "Budget":
+        """Return the budget of trials; some of its seconds are used already."""
+        steps = None if self.steps is None else round(SEARCH_FRACTION * self.steps)
+        return Budget(None if self.seconds is None else max(1e-3, SEARCH_FRACTION * self.seconds - used), steps)
+
+    def of_start(self) -> "Budget":
+        """Return the budget of the start of trials with this budget."""
+        if self.seconds is not None:
+            return Budget(START_FRACTION * self.seconds, MOST_START_STEPS)
+        return Budget(None, min(round(START_FRACTION * (self.steps or 0)), MOST_START_STEPS))
+
+    @property
+    def allows_trials(self) -> bool:
+        """Whether a start of trials would be long enough."""
+        if self.seconds is not None:
+            return START_FRACTION * SEARCH_FRACTION * self.seconds >= LEAST_START_SECONDS
+        return round(START_FRACTION * SEARCH_FRACTION * (self.steps or 0)) >= FEWEST_STEPS
+
+    def allows_matching(self, seconds: float) -> bool:
+        """Return whether photos may be matched in this time to select components."""
+        in_time = self.seconds is None or seconds <= MATCHING_FRACTION * SEARCH_FRACTION * self.seconds
+        return self.allows_trials and in_time
 
 
 @dataclass(frozen=True)
@@ -87,9 +157,8 @@ class Schedule:
     """The schedule of one training.
 
     Args:
-        settings: first and final learning rate, and steps of the warm-up.
+        settings: learning rates, samples, and components.
         parallax: of the capture, see `Extent`; below 1 with a narrow baseline.
-        learns_cameras: whether cameras learn.
         cameras_from: the progress from which they do, for a training that goes on from one with fixed cameras.
         has_large_table: whether the field is one of long trainings.
         closing_steps: the steps after which open cells have the last threshold.
@@ -97,7 +166,6 @@ class Schedule:
 
     settings: TrainSettings
     parallax: float
-    learns_cameras: bool
     cameras_from: float
     has_large_table: bool
     closing_steps: int
@@ -132,12 +200,49 @@ class Schedule:
         return min(1.0, max((step + 1) / settings.warmup_steps, progress / WARMUP_ENDS)) * rate
 
     def detail(self, furthest: float, step: int) -> float:
-        """Return the progress whose detail the field has; cameras that learn late do not delay it."""
-        if self.cameras_from > 0.0:
-            return furthest
-        if self.learns_cameras:
-            return (1.0 - DETAIL_DELAY) * furthest - DETAIL_DELAY
-        return min(1.0, max(furthest, step / LARGE_TABLE_STEPS)) if self.has_large_table else furthest
+        """Return the detail of the field, 1 or more for all; cameras that learn late do not delay it."""
+        if self.cameras_from == 0.0 and self.settings.components.cameras != "fixed":
+            furthest = (1.0 - DETAIL_DELAY) * furthest - DETAIL_DELAY
+        elif self.cameras_from == 0.0 and self.has_large_table:
+            furthest = min(1.0, max(furthest, step / LARGE_TABLE_STEPS))
+        return furthest / DETAILED_PROGRESS
+
+    def plans(self) -> list[tuple[float, StepPlan]]:
+        """Return the plans of steps throughout a training, each with its progress."""
+        steps = self.settings.expected_steps
+        return [(progress, self.at(progress, step=round(progress * steps), furthest=progress)) for progress in SHOWN]
+
+
+# What the table of a schedule does not show.
+NOTES = (
+    f"before the first step: stereo matching for up to {100 * STEREO_FRACTION:.0f} % of the budget, trials for up to "
+    f"{100 * SEARCH_FRACTION:.0f} %",
+    "points, sky and roughness count where the components include points and a background; cameras move where they are "
+    "refined, and then finer levels learn later",
+)
+
+
+def table_of(plans: Sequence[tuple[float, StepPlan]]) -> tuple[list[str], list[list[str]]]:
+    """Return plans as a table: the titles of its columns, values of the progress, and a row for each quantity."""
+
+    def row(title: str, cell: Callable[[StepPlan], str]) -> list[str]:
+        return [title, *(cell(plan) for _, plan in plans)]
+
+    names = dict.fromkeys(name for _, plan in plans for name in plan.weights)
+    rows = [
+        row("steps before", lambda plan: f"{plan.step:,}"),
+        row("samples of a step", lambda plan: f"{plan.samples:,.0f}"),
+        row("learning rate", lambda plan: f"{plan.learning_rate:.4f}"),
+        row("finer levels that learn", lambda plan: f"{100.0 * min(1.0, max(0.0, plan.detail)):.0f} %"),
+        row("steps along rays", lambda plan: "shortest" if plan.stride == SHORTEST else f"{plan.stride} x"),
+        row("closed cells", lambda plan: f"< {plan.threshold:.2g}"),
+        *(row(f"weight of {name}", lambda plan, name=name: f"{plan.weights.get(name, 0.0):.2g}") for name in names),
+        row("loss of points", lambda plan: "logarithm" if plan.are_emerging else "linear"),
+        row("cameras move", lambda plan: f"{100.0 * plan.cameras.rate:.0f} %"),
+        row("cameras are damped", lambda plan: f"{plan.cameras.damping:.2g}"),
+        row("cameras are held", lambda plan: f"{plan.cameras.holding:.2g}"),
+    ]
+    return ["progress", *(f"{100.0 * progress:.0f} %" for progress, _ in plans)], rows
 
 
 def stride(progress: float, step: int) -> int:

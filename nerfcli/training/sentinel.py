@@ -9,7 +9,6 @@ rate. If sums are added up in varying order, a repeated step may stay finite: th
 would not help, and the training simply continues.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,11 +19,13 @@ from torch import Tensor
 
 from nerfcli import distributed
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.kinds import settings_from_json
 from nerfcli.render.trained_field import Marching
-from nerfcli.training.fitting import Fitting, StepResult
+from nerfcli.training.extent import Extent
+from nerfcli.training.fitting import Fitting, StepResult, TrainingInputs
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.step import NonFiniteError, Watch
@@ -95,13 +96,11 @@ class Sentinel:
 
     Args:
         fitting: the training, in a state that is finite.
-        pool: the source of its pixels.
         run: folder for states before failures.
     """
 
-    def __init__(self, fitting: Fitting, pool: PixelPool, *, run: Path, notify: Callable[[str], None]):
+    def __init__(self, fitting: Fitting, *, run: Path, notify: Callable[[str], None]):
         self._fitting = fitting
-        self._pool = pool
         self._run = run
         self._notify = notify
         self._progress: list[float] = []  # progress of the steps since the copy
@@ -210,7 +209,7 @@ class Sentinel:
             "poses": fitting.pool.poses,
             "after_draw": fitting.generator.get_state(),
         }
-        pixels = [self._pool.place(int(drawn.numbers[ray])) for ray in bad.rays[:8]]
+        pixels = [fitting.pool.place(int(drawn.numbers[ray])) for ray in bad.rays[:8]]
         text = f"{bad.name} is not finite at step {fitting.step + 1}: {bad.count} of {bad.total} numbers"
         if pixels:
             name, x, y = pixels[0]
@@ -224,8 +223,8 @@ class Sentinel:
             "share": progress,
             "pixels": [list(pixel) for pixel in pixels],
             "settings": fitting.settings.to_json(),
-            "marching": vars(fitting.marching),
-            "parallax": fitting.schedule.parallax,
+            "marching": vars(fitting.extent.marching),
+            "parallax": fitting.extent.parallax,
             "cameras": [camera.to_json() for camera in fitting.pool.cameras],
             "state": description,
         }
@@ -233,7 +232,7 @@ class Sentinel:
         return path, text
 
 
-class _SavedBatch:
+class _SavedBatch(PixelPool):
     """A pool of pixels that holds a single batch."""
 
     def __init__(self, tensors: dict[str, Tensor], cameras: Sequence[dict[str, Any]]):
@@ -243,18 +242,11 @@ class _SavedBatch:
         self.cameras = tuple(Camera.from_json(camera) for camera in cameras)
         self._drawn = PixelBatch(**{name: tensors[f"batch.{name}"] for name in PixelBatch._fields})
         self._after_draw = tensors["batch.after_draw"]
-        self.footprint = math.nan  # the field's size is known
-
-    @property
-    def has_alpha(self) -> bool:
-        return self.colours.shape[-1] == 4
 
     def draw(self, count: int, generator: torch.Generator) -> PixelBatch:
+        """Return the batch, and bring the generator to where it was after drawing it."""
         generator.set_state(self._after_draw)
         return self._drawn
-
-    def photo_of(self, numbers: Tensor) -> Tensor:
-        return torch.searchsorted(self.first_pixel, numbers, right=True) - 1
 
 
 def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
@@ -275,14 +267,9 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
     settings = replace(TrainSettings.from_json(description["settings"]), device="cpu")
     torch.set_num_threads(settings.threads)
     size = settings_from_json(description["state"]["field"])
-    fitting = Fitting(
-        _SavedBatch(tensors, description.get("cameras", ())),
-        Marching(**description["marching"]),
-        contraction=size.contraction,
-        parallax=description.get("parallax", 1.0),
-        settings=settings,
-        size=size,
-    )
+    marching, parallax = Marching(**description["marching"]), description.get("parallax", 1.0)
+    extent = Extent(size.contraction, Similarity.identity(), marching, parallax=parallax)
+    fitting = Fitting(TrainingInputs(settings, extent, _SavedBatch(tensors, description.get("cameras", ()))), size=size)
     fitting.restore({name: t for name, t in tensors.items() if not name.startswith("batch.")}, description["state"])
     return description, _watched_step(fitting, description["share"])[1]
 

@@ -17,7 +17,7 @@ from nerfcli.training.appearance import Appearance
 from nerfcli.training.losses import LOSSES, Shown, colour_losses, emerging_losses
 from nerfcli.training.open_cells import OpenCells
 from nerfcli.training.optimiser import FieldOptimiser, PartsOptimiser
-from nerfcli.training.pool import PixelBatch, Pool
+from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.runs.components import Components
 from nerfcli.training.schedule import StepPlan
 from nerfcli.training.strides import RaySteps
@@ -55,7 +55,7 @@ class State(Protocol):
     """What a step reads and changes; see `fitting.Fitting`."""
 
     components: Components
-    pool: Pool
+    pool: PixelPool
     field: Field
     appearance: Appearance
     cells: OpenCells

@@ -7,6 +7,7 @@ from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import cube_side
 from nerfcli.render.trained_field import Marching
+from nerfcli.training.extent import Extent
 from nerfcli.training.normalisation import NEAR_PER_POINT
 from nerfcli.training.schedule import SHORTEST
 
@@ -24,14 +25,14 @@ class RaySteps:
     1. That is the distance of the nearest 3D point if the capture has points and no bounds.
 
     Args:
-        marching: the steps of the capture.
-        parallax: of the capture, see `Extent`.
+        extent: gives the steps of the capture, and its parallax.
     """
 
-    def __init__(self, marching: Marching, settings: FieldSettings, *, parallax: float, device: torch.device):
+    def __init__(self, extent: Extent, settings: FieldSettings, device: torch.device):
+        marching = extent.marching
         self._marching, self._detailed = marching, settings.detailed
         self.nearest = min(1.0, marching.near / NEAR_PER_POINT)
-        self._halved = 2 ** halvings(marching, settings, parallax)
+        self._halved = 2 ** halvings(marching, settings, extent.parallax)
         self._edges = marching.stretched(1 / self._halved).edges().to(device, torch.float32)
 
     @property

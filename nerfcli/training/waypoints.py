@@ -22,12 +22,11 @@ from nerfcli.render.held_out_exposure import log_gains_of
 from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.render.tracing import render_rays
 from nerfcli.training.appearance import over_background
+from nerfcli.training.fitting import TrainingInputs
 from nerfcli.training.pool import PixelPool, load_album
-from nerfcli.training.preparation import Prepared
 from nerfcli.training.runs.log import add_to_log
 from nerfcli.training.storage import IN_MEMORY, PhotoStorage
 
-FRACTIONS = (0.25, 0.5, 0.75, 1.0)
 FOLDER = "waypoints"
 # Number of held-out pixels that are measured.
 PIXELS = 4096
@@ -56,26 +55,26 @@ def forget_waypoints(run: Path, *, after: int = -1) -> None:
 
 
 def measure_waypoints(
-    held_out: Sequence[Frame], run: Path, prepared: Prepared, *, notify: Callable[[str], None]
+    held_out: Sequence[Frame], run: Path, inputs: TrainingInputs, *, notify: Callable[[str], None]
 ) -> None:
     """Add the PSNR of a sample of held-out pixels to the waypoint entries of RUN/log.jsonl, and remove the waypoints.
 
     If held-out photos cannot be read, report this and measure nothing: the training itself is complete without them.
     """
-    settings, device = prepared.settings, prepared.settings.device
+    settings, device = inputs.settings, inputs.settings.device
     steps = _kept(run)
     if held_out and steps:
         masks = settings.components.masks
         try:
             album = load_album(
-                held_out, factor=prepared.factor, threads=settings.threads, storage=prepared.storage, masks=masks
+                held_out, factor=inputs.factor, threads=settings.threads, storage=inputs.storage, masks=masks
             )
             pixels = HeldoutPixels(
                 album.photos,
-                prepared.extent.training_from_scene,
+                inputs.extent.training_from_scene,
                 torch.device(device),
                 colours=album.colours,
-                storage=prepared.storage,
+                storage=inputs.storage,
             )
         except UserError as error:
             notify(f"training is complete, but PSNR on held-out photos could not be measured: {error}")

@@ -121,6 +121,16 @@ class TrainSettings:
         return min(by_steps, by_time)
 
     @property
+    def expected_steps(self) -> float:
+        """Number of steps with about `expected_samples`."""
+        doubling = DOUBLING_STEPS / math.log(2.0)
+        rising = DOUBLING_STEPS * math.log2(max(1.0, self.samples_per_step / self.first_samples_per_step))
+        beyond = self.expected_samples - doubling * (self.samples_at(rising) - self.samples_at(0))
+        if beyond >= 0.0:
+            return rising + beyond / self.samples_per_step
+        return doubling * math.log1p(self.expected_samples / (doubling * self.samples_at(0)))
+
+    @property
     def chosen_log2_rows(self) -> int:
         """Binary logarithm of the rows of each table: as given, or chosen by the length of the training."""
         if self.log2_rows is not None:

@@ -11,6 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from nerfcli.training.runs.components import Change, Components, Decision, untried
+from nerfcli.training.schedule import REMOVAL_COST, REMOVAL_FRACTION, Budget
 from nerfcli.training.selection.trials import Trial, Trials, TrialStart
 
 # A gain counts if it exceeds `LEAST_GAIN_DB`, which nobody sees, by this many standard errors.
@@ -156,19 +157,15 @@ def _gains_by_steps(trial: Trial) -> np.ndarray:
 # Steps of a trial relative to those of the training that it continues.
 STEPS_OF_START = 0.5
 SEEDS = 2
-# A removal saves only a little time in the training: its trials have to end within this fraction of a time budget.
-REMOVAL_FRACTION = 0.65
-# They may take this fraction of the budget: 2 % of a training whose search has 15 %.
-REMOVAL_COST = 0.13
 NO_TIME, ONCE = "not tried, no time left", "not clear with one seed, and no time left for a second one"
 COSTS_MORE = "not tried, the trial would take longer than it could save"
 
 
-class SearchBudget:
-    """Budget of all trials together: seconds, or steps."""
+class Purse:
+    """What is left of the budget of all trials together: seconds, or steps where it has none."""
 
-    def __init__(self, seconds: float | None, steps: int | None):
-        self._seconds, self._steps = seconds, steps
+    def __init__(self, budget: Budget):
+        self._seconds, self._steps = budget.seconds, budget.steps
         self._began, self._gone = time.perf_counter(), 0
 
     @property
@@ -206,8 +203,8 @@ class Race:
         requested: the components of the model to improve.
     """
 
-    def __init__(self, trials: Trials, start: TrialStart, budget: SearchBudget, requested: Components):
-        self._trials, self._start, self._budget, self._requested = trials, start, budget, requested
+    def __init__(self, trials: Trials, start: TrialStart, purse: Purse, requested: Components):
+        self._trials, self._start, self._purse, self._requested = trials, start, purse, requested
         self._length = max(1, round(STEPS_OF_START * start.steps))
         self._seconds_each = start.seconds * self._length / start.steps
         self.kept: list[Change] = []
@@ -253,7 +250,7 @@ class Race:
             trials = 2 * SEEDS - len(self._base)  # all seeds, for a sure answer
             if not self._can_run(trials, fraction_of_time=REMOVAL_FRACTION):
                 continue
-            if not self._budget.is_cheap(trials, of_steps=self._length, seconds_each=self._seconds_each):
+            if not self._purse.is_cheap(trials, of_steps=self._length, seconds_each=self._seconds_each):
                 self.decisions[change] = untried(*change, COSTS_MORE)
                 continue
             self._base = self._base or [self._trial([], seed=0)]
@@ -314,20 +311,20 @@ class Race:
         self.decisions[change] = replace(self.decisions[change], kept=False, why=why)
 
     def _judged(self, rule: Rule, change: Change, own: Sequence[Trial]) -> Decision:
-        decision = rule(self._base[: len(own)], change, own, by_time=self._budget.is_time)
+        decision = rule(self._base[: len(own)], change, own, by_time=self._purse.is_time)
         others = ", ".join(name for name, _ in self.kept)
         return replace(decision, why=f"{decision.why}, in addition to {others}") if others else decision
 
     def _can_run(self, trials: int, *, fraction_of_time: float = 1.0) -> bool:
-        return self._budget.can_afford(
+        return self._purse.can_afford(
             trials, of_steps=self._length, seconds_each=self._seconds_each, fraction_of_time=fraction_of_time
         )
 
     def _trial(self, changes: Sequence[Change], *, seed: int) -> Trial:
-        before = self._budget.spent
+        before = self._purse.spent
         values: dict[str, Any] = dict([*self.kept, *changes])
         components = replace(self._requested, **values)
         trial = self._trials.go_on(self._start, components, seed=seed, steps=self._length)
-        self._budget.charge(self._length)
-        self._seconds_each = max(self._seconds_each, self._budget.spent - before)
+        self._purse.charge(self._length)
+        self._seconds_each = max(self._seconds_each, self._purse.spent - before)
         return trial

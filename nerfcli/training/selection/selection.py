@@ -13,19 +13,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from nerfcli.matching.camera_check import CameraCheck
+from nerfcli.training.evidence import LEARN_FOCAL, LEAST_MISS_PX, LEAST_SKY_FRACTION, may_use_points
 from nerfcli.training.runs.components import CHOICES, MOST_DEGREES, Change, Components, Decision, Selection, untried
+from nerfcli.training.schedule import FEWEST_STEPS, Budget
 from nerfcli.training.selection.diagnostics import Diagnostics
-from nerfcli.training.selection.race import Race, Rule, SearchBudget, judge_evidence, judge_likely, judge_supported
+from nerfcli.training.selection.race import Purse, Race, Rule, judge_evidence, judge_likely, judge_supported
 from nerfcli.training.selection.trials import Trials
 
-# Fraction of the budget for all trials together, and fraction of that for the training that they continue.
-SEARCH_FRACTION, START_FRACTION = 0.15, 0.2
-# A search whose first training would have fewer steps tells nothing, and is skipped.
-FEWEST_STEPS = 120
-# No machine takes that many steps in less time than this, and a vain attempt would cost the training time.
-LEAST_START_SECONDS = 0.3
-# A start of this many steps tells as much as a longer one.
-MOST_START_STEPS = 250
 # Spread of the photos' brightness, in logarithms of light. Below the first number, exposures do not help; above the
 # second, they are likely, and a smaller gain in the trial is enough.
 LEAST_EXPOSURE_SPREAD, LIKELY_EXPOSURE_SPREAD = 0.06, 0.11
@@ -36,20 +30,14 @@ FEW_PHOTOS = (MOST_DEGREES + 1) ** 2
 # Fraction of pixels that show distant things. Below the first number, the field itself shows a sky as well; above the
 # second, a sky is likely, and a smaller gain in the trial is enough.
 LEAST_FAR_FRACTION, LIKELY_FAR_FRACTION = 0.01, 0.1
-# If a larger fraction of pixels looks like a sky, there is one.
-LEAST_SKY_FRACTION = 0.05
 # A colour by direction predicts a sky better than one colour by at least this, unlike surfaces that a coarse field has
 # put far away. Or it predicts it this well: an overcast sky has one colour.
 LEAST_SKY_DB, LEAST_SKY_PSNR = 1.0, 22.0
-# Cameras with an epipolar error below this are as good as the features: structure from motion leaves 0.1 to 0.4.
-LEAST_MISS_PX = 0.6
 # Poses with at least this epipolar error at any focal length are wrong; in between, a trial decides.
 SURELY_MISSED_PX = 1.2
 # The focal length from matches is used if it differs from the given one by this many standard errors and this much in
 # the logarithm, and reduces the epipolar error to this fraction.
 FOCAL_ERRORS, LEAST_FOCAL, MISS_FRACTION = 5.0, 0.003, 0.85
-# Values of "cameras" with which focal lengths are learned.
-LEARN_FOCAL = ("focal", "all")
 
 
 @dataclass(frozen=True)
@@ -127,23 +115,6 @@ def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components,
     return replace(requested, cameras="poses"), 0.0, [*decisions, untried("cameras", "poses", reason, kept=True)]
 
 
-def may_use_points(requested: Components, facts: Facts) -> bool:
-    """Return whether triangulated points may be used for depth supervision.
-
-    The cameras must fit. With alpha, which tells where space is empty, points help only at first: on lego they cost
-    half a decibel, through the time that their rays take.
-    """
-    if "points" in facts.fixed:
-        return bool(requested.points)
-    fit = facts.cameras is None or facts.cameras.misses_px[0] < LEAST_MISS_PX
-    return fit and requested.cameras == "fixed" and not facts.has_alpha
-
-
-def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bool:
-    """Return whether stereo matching may add to the points; it relies on the given cameras, as points do."""
-    return requested.stereo if "stereo" in facts.fixed else has_time and facts.points > 0
-
-
 def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
     """Return the model with components that photos support before any training, unless set, and the decisions.
 
@@ -152,7 +123,8 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
     first step on: later, density has formed elsewhere already.
     """
     wanted: list[tuple[Change, str]] = []
-    if facts.points and may_use_points(requested, facts):
+    may_use = may_use_points(requested, facts.fixed, has_alpha=facts.has_alpha, cameras=facts.cameras)
+    if facts.points and may_use:
         wanted.append((("points", CHOICES["points"].on), f"{facts.points:,} pixels see a 3D point at a known distance"))
         if facts.stereo:
             wanted.append((("stereo", True), f"several photos agree on the depth of {facts.stereo} pixels"))
@@ -257,21 +229,7 @@ def _without_poses(model: Components) -> Components:
     return replace(model, cameras="fixed") if model.cameras == "poses" else model
 
 
-def is_worth_a_search(seconds: float | None, steps: int | None) -> bool:
-    """Return whether the budget is large enough for a search; see `select`."""
-    if seconds is not None:
-        return START_FRACTION * SEARCH_FRACTION * seconds >= LEAST_START_SECONDS
-    return round(START_FRACTION * SEARCH_FRACTION * (steps or 0)) >= FEWEST_STEPS
-
-
-def select(
-    trials: Trials,
-    requested: Components,
-    facts: Facts,
-    *,
-    seconds: float | None,
-    steps: int | None,
-) -> Selection:
+def select(trials: Trials, requested: Components, facts: Facts, budget: Budget) -> Selection:
     """Find the components that a scene needs.
 
     Candidates are compared in a race, see `race.Race`. After that, components of the model are removed if hardly
@@ -279,39 +237,32 @@ def select(
 
     Args:
         requested: the components to keep where nothing supports a change.
-        seconds: for all trials together; None to go by `steps`.
-        steps: for all trials together, if there is no time budget.
+        budget: of all trials together; steps count only where there is no time budget.
 
     Returns:
         The selection; if the budget is too small for a first training of `FEWEST_STEPS`, only what needs no trial.
     """
-    budget = SearchBudget(seconds, steps)
-    first_steps = MOST_START_STEPS if seconds is not None else round(START_FRACTION * (steps or 0))
+    purse = Purse(budget)
     model, decided = with_evidence(requested, facts)
-    start = trials.begin(
-        _without_poses(model),
-        steps=min(first_steps, MOST_START_STEPS),
-        seconds=math.inf if seconds is None else START_FRACTION * seconds,
-        fewest=FEWEST_STEPS,
-    )
+    start = trials.begin(_without_poses(model), budget.of_start(), fewest=FEWEST_STEPS)
     if start is None:
-        return Selection(model, tuple(decided), budget.spent)
-    budget.charge(start.steps)
+        return Selection(model, tuple(decided), purse.spent)
+    purse.charge(start.steps)
     if decided:
-        without = trials.begin(_without_poses(requested), steps=start.steps)
+        without = trials.begin(_without_poses(requested), Budget(None, start.steps))
         assert without is not None  # no minimum number of steps was given
-        budget.charge(without.steps)
+        purse.charge(without.steps)
         decided = [
-            judge_evidence([without.trial], (one.component, one.value), [start.trial], by_time=budget.is_time)
+            judge_evidence([without.trial], (one.component, one.value), [start.trial], by_time=purse.is_time)
             for one in decided  # all together: they share one trial
         ]
         if not decided[0].kept:
             model, start = requested, without
     candidates, declined = proposals(model, start.signs, facts)
-    race = Race(trials, start, budget, _without_poses(model))
+    race = Race(trials, start, purse, _without_poses(model))
     race.run(candidates, removals(model, facts), rules(candidates, start.signs, facts))
     values: dict[str, Any] = dict(race.kept)
     chosen = replace(model, **values)
     is_found = chosen.exposure == "learned" and model.exposure != "learned"
     gains = race.log_gains if is_found else None
-    return Selection(chosen, (*decided, *race.decisions.values(), *declined), budget.spent, gains)
+    return Selection(chosen, (*decided, *race.decisions.values(), *declined), purse.spent, gains)

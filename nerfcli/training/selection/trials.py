@@ -9,7 +9,7 @@ The held-out photos of the scene are not used: a model chosen with them could no
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,20 +20,17 @@ from torch import Tensor
 from nerfcli.errors import UserError
 from nerfcli.field.hash_field import HashField
 from nerfcli.photos.colours import psnr_of
-from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.training.extent import Extent
-from nerfcli.training.fitting import Fitting
-from nerfcli.training.point_depth import PointDepths, PointRays
-from nerfcli.training.pool import PixelPool
+from nerfcli.photos.exif import mean_log_exposure, relative_log_exposures
+from nerfcli.training.fitting import Fitting, TrainingInputs
+from nerfcli.training.pool import PixelPool, PointRays
 from nerfcli.training.runs.components import Components
-from nerfcli.training.runs.settings import FEWEST_LOG2_ROWS, TrainSettings
+from nerfcli.training.runs.settings import FEWEST_LOG2_ROWS
+from nerfcli.training.schedule import FORK_PROGRESS, Budget
 from nerfcli.training.selection.diagnostics import Diagnostics, diagnose, paint
 from nerfcli.training.step import compare, light_from_beyond
-from nerfcli.training.storage import IN_MEMORY, PhotoStorage
+from nerfcli.training.storage import PhotoStorage
 
 JUDGED_PIXELS = 8192
-# Fraction of the schedule at which the first training stops and the trials continue.
-FORK_FRACTION = 0.6
 # Seed of the choice of blocks and pixels: the same for all candidates of a scene, and not that of any training.
 SEED = 20_211
 
@@ -90,85 +87,66 @@ class Trials:
     """Trainings of one scene on the same pixels.
 
     Args:
-        settings: of the training that the trials are for; seed and components are given with each trial.
-        exif: (photos,) logarithms of EXIF exposures, relative to their mean.
-        log_focal: see `Fitting`.
-        depths: sets of pixels whose distance is known.
-        log_gains: (photos, 3) exposures from matched pixels, NaN where unknown; None if they are not used.
-        sky: see `Fitting`.
-        colours, storage: see `PixelPool`.
+        inputs: of the training that the trials are for; seed and components are given with each trial. Exposures are
+            those from pixels that photos share; None if they are not used.
 
     Raises:
         UserError: masks leave no pixels to judge by.
     """
 
-    def __init__(
-        self,
-        photos: Sequence[LoadedPhoto],
-        extent: Extent,
-        *,
-        settings: TrainSettings,
-        exif: np.ndarray,
-        log_focal: float = 0.0,
-        depths: Sequence[PointDepths] = (),
-        log_gains: Tensor | None = None,
-        sky: Tensor | None = None,
-        colours: np.ndarray | None = None,
-        storage: PhotoStorage = IN_MEMORY,
-    ):
-        device = torch.device(settings.device)
-        seen, numbers = _split(photos, storage)
-        self._pool = PixelPool(seen, extent.training_from_scene, device, colours=colours, storage=storage)
+    def __init__(self, inputs: TrainingInputs):
+        settings, pool = inputs.settings, inputs.pool
+        masks, numbers = _judged(pool, inputs.storage)
         if len(numbers) == 0:
             raise UserError(
                 "no training pixels are left to compare components on", "remove the masks, or use --model default"
             )
-        self._judged = self._pool.rays_of(torch.from_numpy(numbers).to(device))
-        self._photos = self._pool.photo_of(self._judged.numbers).cpu().numpy()
-        self._counts = np.bincount(self._photos, minlength=len(photos)) * 3
-        self._extent = extent
-        # Small steps throughout: they learn more per sample, and a short training has few samples.
-        self._settings = replace(settings, samples_per_step=settings.first_samples_per_step)
+        self._pool = pool.without(masks, storage=inputs.storage)
+        self._scored = pool.rays_of(torch.from_numpy(numbers).to(pool.colours.device))
+        self._photos = pool.photo_of(self._scored.numbers).cpu().numpy()
+        self._counts = np.bincount(self._photos, minlength=len(pool.frames)) * 3
+        exif = relative_log_exposures(pool.frames, mean_log_exposure(pool.frames))
         self._exif = torch.from_numpy(exif).to(torch.float32)[:, None].expand(-1, 3)
-        self._log_focal = log_focal
-        points = PointRays([one.among(self._pool) for one in depths], self._pool)
-        self._points = points if points.sets else None
-        self._room = storage
-        self._log_gains, self._sky = log_gains, sky
+        depths = [] if inputs.points is None else [one.among(self._pool) for one in inputs.points.sets]
+        points = PointRays(depths, self._pool)
+        # Small steps throughout: they learn more per sample, and a short training has few samples. It has few rows,
+        # however long the training after it.
+        rows = min(settings.chosen_log2_rows, FEWEST_LOG2_ROWS)
+        settings = replace(settings, samples_per_step=settings.first_samples_per_step, log2_rows=rows)
+        self._inputs = replace(inputs, pool=self._pool, settings=settings, points=points if points.sets else None)
 
-    def begin(
-        self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0
-    ) -> TrialStart | None:
-        """Train from the beginning to `FORK_FRACTION` of a schedule.
+    def begin(self, components: Components, budget: Budget, *, fewest: int = 0) -> TrialStart | None:
+        """Train from the beginning to `FORK_PROGRESS` of a schedule.
 
         Args:
-            steps: largest number of steps.
-            seconds: time limit; the result tells how many steps were taken.
+            budget: steps, and seconds if time is limited; the result tells how many steps were taken.
             fewest: smallest number of steps, for which up to twice the time is used; end early if it is out of reach.
 
         Returns:
             The state; None if there were fewer than the fewest steps.
         """
-        gains = self._log_gains if components.exposure in ("matched", "learned") else None
-        fitting = self._fitting(components, seed=self._settings.seed, log_gains=gains, cameras_from=0.0)
+        gains = self._inputs.log_gains if components.exposure in ("matched", "learned") else None
+        fitting = self._fitting(components, seed=self._inputs.settings.seed, log_gains=gains, cameras_from=0.0)
         took: list[float] = []
+        seconds = math.inf if budget.seconds is None else budget.seconds
 
         def fraction() -> float:
             enough = fitting.step / fewest if fewest else math.inf
-            return max(fitting.step / steps, sum(took) / (2.0 * seconds), min(sum(took) / seconds, enough))
+            by_steps = fitting.step / budget.steps if budget.steps else 0.0
+            return max(by_steps, sum(took) / (2.0 * seconds), min(sum(took) / seconds, enough))
 
         def is_in_vain() -> bool:
             # Ten steps tell within a factor of 1.25 how many the time allows, even on a machine slowed by other work.
             return len(took) == 10 and statistics.median(took) * fewest > 2.0 * 1.25 * seconds
 
         while fraction() < 1.0 and not is_in_vain():
-            took.append(self._advance(fitting, FORK_FRACTION * fraction()))
+            took.append(self._advance(fitting, FORK_PROGRESS * fraction()))
         if fitting.step < fewest:
             return None
         drawn = self._pool.draw(JUDGED_PIXELS, fitting.generator)
         with torch.no_grad():
             rendered, measured = compare(fitting, drawn, fitting.plan)
-        reach = self._extent.reach
+        reach = self._inputs.extent.reach
         signs = diagnose(
             rendered,
             measured,
@@ -192,9 +170,10 @@ class Trials:
                 weight, exposures as in the residuals.
             seed: of everything random; candidates with the same seed draw the same pixels.
         """
-        learned = start.signs.log_gains if self._log_gains is None else self._log_gains
-        gains = {"exif": self._exif, "matched": self._log_gains, "learned": learned}.get(components.exposure)
-        fitting = self._fitting(components, seed=seed, log_gains=gains, cameras_from=FORK_FRACTION)
+        matched = self._inputs.log_gains
+        learned = start.signs.log_gains if matched is None else matched
+        gains = {"exif": self._exif, "matched": matched, "learned": learned}.get(components.exposure)
+        fitting = self._fitting(components, seed=seed, log_gains=gains, cameras_from=FORK_PROGRESS)
         self._take_up(fitting, start)
         if fitting.appearance.background is not None:
             paint(fitting.appearance.background, self._draws())
@@ -202,7 +181,7 @@ class Trials:
         for done in range(steps):
             if halfway is None and 2 * done >= steps:
                 halfway = self._errors(fitting)
-            seconds.append(self._advance(fitting, FORK_FRACTION + (1.0 - FORK_FRACTION) * done / steps))
+            seconds.append(self._advance(fitting, FORK_PROGRESS + (1.0 - FORK_PROGRESS) * done / steps))
         errors = self._errors(fitting)
         # A median, so that other work on the machine does not look like the cost of a component.
         took = statistics.median(seconds) * steps if seconds else 0.0
@@ -220,27 +199,15 @@ class Trials:
 
         def seen() -> tuple[Tensor, Tensor]:
             drawn = self._pool.draw(JUDGED_PIXELS, generator)
-            shown = slice(None) if self._sky is None else self._sky[drawn.numbers]
+            sky = self._inputs.sky
+            shown = slice(None) if sky is None else sky[drawn.numbers]
             return drawn.directions[shown], drawn.colours[shown, :3]
 
         return seen
 
     def _fitting(self, components: Components, *, seed: int, log_gains: Tensor | None, cameras_from: float) -> Fitting:
-        # A trial is a short training, however long the training after it.
-        rows = min(self._settings.chosen_log2_rows, FEWEST_LOG2_ROWS)
-        settings = replace(self._settings, components=components, seed=seed, log2_rows=rows)
-        sky = self._sky if components.background == "sphere" else None
-        return Fitting(
-            self._pool,
-            self._extent.before(components.background, sky_known=sky is not None).marching,
-            contraction=self._extent.contraction,
-            settings=settings,
-            log_gains=log_gains,
-            log_focal=self._log_focal,
-            cameras_from=cameras_from,
-            points=self._points if components.points else None,
-            sky=sky,
-        )
+        settings = replace(self._inputs.settings, components=components, seed=seed)
+        return Fitting(replace(self._inputs, settings=settings, log_gains=log_gains), cameras_from=cameras_from)
 
     def _take_up(self, fitting: Fitting, start: TrialStart) -> None:
         """Bring a fresh training to `start`, except for its random numbers and the parts besides the field."""
@@ -255,14 +222,14 @@ class Trials:
         """Take a step, and return the seconds that it took."""
         began = time.perf_counter()
         fitting.advance(fraction)
-        self._room.release_pages()
+        self._inputs.storage.release_pages()
         return time.perf_counter() - began
 
     @torch.no_grad()
     def _errors(self, fitting: Fitting) -> np.ndarray:
         """Return the sums of squared differences of the judged pixels, (photos,)."""
         fitting.settle()
-        rendered, measured = compare(fitting, self._judged, fitting.plan)
+        rendered, measured = compare(fitting, self._scored, fitting.plan)
         errors = (rendered.clamp(0.0, 1.0) - measured).square().sum(-1).double().cpu().numpy()
         return np.bincount(self._photos, errors, len(self._counts))
 
@@ -277,26 +244,21 @@ def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarra
     return np.kron(chosen, np.ones((block, block), bool))[: shape[0], : shape[1]]
 
 
-def _split(photos: Sequence[LoadedPhoto], storage: PhotoStorage) -> tuple[list[LoadedPhoto], np.ndarray]:
-    """Return the photos without the judged blocks, and judged pixels from these blocks, numbered through all photos.
+def _judged(pool: PixelPool, storage: PhotoStorage) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return masks (H, W) bool of the judged blocks of all photos, and judged pixels of a pool in these blocks.
 
     Each photo has the same number of judged pixels, as far as its blocks have them.
     """
     generator = np.random.default_rng(SEED)
-    sizes = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
-    masks = storage.array((sum(sizes),), bool)
-    seen, numbers = [], []
-    for photo, size, end in zip(photos, sizes, np.cumsum(sizes).tolist(), strict=True):
-        judged = _blocks(photo.pixels.shape[:2], generator)
-        used = masks[end - size : end].reshape(judged.shape)
-        np.logical_not(judged, out=used)
-        if photo.used is not None:
-            used &= photo.used
-            judged &= photo.used
-        seen.append(replace(photo, used=used))
-        places = generator.permutation(np.flatnonzero(judged))[: max(1, JUDGED_PIXELS // len(photos))]
-        rows, columns = np.divmod(places, judged.shape[1])
-        valid = photo.frame.camera.bearings(np.stack([columns, rows], axis=-1) + 0.5)[1]
-        numbers.append(end - size + places[valid])
+    sizes, firsts = pool.sizes.tolist(), pool.first_pixel.tolist()
+    room = storage.array((sum(height * width for height, width in sizes),), bool)
+    masks, numbers = [], []
+    for (height, width), first in zip(sizes, firsts, strict=True):
+        mask = room[first : first + height * width].reshape(height, width)
+        mask[...] = _blocks((height, width), generator)
+        inside = torch.from_numpy(first + np.flatnonzero(mask)).to(pool.colours.device)
+        places = generator.permutation(inside[pool.is_usable(inside)].cpu().numpy())
+        masks.append(mask)
+        numbers.append(places[: max(1, JUDGED_PIXELS // len(sizes))])
         storage.release_pages()
-    return seen, np.concatenate(numbers)
+    return masks, np.concatenate(numbers)
