@@ -13,7 +13,8 @@ from nerfcli.cli import app
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.training.loop import train
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.workflows.train_plan import plan_training
+from nerfcli.training.schedule import SHOWN, THRESHOLD
+from nerfcli.workflows.train import plan_training
 
 STEPS = TrainSettings(budget_seconds=None, steps=250)
 
@@ -64,3 +65,23 @@ def test_a_scene_whose_only_photo_is_held_out_is_refused(capture: Path) -> None:
     result = CliRunner().invoke(app, ["train", str(capture), "--dry-run"])
     assert result.exit_code == 3
     assert "has no training photo" in result.stderr
+
+
+def test_the_schedule_is_what_steps_do(capture: Path) -> None:
+    """Every row against the plan of a step; what changes at 30 % are the closed cells and the loss of points."""
+    printed = CliRunner().invoke(app, ["train", str(capture), "--steps", "3000", "--dry-run"]).stdout.splitlines()
+    cells = {line[:26].strip(): line[26:].split() for line in printed if "%" in line[26:] or " x " in line[26:]}
+    assert cells["progress"] == [cell for value in SHOWN for cell in (f"{100 * value:.0f}", "%")]
+    assert " ".join(cells["steps along rays"]) == "8 x 8 x 4 x 2 x 2 x 1 x shortest shortest shortest"
+    plans = dict(plan_training(SPHERES, replace(STEPS, steps=3000, model="auto")).schedule)
+    assert [plans[value].are_emerging for value in (0.2, 0.3)] == [True, False]
+    assert [plans[value].threshold == THRESHOLD for value in (0.0, 0.3)] == [False, True]
+    assert plans[0.5].weights == {"colour": 1.0, "distortion": 0.05, "points": 0.05, "sky": 0.1, "roughness": 1e-6}
+    assert [plans[value].step for value in (0.0, 0.5, 1.0)] == [0, 1500, 3000]
+
+
+@pytest.mark.parametrize("settings", [STEPS, replace(STEPS, steps=5000), TrainSettings(budget_seconds=90.0, threads=2)])
+def test_the_expected_steps_have_the_expected_samples(settings: TrainSettings) -> None:
+    taken = sum(settings.samples_at(step) for step in range(round(settings.expected_steps)))
+    assert taken == pytest.approx(settings.expected_samples, rel=0.01)
+    assert settings.steps is None or settings.expected_steps == pytest.approx(settings.steps)

@@ -1,7 +1,7 @@
 """nerfcli train: from a scene to a field."""
 
 import functools
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -56,7 +56,7 @@ def train(
     ] = False,
     memory: options.DeviceMemory = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show how much memory, disk and time it would take.")
+        bool, typer.Option("--dry-run", help="Show how much memory, disk and time it would take, and its schedule.")
     ] = False,
     device: options.Device = "auto",
     seed: options.Seed = 0,
@@ -113,8 +113,8 @@ def train(
     from nerfcli.memory import default_memory_limit
     from nerfcli.training.runs.components import Components, choose
     from nerfcli.training.runs.settings import TrainSettings, sizes_for
-    from nerfcli.workflows.train import train_scene
-    from nerfcli.workflows.train_plan import plan_training
+    from nerfcli.training.schedule import NOTES, table_of
+    from nerfcli.workflows.train import plan_training, train_scene
 
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
@@ -175,7 +175,11 @@ def train(
         on_host = photo_settings().device == "cpu"  # else --memory refers to the GPU
         resident = (limit or default_memory_limit()) if on_host else None
         plan = plan_training(folder, photo_settings(), memory_bytes=resident, holdout=rule)
-        console.facts(folder, asdict(plan), f"{folder}: {plan.describe()}")
+        console.facts(folder, plan.to_json(), f"{folder}: {plan.describe()}")
+        if not json:
+            console.fact_table(*table_of(plan.schedule), styles={})
+            for note in NOTES:
+                console.note(note)
 
     def work(folder: Path, one_of_many: bool) -> None:
         run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)

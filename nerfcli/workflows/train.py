@@ -1,25 +1,40 @@
-"""Train a scene, keep an existing run, resume one, or refuse to overwrite another one."""
+"""Train a scene, keep an existing run, resume one, or refuse to overwrite another one; plan a training."""
 
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
+from typing import Any
 
 from nerfcli import distributed
 from nerfcli.atomic import clear_leftovers
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.loading import describe_source, describe_unused_masks, fingerprint, load_scene
+from nerfcli.captures.loading import (
+    describe_source,
+    describe_unused_masks,
+    fingerprint,
+    load_scene,
+    refuse_without_training_photos,
+)
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, listed, several
 from nerfcli.exclusive import exclusive
+from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.kinds import chosen_size, closing_steps
 from nerfcli.machine import is_one_of_several
 from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.training import loop
 from nerfcli.training.loop import OCCLUDERS
+from nerfcli.training.runs.components import choose
 from nerfcli.training.runs.config import split_hash
 from nerfcli.training.runs.files import CONFIG, LOCK, METRICS, STATE
 from nerfcli.training.runs.run import Run
-from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
+from nerfcli.training.schedule import Schedule, StepPlan
+from nerfcli.training.storage import InFiles, field_bytes, needs_of, storage_for
+
+# Width of a pixel at the centre of the scene, in units of the training frame, for a field whose photos are not read.
+LIKELY_FOOTPRINT = 1e-3
 
 
 def train_scene(
@@ -212,3 +227,100 @@ def _refuse_others(path: Path) -> None:
     others = path.is_dir() and not (path / CONFIG).exists() and any(entry.name != LOCK for entry in path.iterdir())
     if path.is_file() or others:
         raise UserError(f"{path} exists and is not a run folder", "choose another folder with -o")
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """Cost of a training.
+
+    Args:
+        train_photos, held_out_photos: numbers of photos.
+        downscale: factor by which photos are reduced.
+        pixels: number of pixels of the reduced training photos.
+        memory_bytes: peak memory of the process.
+        disk_bytes: largest size of the run folder, including photos that do not fit into memory.
+        seconds: the budget, which includes the automatic selection but not the reading of photos; None without one.
+        steps: limit on the number of steps; None without one.
+        schedule: what steps do at values of the progress, see `StepPlan`. Known distances and a learned background that
+            are still to be selected are shown as if they were.
+    """
+
+    train_photos: int
+    held_out_photos: int
+    downscale: int
+    pixels: int
+    memory_bytes: int
+    disk_bytes: int
+    seconds: float | None
+    steps: int | None
+    schedule: tuple[tuple[float, StepPlan], ...]
+
+    def describe(self) -> str:
+        """Return one sentence."""
+        length = f"{self.steps} steps" if self.seconds is None else f"{self.seconds:.0f} s"
+        return (
+            f"{self.train_photos} training photos and {self.held_out_photos} held out, {self.pixels / 1e6:.1f} million "
+            f"pixels (photos reduced by {self.downscale}): {length}, about {self.memory_bytes / 1e9:.2f} GB of memory, "
+            f"{self.disk_bytes / 1e9:.2f} GB on disk"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values."""
+        schedule = [{"progress": progress, **asdict(plan)} for progress, plan in self.schedule]
+        return {**asdict(self), "schedule": schedule}
+
+
+def plan_training(
+    scene: str | Path, settings: TrainSettings, *, memory_bytes: int | None = None, holdout: str | None = None
+) -> TrainingPlan:
+    """Estimate the cost of `train_scene` without opening photos or writing anything.
+
+    Example:
+        >>> from nerfcli.training.runs.settings import TrainSettings
+        >>> from nerfcli.workflows.train import plan_training
+        >>> plan_training("photos-scene", TrainSettings(budget_seconds=300)).memory_bytes
+
+    Args:
+        scene, settings, memory_bytes, holdout: as for `train_scene`.
+
+    Raises:
+        UserError: the scene cannot be read, has no training photo, or does not fit into memory.
+    """
+    loaded = load_scene(Path(scene), holdout=holdout)
+    refuse_without_training_photos(loaded)
+    factor = settings.downscale or automatic_downscale(loaded.train_frames[0].camera)
+    needs = needs_of((*loaded.train_frames, *loaded.test_frames), factor, settings=settings)
+    storage, _ = storage_for(needs, memory_bytes, folder=Path(gettempdir()))
+    in_files = needs.photos if isinstance(storage, InFiles) else 0
+    total = needs.photos + needs.rest
+    return TrainingPlan(
+        train_photos=len(loaded.train_frames),
+        held_out_photos=len(loaded.test_frames),
+        downscale=factor,
+        pixels=sum((f.camera.width // factor) * (f.camera.height // factor) for f in loaded.train_frames),
+        memory_bytes=min(total, memory_bytes) if memory_bytes else total,
+        # The field, the state with both moments of the optimiser, and the previous state until the next is written.
+        disk_bytes=(1 + 3 + 3) * field_bytes(settings) + in_files,
+        seconds=settings.budget_seconds,
+        steps=settings.steps,
+        schedule=tuple(_likely_schedule(settings).plans()),
+    )
+
+
+def _likely_schedule(settings: TrainSettings) -> Schedule:
+    """Return the schedule of a training with a wide baseline, with what is still to be selected for its losses."""
+    is_open = [name for name in ("points", "background") if settings.model == "auto" and name not in settings.fixed]
+    components = choose(settings.components, included=is_open, excluded=())
+    size = chosen_size(
+        settings.field,
+        hash_grid=HashFieldSettings(contraction="l2", log2_rows=settings.chosen_log2_rows),
+        footprint=LIKELY_FOOTPRINT,
+        memory_bytes=settings.field_memory_bytes,
+    )
+    return Schedule(
+        replace(settings, components=components),
+        parallax=1.0,
+        cameras_from=0.0,
+        has_large_table=size.detailed,
+        closing_steps=closing_steps(size),
+    )
