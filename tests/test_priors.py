@@ -280,7 +280,7 @@ def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
     assert inputs.settings.components == Components(points=0.1)
     assert inputs.points is not None
     assert [len(depths.numbers) for depths in inputs.points.sets] == [3]
-    assert "points=0.1: kept, 3 pixels see a 3D point at a known distance" in reported
+    assert "points: kept, 3 pixels see a 3D point at a known distance" in reported
 
 
 @pytest.mark.parametrize("limit", [{"budget_seconds": None, "steps": 10}, {"budget_seconds": 1.0}])

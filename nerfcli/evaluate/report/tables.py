@@ -158,7 +158,7 @@ def selection_html(runs: Sequence[RunFacts]) -> str:
             "" if decision.gain_db is None else f"{decision.gain_db:+.2f} ± {decision.error_db:.2f}",
             "" if decision.cost is None else f"{decision.cost:+.0%}",
             "yes" if decision.kept else "no",
-            decision.why,
+            decision.reason,
         )
         for run in runs
         if run.config.selection is not None

@@ -189,7 +189,8 @@ class Decision:
         cost: time per step relative to a step without the change, minus 1.
         gain_at_equal_time_db: gain minus what spending the extra time on more steps would bring.
         kept: whether the change is in the model.
-        why: reason for the decision, shown to the user.
+        why: what else decided; "" if nothing did.
+        seen: what was seen in the photos before any trial; "" if that is nothing.
     """
 
     component: str
@@ -200,21 +201,28 @@ class Decision:
     cost: float | None
     gain_at_equal_time_db: float | None
     kept: bool
-    why: str
+    why: str = ""
+    seen: str = ""
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Decision":
-        """Read the entries of a decision; numbers that earlier versions did not write are None."""
+        """Read the entries of a decision; those that earlier versions did not write are None or ""."""
         entries: dict[str, Any] = {entry.name: content.get(entry.name) for entry in fields(cls)}
-        return cls(**entries)
+        return cls(**{**entries, "seen": content.get("seen", "")})
+
+    @property
+    def reason(self) -> str:
+        """What was seen, and what else decided."""
+        return "; ".join(part for part in (self.seen, self.why) if part)
 
     def in_words(self) -> str:
-        """Return a line for people: "exposure=learned: +1.20 dB (± 0.08), 3 % more time: kept, gains ..."."""
-        named = f"{self.component}={str(self.value).lower()}"
+        """Return a line: "exposure=learned: kept, photos differ by 0.8 stops; +1.20 ± 0.08 dB, 3 % more time"."""
+        named = self.component if self.component == "points" or self.value is True else f"{self.component}={self.value}"
         if self.gain_db is None or self.error_db is None or self.cost is None:
-            return f"{named}: {'kept, ' if self.kept else ''}{self.why}"
-        measured = f"{self.gain_db:+.2f} dB (± {self.error_db:.2f}), {_time_in_words(self.cost)}"
-        return f"{named}: {measured}: {'kept' if self.kept else 'not kept'}, {self.why}"
+            return f"{named}: {'kept' if self.kept else 'not tried'}, {self.reason}"
+        measured = f"{self.gain_db:+.2f} ± {self.error_db:.2f} dB, {_time_in_words(self.cost)}"
+        parts = "; ".join(part for part in (self.seen, measured, self.why) if part)
+        return f"{named}: {'kept' if self.kept else 'not kept'}, {parts}"
 
 
 def _time_in_words(cost: float) -> str:
@@ -224,9 +232,9 @@ def _time_in_words(cost: float) -> str:
     return f"{per_cent} % {'more' if cost > 0 else 'less'} time"
 
 
-def untried(component: str, value: Value, why: str, *, kept: bool = False) -> Decision:
+def untried(change: Change, seen: str, *, why: str = "", kept: bool = False) -> Decision:
     """Return the decision about a candidate that was not tried, or that is kept without a trial."""
-    return Decision(component, value, None, None, None, None, None, kept, why)
+    return Decision(*change, None, None, None, None, None, kept, why, seen)
 
 
 @dataclass(frozen=True)

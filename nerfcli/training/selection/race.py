@@ -4,8 +4,8 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any, Protocol
+from enum import Enum
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -16,7 +16,7 @@ from nerfcli.training.selection.trials import Trial, Trials, TrialStart
 
 # A gain counts if it exceeds `LEAST_GAIN_DB`, which nobody sees, by this many standard errors.
 STANDARD_ERRORS = 2.0
-# The same for a gain that diagnostics suggest, as well as the trial.
+# The same for a gain that is likely, as well; with one seed, `STANDARD_ERRORS`.
 LIKELY_ERRORS = 1.0
 # The same for a gain with one seed only, and its standard deviation between seeds.
 CLEAR_ERRORS, SEED_DB = 5.0, 0.1
@@ -31,22 +31,24 @@ MOST_LOSS_OF_EVIDENCE_DB = 1.0
 FLOOR = 0.1
 
 
-class Rule(Protocol):
-    """Judges the trials of a change; see `judge_one`."""
+class Support(Enum):
+    """How much other evidence than a trial supports a change."""
 
-    def __call__(self, base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision: ...
+    NONE = "none"
+    LIKELY = "likely"
+    SURE = "sure"
 
 
-def judge_one(
+def judge(
     base: Sequence[Trial],
     change: Change,
     tried: Sequence[Trial],
     *,
     by_time: bool,
-    standard_errors: float = STANDARD_ERRORS,
-    clear_errors: float = CLEAR_ERRORS,
+    support: Support = Support.NONE,
+    seen: str = "",
 ) -> Decision:
-    """Judge an added component: its gain must exceed the noise.
+    """Judge an added component: its gain must exceed the noise, or, with sure support, it must not lose.
 
     gain = mean over photos and seeds of 10 log10(MSE of base / MSE of candidate). Its variance is that of the mean over
     photos plus that of the mean over seeds; with a single seed, the latter is SEED_DB squared, and the gain must exceed
@@ -59,7 +61,8 @@ def judge_one(
         tried: trials with the change, in the same order of seeds.
         by_time: whether the gain must also exceed that of more steps in the same time; with a budget of steps, the
             answer must not depend on the speed of the machine.
-        standard_errors, clear_errors: how many of them the gain has to exceed, with several seeds and with one.
+        support: a likely change needs fewer standard errors; of a sure one, a trial is too short for most of the gain.
+        seen: what supports it, for the user.
     """
     gains = np.array([_gains(one, other) for one, other in zip(base, tried, strict=True)])
     seeds, photos = gains.shape
@@ -73,72 +76,53 @@ def judge_one(
     # Gain of the unchanged model from twice as many steps.
     slope_db = max(0.0, float(np.mean([_gains_by_steps(trial).mean() for trial in base])))
     at_equal_time = gain - slope_db * math.log2(1.0 + cost) if by_time else gain
-    errors = standard_errors if seeds > 1 else clear_errors
-    against = _against(gain, error, errors=errors, trend=trend, at_equal_time=at_equal_time)
-    why = against or f"gains more than {LEAST_GAIN_DB:g} dB and {errors:g} standard errors"
-    return Decision(*change, gain, error, trend, cost, at_equal_time, against is None, why)
+    if support is Support.SURE:
+        against = "" if gain > -error else LOSES
+    else:
+        few, many = (LIKELY_ERRORS, STANDARD_ERRORS) if support is Support.LIKELY else (STANDARD_ERRORS, CLEAR_ERRORS)
+        errors = few if seeds > 1 else many
+        against = _against(gain, error, errors=errors, trend=trend, at_equal_time=at_equal_time)
+    return Decision(*change, gain, error, trend, cost, at_equal_time, not against, against, seen)
 
 
-def judge_likely(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
-    """Judge an added component that diagnostics suggest: one standard error is enough, or two with a single seed.
+def judge_evidence(base: Trial, decision: Decision, tried: Trial, *, by_time: bool) -> Decision:
+    """Judge a component that rests on measurements of the photos, such as known distances.
 
-    Arguments as for `judge_one`.
+    It must not lose more than `MOST_LOSS_OF_EVIDENCE_DB`, or than the error of the gain if that is larger.
     """
-    return judge_one(base, change, tried, by_time=by_time, standard_errors=LIKELY_ERRORS, clear_errors=STANDARD_ERRORS)
-
-
-def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
-    """Judge a component that corrects an error known from other evidence: it must not lose.
-
-    A trial is too short for most of its gain. Arguments as for `judge_one`.
-    """
-    return _unless_it_loses(judge_one(base, change, tried, by_time=by_time), most_db=0.0)
-
-
-def judge_evidence(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
-    """Judge components that rest on measurements of the photos, such as known distances.
-
-    They must not lose more than `MOST_LOSS_OF_EVIDENCE_DB`, or than the error of the gain if that is larger. Arguments
-    as for `judge_one`.
-    """
-    return _unless_it_loses(judge_one(base, change, tried, by_time=by_time), most_db=MOST_LOSS_OF_EVIDENCE_DB)
+    change = (decision.component, decision.value)
+    measured = judge([base], change, [tried], by_time=by_time, support=Support.SURE, seen=decision.seen)
+    assert measured.gain_db is not None
+    if measured.kept or measured.gain_db <= -MOST_LOSS_OF_EVIDENCE_DB:
+        return measured
+    return replace(measured, kept=True, why="a trial is too short for its gain")
 
 
 def judge_removal(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
     """Judge the removal of a component: hardly anything may be lost, noise and trend included.
 
     What the model has learned with the component is lost at once; a model that does not need it recovers within the
-    trial. Arguments as for `judge_one`.
+    trial. Arguments as for `judge`.
     """
-    measured = judge_one(base, change, tried, by_time=by_time)
+    measured = judge(base, change, tried, by_time=by_time)
     gain, error, trend = measured.gain_db or 0.0, measured.error_db or 0.0, measured.trend_db or 0.0
-    worst = gain + min(0.0, trend) - STANDARD_ERRORS * error
-    if worst > -MOST_LOSS_DB:
-        return replace(measured, kept=True, why=f"not needed: the loss without it is below {MOST_LOSS_DB:g} dB")
-    why = "needed: PSNR drops without it" if gain < -STANDARD_ERRORS * error else "may be needed"
+    if gain + min(0.0, trend) - STANDARD_ERRORS * error > -MOST_LOSS_DB:
+        return replace(measured, kept=True, why=f"the loss without it is below {MOST_LOSS_DB:g} dB")
+    why = "it is needed" if gain < -STANDARD_ERRORS * error else "it may be needed"
     return replace(measured, kept=False, why=why)
 
 
-def _unless_it_loses(measured: Decision, *, most_db: float) -> Decision:
-    """Keep a component unless it loses more than this and more than the error of its gain."""
-    gain, error = measured.gain_db or 0.0, measured.error_db or 0.0
-    if gain > -max(error, most_db):
-        why = "does not lose" if gain > -error else f"loses less than {most_db:g} dB"
-        return replace(measured, kept=True, why=f"measured before training, and {why}")
-    return replace(measured, kept=False, why="loses, although measured before training")
-
-
-def _against(gain: float, error: float, *, errors: float, trend: float, at_equal_time: float) -> str | None:
-    """Return the reason to reject a candidate; None if there is none."""
+def _against(gain: float, error: float, *, errors: float, trend: float, at_equal_time: float) -> str:
+    """Return the reason to reject a candidate; "" if there is none."""
     if gain < -STANDARD_ERRORS * error:
-        return "loses"
+        return LOSES
     if not gain > LEAST_GAIN_DB + errors * error:
         return "no gain above the noise"
     if trend < -error - 1e-6:  # not for rounding
         return "the gain vanishes during the trial"
     if at_equal_time <= LEAST_GAIN_DB:
         return "gains less than spending the same time on more steps"
-    return None
+    return ""
 
 
 def _gains(base: Trial, changed: Trial, *, halfway: bool = False) -> np.ndarray:
@@ -157,8 +141,8 @@ def _gains_by_steps(trial: Trial) -> np.ndarray:
 # Steps of a trial relative to those of the training that it continues.
 STEPS_OF_START = 0.5
 SEEDS = 2
-NO_TIME, ONCE = "not tried, no time left", "not clear with one seed, and no time left for a second one"
-COSTS_MORE = "not tried, the trial would take longer than it could save"
+LOSES, NO_TIME, ONCE = "loses", "no time left", "not clear with one seed, and no time left for a second one"
+COSTS_MORE = "the trial would take longer than it could save"
 
 
 class Purse:
@@ -212,19 +196,14 @@ class Race:
         # Trials of the components kept so far, one per seed; and first trials of changes that may gain in addition.
         self._base: list[Trial] = []
         self._once: dict[Change, Trial] = {}
-        self._rules: Mapping[Change, Rule] = {}
+        self._additions: Mapping[Change, tuple[str, Support]] = {}
 
     @property
     def log_gains(self) -> Tensor | None:
         """Exposures found by the winning model."""
         return self._base[0].log_gains if self._base else None
 
-    def run(
-        self,
-        additions: Sequence[Change],
-        removals: Sequence[Change],
-        rules: Mapping[Change, Rule] = MappingProxyType({}),
-    ) -> None:
+    def run(self, additions: Mapping[Change, tuple[str, Support]], removals: Sequence[Change]) -> None:
         """Fill `decisions` and `kept`.
 
         Try all additions with one seed, then the best of them with the other seeds unless it is clear already. If it is
@@ -232,17 +211,18 @@ class Race:
         removed.
 
         Args:
-            additions, removals: changes to the requested model.
-            rules: for additions that other evidence supports; the others use `judge_one`.
+            additions: changes to the requested model, with what was seen and how much that supports them.
+            removals: components to leave out of it.
         """
-        self.decisions = {change: untried(*change, NO_TIME) for change in (*additions, *removals)}
-        self._rules = rules
+        self._additions = additions
+        self.decisions = {change: untried(change, seen, why=NO_TIME) for change, (seen, _) in additions.items()}
+        self.decisions |= {change: untried(change, "", why=NO_TIME) for change in removals}
         if additions and self._can_run(2):
             self._base = [self._trial([], seed=0)]
-            self._try_once(additions)
+            self._try_once(list(additions))
         while self._once:
             best = self._best()
-            if self._is_confirmed(best, self._rule(best)):
+            if self._is_confirmed(best):
                 for other in [other for other in self._once if other[0] == best[0]]:
                     self._drop(other, f"{best[0]}={best[1]} is better")
                 self._try_once(list(self._once))
@@ -251,11 +231,11 @@ class Race:
             if not self._can_run(trials, fraction_of_time=REMOVAL_FRACTION):
                 continue
             if not self._purse.is_cheap(trials, of_steps=self._length, seconds_each=self._seconds_each):
-                self.decisions[change] = untried(*change, COSTS_MORE)
+                self.decisions[change] = untried(change, "", why=COSTS_MORE)
                 continue
             self._base = self._base or [self._trial([], seed=0)]
             self._once[change] = self._trial([change], seed=0)
-            self._is_confirmed(change, judge_removal)
+            self._is_confirmed(change)
 
     def _try_once(self, changes: Sequence[Change]) -> None:
         """Try each change with the first seed, in addition to what is kept; `_once` then has those that may gain.
@@ -270,14 +250,11 @@ class Race:
                     self._drop(change, ONCE)
                 continue
             trial = self._trial([change], seed=0)
-            decision = self._judged(self._rule(change), change, [trial])
+            decision = self._judged(change, [trial])
             self.decisions[change] = replace(decision, kept=False)
-            if self._rule(change) is judge_supported or (decision.gain_db or 0.0) > LEAST_GAIN_DB:
+            if self._additions[change][1] is Support.SURE or (decision.gain_db or 0.0) > LEAST_GAIN_DB:
                 self._once[change] = trial
                 reserved = 0 if decision.kept else SEEDS - len(self._base) + SEEDS - 1
-
-    def _rule(self, addition: Change) -> Rule:
-        return self._rules.get(addition, judge_one)
 
     def _best(self) -> Change:
         """Return the change with the largest gain.
@@ -289,17 +266,17 @@ class Race:
         best = max(gains, key=lambda change: gains[change])
         return next(change for change in gains if change[0] == best[0] and gains[change] >= gains[best] - SEED_DB)
 
-    def _is_confirmed(self, change: Change, rule: Rule) -> bool:
+    def _is_confirmed(self, change: Change) -> bool:
         """Decide on a change: keep it if its gain is clear with one seed, or is confirmed with the other seeds."""
         own = [self._once.pop(change)]
-        decision = self._judged(rule, change, own)
+        decision = self._judged(change, own)
         if not decision.kept and (decision.gain_db or 0.0) > -MOST_LOSS_DB:
             if not self._can_run(SEEDS - len(self._base) + SEEDS - 1):
                 self.decisions[change] = replace(decision, why=ONCE)
                 return False
             self._base += [self._trial([], seed=seed) for seed in range(len(self._base), SEEDS)]
             own += [self._trial([change], seed=seed) for seed in range(1, SEEDS)]
-            decision = self._judged(rule, change, own)
+            decision = self._judged(change, own)
         self.decisions[change] = decision
         if decision.kept:
             self.kept.append(change)
@@ -310,10 +287,17 @@ class Race:
         self._once.pop(change, None)
         self.decisions[change] = replace(self.decisions[change], kept=False, why=why)
 
-    def _judged(self, rule: Rule, change: Change, own: Sequence[Trial]) -> Decision:
-        decision = rule(self._base[: len(own)], change, own, by_time=self._purse.is_time)
-        others = ", ".join(name for name, _ in self.kept)
-        return replace(decision, why=f"{decision.why}, in addition to {others}") if others else decision
+    def _judged(self, change: Change, own: Sequence[Trial]) -> Decision:
+        base, by_time = self._base[: len(own)], self._purse.is_time
+        if change in self._additions:
+            seen, support = self._additions[change]
+            decision = judge(base, change, own, by_time=by_time, support=support, seen=seen)
+        else:
+            decision = judge_removal(base, change, own, by_time=by_time)
+        if not self.kept:
+            return decision
+        others = f"in addition to {', '.join(name for name, _ in self.kept)}"
+        return replace(decision, why=f"{decision.why}, {others}" if decision.why else others)
 
     def _can_run(self, trials: int, *, fraction_of_time: float = 1.0) -> bool:
         return self._purse.can_afford(

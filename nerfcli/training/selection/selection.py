@@ -8,7 +8,6 @@ needed.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +16,7 @@ from nerfcli.training.evidence import LEARN_FOCAL, LEAST_MISS_PX, LEAST_SKY_FRAC
 from nerfcli.training.runs.components import CHOICES, MOST_DEGREES, Change, Components, Decision, Selection, untried
 from nerfcli.training.schedule import FEWEST_STEPS, Budget
 from nerfcli.training.selection.diagnostics import Diagnostics
-from nerfcli.training.selection.race import Purse, Race, Rule, judge_evidence, judge_likely, judge_supported
+from nerfcli.training.selection.race import Purse, Race, Support, judge_evidence
 from nerfcli.training.selection.trials import Trials
 
 # Spread of the photos' brightness, in logarithms of light. Below the first number, exposures do not help; above the
@@ -86,33 +85,30 @@ def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components,
     if check is None or ("cameras" in facts.fixed and not learns):
         return requested, 0.0, []
     given, changed = check.misses_px
+    best_px = min(check.misses_px)
     if math.isfinite(check.error):
         per_cent = 100.0 * math.expm1(check.log_focal)
-        direction = "longer" if per_cent > 0 else "shorter"
-        reason = (
+        seen = (
             f"{check.matches} matched features suggest a focal length {abs(per_cent):.2f} % "
-            f"(± {100.0 * check.error:.2f} %) {direction}; epipolar error {given:.2f} px -> {changed:.2f} px"
+            f"(± {100.0 * check.error:.2f} %) {'longer' if per_cent > 0 else 'shorter'}; they miss by {given:.2f} px "
+            f"with the given one, by {changed:.2f} px with this one"
         )
     else:
-        reason = (
-            f"the epipolar error of {check.matches} matched features is {given:.2f} px, more at other focal lengths"
-        )
+        seen = f"{check.matches} matched features miss by {given:.2f} px, and by more at other focal lengths"
     is_sure = abs(check.log_focal) > max(LEAST_FOCAL, FOCAL_ERRORS * check.error)
     # With wrong poses, any focal length may seem best; the right one leaves hardly any error.
     is_sure = is_sure and changed < min(MISS_FRACTION * given, LEAST_MISS_PX)
     if is_sure:
         value = requested.cameras if learns else "focal"
-        return replace(requested, cameras=value), check.log_focal, [untried("cameras", value, reason, kept=True)]
+        return replace(requested, cameras=value), check.log_focal, [untried(("cameras", value), seen, kept=True)]
     if learns:
         return requested, 0.0, []
-    decisions = [untried("cameras", "focal", f"not tried, {reason}")]
-    if min(check.misses_px) < SURELY_MISSED_PX:
+    decisions = [untried(("cameras", "focal"), seen)]
+    if best_px < SURELY_MISSED_PX:
         return requested, 0.0, decisions
-    reason = (
-        f"the epipolar error of {check.matches} matched features is at least {min(check.misses_px):.2f} px at "
-        "any focal length"
-    )
-    return replace(requested, cameras="poses"), 0.0, [*decisions, untried("cameras", "poses", reason, kept=True)]
+    seen = f"{check.matches} matched features miss by at least {best_px:.2f} px at any focal length"
+    decisions.append(untried(("cameras", "poses"), seen, kept=True))
+    return replace(requested, cameras="poses"), 0.0, decisions
 
 
 def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
@@ -127,13 +123,12 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
     if facts.points and may_use:
         wanted.append((("points", CHOICES["points"].on), f"{facts.points:,} pixels see a 3D point at a known distance"))
         if facts.stereo:
-            wanted.append((("stereo", True), f"several photos agree on the depth of {facts.stereo} pixels"))
+            wanted.append((("stereo", True), f"several photos agree on the depth of {facts.stereo:,} pixels"))
         if facts.occluded_fraction:
             reason = f"{100.0 * facts.occluded_fraction:.1f} % of the pixels hide surfaces that other photos see"
             wanted.append((("occluders", True), reason))
         if facts.exposure_spread > LIKELY_EXPOSURE_SPREAD:
-            per_cent = 100.0 * math.expm1(facts.exposure_spread)
-            reason = f"photos differ in brightness by {per_cent:.0f} % at the same points"
+            reason = f"photos differ by {_stops(facts.exposure_spread)} at the same points"
             wanted.append((("exposure", "matched" if facts.photos <= FEW_PHOTOS else "learned"), reason))
     if facts.sky_confirmed:
         reason = f"{100.0 * facts.sky_fraction:.0f} % of the pixels look like a sky, with hardly any 3D point in front"
@@ -141,79 +136,73 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
     wanted = [(change, reason) for change, reason in wanted if change[0] not in facts.fixed]
     values: dict[str, Any] = dict(change for change, _ in wanted)
     model = replace(requested, **values)
-    return model, [untried(*change, reason, kept=True) for change, reason in wanted]
+    return model, [untried(change, reason, kept=True) for change, reason in wanted]
 
 
-def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list[Change], list[Decision]]:
-    """Return changes that may help a scene, and decisions on those that nothing supports.
+def _stops(spread: float) -> str:
+    """Return a spread of the logarithm of light in words."""
+    return f"{spread / math.log(2.0):.2g} stops"
+
+
+def proposals(
+    start: Components, signs: Diagnostics, facts: Facts
+) -> tuple[dict[Change, tuple[str, Support]], list[Decision]]:
+    """Return changes that may help a scene, each with what was seen, and decisions on those that nothing supports.
 
     Args:
         start: components of the model so far.
         signs: diagnostics of its first training.
     """
-    candidates: list[Change] = []
+    candidates: dict[Change, tuple[str, Support]] = {}
     declined: list[Decision] = []
-    if facts.has_exif and start.exposure == "none":
-        candidates.append(("exposure", "exif"))
-    has_gains = start.exposure in ("matched", "learned")
-    if not has_gains and signs.exposure_spread > LEAST_EXPOSURE_SPREAD:
-        candidates.append(("exposure", "learned"))
-    elif not has_gains:
-        spread = 100.0 * math.expm1(signs.exposure_spread)
-        declined.append(
-            untried("exposure", "learned", f"not tried, photos differ in brightness by only {spread:.1f} %")
-        )
+    if start.exposure not in ("matched", "learned"):
+        spread = signs.exposure_spread
+        support = Support.LIKELY if spread > LIKELY_EXPOSURE_SPREAD else Support.NONE
+        if facts.has_exif and start.exposure == "none":
+            candidates["exposure", "exif"] = ("EXIF says that exposures differ", support)
+        if spread > LEAST_EXPOSURE_SPREAD:
+            candidates["exposure", "learned"] = (f"photos differ by {_stops(spread)}", support)
+        else:
+            declined.append(untried(("exposure", "learned"), f"photos differ by only {_stops(spread)}"))
     check = facts.cameras
     if facts.cameras_known is not None:
-        declined.append(untried("cameras", "poses", f"not tried, {facts.cameras_known}"))
+        declined.append(untried(("cameras", "poses"), facts.cameras_known))
     elif check is None:
-        candidates.append(("cameras", "poses"))
+        candidates["cameras", "poses"] = ("too few matched features to check them", Support.NONE)
         # In a trial, a right focal length changes as much as a wrong one, because of the coarse field.
-        declined.append(untried("cameras", "focal", "not tried, too few matched features to decide"))
+        declined.append(untried(("cameras", "focal"), "too few matched features to decide"))
     elif min(check.misses_px) < LEAST_MISS_PX:
-        reason = f"not tried, the epipolar error of matched features is only {min(check.misses_px):.2f} px"
-        declined.append(untried("cameras", "poses", reason))
+        declined.append(untried(("cameras", "poses"), f"matched features miss by only {min(check.misses_px):.2f} px"))
     else:
-        candidates.append(("cameras", "poses"))
-    against_sky = None if facts.sky_fraction > LEAST_SKY_FRACTION else _against_sky(signs)
-    if not facts.has_alpha and against_sky is None:
-        candidates.append(("background", "sphere"))
-    elif not facts.has_alpha:
-        declined.append(untried("background", "sphere", f"not tried, {against_sky}"))
-    open_ones = [(name, value) for name, value in candidates if getattr(start, name) != value]
+        candidates["cameras", "poses"] = (f"matched features miss by {min(check.misses_px):.2f} px", Support.SURE)
+    if not facts.has_alpha:
+        change = ("background", "sphere")
+        distant = f"{100.0 * signs.far_fraction:.1f} % of the pixels see mostly distant things"
+        if facts.sky_fraction > LEAST_SKY_FRACTION:
+            candidates[change] = (f"{100.0 * facts.sky_fraction:.0f} % of the pixels look like a sky", Support.SURE)
+        elif signs.far_fraction <= LEAST_FAR_FRACTION:
+            declined.append(untried(change, f"only {distant}"))
+        elif why := _unlike_a_sky(signs):
+            declined.append(untried(change, f"{distant}, but {why}"))
+        else:
+            support = Support.LIKELY if signs.far_fraction > LIKELY_FAR_FRACTION else Support.NONE
+            candidates[change] = (distant, support)
     return (
-        [change for change in open_ones if change[0] not in facts.fixed],
+        {
+            (name, value): why
+            for (name, value), why in candidates.items()
+            if getattr(start, name) != value and name not in facts.fixed
+        },
         [decision for decision in declined if decision.component not in facts.fixed],
     )
 
 
-def _against_sky(signs: Diagnostics) -> str | None:
-    """Return why no sky is expected; None if there may be one."""
-    far = f"{100.0 * signs.far_fraction:.1f} % of the pixels see mostly distant surfaces"
-    if signs.far_fraction <= LEAST_FAR_FRACTION:
-        return f"only {far}"
+def _unlike_a_sky(signs: Diagnostics) -> str | None:
+    """Return why distant things are no sky; None if they may be one."""
     one, painted = signs.sky_psnr
-    if painted < LEAST_SKY_PSNR and painted - one < LEAST_SKY_DB:
-        return (
-            f"{far}, but viewing direction does not explain their colours: {painted:.1f} dB with it, {one:.1f} dB with "
-            "one colour"
-        )
-    return None
-
-
-def rules(candidates: Sequence[Change], signs: Diagnostics, facts: Facts) -> dict[Change, Rule]:
-    """Return the rules for candidates that other evidence than a trial supports."""
-    found: dict[Change, Rule] = {}
-    for change in candidates:
-        if change[0] == "cameras" and facts.cameras is not None:
-            found[change] = judge_supported  # photos disagree
-        if change[0] == "background" and facts.sky_fraction > LEAST_SKY_FRACTION:
-            found[change] = judge_supported  # pixels look like a sky
-        elif change[0] == "background" and signs.far_fraction > LIKELY_FAR_FRACTION:
-            found[change] = judge_likely
-        if change[0] == "exposure" and signs.exposure_spread > LIKELY_EXPOSURE_SPREAD:
-            found[change] = judge_likely
-    return found
+    if painted >= LEAST_SKY_PSNR or painted - one >= LEAST_SKY_DB:
+        return None
+    return f"viewing direction does not explain their colours: {painted:.1f} dB with it, {one:.1f} dB with one colour"
 
 
 def removals(start: Components, facts: Facts) -> list[Change]:
@@ -252,15 +241,13 @@ def select(trials: Trials, requested: Components, facts: Facts, budget: Budget) 
         without = trials.begin(_without_poses(requested), Budget(None, start.steps))
         assert without is not None  # no minimum number of steps was given
         purse.charge(without.steps)
-        decided = [
-            judge_evidence([without.trial], (one.component, one.value), [start.trial], by_time=purse.is_time)
-            for one in decided  # all together: they share one trial
-        ]
+        # All together: they share one trial.
+        decided = [judge_evidence(without.trial, one, start.trial, by_time=purse.is_time) for one in decided]
         if not decided[0].kept:
             model, start = requested, without
     candidates, declined = proposals(model, start.signs, facts)
     race = Race(trials, start, purse, _without_poses(model))
-    race.run(candidates, removals(model, facts), rules(candidates, start.signs, facts))
+    race.run(candidates, removals(model, facts))
     values: dict[str, Any] = dict(race.kept)
     chosen = replace(model, **values)
     is_found = chosen.exposure == "learned" and model.exposure != "learned"
