@@ -31,8 +31,8 @@ from nerfcli.render.held_out_exposure import log_gains_of
 from nerfcli.render.model import load_model
 from nerfcli.training.loop import Progress, train
 from nerfcli.training.runs.components import Components, choose, differences
-from nerfcli.training.runs.config import read_config
 from nerfcli.training.runs.files import FIELD
+from nerfcli.training.runs.run import read_config
 from nerfcli.training.runs.settings import TrainSettings
 
 # Scene, downscale, and the choices to compare, the baseline first. "-name" is --without, "auto" is --model auto.

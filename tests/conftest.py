@@ -25,13 +25,11 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import write_cameras
 from nerfcli.captures.loading import load_scene
 from nerfcli.render.model import Model, save_model
-from nerfcli.training import preparation, waypoints
-from nerfcli.training.extent import Extent, choose_extent
+from nerfcli.training import checkpoints, preparation
+from nerfcli.training.extent import Extent, choose_extent, object_frame
 from nerfcli.training.loop import train
-from nerfcli.training.normalisation import object_frame
-from nerfcli.training.runs.config import RunConfig
-from nerfcli.training.runs.files import CONFIG, FIELD
-from nerfcli.training.runs.log import LogEntry, append_log
+from nerfcli.training.runs.files import CONFIG, FIELD, LogEntry, append_log
+from nerfcli.training.runs.run import RunConfig
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.workflows import photo_depths
 
@@ -75,7 +73,7 @@ def _two_threads():
 def _few_held_out_pixels() -> Iterator[None]:
     """Use 512 held-out pixels: most tests train only to fog, where the default 4096 would take longer than training."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(waypoints, "PIXELS", 512)
+        patched.setattr(checkpoints, "WAYPOINT_PIXELS", 512)
         yield
 
 
@@ -98,7 +96,7 @@ def spheres_run(spheres: Capture, tmp_path_factory: pytest.TempPathFactory) -> P
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not run.exists():
             with pytest.MonkeyPatch.context() as patched:
-                patched.setattr(waypoints, "PIXELS", 1024)
+                patched.setattr(checkpoints, "WAYPOINT_PIXELS", 1024)
                 train(spheres, run, training, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
     return run
 

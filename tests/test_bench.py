@@ -39,7 +39,7 @@ from nerfcli.errors import BAD_INPUT, INTERRUPTED
 from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.render.model import Model
-from nerfcli.training.normalisation import object_frame
+from nerfcli.training.extent import object_frame
 from nerfcli.training.runs.settings import TrainSettings
 
 FEW = [RenderSetting(2), RenderSetting(2, step=2.0), RenderSetting(2, step=0.5), RenderSetting(1)]

@@ -35,7 +35,7 @@ from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.training import loop
 from nerfcli.training.loop import Progress
 from nerfcli.training.runs import settings
-from nerfcli.training.runs.log import append_log, read_log
+from nerfcli.training.runs.files import append_log, read_log
 from nerfcli.workflows import poses as poses_workflow
 
 BATCH_COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench", "export")

@@ -17,7 +17,7 @@ from nerfcli.evaluate.metrics import colour_aligned
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.evaluate.requirements import known_numbers, parse_requirements, unmet
 from nerfcli.training.runs.components import Components, Selection
-from nerfcli.training.runs.config import RunConfig
+from nerfcli.training.runs.run import RunConfig
 
 UP = np.array([0.0, -1.0, 0.0])
 

@@ -21,13 +21,11 @@ from nerfcli.captures.loading import load_scene
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.matching.sky import sky_masks
 from nerfcli.photos.images import read_image, write_png
-from nerfcli.training import evidence, loop, schedule, waypoints
+from nerfcli.training import checkpoints, evidence, loop, schedule, selection
 from nerfcli.training.loop import train
 from nerfcli.training.runs.components import Components
-from nerfcli.training.runs.files import FIELD
-from nerfcli.training.runs.log import read_log
+from nerfcli.training.runs.files import FIELD, read_log
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.training.selection import selection
 
 HELD_OUT = "test"  # the folder of these photos in the capture
 _listeners: list[list[str]] = []
@@ -109,7 +107,7 @@ def test_no_held_out_photo_is_opened_before_the_training_is_over(case, capture, 
     monkeypatch.setattr(schedule, "FEWEST_STEPS", 1)
     monkeypatch.setattr(schedule, "SEARCH_FRACTION", 1.0)
     until_then: list[str] = []
-    measure = waypoints.measure_waypoints
+    measure = checkpoints.measure_waypoints
 
     def after_training(*arguments, **named) -> None:
         until_then.extend(opened)

@@ -21,15 +21,14 @@ from nerfcli.matching.occluders import occluder_masks
 from nerfcli.matching.stereo import DenseDepth
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.training import preparation, schedule
+from nerfcli.training import preparation, schedule, selection
 from nerfcli.training.fitting import TrainingInputs
 from nerfcli.training.loop import train
 from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.training.selection import selection
-from nerfcli.training.selection.trials import Trials
+from nerfcli.training.trials import Trials
 
 SAME = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
 UNKNOWN = np.full((4, 3), np.nan)

@@ -17,7 +17,7 @@ from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.workspace import is_same_scene
-from nerfcli.training.runs.config import RunConfig
+from nerfcli.training.runs.run import RunConfig
 
 HELD_OUT = 2  # in the middle, and stored upright
 

@@ -32,7 +32,7 @@ from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import point_weight
-from nerfcli.training.selection.selection import Facts
+from nerfcli.training.selection import Facts
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
 # Both cameras see them; the first point is off by half a pixel in the second camera.

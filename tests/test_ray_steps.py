@@ -9,12 +9,11 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.voxel_field import VoxelFieldSettings
 from nerfcli.render.trained_field import Marching
-from nerfcli.training.extent import Extent
+from nerfcli.training.extent import Extent, RaySteps, halvings
 from nerfcli.training.fitting import Fitting
 from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import DETAILED_STEPS, stride
-from nerfcli.training.strides import RaySteps, halvings
 
 BALL = Marching(near=0.5, far=300.0, shortest_step=1 / 256, growth=1 / 128)
 CUBE = Marching(near=0.5, far=4.0, shortest_step=1 / 128, growth=0.0)

@@ -27,7 +27,10 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import find_run, parse_run, read_cameras, read_given_cameras
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.photos.loading import load_photos
-from nerfcli.training.camera_optimiser import (
+from nerfcli.training.extent import Extent
+from nerfcli.training.fitting import Fitting, TrainingInputs
+from nerfcli.training.loop import train
+from nerfcli.training.optimiser import (
     BETAS,
     EPS,
     NewtonSteps,
@@ -36,9 +39,6 @@ from nerfcli.training.camera_optimiser import (
     whitening,
     without_mean,
 )
-from nerfcli.training.extent import Extent
-from nerfcli.training.fitting import Fitting, TrainingInputs
-from nerfcli.training.loop import train
 from nerfcli.training.pool import PixelPool
 from nerfcli.training.refinement import LENS_RATE, PoseRefinement, Refinement
 from nerfcli.training.runs.components import Components

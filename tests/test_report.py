@@ -34,8 +34,8 @@ from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.outputs import depth_meta
 from nerfcli.training.runs.components import Components, Decision, Selection
-from nerfcli.training.runs.config import RunConfig
-from nerfcli.training.runs.log import LogEntry
+from nerfcli.training.runs.files import LogEntry
+from nerfcli.training.runs.run import RunConfig
 from nerfcli.training.runs.settings import TrainSettings
 
 EVIL = "</script><script>alert(1)</script><b>\"'"

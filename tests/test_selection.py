@@ -12,10 +12,7 @@ from hypothesis import strategies as st
 
 from nerfcli.matching.camera_check import CameraCheck
 from nerfcli.training.evidence import may_use_points
-from nerfcli.training.runs.components import Components, Decision, Selection, untried
-from nerfcli.training.schedule import MOST_START_STEPS, REMOVAL_FRACTION, Budget
-from nerfcli.training.selection.diagnostics import Diagnostics
-from nerfcli.training.selection.race import (
+from nerfcli.training.race import (
     CLEAR_ERRORS,
     COSTS_MORE,
     FLOOR,
@@ -30,7 +27,9 @@ from nerfcli.training.selection.race import (
     judge_evidence,
     judge_removal,
 )
-from nerfcli.training.selection.selection import (
+from nerfcli.training.runs.components import Components, Decision, Selection, untried
+from nerfcli.training.schedule import MOST_START_STEPS, REMOVAL_FRACTION, Budget
+from nerfcli.training.selection import (
     Facts,
     proposals,
     removals,
@@ -38,7 +37,7 @@ from nerfcli.training.selection.selection import (
     with_evidence,
     with_known_cameras,
 )
-from nerfcli.training.selection.trials import Trial, TrialStart
+from nerfcli.training.trials import Diagnostics, Trial, TrialStart
 
 PHOTOS = 20
 FITTED = Facts("hash", has_alpha=False, has_exif=False, cameras_known="they are exact")

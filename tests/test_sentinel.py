@@ -18,9 +18,9 @@ from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 from nerfcli.render.model import load_model, save_model
 from nerfcli.render.pictures import render_picture
 from nerfcli.training import fitting, sentinel, step
-from nerfcli.training.delayed import Delayed
 from nerfcli.training.loop import train
-from nerfcli.training.runs.log import read_log
+from nerfcli.training.optimiser import Delayed
+from nerfcli.training.runs.files import read_log
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.sentinel import FirstBad, is_finite, replay
 

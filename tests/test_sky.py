@@ -11,7 +11,7 @@ from nerfcli.field.background import SphereBackground
 from nerfcli.training.losses import colour_losses
 from nerfcli.training.optimiser import Adam
 from nerfcli.training.schedule import ROUGHNESS_WEIGHT
-from nerfcli.training.selection.diagnostics import explained_by_direction, paint
+from nerfcli.training.trials import explained_by_direction, paint
 
 PHOTOS = 12
 PIXELS = 150

@@ -40,9 +40,8 @@ from nerfcli.render.pictures import DepthRequest, render_picture
 from nerfcli.training import loop, sentinel
 from nerfcli.training.loop import Progress, train
 from nerfcli.training.pool import PixelBatch, PixelPool
-from nerfcli.training.runs.config import read_config
-from nerfcli.training.runs.log import LogEntry, append_log, read_log
-from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.files import LogEntry, append_log, read_log
+from nerfcli.training.runs.run import Run, read_config
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 
 # A step of a few rays is enough where bits are compared, not pictures.

@@ -20,15 +20,17 @@ from nerfcli.photos.images import downscale, write_png
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
 from nerfcli.training import preparation
 from nerfcli.training.appearance import over_background
-from nerfcli.training.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
-from nerfcli.training.losses import colour_losses
-from nerfcli.training.normalisation import (
+from nerfcli.training.extent import (
+    BALLS_BEFORE_BACKGROUND,
+    Extent,
     box_frame,
+    choose_extent,
     contracted_frame,
     has_narrow_baseline,
     narrow_frame,
     object_frame,
 )
+from nerfcli.training.losses import colour_losses
 from nerfcli.training.pool import Album, PixelPool, load_album
 from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.settings import TrainSettings

@@ -19,9 +19,8 @@ from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import Budget
-from nerfcli.training.selection.diagnostics import diagnose
-from nerfcli.training.selection.trials import Trials, TrialStart
 from nerfcli.training.step import light_from_beyond
+from nerfcli.training.trials import Trials, TrialStart, diagnose
 
 SETTINGS = TrainSettings(budget_seconds=None, steps=100, first_samples_per_step=2**11, threads=1)
 
@@ -41,7 +40,7 @@ def inputs_of(scene: Capture) -> TrainingInputs:
 def start(trials) -> Iterator[TrialStart]:
     """A start early in a schedule, without closing cells: within a few dozen steps they would leave nothing to see."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nerfcli.training.selection.trials.FORK_PROGRESS", 0.02)
+        patch.setattr("nerfcli.training.trials.FORK_PROGRESS", 0.02)
         patch.setattr("nerfcli.training.schedule.CLOSING_ENDS", 1e9)
         yield trials.begin(Components(view=0), Budget(None, 20))
 

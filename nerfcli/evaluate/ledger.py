@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from nerfcli.training.runs.config import RunConfig
+from nerfcli.training.runs.run import RunConfig
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from nerfcli.training.runs.config import RunConfig
+from nerfcli.training.runs.run import RunConfig
 
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 # Metrics that may be required: the means in metrics.json, the fraction of photos with a pose, and the run's times.

@@ -10,8 +10,7 @@ from nerfcli.evaluate.protocol import HeldOutPhoto, over_white
 from nerfcli.photos.loading import downscaled_camera, load_photos
 from nerfcli.render.held_out_exposure import gain_sources, log_gains_of
 from nerfcli.render.model import Model
-from nerfcli.training.runs.config import RunConfig
-from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.run import Run, RunConfig
 
 
 def held_out_photos(

@@ -1,30 +1,47 @@
-"""Checkpoints: write a training's state to the run folder and restore it bit for bit."""
+"""What a training writes while it runs: checkpoints, from which it resumes bit for bit, and waypoints.
 
+Waypoints are copies of the field, measured on held-out pixels once the training is over. No held-out photo is opened
+before, so training can neither learn from them nor be stopped or steered by them.
+"""
+
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from nerfcli import distributed
+from nerfcli.atomic import cannot_write
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import write_cameras
 from nerfcli.errors import UserError
+from nerfcli.field.background import colours_behind
 from nerfcli.field.checkpoint import refuse_non_finite, save_tensors
+from nerfcli.field.exposure import exposed
 from nerfcli.field.kinds import settings_from_json
+from nerfcli.photos.colours import psnr_of
 from nerfcli.photos.exif import log_exposures
-from nerfcli.render.held_out_exposure import exif_slope, gains_between, gains_beyond_exif
-from nerfcli.render.model import Model, save_model
+from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.render.held_out_exposure import exif_slope, gains_between, gains_beyond_exif, log_gains_of
+from nerfcli.render.model import Model, load_model, save_model
+from nerfcli.render.tracing import render_rays
+from nerfcli.training.appearance import over_background
 from nerfcli.training.extent import Extent
 from nerfcli.training.fitting import Fitting, TrainingInputs
+from nerfcli.training.pool import PixelPool, load_album
 from nerfcli.training.preparation import EarlierDecisions
-from nerfcli.training.runs.config import read_config
-from nerfcli.training.runs.files import FIELD, STATE
+from nerfcli.training.runs.files import FIELD, STATE, add_to_log
+from nerfcli.training.runs.run import read_config
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.sentinel import that_must_be_finite
+from nerfcli.training.storage import IN_MEMORY, PhotoStorage
 
 STATE_FORMAT = "nerfcli training 2"
 # Photos without alpha fill the frame; behind the field is black, and little of it shows through.
@@ -172,3 +189,120 @@ def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description
     refuse_non_finite(that_must_be_finite(tensors), run / STATE)
     fitting.restore(tensors, description)
     return Totals(**description["totals"])
+
+
+WAYPOINTS_FOLDER = "waypoints"
+# Number of held-out pixels that are measured.
+WAYPOINT_PIXELS = 4096
+
+
+def keep_waypoint(run: Path, step: int, model: Model) -> None:
+    """Write the field after a step.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    try:
+        (run / WAYPOINTS_FOLDER).mkdir(exist_ok=True)
+    except OSError as error:
+        raise cannot_write(run / WAYPOINTS_FOLDER, error) from error
+    save_model(_waypoint_path(run, step), model)
+
+
+def forget_waypoints(run: Path, *, after: int = -1) -> None:
+    """Remove waypoints of steps later than `after`: a killed training has come farther than its last checkpoint."""
+    for step in _waypoints_of(run):
+        if step > after:
+            _waypoint_path(run, step).unlink(missing_ok=True)
+    if not _waypoints_of(run):
+        shutil.rmtree(run / WAYPOINTS_FOLDER, ignore_errors=True)
+
+
+def measure_waypoints(
+    held_out: Sequence[Frame], run: Path, inputs: TrainingInputs, *, notify: Callable[[str], None]
+) -> None:
+    """Add the PSNR of a sample of held-out pixels to the waypoint entries of RUN/log.jsonl, and remove the waypoints.
+
+    If held-out photos cannot be read, report this and measure nothing: the training itself is complete without them.
+    """
+    settings, device = inputs.settings, inputs.settings.device
+    steps = _waypoints_of(run)
+    if held_out and steps:
+        masks = settings.components.masks
+        try:
+            album = load_album(
+                held_out, factor=inputs.factor, threads=settings.threads, storage=inputs.storage, masks=masks
+            )
+            pixels = HeldoutPixels(
+                album.photos,
+                inputs.extent.training_from_scene,
+                torch.device(device),
+                colours=album.colours,
+                storage=inputs.storage,
+            )
+        except UserError as error:
+            notify(f"training is complete, but PSNR on held-out photos could not be measured: {error}")
+            return
+        measured = {}
+        for step in steps:
+            model = load_model(_waypoint_path(run, step), device)
+            measured[step] = pixels.psnr(model, log_gains=log_gains_of(held_out, model))
+        add_to_log(run, {step: {"heldout_psnr": psnr} for step, psnr in measured.items()})
+        curve = ", ".join(f"{psnr:.2f} dB at step {step}" for step, psnr in measured.items())
+        notify(f"PSNR on a sample of held-out pixels: {curve}")
+    forget_waypoints(run)
+
+
+class HeldoutPixels:
+    """A fixed sample of a few thousand distinct pixels of the held-out photos, or most of them if there are fewer.
+
+    Args:
+        colours, storage: see `PixelPool`.
+    """
+
+    def __init__(
+        self,
+        photos: Sequence[LoadedPhoto],
+        training_from_scene: Similarity,
+        device: torch.device,
+        *,
+        colours: np.ndarray | None = None,
+        storage: PhotoStorage = IN_MEMORY,
+    ):
+        pool = PixelPool(photos, training_from_scene, device, colours=colours, storage=storage)
+        generator = torch.Generator(device=device).manual_seed(1)
+        numbers = pool.numbers(WAYPOINT_PIXELS, generator).unique()
+        self.origins, self.directions, self.colours = pool.rays_of(numbers)[:3]
+        self.cones = pool.cones[pool.photo_of(numbers)]
+        self.photos = pool.photo_of(numbers)
+
+    @torch.no_grad()
+    def psnr(self, model: Model, *, log_gains: np.ndarray) -> float:
+        """Return the PSNR in dB over all these pixels, clipped to [0, 1], on the model's background.
+
+        Args:
+            log_gains: (photos, 3) of the photos relative to the model's pictures; see `held_out_exposure`.
+        """
+        background = colours_behind(model.background, self.directions)
+        # All rays at once would take half a gigabyte while space is still full of fog.
+        parts = zip(
+            *(rays.split(512) for rays in (self.origins, self.directions, self.cones, background)),
+            strict=True,
+        )
+        rendered = torch.cat(
+            [render_rays(model, *rays, background=behind, cones=cones).rgb for *rays, cones, behind in parts]
+        )
+        wanted = over_background(self.colours, background)
+        if log_gains.any():
+            rendered = exposed(rendered, torch.as_tensor(log_gains).to(rendered)[self.photos])
+        error = (rendered.clamp(0.0, 1.0) - wanted).square().mean().item()
+        return psnr_of(error)
+
+
+def _waypoints_of(run: Path) -> list[int]:
+    """Return the steps that have waypoints, in order."""
+    return sorted(int(path.stem) for path in (run / WAYPOINTS_FOLDER).glob("*.safetensors") if path.stem.isdecimal())
+
+
+def _waypoint_path(run: Path, step: int) -> Path:
+    return run / WAYPOINTS_FOLDER / f"{step}.safetensors"

@@ -14,18 +14,16 @@ from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import chosen_size, fresh_field
 from nerfcli.training.appearance import Appearance
-from nerfcli.training.delayed import Delayed
-from nerfcli.training.extent import Extent
+from nerfcli.training.extent import Extent, RaySteps
 from nerfcli.training.losses import LOSSES
 from nerfcli.training.open_cells import OpenCells
-from nerfcli.training.optimiser import FieldOptimiser, PartsOptimiser
+from nerfcli.training.optimiser import Delayed, FieldOptimiser, PartsOptimiser
 from nerfcli.training.pool import PixelBatch, PixelPool, PointRays
 from nerfcli.training.runs.components import Selection
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import Schedule, StepPlan
 from nerfcli.training.step import UNWATCHED, Batch, NonFiniteError, StepLosses, Watch, step, update
 from nerfcli.training.storage import IN_MEMORY, PhotoStorage
-from nerfcli.training.strides import RaySteps
 
 # Rays of a step, at most. The optimiser takes longer with larger tables, for any number of rays: there is one more ray
 # for this many rows of a level.

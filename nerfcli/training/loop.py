@@ -19,17 +19,23 @@ from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.kinds import field_bytes
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.photos.masks import write_masks
-from nerfcli.training.checkpoints import Checkpoints, Totals, decisions_of, restore
+from nerfcli.training.checkpoints import (
+    Checkpoints,
+    Totals,
+    decisions_of,
+    forget_waypoints,
+    keep_waypoint,
+    measure_waypoints,
+    restore,
+)
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.components import Selection
-from nerfcli.training.runs.config import RunConfig, write_config
-from nerfcli.training.runs.files import FIELD, LOG, STATE
-from nerfcli.training.runs.log import LogEntry, append_log, cut_log
+from nerfcli.training.runs.files import FIELD, LOG, STATE, LogEntry, append_log, cut_log
+from nerfcli.training.runs.run import RunConfig, write_config
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import WAYPOINTS, Budget
 from nerfcli.training.sentinel import FAILURES, Sentinel
-from nerfcli.training.waypoints import forget_waypoints, keep_waypoint, measure_waypoints
 
 # Folder of a run, named like the component that leaves pixels out.
 OCCLUDERS = "occluders"

@@ -27,9 +27,9 @@ from nerfcli.training.pool import PixelPool, PointRays, load_album
 from nerfcli.training.runs.components import Components, Selection
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.schedule import SEARCH_FRACTION, Budget
-from nerfcli.training.selection.selection import Facts, select, with_evidence, with_known_cameras
-from nerfcli.training.selection.trials import Trials
+from nerfcli.training.selection import Facts, select, with_evidence, with_known_cameras
 from nerfcli.training.storage import PhotoStorage, check_device_memory, needs_of, storage_for
+from nerfcli.training.trials import Trials
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from nerfcli.cameras.camera import Camera, by_lens
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.lens_change import FOCAL, bearings_by_change, changeable, changed, pixels_by_change
 from nerfcli.cameras.rigid import from_parts, inverse, transform_from_twist, vector_from_rotation
-from nerfcli.training.camera_optimiser import NewtonSteps, WhitenedAdam, whitening, without_mean
-from nerfcli.training.delayed import Delayed, on_device_of
+from nerfcli.training.optimiser import Delayed, NewtonSteps, WhitenedAdam, on_device_of, whitening, without_mean
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.schedule import CameraPlan
 

@@ -14,13 +14,13 @@ from torch import Tensor
 from nerfcli.field.interface import Field
 from nerfcli.kernels import March, Rays, RaySums, Targets
 from nerfcli.training.appearance import Appearance
+from nerfcli.training.extent import RaySteps
 from nerfcli.training.losses import LOSSES, Shown, colour_losses, emerging_losses
 from nerfcli.training.open_cells import OpenCells
 from nerfcli.training.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.runs.components import Components
 from nerfcli.training.schedule import StepPlan
-from nerfcli.training.strides import RaySteps
 
 # Optical depth at which training rays end: less than a thousandth of the light is left.
 DEEPEST = 7.0

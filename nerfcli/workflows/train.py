@@ -26,9 +26,8 @@ from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.training import loop
 from nerfcli.training.loop import OCCLUDERS
 from nerfcli.training.runs.components import choose
-from nerfcli.training.runs.config import split_hash
 from nerfcli.training.runs.files import CONFIG, LOCK, METRICS, STATE
-from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.run import Run, split_hash
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.schedule import Schedule, StepPlan
 from nerfcli.training.storage import InFiles, field_bytes, needs_of, storage_for

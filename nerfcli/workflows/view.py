@@ -19,9 +19,8 @@ from nerfcli.errors import UserError
 from nerfcli.export.extent import scene_box
 from nerfcli.photos.loading import pinhole_frame
 from nerfcli.render.model import Model, load_model
-from nerfcli.training.runs.config import no_run
 from nerfcli.training.runs.files import CONFIG, FIELD
-from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.run import Run, no_run
 from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.page import live_page_html
 from nerfcli.viewer.painter import Painter, view_from_json

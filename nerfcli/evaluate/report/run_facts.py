@@ -8,9 +8,8 @@ from typing import Any
 
 from nerfcli.captures.formats.run_cameras import RunCameras
 from nerfcli.errors import UserError, listed, several
-from nerfcli.training.runs.config import RunConfig
-from nerfcli.training.runs.log import LogEntry
-from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.files import LogEntry
+from nerfcli.training.runs.run import Run, RunConfig
 
 POSES_REPORT = "poses_report.json"
 

@@ -13,11 +13,10 @@ from typing import Any
 
 from nerfcli.matching.camera_check import CameraCheck
 from nerfcli.training.evidence import LEARN_FOCAL, LEAST_MISS_PX, LEAST_SKY_FRACTION, may_use_points
+from nerfcli.training.race import Purse, Race, Support, judge_evidence
 from nerfcli.training.runs.components import CHOICES, MOST_DEGREES, Change, Components, Decision, Selection, untried
 from nerfcli.training.schedule import FEWEST_STEPS, Budget
-from nerfcli.training.selection.diagnostics import Diagnostics
-from nerfcli.training.selection.race import Purse, Race, Support, judge_evidence
-from nerfcli.training.selection.trials import Trials
+from nerfcli.training.trials import Diagnostics, Trials
 
 # Spread of the photos' brightness, in logarithms of light. Below the first number, exposures do not help; above the
 # second, they are likely, and a smaller gain in the trial is enough.

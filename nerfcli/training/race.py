@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerfcli.training.runs.components import Change, Components, Decision, untried
 from nerfcli.training.schedule import REMOVAL_COST, REMOVAL_FRACTION, Budget
-from nerfcli.training.selection.trials import Trial, Trials, TrialStart
+from nerfcli.training.trials import Trial, Trials, TrialStart
 
 # A gain counts if it exceeds `LEAST_GAIN_DB`, which nobody sees, by this many standard errors.
 STANDARD_ERRORS = 2.0

@@ -1,1 +1,0 @@
-"""Automatic selection of components: paired short trainings and their evaluation."""
