@@ -74,6 +74,11 @@ def own(rows: Tensor, total: int) -> Tensor:
     return rows[(rank() - (total - len(rows))) % count() :: count()].contiguous()
 
 
+def whole_row(own_row: int) -> int:
+    """Return the number of a row in the whole, from that in what `own` has returned."""
+    return rank() + count() * own_row
+
+
 def add_up_step(
     losses: Mapping[str, Tensor],
     of_rays: Tensor,

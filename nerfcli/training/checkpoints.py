@@ -23,7 +23,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import write_cameras
 from nerfcli.errors import UserError
 from nerfcli.field.background import colours_behind
-from nerfcli.field.checkpoint import refuse_non_finite, save_tensors
+from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
 from nerfcli.field.exposure import exposed
 from nerfcli.field.kinds import settings_from_json
 from nerfcli.photos.colours import psnr_of
@@ -152,12 +152,15 @@ class Checkpoints:
             self.write_cameras()
 
 
-def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]) -> EarlierDecisions:
-    """Return the decisions of an earlier call, from its last checkpoint and its settings.
+def read_checkpoint(
+    run: Path, settings: TrainSettings
+) -> tuple[tuple[dict[str, Tensor], dict[str, Any]], EarlierDecisions]:
+    """Return the last checkpoint of a run, for `restore`, and the decisions made before it.
 
     Raises:
-        UserError: another version wrote the checkpoint, or it has another contraction than requested.
+        UserError: there is none, another version wrote it, or it has another contraction than requested.
     """
+    tensors, description = load_tensors(run / STATE, settings.device)
     if description.get("format") != STATE_FORMAT:
         raise UserError(f"{run / STATE} was written by another version of nerfcli", "train again with --overwrite")
     extent = Extent.from_json(description["extent"])
@@ -167,7 +170,7 @@ def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]
             "train into a new folder with -o, or again with --overwrite",
         )
     config = read_config(run)
-    return EarlierDecisions(extent, config.components, config.selection)
+    return (tensors, description), EarlierDecisions(extent, config.components, config.selection)
 
 
 def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> Totals:

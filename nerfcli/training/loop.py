@@ -4,7 +4,7 @@ import resource
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,22 +15,20 @@ from nerfcli import distributed, kernels
 from nerfcli.atomic import cannot_write
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import LOST_RANK, UserError
-from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.kinds import field_bytes
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.photos.masks import write_masks
 from nerfcli.training.checkpoints import (
     Checkpoints,
     Totals,
-    decisions_of,
     forget_waypoints,
     keep_waypoint,
     measure_waypoints,
+    read_checkpoint,
     restore,
 )
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.preparation import prepare
-from nerfcli.training.runs.components import Selection
 from nerfcli.training.runs.files import FIELD, LOG, STATE, LogEntry, append_log, cut_log
 from nerfcli.training.runs.run import RunConfig, write_config
 from nerfcli.training.runs.settings import TrainSettings
@@ -47,21 +45,23 @@ def remove_left_out(run: Path) -> None:
         shutil.rmtree(run / OCCLUDERS)
 
 
-def write_left_out(run: Path, masks: Mapping[str, np.ndarray], *, notify: Callable[[str], None]) -> None:
+def write_left_out(run: Path, inputs: TrainingInputs, *, notify: Callable[[str], None]) -> None:
     """Write RUN/occluders/PHOTO.png, black where pixels are left out, for each photo with such pixels; report how many.
 
     Args:
         run: its folder; masks of an earlier training are replaced.
-        masks: (height, width) bool by the name of the photo, True where pixels are used.
 
     Raises:
         UserError: the masks cannot be written.
     """
+    if inputs.occluders is None:
+        return
     folder = run / OCCLUDERS
-    left_out = {name: 100.0 * float(1.0 - mask.mean()) for name, mask in masks.items()}
+    masks = {frame.name: mask for frame, mask in zip(inputs.pool.frames, inputs.occluders, strict=True)}
+    left_out = {name: 100.0 * float(mask.mean()) for name, mask in masks.items()}
     most = sorted((name for name in left_out if left_out[name]), key=lambda name: -left_out[name])
     shutil.rmtree(folder, ignore_errors=True)
-    write_masks(folder, {name: masks[name] for name in most})
+    write_masks(folder, {name: ~masks[name] for name in most})
     if not most:
         notify("occluders: none found")
         return
@@ -117,8 +117,7 @@ def train(
     """
     torch.set_num_threads(settings.threads)
     kernels.prepare(notify, settings.device)
-    saved = distributed.from_first(lambda: load_tensors(run / STATE, settings.device) if resume else None)
-    begun = distributed.from_first(lambda: None if saved is None else decisions_of(run, settings, saved[1]))
+    saved, begun = distributed.from_first(lambda: read_checkpoint(run, settings) if resume else (None, None))
     # A training resumed with a larger budget keeps its number of rows.
     rows = settings.log2_rows or (saved[1]["field"].get("log2_rows") if saved is not None else None)
     with_all_threads = replace(settings, threads=sum(distributed.gathered(settings.threads)))
@@ -135,11 +134,10 @@ def train(
         searched = sum(inputs.seconds.values())
         totals = Totals(seconds=searched, searched=searched)
         _clear(run)
-    if inputs.occluders is not None:
-        named = zip(inputs.pool.frames, inputs.occluders, strict=True)
-        write_left_out(run, {frame.name: ~mask for frame, mask in named}, notify=notify)
-    selection = inputs.selection if begun is None else begun.selection
-    _describe(scene, run, settings, inputs, selection=selection)
+    write_left_out(run, inputs, notify=notify)
+    factor, contraction = inputs.factor, inputs.extent.contraction
+    config = RunConfig.describing(scene, settings, factor=factor, contraction=contraction, selection=inputs.selection)
+    write_config(run, config)
     checkpoints = Checkpoints(run, fitting, totals, inputs=inputs, scene=scene)
     checkpoints.write_cameras()
     sentinel = Sentinel(fitting, run=run, notify=notify)
@@ -180,20 +178,6 @@ def _clear(run: Path) -> None:
     except OSError as error:
         raise cannot_write(run, error) from error
     forget_waypoints(run)
-
-
-def _describe(
-    scene: Capture, run: Path, requested: TrainSettings, inputs: TrainingInputs, *, selection: Selection | None
-) -> None:
-    """Write RUN/config.json."""
-    described = RunConfig.describing(
-        scene,
-        requested,
-        factor=inputs.factor,
-        contraction=inputs.extent.contraction,
-        selection=selection,
-    )
-    write_config(run, described)
 
 
 def _run(

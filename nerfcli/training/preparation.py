@@ -104,7 +104,7 @@ def prepare(
     log_exposure, log_gains = _exposures(scene, settings.components, evidence, selection, notify=notify)
     return replace(
         inputs,
-        selection=selection,
+        selection=selection if begun is None else begun.selection,
         log_exposure=log_exposure,
         log_gains=log_gains,
         log_focal=log_focal,
@@ -183,7 +183,7 @@ def _select(
     if not budget.allows_trials:
         notify("the budget is too short for trials; only components that need no trial are selected")
         components, decisions = with_evidence(requested, facts)
-        return Selection(components, tuple(decisions), 0.0)
+        return Selection(components, tuple(decisions))
     requested, log_focal, measured = with_known_cameras(requested, facts)
     model, _ = with_evidence(requested, facts)
     uses_matched = facts.exposure_spread > 0.0 or requested.exposure == "matched"

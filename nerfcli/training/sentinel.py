@@ -288,7 +288,7 @@ def _watched_step(fitting: Fitting, progress: float) -> tuple[StepResult | None,
 def _first_of_all(bad: BadTensor | None) -> BadTensor | None:
     """Return the bad tensor of the first process that has one, with its rays numbered among those of all processes."""
     if bad is not None:
-        bad = replace(bad, rays=tuple(distributed.rank() + distributed.count() * ray for ray in bad.rays))
+        bad = replace(bad, rays=tuple(map(distributed.whole_row, bad.rays)))
     return next((found for found in distributed.gathered(bad) if found is not None), None)
 
 

@@ -251,7 +251,7 @@ class Selection:
 
     components: Components
     decisions: tuple[Decision, ...]
-    seconds: float
+    seconds: float = 0.0
     log_gains: Tensor | None = None
     log_focal: float = 0.0
 
