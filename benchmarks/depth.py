@@ -35,8 +35,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.formats.run_cameras import read_cameras
 from nerfcli.render.depth import CONVENTIONS, DepthRequest, requested
 from nerfcli.render.model import Model, load_model
-from nerfcli.render.rays import pixel_rays
-from nerfcli.render.tracing import render_rays
+from nerfcli.render.tracing import pixel_rays, render_rays
 from nerfcli.training.runs.files import FIELD
 
 DEPTHS = (*CONVENTIONS, "quantile:0.05", "quantile:0.95")

@@ -249,7 +249,9 @@ def quality(capture: Path, device: str, seconds: int, folder: Path, *, dry: bool
     if dry:
         settings = replace(settings, budget_seconds=None, steps=2, downscale=8)
     run = nerfcli.train_scene(capture, folder / f"{device.replace(':', '-')}-{seconds}", settings, overwrite=True)
-    metrics = nerfcli.evaluate_run(run.path, device=device, overwrite=True).metrics
+    metrics = nerfcli.evaluate_run(
+        run.path, nerfcli.Output(overwrite=True), resources=nerfcli.Resources(device=device)
+    ).metrics
     summary = run.summary
     assert summary is not None
     return {"psnr": float(metrics["mean"]["psnr"]), "steps": summary.steps, "seconds": summary.seconds}

@@ -20,7 +20,9 @@ import torch
 import typer
 
 from nerfcli import evaluate_run, export_run, load_run, load_splats
-from nerfcli.splats.state import load_splat_state
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
+from nerfcli.splats.refine import load_splat_state
 from nerfcli.training.runs.files import SPLATS
 from nerfcli.workflows.evaluate import evaluate_splats
 from nerfcli.workflows.splats import SplatSettings
@@ -65,10 +67,12 @@ def measure(run: Path, budget: float, field: dict[str, float], *, resume: bool, 
     """Refine to a budget, write both files, and evaluate them."""
     settings = SplatSettings(count=count, budget_seconds=budget, resume=resume)
     began = time.perf_counter()
-    ply = export_run(run, run.with_name("a.ply"), to="splats", splats=settings, overwrite=True, notify=print)
+    again = Output(run.with_name("a.ply"), overwrite=True)
+    ply = export_run(run, again, to="splats", splats=settings, reporter=Reporter(note=print))
     seconds = time.perf_counter() - began
-    spz = export_run(run, run.with_name("a.spz"), to="splats", splats=SplatSettings(count, budget), overwrite=True)
-    found, of_spz = (evaluate_splats(run, path, overwrite=True).metrics for path in (ply, spz))
+    small = Output(run.with_name("a.spz"), overwrite=True)
+    spz = export_run(run, small, to="splats", splats=SplatSettings(count, budget))
+    found, of_spz = (evaluate_splats(run, path, Output(overwrite=True)).metrics for path in (ply, spz))
     return Row(
         **field,
         run=run.name,

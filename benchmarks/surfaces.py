@@ -27,7 +27,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.export.depth_views import depth_views
 from nerfcli.export.extent import Grid, scene_box
 from nerfcli.export.fusion import fuse
-from nerfcli.export.marching import Mesh, mesh_of, simplified, surface_of, without_small_pieces
+from nerfcli.export.meshes import Mesh, mesh_of, simplified, surface_of, without_small_pieces
 from nerfcli.kernels import grid_coordinates
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.float_maps import read_any_tiff

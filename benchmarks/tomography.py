@@ -26,6 +26,9 @@ from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.result import ReconstructionSettings
 from nerfcli.ct.scan import Scan, save_scan
 from nerfcli.ct.train import train_scan
+from nerfcli.machine import Resources
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 
 
 @dataclass(frozen=True)
@@ -98,10 +101,12 @@ def main(
                 settings = ReconstructionSettings(None if passes else seconds, passes, threads=threads)
                 run = folder.with_name(f"{folder.name}-run")
                 begun, used = clock(), time.process_time()
-                result = train_scan(folder, run, settings, overwrite=True, notify=print)
+                result = train_scan(folder, Output(run, overwrite=True), settings, reporter=Reporter(note=print))
                 spent = {"clock_s": clock() - begun, "cpu_s": time.process_time() - used}
                 others = baselines and seed == first_seed
-                metrics = evaluate_scan(run, threads=threads, overwrite=True, baselines=others).metrics
+                metrics = evaluate_scan(
+                    run, Output(overwrite=True), baselines=others, resources=Resources(threads)
+                ).metrics
                 for name, found in metrics["methods"].items():
                     own = name == "nerfcli"
                     projections, volume = found["projections"], found["volume"]

@@ -1,8 +1,9 @@
 """nerfcli: from a folder of photos to a radiance field, its renders, depth maps and videos.
 
-Python programs can call the commands as functions: `estimate_poses`, `train_scene`, `evaluate_run`, `render_run` and
-`export_run`; `load_scene`, `load_run` and `load_splats` read their results. All are imported on first use: `import
-nerfcli` is fast.
+Python programs can call the commands as functions: `run_pipeline` is all of them; `estimate_poses`, `train_scene`,
+`evaluate_run`, `render_run` and `export_run` are its stages; `load_scene`, `load_run` and `load_splats` read their
+results. `Output`, `Resources` and `Reporter` say where results go, what may be used and who is told. All are imported
+on first use: `import nerfcli` is fast.
 """
 
 # Must come before any import of pycolmap: its wheel exports zlib's functions, and if Python's zlib is loaded after it,
@@ -12,6 +13,9 @@ import zlib  # noqa: F401
 from nerfcli.version import __version__ as __version__
 
 __all__ = [
+    "Output",
+    "Reporter",
+    "Resources",
     "estimate_poses",
     "evaluate_run",
     "export_run",
@@ -19,21 +23,29 @@ __all__ = [
     "load_scene",
     "load_splats",
     "render_run",
+    "run_pipeline",
     "train_scene",
 ]
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from nerfcli.captures.loading import load_scene
+    from nerfcli.machine import Resources
+    from nerfcli.notices import Reporter
+    from nerfcli.output import Output
     from nerfcli.training.runs.run import load_run
     from nerfcli.workflows.evaluate import evaluate_run
     from nerfcli.workflows.export import export_run
+    from nerfcli.workflows.pipeline import run_pipeline
     from nerfcli.workflows.poses import estimate_poses
     from nerfcli.workflows.render import render_run
     from nerfcli.workflows.splats import load_splats
     from nerfcli.workflows.train import train_scene
 
 _MODULES = {
+    "Output": "nerfcli.output",
+    "Reporter": "nerfcli.notices",
+    "Resources": "nerfcli.machine",
     "estimate_poses": "nerfcli.workflows.poses",
     "evaluate_run": "nerfcli.workflows.evaluate",
     "export_run": "nerfcli.workflows.export",
@@ -41,6 +53,7 @@ _MODULES = {
     "load_scene": "nerfcli.captures.loading",
     "load_splats": "nerfcli.workflows.splats",
     "render_run": "nerfcli.workflows.render",
+    "run_pipeline": "nerfcli.workflows.pipeline",
     "train_scene": "nerfcli.workflows.train",
 }
 

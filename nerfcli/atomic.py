@@ -1,4 +1,4 @@
-"""Files and folders that are written completely or not at all; JSON with a digest of its content.
+"""Files and folders that are written completely or not at all; locks of files; JSON with a digest of its content.
 
 Everything is written under a hidden name beside its destination and renamed when complete, so that a killed
 command or a full disk leaves nothing behind that a later command would take for a result.
@@ -9,7 +9,6 @@ import json
 import os
 import re
 import shutil
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from errno import EDQUOT, EFBIG, ENOSPC
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.errors import UserError
+from nerfcli.machine import is_running
 
 # Leftovers of a killed process: a partial result, or an old result that it had just moved aside.
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<kind>partial|old)-(?P<process>\d+)(\D.*)?", re.DOTALL)
@@ -87,7 +87,7 @@ def clear_leftovers(folder: Path) -> None:
     restored if nothing has replaced them. Files of running processes are kept."""
     hidden = [path.name for path in folder.glob(".*")]
     for match in map(_LEFTOVER.fullmatch, hidden):
-        if match is None or _lives(int(match["process"])):
+        if match is None or is_running(int(match["process"])):
             continue
         path, place = folder / match.string, folder / match["name"]
         with suppress(OSError):  # another command is doing the same, or the file does no harm
@@ -99,17 +99,33 @@ def clear_leftovers(folder: Path) -> None:
                 path.unlink()
 
 
-def _lives(process: int) -> bool:
-    """Return True if a process with this number runs on this machine, or if that cannot be checked."""
-    if sys.platform == "win32":
-        return True
+@contextmanager
+def exclusive(path: Path, holder: str) -> Iterator[int]:
+    """Hold the lock of a file, which is created with its folder if necessary, until this process ends or is killed.
+
+    Args:
+        path: the file; its content is unused.
+        holder: description of the holder for the error message: "nerfcli poses is at work on photos-scene".
+
+    Yields:
+        The descriptor. A child process that inherits it also holds the lock, until both have ended.
+
+    Raises:
+        UserError: another process holds the lock, or the file cannot be created.
+    """
+    from filelock import lock_descriptor
+
     try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # a process of another user
-        return True
-    return True
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise cannot_write(path.parent, error) from error
+    try:
+        if not lock_descriptor(lock, blocking=False):
+            raise UserError(f"another {holder}", "wait until it has finished, or choose another folder with -o")
+        yield lock
+    finally:
+        os.close(lock)
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import typer.testing
 from typer.testing import CliRunner, Result
@@ -28,6 +29,11 @@ def error_of(result: Result) -> tuple[str, str]:
     assert len(lines) == 2, result.stderr
     assert "Traceback" not in result.stderr
     return lines[0], lines[1]
+
+
+def estimated_poses() -> SimpleNamespace:
+    """Return what `nerfcli.poses.structure_from_motion.estimate_poses` reports of five photos."""
+    return SimpleNamespace(images=[], registered=5, total=5, seconds={"total": 1.0}, mean_reprojection_error_px=0.5)
 
 
 def listing(folder: Path) -> dict[str, bytes]:

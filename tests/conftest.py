@@ -1,6 +1,5 @@
 """Shared fixtures, the trained run that several test files use, and the table of tolerances."""
 
-import fcntl
 import gc
 import json
 import os
@@ -17,6 +16,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import pytest
 import torch
 from examples import MANY
+from filelock import FileLock
 from fog import fog, foggy_cells
 from hypothesis import settings
 
@@ -92,8 +92,7 @@ def spheres_run(spheres: Capture, tmp_path_factory: pytest.TempPathFactory) -> P
     run.parent.mkdir(exist_ok=True)
     # 22 dB, and 0.06 between median and true depth; 250 steps with the default rows, and 8192 samples, take 10 CPU s.
     training = TrainSettings(budget_seconds=None, steps=200, log2_rows=14, samples_per_step=2**12, threads=2)
-    with (run.parent / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with FileLock(run.parent / "lock"):
         if not run.exists():
             with pytest.MonkeyPatch.context() as patched:
                 patched.setattr(checkpoints, "WAYPOINT_PIXELS", 1024)

@@ -5,7 +5,7 @@ import torch
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.render.rays import PictureRays, pixel_rays
+from nerfcli.render.tracing import PictureRays, pixel_rays
 
 
 def frame_rays(frame: Frame, training_from_scene: Similarity, device: torch.device) -> PictureRays:

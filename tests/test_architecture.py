@@ -17,8 +17,8 @@ FOLDERS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 # A part is a folder of nerfcli, a subfolder of `poses`, or a module beside the folders.
 # The part on the left may import those on the right, which all stand above it.
 ROOTS = {
-    *("errors", "atomic", "exclusive", "memory", "interrupts", "child", "distributed", "machine", "notices"),
-    *("ply", "version", "__init__"),
+    *("errors", "atomic", "interrupts", "child", "distributed", "machine", "notices"),
+    *("output", "ply", "version", "__init__"),
 }
 MAY_IMPORT: dict[str, set[str]] = {
     **{root: set() for root in ROOTS},
@@ -47,7 +47,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "ct": {"captures", "render", "kernels", "photos", "pages"},
     "workflows": {
-        *("bench", "viewer", "splats", "evaluate", "training", "export", "render", "field", "doctor", "poses"),
+        *("bench", "viewer", "splats", "evaluate", "training", "export", "render", "field", "poses"),
         *("poses.input", "captures", "photos", "cameras", "pages"),
     },
 }

@@ -25,7 +25,6 @@ from nerfcli.bench.measurement import (
     as_text,
     is_busy,
     measure_renderings,
-    processor_name,
     render_settings,
     smaller,
     train_settings,
@@ -38,6 +37,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.errors import BAD_INPUT, INTERRUPTED
 from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
+from nerfcli.machine import processor_name
 from nerfcli.render.model import Model
 from nerfcli.training.extent import object_frame
 from nerfcli.training.runs.settings import TrainSettings

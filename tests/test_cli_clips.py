@@ -5,11 +5,12 @@ from typing import Any
 
 import pytest
 from clips import encode, ffmpeg, pan
+from commands import estimated_poses
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
-from nerfcli.workflows import poses as poses_workflow
+from nerfcli.poses import structure_from_motion
 from nerfcli.workflows import train as train_workflow
 
 
@@ -22,11 +23,12 @@ def estimated(monkeypatch) -> list[tuple[str, str, int]]:
     """The calls of structure from motion: folder, scene, number of photos in the folder. Each makes an empty scene."""
     calls = []
 
-    def estimate(folder: Path, scene: Path, settings: Any, **more: Any) -> None:
+    def estimate(folder: Path, scene: Path, **more: Any) -> Any:
         calls.append((str(folder), str(scene), len(list(folder.glob("*.jpg")))))
         scene.mkdir(parents=True, exist_ok=True)
+        return estimated_poses()
 
-    monkeypatch.setattr(poses_workflow, "estimate_poses", estimate)
+    monkeypatch.setattr(structure_from_motion, "estimate_poses", estimate)
     return calls
 
 
@@ -114,9 +116,12 @@ def test_frames_and_scene_are_kept(clip, estimated):
 
 def test_masks_go_to_the_settings(tmp_path, monkeypatch):
     calls: list[Any] = []
-    monkeypatch.setattr(
-        poses_workflow, "estimate_poses", lambda photos, scene, settings, **more: calls.append(settings)
-    )
+
+    def estimate(folder: Path, scene: Path, *, settings: Any, **more: Any) -> Any:
+        calls.append(settings)
+        return estimated_poses()
+
+    monkeypatch.setattr(structure_from_motion, "estimate_poses", estimate)
     monkeypatch.chdir(tmp_path)
     Path("photos").mkdir()
     assert nerfcli("poses", "photos", "--masks", "masks").exit_code == 0

@@ -26,6 +26,8 @@ from nerfcli.ct.scan import save_scan
 from nerfcli.ct.train import train_scan
 from nerfcli.errors import UserError
 from nerfcli.interrupts import Terminated
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.photos.images import read_image
 
 
@@ -144,7 +146,7 @@ def test_info_reads_reconstructions_and_their_volumes(bean_run: Path, tmp_path: 
     facts = json.loads(out)
     assert (facts["kind"], facts["unit"]) == ("reconstruction", "mm")
     assert facts["decisions"] == list(load_reconstruction(bean_run).decisions)
-    export_scan(bean_run, tmp_path / f"bean{suffix}")
+    export_scan(bean_run, Output(tmp_path / f"bean{suffix}"))
     code, out, err = call("info", tmp_path / f"bean{suffix}", "--json")
     assert code == 0, err
     facts = json.loads(out)
@@ -202,7 +204,7 @@ def test_an_interrupted_fit_is_not_complete_and_resume_goes_on_from_it(bean_run:
             raise Terminated
 
     with pytest.raises(Terminated):
-        train_scan(scan, run, settings, notify=notes.append, progress=terminate_in_second_pass)
+        train_scan(scan, Output(run), settings, reporter=Reporter(note=notes.append, progress=terminate_in_second_pass))
     interrupted = load_reconstruction(run)
     assert (interrupted.passes, interrupted.complete) == (1, False)
     saved = f"the volume of pass {interrupted.passes} is saved in {run}"
@@ -259,7 +261,7 @@ def test_pictures_that_are_there_are_kept_and_nothing_is_added(
 @pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii", ".tif"])
 def test_volume_files_read_back(bean_run: Path, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"bean{suffix}"
-    written = export_scan(bean_run, path)
+    written = export_scan(bean_run, Output(path))
     result, back = load_reconstruction(bean_run), read_volume(path)
     unseen = (np.asarray(result.marks) & UNSEEN) > 0
     np.testing.assert_array_equal(np.isnan(back.values), unseen)
@@ -273,7 +275,7 @@ def test_volume_files_read_back(bean_run: Path, tmp_path: Path, suffix: str) -> 
     if len(written) == 2:
         np.testing.assert_array_equal(read_volume(written[1]).values, result.marks)
     with pytest.raises(UserError, match=r" exists$"):
-        export_scan(bean_run, path)
+        export_scan(bean_run, Output(path))
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(UserError, match="damaged"):
         read_volume(path)
@@ -297,7 +299,7 @@ def test_an_nrrd_states_its_place_and_unit(tmp_path: Path) -> None:
 
 def test_hounsfield_units_of_water_and_air(tmp_path: Path, bean_run: Path) -> None:
     """Closed form: 0 for water, -1000 for nothing."""
-    export_scan(bean_run, tmp_path / "hu.nrrd", water=0.12)
+    export_scan(bean_run, Output(tmp_path / "hu.nrrd"), water=0.12)
     back = read_volume(tmp_path / "hu.nrrd")
     assert back.quantity == "HU"
     volume = np.asarray(load_reconstruction(bean_run).volume)

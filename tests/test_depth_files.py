@@ -22,8 +22,15 @@ from nerfcli.errors import UserError
 from nerfcli.photos.colours import linear_light
 from nerfcli.render.files.depth_pictures import DepthMeta, difference_of
 from nerfcli.render.files.file_facts import depth_meta_of
-from nerfcli.render.files.float_maps import read_tiff, write_exr, write_tiff
-from nerfcli.render.files.levels import LARGEST_LEVEL, chosen_scale, depth_of_levels, write_png16
+from nerfcli.render.files.float_maps import (
+    LARGEST_LEVEL,
+    chosen_scale,
+    depth_of_levels,
+    read_tiff,
+    write_exr,
+    write_png16,
+    write_tiff,
+)
 
 
 def odd_depth() -> np.ndarray:

@@ -13,17 +13,16 @@ from PIL import Image
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.errors import UserError
+from nerfcli.output import Output
 from nerfcli.photos.images import read_image
 from nerfcli.render.depth import effective_floor
 from nerfcli.render.files.float_maps import read_tiff
-from nerfcli.render.files.preview import preview
-from nerfcli.render.frames import export_frames
-from nerfcli.render.job import RenderJob, file_names
+from nerfcli.render.frames import render_job
+from nerfcli.render.job import ExportSettings, RenderJob, VideoSettings, file_names
 from nerfcli.render.model import Model
-from nerfcli.render.outputs import ExportSettings, VideoSettings
 from nerfcli.render.pictures import DepthRequest, render_picture
-from nerfcli.render.presentation import value_range
+from nerfcli.render.presentation import preview, value_range
+from nerfcli.render.tracing import TOLERANCE
 
 CAMERA = Camera.pinhole(10, 8, 8.0)
 DEPTH = DepthRequest("conditional", "z", min_opacity=0.1)
@@ -47,7 +46,7 @@ def order(frames: list[Frame], *, outputs: tuple[str, ...] = ("rgb", "depth", "o
 
 def export(model: Model, frames: list[Frame], folder: Path, **settings: Any) -> list[Path]:
     ordered = order(frames, **settings)
-    return export_frames(model, ordered, folder, on_rays=lambda rays: None, notify=lambda text: None)
+    return render_job(model, ordered, Output(folder))
 
 
 def listing(folder: Path) -> list[str]:
@@ -167,8 +166,34 @@ def test_one_video_per_output_with_every_frame_in_it(model, tmp_path):
     assert len(listing(tmp_path / "views/rgb")) == 5
 
 
-def test_a_file_in_the_folders_place_is_reported(model, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"cannot write .*views"):
-        export(model, [frame("a")], tmp_path / "file" / "views")
-    assert listing(tmp_path) == ["file"]
+@pytest.fixture
+def views(model, tmp_path):
+    """The export of one view on alpha."""
+    export(model, [frame("a.png")], tmp_path / "views", outputs=("rgb", "depth"), rgba=True)
+    return tmp_path / "views"
+
+
+def test_alpha_is_straight_and_holds_no_background(views):
+    rgba = read_image(views / "rgb/a.png")
+    assert rgba.shape == (8, 10, 4)
+    there = rgba[..., 3] > 20
+    assert 0.2 < there.mean() < 1
+    assert np.abs(rgba[there][:, :3].astype(int) - 128).max() <= 1  # the fog's colour is 1/2, its background is not
+    assert (rgba[rgba[..., 3] == 0] == 0).all()
+
+
+def test_every_file_states_the_error_of_its_rendering(views):
+    description = json.loads((views / "render.json").read_text())
+    facts = description["facts"]["a"]
+    assert facts["tolerance"] == TOLERANCE
+    assert 0 <= facts["truncation_of_colour_mean"] <= facts["truncation_of_colour_max"] <= TOLERANCE
+    assert facts["pixels_measured"] == 80
+    assert facts["quadrature_of_depth_p95"] > 0
+    assert "not how close the field is to the scene" in description["error_meaning"]
+    _, meta = read_tiff(views / "depth/a.tiff")
+    assert {name: meta.error_bounds[name] for name in facts} == facts
+    assert meta.error_bounds["meaning"] == description["error_meaning"]
+    with Image.open(views / "rgb/a.png") as picture:
+        assert picture.info["background"] == "none: straight alpha"
+        assert float(picture.info["error truncation_of_colour_max"]) == facts["truncation_of_colour_max"]
+    assert description["settings"]["step"] == 1.0

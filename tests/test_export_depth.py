@@ -16,15 +16,16 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.photos.colours import linear_light
 from nerfcli.render.files.depth_files import Levels, map_path, read_map, write_levels, write_maps
 from nerfcli.render.files.depth_pictures import DepthMeta
 from nerfcli.render.files.file_facts import depth_meta_of
 from nerfcli.render.files.float_maps import write_tiff
-from nerfcli.render.frames import export_frames
-from nerfcli.render.job import RenderJob
+from nerfcli.render.frames import render_job
+from nerfcli.render.job import MEASURED, ExportSettings, RenderJob, depth_meta, floor_of
 from nerfcli.render.model import Model
-from nerfcli.render.outputs import MEASURED, ExportSettings, depth_meta, floor_of
 from nerfcli.render.pictures import DepthRequest, RenderedPicture, render_picture
 
 CAMERA = Camera.pinhole(10, 8, 8.0)
@@ -53,7 +54,7 @@ def ordered(frames: list[Frame], **settings: Any) -> RenderJob:
 def export(model: Model, order: RenderJob, folder: Path) -> list[str]:
     """Export and return the notes."""
     notes: list[str] = []
-    export_frames(model, order, folder, on_rays=lambda rays: None, notify=notes.append)
+    render_job(model, order, Output(folder), reporter=Reporter(note=notes.append))
     return notes
 
 
@@ -183,5 +184,6 @@ def test_depth_without_a_meaning_is_not_read_into_a_clip(model, tmp_path):
 def test_a_folder_of_another_kind_is_named_as_such(other, stated, model, tmp_path):
     export(model, ordered([frame("a")], outputs=("depth",)), tmp_path / "views")
     with pytest.raises(UserError, match=f"views contains depth with another definition: {stated}"):
-        ordered([frame("a")], outputs=("depth",), depth=other).is_held_by(tmp_path / "views")
-    assert ordered([frame("a")], outputs=("depth",)).is_held_by(tmp_path / "views")
+        export(model, ordered([frame("a")], outputs=("depth",), depth=other), tmp_path / "views")
+    (note,) = export(model, ordered([frame("a")], outputs=("depth",)), tmp_path / "views")
+    assert "is kept" in note

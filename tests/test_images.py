@@ -98,13 +98,6 @@ def test_every_orientation_is_applied_once_as_pillow_does(tmp_path, orientation,
     assert (found.orientation, found.width, found.height) == (orientation, *image_size(path))
 
 
-def test_orientation_6_by_hand(tmp_path):
-    """The camera was turned: the first stored column, read upwards, is the top row."""
-    path, stored = tmp_path / "photo.png", noise(2, 3, 3)
-    Image.fromarray(stored).save(path, exif=exif_with({ExifTags.Base.Orientation: 6}))
-    np.testing.assert_array_equal(read_image(path)[0], stored[::-1, 0])
-
-
 @pytest.mark.parametrize("orientation", [0, 9, 65535])
 def test_an_orientation_out_of_range_reads_as_upright(tmp_path, orientation):
     path, stored = tmp_path / "photo.png", noise(2, 3, 3)

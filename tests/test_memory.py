@@ -6,13 +6,13 @@ import sys
 
 import pytest
 
-from nerfcli.memory import keep_freed_memory, return_freed_memory
+from nerfcli.machine import keep_freed_memory, return_freed_memory
 
 _MEGABYTE = 2**20
 # Arrays of 40 MB are allocated and freed: the system provides cleared pages for each, or none if memory is kept.
 _PROGRAM = """
 import os, resource
-from nerfcli.memory import keep_freed_memory, resident_bytes, return_freed_memory
+from nerfcli.machine import keep_freed_memory, resident_bytes, return_freed_memory
 {keep}
 def work():
     for _ in range(10):

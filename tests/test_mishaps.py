@@ -17,9 +17,9 @@ from commands import error_of, listing, nerfcli, started
 from full_disk import files_of_at_most
 
 from nerfcli import atomic, kernels
+from nerfcli.atomic import exclusive
 from nerfcli.captures.loading import load_scene
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, TERMINATED
-from nerfcli.exclusive import exclusive
 from nerfcli.interrupts import Terminated, install_handlers
 from nerfcli.training.runs.files import LOCK, PHOTO_DEPTHS
 from nerfcli.workflows import describe

@@ -29,17 +29,17 @@ from nerfcli.field.interface import Field
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
 from nerfcli.kernels import grid_coordinates
 from nerfcli.kernels.reference.encoding import hash_encode
-from nerfcli.render.coverage import DepthMap, depth_maps
+from nerfcli.machine import Resources
+from nerfcli.output import Output
+from nerfcli.render.coverage import DepthMap, depth_maps, with_coverage
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
-from nerfcli.render.one_frame import with_coverage
 from nerfcli.render.pictures import render_picture
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.runs.run import Run
 from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_rows, seen_cells
-from nerfcli.viewer.page import PageNumbers, page_html
-from nerfcli.viewer.pictures import PagePhotos
-from nerfcli.viewer.proof import HEIGHT, WIDTH, Proof, make_proof
+from nerfcli.viewer.page import PageNumbers, page_html, scene_of
+from nerfcli.viewer.pictures import HEIGHT, WIDTH, PagePhotos, Proof, make_proof
 from nerfcli.workflows import photo_depths
 from nerfcli.workflows.export import export_run
 
@@ -78,7 +78,8 @@ def page_of(model: Model, frames: list[Frame], proof: Proof) -> str:
     photos = PagePhotos([], 0, 0)
     numbers = PageNumbers.of(pack_model(model), proof, UNSEEN)
     box = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
-    return page_html(model, numbers, run=Path("a-run"), frames=frames, photos=photos, box=box)
+    scene = scene_of(model, run=Path("a-run"), frames=frames, photos=photos.entries, box=box)
+    return page_html(scene, numbers)
 
 
 def hash_settings(contraction: str, *, antialias: bool = False, view_degree: int = 3) -> HashFieldSettings:
@@ -225,14 +226,14 @@ def test_networks_beyond_a_block_of_uniforms_are_refused():
 def test_names_of_a_capture_stay_text():
     model = rough(HashField(hash_settings("none")))
     evil = "</script><script>alert(1)</script>"
-    page = page_html(
+    scene = scene_of(
         model,
-        PageNumbers.of(pack_model(model), NO_PROOF, UNSEEN),
         run=Path("a-run"),
         frames=[at((1, 1, 1))],
-        photos=PagePhotos([{"name": evil, "split": "train"}], 0, 0),
+        photos=[{"name": evil, "split": "train"}],
         box=(0, 0, 0, 1, 1, 1),
     )
+    page = page_html(scene, PageNumbers.of(pack_model(model), NO_PROOF, UNSEEN))
     assert evil not in page
     assert json.loads(element(page, "scene"))["photos"][0]["name"] == evil
 
@@ -244,17 +245,6 @@ def test_the_page_loads_nothing(spheres_page):
     assert len(text) < 10_000_000
 
 
-def test_existing_files_are_not_replaced_without_overwrite(spheres_run, tmp_path):
-    target = tmp_path / "a.html"
-    target.write_text("mine")
-    with pytest.raises(UserError, match="exists") as caught:
-        export_run(spheres_run, target, to="page")
-    assert caught.value.exit_code == 3
-    assert target.read_text() == "mine"
-    with pytest.raises(UserError, match="not have the suffix of a page"):
-        export_run(spheres_run, tmp_path / "a.ply", to="page")
-
-
 # In a browser
 
 
@@ -263,7 +253,9 @@ def spheres_page(spheres_run, tmp_path_factory) -> Path:
     run = shutil.copytree(spheres_run, spheres_run.with_name(f"page-run-{os.getpid()}"))  # it keeps depths of photos
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(photo_depths, "MAX_SIZE", 48)  # a quarter of the rays
-        return export_run(run, tmp_path_factory.mktemp("page") / "spheres.html", to="page", threads=2)
+        return export_run(
+            run, Output(tmp_path_factory.mktemp("page") / "spheres.html"), to="page", resources=Resources(2)
+        )
 
 
 @pytest.fixture(scope="module")

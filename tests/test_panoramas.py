@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from nerfcli.cameras.alignment import align
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures.calibration import read_calibration
 from nerfcli.captures.loading import load_scene
 from nerfcli.doctor.compared_pairs import compare
 from nerfcli.doctor.photo_facts import Source, read_all
@@ -24,6 +25,7 @@ from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
 from nerfcli.matching.panorama_faces import FACES, Faces
 from nerfcli.matching.stereo import dense_depths
 from nerfcli.matching.tracks import Tracks
+from nerfcli.output import Output
 from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto, load_photos
 from nerfcli.photos.panoramas import PANORAMA, is_panorama
@@ -37,7 +39,6 @@ from nerfcli.poses.model.projection import is_ahead, offsets_px, panorama_camera
 from nerfcli.poses.model.two_views import VerifiedPair, panorama_inliers, rays
 from nerfcli.training.evidence import tracks_of_model
 from nerfcli.training.runs.run import load_run
-from nerfcli.workflows.poses import given_intrinsics
 from nerfcli.workflows.render import render_run
 from nerfcli.workflows.report import report_runs
 from nerfcli.workflows.views import PictureOptions, Views, usual_axis
@@ -193,8 +194,7 @@ def test_held_out_errors_cross_the_edge_of_a_panorama(scene):
 
 def test_given_panorama_cameras_are_fixed(photos, tmp_path):
     (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 768 384 768 384\n")
-    given = given_intrinsics(tmp_path / "cameras.txt", photos)
-    assert given is not None
+    given = read_calibration(tmp_path / "cameras.txt", images=photos)
     (group,) = group_by_given(find_photos(photos), given).groups
     assert (group.model, group.params, group.fixed, group.is_panorama) == (PANORAMA, (768.0, 384.0), True, True)
 
@@ -389,9 +389,9 @@ def test_a_field_of_panoramas_renders_distances_along_rays(scene, tmp_path):
     assert usual_axis(load_run(run), Views("test", look=PictureOptions(lens="pinhole"))) == "z"
     assert usual_axis(load_run(run), Views("orbit", look=PictureOptions(lens="equirectangular"))) == "ray"
     assert all(frame.camera.is_spherical for frame in frames.test)
-    written = render_run(run, tmp_path / "by-python")
+    written = render_run(run, Output(tmp_path / "by-python"))
     assert {path.name for path in written} == {"rgb", "depth", "opacity"}
-    page = report_runs([run], tmp_path / "page.html").read_text()
+    page = report_runs([run], Output(tmp_path / "page.html")).read_text()
     assert "along the ray" in page
     error, hint = error_of(nerfcli("render", run, "--outputs", "depth", "--depth-axis", "z"))
     assert "equirectangular" in error

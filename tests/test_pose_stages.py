@@ -24,7 +24,7 @@ from in_this_process import worker_in_this_process
 
 import nerfcli
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.memory import default_memory_limit, resident_bytes
+from nerfcli.machine import default_memory_limit, resident_bytes
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.input.stages import read_stage, write_stage

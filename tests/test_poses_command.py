@@ -10,9 +10,9 @@ from test_cli import USAGE, write_photos
 
 from nerfcli.cli.options import bytes_from_text
 from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.poses import structure_from_motion
 from nerfcli.poses.engine import supervise
 from nerfcli.poses.input.settings import QUALITIES, PoseSettings
-from nerfcli.workflows import poses as poses_workflow
 from nerfcli.workflows.poses import _STAGES
 
 
@@ -70,11 +70,11 @@ def test_the_plan_names_the_files_that_are_skipped(tmp_path: Path):
 def test_the_quality_goes_to_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str):
     calls: list[tuple[int, int]] = []
 
-    def estimate(folder: Path, scene: Path, settings: PoseSettings, **more: object) -> None:
+    def estimate(folder: Path, scene: Path, *, settings: PoseSettings, **more: object) -> None:
         calls.append((settings.max_image_size, settings.max_features))
         raise UserError("enough", "that was all")
 
-    monkeypatch.setattr(poses_workflow, "estimate_poses", estimate)
+    monkeypatch.setattr(structure_from_motion, "estimate_poses", estimate)
     photos = write_photos(tmp_path / "photos", 5)
     for quality in ("fast", "best"):
         assert nerfcli(command, photos, "--quality", quality).exit_code == BAD_INPUT

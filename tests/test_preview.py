@@ -1,4 +1,4 @@
-"""nerfcli.render.files.preview: previews show what they say."""
+"""nerfcli.render.presentation: previews show what they say."""
 
 import math
 
@@ -12,7 +12,7 @@ from skimage.color import rgb2lab
 
 from nerfcli.photos.colours import COLOUR_MAPS, levels_of
 from nerfcli.render.files.depth_pictures import DepthMeta
-from nerfcli.render.files.preview import coloured, preview
+from nerfcli.render.presentation import coloured, preview
 
 META = DepthMeta("conditional", "ray", "arbitrary", 0.5)
 

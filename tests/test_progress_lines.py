@@ -16,28 +16,28 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
 
 
 def test_the_time_left_follows_from_what_is_done(clock, capsys):
-    with Console(quiet=False, json_lines=False).progress("render orbit") as update:
-        update(0.0, "of 8 frames")
+    with Console(quiet=False, json_lines=False).stage("render orbit") as reporter:
+        reporter.progress(0.0, "of 8 frames")
         clock(PLAIN_LINE_SECONDS - 1)
-        update(0.1, "of 8 frames")  # too early for a line
+        reporter.progress(0.1, "of 8 frames")  # too early for a line
         clock(11.0)
-        update(0.25, "of 8 frames")
+        reporter.progress(0.25, "of 8 frames")
     assert capsys.readouterr().err == "render orbit: 25 % of 8 frames, about 60 s left\n"
 
 
 def test_resumed_work_takes_as_long_for_the_rest_as_since_it_began_again(clock, capsys):
-    with Console(quiet=False, json_lines=False).progress("train desk") as update:
-        update(0.6, "step 600")
+    with Console(quiet=False, json_lines=False).stage("train desk") as reporter:
+        reporter.progress(0.6, "step 600")
         clock(30.0)
-        update(0.7, "step 700")
+        reporter.progress(0.7, "step 700")
     assert capsys.readouterr().err == "train desk: 70 % step 700, about 2 min left\n"
 
 
 def test_no_time_is_estimated_from_hardly_any_work_or_beside_a_better_estimate(clock, capsys):
-    with Console(quiet=False, json_lines=False).progress("poses desk") as update:
-        update(0.0, "")
+    with Console(quiet=False, json_lines=False).stage("poses desk") as reporter:
+        reporter.progress(0.0, "")
         clock(20.0)
-        update(0.01, "")
+        reporter.progress(0.01, "")
         clock(20.0)
-        update(0.5, "(5 of 10 photos, about 34 s left)")
+        reporter.progress(0.5, "(5 of 10 photos, about 34 s left)")
     assert capsys.readouterr().err == "poses desk: 1 %\nposes desk: 50 % (5 of 10 photos, about 34 s left)\n"

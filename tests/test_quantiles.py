@@ -1,4 +1,4 @@
-"""nerfcli.render.files.preview: exact order statistics of data that do not fit in memory."""
+"""nerfcli.render.presentation: exact order statistics of data that do not fit in memory."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerfcli.render.files.preview import quantiles
+from nerfcli.render.files.depth_files import quantiles
 
 FRACTIONS = (0.0, 0.01, 0.5, 0.99, 1.0)
 

@@ -45,7 +45,7 @@ from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.files import STATE
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import CAMERAS_END, camera_plan
-from nerfcli.workflows.describe_run import camera_moves
+from nerfcli.workflows.describe import camera_moves
 
 seeds = st.integers(0, 2**32 - 1)
 FEW = TrainSettings(

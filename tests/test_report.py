@@ -32,7 +32,7 @@ from nerfcli.evaluate.report.views import look_at as look_through
 from nerfcli.photos.colours import levels_of
 from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.outputs import depth_meta
+from nerfcli.render.job import depth_meta
 from nerfcli.training.runs.components import Components, Decision, Selection
 from nerfcli.training.runs.files import LogEntry
 from nerfcli.training.runs.run import RunConfig

@@ -15,7 +15,7 @@ from scipy.special import expit
 from test_gaussians import some_gaussians
 
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.splats import ply as ply_file
+from nerfcli.splats import files as ply_file
 from nerfcli.splats import spz as spz_file
 from nerfcli.splats.files import read_splats, write_splats
 from nerfcli.splats.gaussians import Gaussians

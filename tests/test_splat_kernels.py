@@ -23,7 +23,7 @@ from nerfcli.kernels.numba_cpu.splats import (
     step_splats,
 )
 from nerfcli.kernels.reference.splats import composite_splats, project_splats
-from nerfcli.splats.views import lens_table
+from nerfcli.splats.render import lens_table
 
 WIDTH, HEIGHT = 70, 50
 BACKGROUND = np.array([0.2, 0.5, 0.7])

@@ -12,6 +12,7 @@ import torch
 from commands import nerfcli as command
 
 import nerfcli
+from nerfcli import Output, Reporter
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
@@ -21,12 +22,11 @@ from nerfcli.kernels.numba_cpu.splats import render_splats
 from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.outputs import ExportSettings
+from nerfcli.render.job import ExportSettings
 from nerfcli.splats import refine as refinement
 from nerfcli.splats.gaussians import Gaussians, gaussians_of, rows_of
-from nerfcli.splats.refine import Refinement, refine, splat_photos
+from nerfcli.splats.refine import Refinement, load_splat_state, refine, splat_photos
 from nerfcli.splats.render import SplatScene
-from nerfcli.splats.state import load_splat_state
 from nerfcli.training.runs.files import SPLATS
 from nerfcli.workflows.evaluate import evaluate_splats
 from nerfcli.workflows.render import render_splats as render_file
@@ -160,13 +160,13 @@ def run(spheres_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_export_refines_once_and_writes_every_format(run: Path) -> None:
     """The .ply and .spz hold the same scene, whichever frame they are in; the second export uses the first's splats."""
     told: list[str] = []
-    ply = nerfcli.export_run(run, to="splats", splats=SMALL, notify=told.append)
+    ply = nerfcli.export_run(run, to="splats", splats=SMALL, reporter=Reporter(note=told.append))
     assert ply == run.with_name("spheres-run-splats.ply")
     assert any("training photos: field" in line for line in told)
     state = (run / SPLATS).read_bytes()
     for name, frame in (("a.spz", "viewer"), ("b.ply", "scene")):
-        nerfcli.export_run(run, run.with_name(name), to="splats", splats=replace(SMALL, frame=frame))
-    nerfcli.export_run(run, run.with_name("c.html"), to="splats", splats=SMALL)
+        nerfcli.export_run(run, Output(run.with_name(name)), to="splats", splats=replace(SMALL, frame=frame))
+    nerfcli.export_run(run, Output(run.with_name("c.html")), to="splats", splats=SMALL)
     assert (run / SPLATS).read_bytes() == state
     held_out = nerfcli.load_run(run).cameras.test[0]
     pictures = [nerfcli.load_splats(run.with_name(n)).render(held_out).rgb for n in (ply.name, "b.ply", "a.spz")]
@@ -178,7 +178,7 @@ def test_export_refines_once_and_writes_every_format(run: Path) -> None:
 def test_what_splats_cannot_do_is_refused(run: Path) -> None:
     """A page in the scene's frame; cameras of a file of splats; splats that are not there."""
     with pytest.raises(UserError, match="the page needs y to point down"):
-        nerfcli.export_run(run, run.with_name("d.html"), to="splats", splats=replace(SMALL, frame="scene"))
+        nerfcli.export_run(run, Output(run.with_name("d.html")), to="splats", splats=replace(SMALL, frame="scene"))
     ply = run.with_name("spheres-run-splats.ply")
     for arguments, words in (
         (["render", ply, "--cameras", run / "cameras.json", "--cameras-only"], "it works with a run"),
@@ -193,13 +193,14 @@ def test_what_splats_cannot_do_is_refused(run: Path) -> None:
 def test_resume_goes_on_and_other_settings_begin_again(run: Path) -> None:
     before = load_splat_state(run / SPLATS)
     longer = replace(SMALL, budget_seconds=2.0, resume=True)
-    nerfcli.export_run(run, to="splats", splats=longer, overwrite=True)
+    again = Output(overwrite=True)
+    nerfcli.export_run(run, again, to="splats", splats=longer)
     after = load_splat_state(run / SPLATS)
     assert after.refinement.steps > before.refinement.steps
     assert len(after.refinement.rows) == len(before.refinement.rows)
     with pytest.raises(UserError, match="no splats of this field"):
-        nerfcli.export_run(run, to="splats", splats=replace(longer, degree=2), overwrite=True)
-    nerfcli.export_run(run, to="splats", splats=replace(SMALL, degree=0), overwrite=True)
+        nerfcli.export_run(run, again, to="splats", splats=replace(longer, degree=2))
+    nerfcli.export_run(run, again, to="splats", splats=replace(SMALL, degree=0))
     assert load_splat_state(run / SPLATS).degree == 0
 
 
@@ -216,7 +217,13 @@ def test_an_interrupt_saves_the_splats_and_writes_no_file(run: Path, monkeypatch
     monkeypatch.setattr(refinement, "step_splats", interrupted)
     target, told = run.with_name("interrupted.ply"), []
     with pytest.raises(KeyboardInterrupt):
-        nerfcli.export_run(run, target, to="splats", splats=replace(SMALL, budget_seconds=60), notify=told.append)
+        nerfcli.export_run(
+            run,
+            Output(target),
+            to="splats",
+            splats=replace(SMALL, budget_seconds=60),
+            reporter=Reporter(note=told.append),
+        )
     assert not target.exists()
     assert load_splat_state(run / SPLATS).refinement.steps == 3
     assert told[-1] == "the splats are saved; the same command with --resume goes on"

@@ -15,7 +15,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_quaternion
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.memory import default_memory_limit, resident_bytes
+from nerfcli.machine import default_memory_limit, resident_bytes
 from nerfcli.photos.images import downscale, write_png
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
 from nerfcli.training import preparation

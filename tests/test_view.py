@@ -28,6 +28,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.loading import load_scene
 from nerfcli.errors import INTERRUPTED
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
+from nerfcli.machine import Resources
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model, save_model
 from nerfcli.render.pictures import RenderedPicture, render_picture
@@ -40,7 +41,7 @@ from nerfcli.viewer import painter
 from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.painter import Painter, Tile, View, render_tile, strides_of, tiles_of, view_from_json
 from nerfcli.viewer.pictures import view_of
-from nerfcli.viewer.server import PageServer
+from nerfcli.viewer.server import Address, PageServer
 from nerfcli.workflows.view import RunData
 
 FEW = TrainSettings(
@@ -52,8 +53,8 @@ class Served:
     """A run that is served, and a client of it."""
 
     def __init__(self, run: Path):
-        self.show = RunData(run, threads=2)
-        self.server = PageServer(self.show, host="127.0.0.1", port=0)
+        self.show = RunData(run, Resources(2))
+        self.server = PageServer(self.show, Address(port=0))
         self.url = self.server.url("127.0.0.1")
         threading.Thread(target=self.server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
 
@@ -332,8 +333,8 @@ def test_a_port_in_use_is_reported_or_skipped(finished):
         error, hint = error_of(nerfcli("view", finished, "--port", str(port), "--no-browser"))
         assert error == f"Error: port {port} of 127.0.0.1 is in use"
         assert "--port" in hint
-    show = RunData(finished, threads=1)
-    with PageServer(show, host="127.0.0.1", port=None) as one, PageServer(show, host="127.0.0.1", port=None) as two:
+    show = RunData(finished, Resources(1))
+    with PageServer(show, Address()) as one, PageServer(show, Address()) as two:
         assert one.port < two.port
 
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nerfcli import machine
 from nerfcli.bench.results import Point, spread
 from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
@@ -144,14 +145,10 @@ def as_text(value: float) -> str:
     return str(ratio) if ratio.numerator == 1 and value < 1 else f"{value:g}"
 
 
-_CPU_INFO = Path("/proc/cpuinfo")
-_STATUS, _CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-
-
 def describe_machine(device: str, threads: int) -> dict[str, Any]:
     """Describe the machine: everything that a time depends on besides the settings."""
     return {
-        "processor": processor_name(),
+        "processor": machine.processor_name(),
         "processors": os.cpu_count(),
         "device": "cpu" if device == "cpu" else torch.cuda.get_device_name(device),
         "threads": threads,
@@ -159,15 +156,6 @@ def describe_machine(device: str, threads: int) -> dict[str, Any]:
         "python": platform.python_version(),
         "torch": torch.__version__,
     }
-
-
-def processor_name() -> str:
-    """Return the CPU's model."""
-    if _CPU_INFO.exists():
-        for line in _CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return " ".join(line.split(":", 1)[1].split())
-    return platform.processor() or platform.machine()
 
 
 def load_average() -> float | None:
@@ -191,19 +179,14 @@ class PeakMemory:
         """Reset the peak."""
         if self.device != "cpu":
             torch.cuda.reset_peak_memory_stats(self.device)
-        elif _CLEAR_REFS.exists():
-            _CLEAR_REFS.write_text("5")  # resets the peak of the resident size: Linux, proc(5)
+        else:
+            machine.begin_recent_peak()
 
     def read(self) -> int | None:
         """Return the peak in bytes; None if the system does not report it."""
         if self.device != "cpu":
             return torch.cuda.max_memory_allocated(self.device)
-        if not (_CLEAR_REFS.exists() and _STATUS.exists()):
-            return None
-        for line in _STATUS.read_text(encoding="utf-8").splitlines():
-            if line.startswith("VmHWM:"):
-                return 1024 * int(line.split()[1])
-        return None
+        return machine.recent_peak_bytes()
 
 
 MOST_PHOTOS = 3
@@ -330,7 +313,7 @@ def smaller(photo: HeldOutPhoto, factor: float) -> HeldOutPhoto:
 
 
 def _render(model: Model, photo: HeldOutPhoto, setting: RenderSetting) -> RenderedPicture:
-    torch.set_num_threads(setting.threads)
+    machine.use_threads(setting.threads)
     background, fine = background_of(model, photo), model.stretched(setting.step)
     return render_picture(fine, photo.frame, background=background, tolerance=setting.tolerance)
 

@@ -27,7 +27,7 @@ from nerfcli.cli import (
 from nerfcli.cli.usage import PhotoCommand, Program
 from nerfcli.errors import INTERRUPTED, TERMINATED
 from nerfcli.interrupts import install_handlers
-from nerfcli.memory import keep_freed_memory
+from nerfcli.machine import keep_freed_memory
 from nerfcli.version import __version__
 
 app = typer.Typer(

@@ -1,14 +1,12 @@
 """nerfcli ablate: what each component of the model contributes on a scene."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from nerfcli.cli import options
-from nerfcli.cli.batch import for_each_input, result_path
-from nerfcli.cli.console import Console, command
-from nerfcli.machine import device_name, thread_count
+from nerfcli.cli.batch import Given, for_each_input
+from nerfcli.cli.console import command
 
 DEFAULT_BUDGET = "1m"
 _STYLES = {"would help": "green", "needed: worse without it": "green", "not needed: better without it": "yellow"}
@@ -17,7 +15,8 @@ _STYLES = {"would help": "green", "needed: worse without it": "green", "not need
 @command
 def ablate(
     scene: Annotated[str, typer.Argument(help="Scene folder, or - to read paths from standard input.")],
-    output: options.Output = None,
+    *,
+    writing: options.Writing,
     budget: Annotated[
         str | None, typer.Option(help="Time of each training: 30s, 2m.  [default: 1m, or none with --steps]")
     ] = None,
@@ -34,13 +33,8 @@ def ablate(
             callback=options.split_at_commas,
         ),
     ] = None,
-    downscale: options.Downscale = "auto",
-    device: options.Device = "auto",
-    seed: options.Seed = 0,
-    threads: options.Threads = 0,
-    overwrite: options.Overwrite = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    training: options.Training,
+    printing: options.Printing,
 ) -> None:
     """Measure what each component of the model contributes on a scene.
 
@@ -63,46 +57,22 @@ def ablate(
       nerfcli ablate photos-scene --seeds 5 -o paper/ablation
     """
     from nerfcli.bench.ablation import COLUMNS, ResultRow, table_of
-    from nerfcli.memory import default_memory_limit
     from nerfcli.training.runs.components import CHOICES
-    from nerfcli.training.runs.settings import TrainSettings, sizes_for
     from nerfcli.workflows.ablate import ablate_scene
 
     if unknown := [name for name in only or () if name not in CHOICES]:
         raise typer.BadParameter(f"{unknown[0]!r}; choose from {', '.join(CHOICES)}", param_hint="--only")
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
-    console = Console(quiet=quiet, json_lines=json)
-    torch_device = device_name(device)
-    settings = TrainSettings(
-        budget_seconds=None if budget is None else options.seconds_from_text(budget),
-        steps=steps,
-        downscale=options.downscale_factor(downscale),
-        seed=seed,
-        device=torch_device,
-        threads=thread_count(threads),
-        model="auto",
-        **sizes_for(torch_device),
-    )
-    limit = default_memory_limit(torch_device)
+    console, settings = printing.console, training.settings(budget, steps)
 
-    def work(path: Path, one_of_many: bool) -> None:
-        folder = result_path(path, suffix="-ablation", output=output, one_of_many=one_of_many)
-        with console.callbacks(f"ablate {path.name}") as callbacks:
-            content = ablate_scene(
-                path,
-                folder,
-                settings,
-                seeds=seeds,
-                only=tuple(only or ()),
-                memory_bytes=limit,
-                overwrite=overwrite,
-                warn=console.warn,
-                **callbacks,
-            )
+    def work(given: Given) -> None:
+        output = writing.of(given, "-ablation")
+        with console.stage(f"ablate {given.path.name}") as reporter:
+            content = ablate_scene(given.path, output, settings, seeds=seeds, only=tuple(only or ()), reporter=reporter)
         rows = [ResultRow(**row) for row in content["rows"]]
         console.table(COLUMNS, table_of(rows), styles=_STYLES)
         console.note(f"protocol: {rows[-1].protocol}; 95 % intervals from Student's t over the seeds")
-        console.result(folder / "ablation.csv", content)
+        console.result(output.at(given.path) / "ablation.csv", content)
 
     for_each_input(scene, work, command="ablate")

@@ -1,23 +1,61 @@
-"""Process one input, or several from standard input."""
+"""Process one input, or several from standard input; refuse X-ray scans in commands for photos."""
 
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import typer
 
 from nerfcli.cli.console import out_of_memory_explained, report_error
-from nerfcli.cli.scans import refuse_scan
-from nerfcli.errors import UserError
-from nerfcli.memory import return_freed_memory
+from nerfcli.ct.recognise import OWN, is_reconstruction, is_volume, recognise
+from nerfcli.errors import UserError, in_shell
+from nerfcli.machine import return_freed_memory
+
+# Commands of `nerfcli ct` for a scan in another format, a scan folder and a run; the first is named by the others.
+_OF_FORMATS, _OF_SCANS = ("convert", "doctor", "info"), ("train", "doctor", "info")
+_OF_RUNS = ("render", "evaluate", "export", "info")
+
+
+def refuse_scan(path: Path, command: str) -> None:
+    """Refuse a scan, its reconstruction or its volume in a command for photos.
+
+    Raises:
+        UserError: the path is one; the hint is the command line for it.
+    """
+    if is_reconstruction(path):
+        what, commands = "the reconstruction of an X-ray scan", _OF_RUNS
+    elif command == "info" and is_volume(path):
+        what, commands = "the volume of an X-ray scan", ("info",)
+    elif (form := recognise(path)) is not None:
+        what, commands = ("an X-ray scan", _OF_SCANS) if form == OWN else (f"an X-ray scan ({form})", _OF_FORMATS)
+    else:
+        return
+    suited = command if command in commands else commands[0]
+    line = f"nerfcli ct {suited} {in_shell(path)}{' SCAN' if suited == 'convert' else ''}"
+    raise UserError(f"{path} is {what}, and {command} is for photos", f"use {line}")
+
 
 STDIN = "-"
 # Commands that read scenes, and those that read runs; the others read captures.
 _READ_SCENES, _READ_RUNS = ("train", "ablate"), ("evaluate", "render", "export", "report", "bench", "info")
 
 
-def for_each_input(source: str, work: Callable[[Path, bool], None], *, command: str) -> None:
-    """Call `work(path, one_of_many)` for the path, or for each line of standard input as it arrives.
+@dataclass(frozen=True)
+class Given:
+    """An input of a command.
+
+    Args:
+        path: the file or folder.
+        one_of_many: whether it is from standard input, so that an output is the folder of the results.
+    """
+
+    path: Path
+    one_of_many: bool = False
+
+
+def for_each_input(source: str, work: Callable[[Given], None], *, command: str) -> None:
+    """Call `work` for the path, or for each line of standard input as it arrives.
 
     A path that fails is reported and the remaining ones are processed; the exit code is that of the first failure.
 
@@ -30,7 +68,7 @@ def for_each_input(source: str, work: Callable[[Path, bool], None], *, command: 
         UserError: the only input failed, or standard input held no path.
     """
     if source != STDIN:
-        work(Path(source), False)
+        work(Given(Path(source)))
         return
     first_failure: UserError | None = None
     count = 0
@@ -40,7 +78,7 @@ def for_each_input(source: str, work: Callable[[Path, bool], None], *, command: 
             with out_of_memory_explained():
                 if not command.startswith("ct "):
                     refuse_scan(path, command)
-                work(path, True)
+                work(Given(path, one_of_many=True))
         except UserError as error:
             report_error(error, about=str(path))
             first_failure = first_failure or error
@@ -68,22 +106,3 @@ def stdin_paths() -> Iterator[Path]:
     while line := sys.stdin.readline() if sys.stdin is not None else "":  # None where the parent process has closed it
         if text := line.rstrip("\r\n"):
             yield Path(text)
-
-
-def result_path(source: Path, *, suffix: str, output: Path | None, one_of_many: bool) -> Path:
-    """Return the output path for `source`.
-
-    The default is beside the source, with `suffix` added to its name. If `output` is given, it is `output`, or a path
-    inside `output` if there are many sources.
-
-    Raises:
-        UserError: the source is the root of the file system, beside which nothing can be written.
-    """
-    if source.name in ("", ".."):  # "." and ".." have a name only once they are resolved
-        source = source.resolve()
-    if not source.name and (output is None or one_of_many):
-        raise UserError(f"cannot write a result next to {source}", "choose the output folder with -o")
-    name = source.name + suffix
-    if output is None:
-        return source.with_name(name)
-    return output / name if one_of_many else output

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nerfcli.cli import options
-from nerfcli.cli.batch import for_each_input, result_path
+from nerfcli.cli.batch import Given, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.errors import UserError
-from nerfcli.machine import device_name, thread_count
+from nerfcli.machine import Resources
+from nerfcli.output import Output
 
 if TYPE_CHECKING:
     from nerfcli.bench.results import Point
@@ -22,15 +23,13 @@ _STYLES = {"yes": "green"}
 @command
 def bench(
     source: Annotated[str, typer.Argument(help="Run folder, or a scene; - to read paths from standard input.")],
-    output: options.Output = None,
+    *,
+    writing: options.Writing,
     budget: Annotated[
         str, typer.Option(help="Total time: 8m, 1h. More time allows more settings, longer trainings and more repeats.")
     ] = "8m",
-    device: options.Device = "auto",
-    threads: options.Threads = 0,
-    overwrite: options.Overwrite = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    computing: options.Computing,
+    printing: options.Printing,
 ) -> None:
     """Measure speed against error on this scene and machine.
 
@@ -51,52 +50,54 @@ def bench(
     seconds = options.seconds_from_text(budget)
     if seconds < 20.0:
         raise typer.BadParameter(f"{budget!r} is too short; give at least 20s", param_hint="--budget")
-    console = Console(quiet=quiet, json_lines=json)
+    console = printing.console
 
-    def work(path: Path, one_of_many: bool) -> None:
-        folder = result_path(path, suffix="-bench", output=output, one_of_many=one_of_many)
-        how = {"device": device_name(device), "threads": thread_count(threads), "seconds": seconds}
-        content = bench_one(path, folder, how, overwrite=overwrite, console=console)
-        console.result(folder / "bench.csv", content)
+    def work(given: Given) -> None:
+        output = writing.of(given, "-bench")
+        content = bench_one(given.path, output, seconds, resources=computing.resources, console=console)
+        console.result(output.at(given.path) / "bench.csv", content)
 
     for_each_input(source, work, command="bench")
 
 
-def bench_one(path: Path, folder: Path, how: dict[str, Any], *, overwrite: bool, console: Console) -> dict[str, Any]:
+def bench_one(path: Path, output: Output, seconds: float, *, resources: Resources, console: Console) -> dict[str, Any]:
     """Measure one run or scene, or keep a complete bench of it; return the content of bench.json.
 
     Raises:
-        UserError: the input cannot be measured, or `folder` holds something else.
+        UserError: the input cannot be measured, or the output folder holds something else.
     """
     from nerfcli import kernels
     from nerfcli.bench.measurement import describe_machine, is_busy, load_average, measure_renderings, measure_trainings
     from nerfcli.bench.results import BENCH, COLUMNS, Point, table_of, write_results
     from nerfcli.training.runs.run import Run
 
+    folder = output.beside(path, "-bench")
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a run folder, or a scene folder")
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / BENCH).is_file()):
         raise UserError(f"{folder} exists and is not a bench folder", "choose another folder with -o")
-    if not overwrite and (folder / BENCH).is_file():
+    if not output.overwrite and (folder / BENCH).is_file():
         content = json_text.loads((folder / BENCH).read_text(encoding="utf-8"))
         if content["complete"]:
             console.note(f"{folder} is complete; add --overwrite to measure again")
             return content
     if is_busy(load := load_average()):
         console.warn(f"other programs use the processors (load average {load:.1f}): times will be too long and vary")
-    kernels.prepare(console.note, how["device"])
-    about = {"source": str(path), "machine": describe_machine(how["device"], how["threads"]), "load_average": load}
+    device, threads = resources.torch_device, resources.cores
+    kernels.prepare(console.note, device)
+    about = {"source": str(path), "machine": describe_machine(device, threads), "load_average": load}
+    how = {"device": device, "threads": threads, "seconds": seconds}
     latest: list[Point] = []
 
     def save(points: Sequence["Point"]) -> None:
         latest[:] = points
         write_results(folder, about, latest, complete=False)
 
-    with console.progress(f"bench {path.name}") as tell:
+    with console.stage(f"bench {path.name}") as reporter:
         if Run(path).is_trained:
-            measure_renderings(Run(path), **how, save=save, tell=tell)
+            measure_renderings(Run(path), **how, save=save, tell=reporter.progress)
         else:
-            measure_trainings(path, folder, **how, save=save, tell=tell)
+            measure_trainings(path, folder, **how, save=save, tell=reporter.progress)
     content = write_results(folder, about, latest, complete=True)
     console.table(COLUMNS, table_of(latest), styles=_STYLES)
     return content

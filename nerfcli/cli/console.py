@@ -2,19 +2,22 @@
 
 import errno
 import functools
+import inspect
 import json
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, ParamSpec, TextIO, TypedDict, TypeVar
+from typing import Any, ParamSpec, TextIO, TypeVar
 
 import typer
 
 from nerfcli.errors import INTERRUPTED, OUT_OF_MEMORY, TERMINATED, UserError, duration
 from nerfcli.interrupts import Terminated
+from nerfcli.notices import Reporter, no_progress
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -27,13 +30,6 @@ STATES_LEFT = " left"
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 # Width of tables in a file or a pipe, which have no width of their own.
 TABLE_WIDTH = 200
-
-
-class Callbacks(TypedDict):
-    """Callbacks that tell the user what a workflow does."""
-
-    notify: Callable[[str], None]
-    progress: Callable[[float, str], None]
 
 
 class Console:
@@ -70,8 +66,7 @@ class Console:
 
     def fact_table(self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, styles: Mapping[str, str]) -> None:
         """Print results that are not files as a table on stdout; `styles` gives the styles of cells by their text."""
-        width = None if sys.stdout.isatty() else TABLE_WIDTH
-        _print_table(columns, rows, styles=styles, width=width, file=sys.stdout)
+        _print_table(columns, rows, styles, sys.stdout)
 
     def note(self, text: str) -> None:
         """Print a line for the user."""
@@ -86,15 +81,18 @@ class Console:
         """Print a table for the user; `styles` gives the styles of cells by their text."""
         if self.quiet:
             return
-        width = None if sys.stderr.isatty() else TABLE_WIDTH
-        _print_table(columns, rows, styles=styles, width=width, file=sys.stderr)
+        _print_table(columns, rows, styles, sys.stderr)
+
+    @property
+    def reporter(self) -> Reporter:
+        """The reporter of a workflow, which shows the progress of its stages only."""
+        return Reporter(self.note, self.warn, titled=self.stage)
 
     @contextmanager
-    def progress(self, title: str) -> Iterator[Callable[[float, str], None]]:
-        """Show a progress bar on a terminal, or an occasional plain line elsewhere, from the first update on.
+    def stage(self, title: str) -> Iterator[Reporter]:
+        """Provide the reporter of a stage: a progress bar on a terminal, or an occasional plain line elsewhere.
 
-        Yields:
-            update(fraction in [0, 1], detail): to be called as often as desired.
+        The bar appears with the first progress.
         """
         with ExitStack() as stack:
             bar: Callable[[float, str], None] | None = None
@@ -105,17 +103,11 @@ class Console:
                     bar = stack.enter_context(_bar(title) if sys.stderr.isatty() else _plain_lines(title))
                 bar(fraction, detail)
 
-            yield (lambda fraction, detail: None) if self.quiet else update
-
-    @contextmanager
-    def callbacks(self, title: str) -> Iterator[Callbacks]:
-        """Provide `note` and `progress` under the names that workflows give them."""
-        with self.progress(title) as update:
-            yield {"notify": self.note, "progress": update}
+            yield Reporter(self.note, self.warn, no_progress if self.quiet else update)
 
 
 def _print_table(
-    columns: Sequence[str], rows: Sequence[Sequence[str]], *, styles: Mapping[str, str], width: int | None, file: TextIO
+    columns: Sequence[str], rows: Sequence[Sequence[str]], styles: Mapping[str, str], file: TextIO
 ) -> None:
     from rich.box import SIMPLE
     from rich.console import Console as RichConsole
@@ -125,7 +117,7 @@ def _print_table(
     table = Table(*columns, box=SIMPLE, pad_edge=False)
     for row in rows:
         table.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
-    RichConsole(file=file, width=width).print(table)
+    RichConsole(file=file, width=None if file.isatty() else TABLE_WIDTH).print(table)
 
 
 @contextmanager
@@ -179,8 +171,35 @@ def report_error(error: UserError, about: str | None = None) -> None:
     _stderr(f"Hint:  {error.hint}")
 
 
-def command(function: Callable[P, R]) -> Callable[P, R]:
-    """Turn the exceptions of a command into two lines and an exit code; bugs keep their traceback."""
+def command(function: Callable[..., R]) -> Callable[..., R]:
+    """Make a command of a function: its options are its parameters, and the fields of those that are dataclasses.
+
+    Exceptions become two lines and an exit code, see `errors_explained`.
+    """
+    parameters = list(inspect.signature(function).parameters.values())
+    records = {each.name: each.annotation for each in parameters if is_dataclass(each.annotation)}
+    options = [
+        option
+        for each in parameters
+        for option in (inspect.signature(each.annotation).parameters.values() if each.name in records else (each,))
+    ]
+
+    @errors_explained
+    @functools.wraps(function)
+    def parsed(**given: Any) -> R:
+        for name, record in records.items():
+            given[name] = record(**{field.name: given.pop(field.name) for field in fields(record)})
+        return function(**given)
+
+    # Typer reads these.
+    keywords = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    setattr(parsed, "__signature__", inspect.Signature(keywords))  # noqa: B010 - functions do not declare it
+    parsed.__annotations__ = {option.name: option.annotation for option in options}
+    return parsed
+
+
+def errors_explained(function: Callable[P, R]) -> Callable[P, R]:
+    """Turn the exceptions of a function into two lines and an exit code; bugs keep their traceback."""
 
     @functools.wraps(function)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> R:

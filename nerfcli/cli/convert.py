@@ -1,16 +1,20 @@
 """nerfcli convert: convert cameras between formats; detect conventions."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nerfcli.cli.batch import for_each_input
+from nerfcli.cli.batch import Given, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Json, Overwrite, Quiet, one_of
+from nerfcli.cli.options import Overwrite, Printing, one_of
 
 if TYPE_CHECKING:
+    from nerfcli.captures.conversion import ConventionOverrides, TargetOptions
     from nerfcli.captures.detect import Detection, HypothesisScore, Question
+    from nerfcli.captures.formats.format import UserInputs
+    from nerfcli.captures.world_frame import WorldFrame
 
 FORMATS_WRITTEN = (
     "nerfcli",
@@ -32,92 +36,156 @@ COMMON_STEMS = ("transforms", "reconstruction", "bundle", "poses_bounds", "scene
 PIXEL_CENTRES = {"0.5": 0.5, "0": 0.0}
 _AXES = "opencv (= rdf), opengl (= rub), llff (= drb), pytorch3d (= luf), ros (= flu), or three such letters"
 
+Source = Annotated[
+    str,
+    typer.Argument(metavar="IN", help="Capture to read: file or folder, or - to read paths from standard input."),
+]
+Target = Annotated[
+    Path | None,
+    typer.Argument(metavar="OUT", help="File or folder to write; with -, the folder that will contain the results."),
+]
 
-@command
-def convert(
-    source: Annotated[
-        str,
-        typer.Argument(metavar="IN", help="Capture to read: file or folder, or - to read paths from standard input."),
-    ],
-    target: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="OUT", help="File or folder to write; with -, the folder that will contain the results."
-        ),
-    ] = None,
-    to: Annotated[
-        str | None,
-        typer.Option(help=f"Output format: {', '.join(FORMATS_WRITTEN)}; {' or '.join(PROGRAMS)} for transforms."),
-    ] = None,
-    detect: Annotated[
-        bool, typer.Option("--detect", help="Write nothing; detect which convention IN follows.")
-    ] = False,
-    axes: Annotated[str | None, typer.Option(help=f"Camera axes of the poses in OUT: {_AXES}.")] = None,
-    pixel_center: Annotated[
-        str | None,
-        typer.Option(help="Pixel coordinates of the top-left pixel's centre in OUT: 0.5, or 0 as in OpenCV."),
-    ] = None,
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """Options of what the source does not say, or says wrongly."""
+
     from_axes: Annotated[
         str | None, typer.Option(help="Camera axes of the poses in IN, if they differ from its format's.")
-    ] = None,
+    ] = None
     from_inverted: Annotated[
         bool,
         typer.Option(
             "--from-inverted",
             help="The transforms in IN are inverted (camera-from-world instead of world-from-camera, or vice versa).",
         ),
-    ] = False,
-    from_pixel_center: Annotated[str | None, typer.Option(help="Like --pixel-center, for IN.")] = None,
+    ] = False
+    from_pixel_center: Annotated[str | None, typer.Option(help="Like --pixel-center, for IN.")] = None
     from_size: Annotated[
         float, typer.Option(help="The intrinsics in IN refer to pictures larger than stated by this factor.", min=1e-3)
-    ] = 1.0,
-    images: Annotated[Path | None, typer.Option(help="Folder of the photos, if IN does not point to them.")] = None,
+    ] = 1.0
+    images: Annotated[Path | None, typer.Option(help="Folder of the photos, if IN does not point to them.")] = None
     masks: Annotated[
         Path | None,
         typer.Option(help="Folder of masks named after the photos, if IN has none; black is ignored in training."),
-    ] = None,
+    ] = None
     intrinsics: Annotated[
         Path | None,
         typer.Option(
             help="File with the camera for tum, kitti and pose-files: cameras.txt, a JSON camera, or a capture."
         ),
-    ] = None,
+    ] = None
+
+    def overrides(self) -> "ConventionOverrides":
+        """Return the conventions of the source.
+
+        Raises:
+            typer.BadParameter: a value is unknown.
+        """
+        from nerfcli.captures.conversion import ConventionOverrides
+
+        centre = _pixel_centre(self.from_pixel_center, "--from-pixel-center")
+        return ConventionOverrides(self.from_axes, self.from_inverted, centre, self.from_size)
+
+    def given(self) -> "UserInputs":
+        """Return photos, masks and camera; reads the file of intrinsics."""
+        from nerfcli.captures.calibration import read_intrinsics
+        from nerfcli.captures.formats.format import UserInputs
+
+        camera = None if self.intrinsics is None else read_intrinsics(self.intrinsics)
+        return UserInputs(images=self.images, camera=camera, masks=self.masks)
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """Options of the frame and the unit of the result."""
+
     world_up: Annotated[
         str | None, typer.Option(help="Rotate the world so that this axis points up: x, y, z, -x, -y or -z.")
-    ] = None,
+    ] = None
     origin: Annotated[
         str | None, typer.Option(help="Move the world's origin to centre-of-cameras, focus, or a point x,y,z of IN.")
-    ] = None,
+    ] = None
     scale: Annotated[
         str | None,
         typer.Option(help="Multiply lengths by this number; gps: scale to metres by the GPS positions in EXIF."),
-    ] = None,
+    ] = None
     distance: Annotated[
         list[str] | None,
         typer.Option(
             help='Scale to metres by a known distance: "A B 1.25", A and B images or points x,y,z. Repeatable.'
         ),
-    ] = None,
+    ] = None
     markers: Annotated[
         str | None,
         typer.Option(
             help="Scale to metres by ArUco markers, DICT_4X4_50:0.05 (side length), or a ChArUco board, "
             "DICT_5X5_100:7x5:0.04:0.03 (squares, sides of square and marker; append :legacy for OpenCV < 4.6)."
         ),
-    ] = None,
+    ] = None
+
+    def frame(self) -> "WorldFrame":
+        """Return the frame that the options select."""
+        from nerfcli.captures.world_frame import WorldFrame
+
+        return WorldFrame(self.world_up, self.origin, self.scale, self.markers, tuple(self.distance or ()))
+
+
+@dataclass(frozen=True)
+class FormatOptions:
+    """Options of what is written."""
+
+    to: Annotated[
+        str | None,
+        typer.Option(help=f"Output format: {', '.join(FORMATS_WRITTEN)}; {' or '.join(PROGRAMS)} for transforms."),
+    ] = None
+    axes: Annotated[str | None, typer.Option(help=f"Camera axes of the poses in OUT: {_AXES}.")] = None
+    pixel_center: Annotated[
+        str | None,
+        typer.Option(help="Pixel coordinates of the top-left pixel's centre in OUT: 0.5, or 0 as in OpenCV."),
+    ] = None
     pixels: Annotated[
         str | None,
         typer.Option(
             help="For photos with an EXIF orientation, whether cameras in OUT refer to the pixels as stored (COLMAP, "
             "nerfstudio and most programs) or upright.  [default: upright for nerfcli, else stored]"
         ),
-    ] = None,
+    ] = None
     allow_loss: Annotated[
         bool, typer.Option("--allow-loss", help="Drop what the format cannot hold (it is listed).")
+    ] = False
+    overwrite: Overwrite = False
+
+    def target(self) -> "TargetOptions":
+        """Return how to write.
+
+        Raises:
+            typer.BadParameter: a value is missing or unknown.
+        """
+        from nerfcli.captures.conversion import TargetOptions
+        from nerfcli.captures.formats.registry import format_named
+
+        to = PROGRAMS.get(self.to or "", self.to)
+        if to is None or to not in FORMATS_WRITTEN:
+            stated = "missing" if to is None else repr(to)
+            raise typer.BadParameter(f"{stated}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
+        one_of(self.pixels, ("stored", "upright"), "--pixels")
+        centre = _pixel_centre(self.pixel_center, "--pixel-center")
+        return TargetOptions(format_named(to), self.axes, centre, self.allow_loss, self.overwrite, self.pixels)
+
+
+@command
+def convert(
+    source: Source,
+    target: Target = None,
+    *,
+    detect: Annotated[
+        bool, typer.Option("--detect", help="Write nothing; detect which convention IN follows.")
     ] = False,
-    overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    written: FormatOptions,
+    read: SourceOptions,
+    world: WorldOptions,
+    printing: Printing,
 ) -> None:
     """Convert a capture to another format.
 
@@ -156,67 +224,41 @@ def convert(
       nerfcli convert strange/ repaired.json --to transforms --from-axes opencv --from-inverted
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
     """
-    from nerfcli.captures.calibration import read_intrinsics
-    from nerfcli.captures.conversion import ConventionOverrides, TargetOptions
-    from nerfcli.captures.formats.format import UserInputs
-    from nerfcli.captures.formats.registry import format_named
-    from nerfcli.captures.world_frame import WorldFrame
-    from nerfcli.workflows.convert import convert_capture, detect_convention, detection_record
-
-    console = Console(quiet=quiet, json_lines=json)
-    from_centre = _pixel_centre(from_pixel_center, "--from-pixel-center")
-    overrides = ConventionOverrides(
-        axes=from_axes, inverted=from_inverted, pixel_centre=from_centre, intrinsics_scale=from_size
-    )
-
-    def given() -> UserInputs:
-        camera = None if intrinsics is None else read_intrinsics(intrinsics)
-        return UserInputs(images=images, camera=camera, masks=masks)
-
+    console, overrides = printing.console, read.overrides()
     if detect:
-        if to is not None or target is not None:
+        if written.to is not None or target is not None:
             raise typer.BadParameter("--detect writes nothing; remove OUT and --to")
+        for_each_input(source, lambda given: _detect(given.path, read, overrides, console), command="convert")
+        return
+    wanted, frame = written.target(), world.frame()
+    if target is None:
+        raise typer.BadParameter("missing; give the file or folder to write", param_hint="OUT")
+    from nerfcli.workflows.convert import convert_capture
 
-        def work(path: Path, one_of_many: bool) -> None:
-            with console.callbacks(f"detect {path.name}") as callbacks:
-                form, found = detect_convention(path, given=given(), overrides=overrides, **callbacks)
-            lines = [f"{path} ({form.name}), judged by {found.evidence}", *_table(found)]
-            console.facts(path, detection_record(found, form.name), "\n".join(lines))
-    else:
-        to = PROGRAMS.get(to or "", to)
-        if to is None or to not in FORMATS_WRITTEN:
-            given_text = "missing" if to is None else repr(to)
-            raise typer.BadParameter(f"{given_text}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
-        if target is None:
-            raise typer.BadParameter("missing; give the file or folder to write", param_hint="OUT")
-        one_of(pixels, ("stored", "upright"), "--pixels")
-        world = WorldFrame(world_up, origin, scale, markers, tuple(distance or ()))
-        wanted = TargetOptions(
-            format_named(to),
-            axes=axes,
-            pixel_centre=_pixel_centre(pixel_center, "--pixel-center"),
-            allow_loss=allow_loss,
-            overwrite=overwrite,
-            pixels=pixels,
+    def work(given: Given) -> None:
+        done, record = convert_capture(
+            given.path,
+            target / _named_for(given.path).resolve().name if given.one_of_many else target,
+            wanted,
+            given=read.given(),
+            overrides=overrides,
+            world=frame,
+            reporter=console.reporter,
         )
-
-        def work(path: Path, one_of_many: bool) -> None:
-            place = target / _named_for(path).resolve().name if one_of_many else target
-            done, record = convert_capture(
-                path,
-                place,
-                wanted,
-                given=given(),
-                overrides=overrides,
-                world=world,
-                notify=console.note,
-                warn=console.warn,
-            )
-            off = f", {done.check.rays} rays are off by at most {done.check.max_px:.2g} px" if done.check.rays else ""
-            console.note(f"{done.path}: read back{off}")
-            console.result(done.path, record)
+        off = f", {done.check.rays} rays are off by at most {done.check.max_px:.2g} px" if done.check.rays else ""
+        console.note(f"{done.path}: read back{off}")
+        console.result(done.path, record)
 
     for_each_input(source, work, command="convert")
+
+
+def _detect(path: Path, read: SourceOptions, overrides: "ConventionOverrides", console: Console) -> None:
+    from nerfcli.workflows.convert import detect_convention, detection_record
+
+    with console.stage(f"detect {path.name}") as reporter:
+        form, found = detect_convention(path, given=read.given(), overrides=overrides, reporter=reporter)
+    lines = [f"{path} ({form.name}), judged by {found.evidence}", *_table(found)]
+    console.facts(path, detection_record(found, form.name), "\n".join(lines))
 
 
 def _table(found: "Detection") -> list[str]:

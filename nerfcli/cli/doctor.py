@@ -1,17 +1,18 @@
 """nerfcli doctor: check photos before any long work."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nerfcli.cli.batch import for_each_input, result_path
+from nerfcli.cli.batch import Given, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads, one_of
+from nerfcli.cli.options import Printing, Threads, Writing, one_of
 from nerfcli.cli.poses import Intrinsics, Subfolders
 from nerfcli.errors import GATE_NOT_MET, UserError, listed
-from nerfcli.machine import thread_count
-from nerfcli.pages.findings import VERDICTS
+from nerfcli.machine import Resources
+from nerfcli.pages.findings import VERDICTS, Finding
 
 if TYPE_CHECKING:
     from nerfcli.ct.checks.examine import ScanDiagnosis
@@ -29,14 +30,13 @@ def doctor(
     capture: Annotated[
         str, typer.Argument(help="Folder of photos, or a scene, or - to read paths from standard input.")
     ],
-    output: Output = None,
+    *,
+    writing: Writing,
     intrinsics: Intrinsics = None,
     subfolders: Subfolders = False,
     require: Gate = None,
     threads: Threads = 0,
-    overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    printing: Printing,
 ) -> None:
     """Check photos for problems before any long work.
 
@@ -55,41 +55,31 @@ def doctor(
     """
     one_of(require, GATES, "--require")
     from nerfcli.captures.formats.run_cameras import find_run
-    from nerfcli.doctor.examination import content
-    from nerfcli.workflows.doctor import examine_capture
+    from nerfcli.doctor.examination import content, find_subject
+    from nerfcli.doctor.page import examine_capture
 
-    console = Console(quiet=quiet, json_lines=json)
+    console, resources = printing.console, Resources(threads)
 
-    def work(path: Path, one_of_many: bool) -> None:
+    def work(given: Given) -> None:
+        path = given.path
         if find_run(path) is not None:
             raise UserError(
                 f"{path} is a run: doctor examines photos and scenes",
                 "nerfcli report RUN shows how many photos see what; render has --outputs coverage,parallax",
             )
-        page = result_path(path, suffix="-doctor.html", output=output, one_of_many=one_of_many)
-        with console.callbacks(f"doctor {path.name}") as callbacks:
+        page = writing.of(given, "-doctor.html")
+        with console.stage(f"doctor {path.name}") as reporter:
             diagnosis = examine_capture(
-                path,
-                page,
-                threads=thread_count(threads),
-                overwrite=overwrite,
-                intrinsics=intrinsics,
-                subfolders=subfolders,
-                **callbacks,
+                find_subject(path, subfolders=subfolders), page, intrinsics, resources=resources, reporter=reporter
             )
-        show_findings(diagnosis, page, content(diagnosis), console, require=require)
+        show_findings(diagnosis, page.at(path), content(diagnosis), console)
+        check_gate(diagnosis.findings, require)
 
     for_each_input(capture, work, command="doctor")
 
 
-def show_findings(
-    diagnosis: "Diagnosis | ScanDiagnosis", page: Path, record: dict[str, Any], console: Console, *, require: str | None
-) -> None:
-    """Print a table of the findings and the result.
-
-    Raises:
-        UserError: a finding is worse than required.
-    """
+def show_findings(diagnosis: "Diagnosis | ScanDiagnosis", page: Path, record: dict[str, Any], console: Console) -> None:
+    """Print a table of the findings and the result."""
     rows = []
     for finding in diagnosis.findings:
         found = ": ".join(filter(None, (finding.summary, listed(finding.names))))
@@ -98,9 +88,17 @@ def show_findings(
     for check, reason in diagnosis.not_checked:
         console.note(f"not checked: {check}: {reason}")
     console.result(page, record)
+
+
+def check_gate(findings: Sequence[Finding], require: str | None) -> None:
+    """Raise if a finding is worse than required.
+
+    Raises:
+        UserError: one is.
+    """
     if require is None:
         return
-    worse = [f for f in diagnosis.findings if VERDICTS.index(f.verdict) > VERDICTS.index(require)]
+    worse = [f for f in findings if VERDICTS.index(f.verdict) > VERDICTS.index(require)]
     if worse:
         raise UserError(
             f"--require {require} is not met by {', '.join(f'{f.check} ({f.verdict})' for f in worse)}",

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nerfcli.cli.batch import STDIN, for_each_input
+from nerfcli.cli.batch import STDIN, Given, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Device, Json, Overwrite, Quiet, Require, Threads, one_of
-from nerfcli.machine import device_name, thread_count
+from nerfcli.cli.options import Computing, Overwrite, Printing, Require, one_of
+from nerfcli.output import Output
 
 if TYPE_CHECKING:
     from nerfcli.evaluate.requirements import Requirement
@@ -27,6 +27,7 @@ def evaluate(
     runs: Annotated[
         list[str], typer.Argument(help="Run folders written by train, or - to read paths from standard input.")
     ],
+    *,
     save_predictions: Annotated[
         str | None, typer.Option(help="png: save the compared pictures in RUN/predictions; float: also unrounded.")
     ] = None,
@@ -34,11 +35,9 @@ def evaluate(
         Path | None, typer.Option(help="A .ply or .spz of splats, measured on the held-out photos beside the field.")
     ] = None,
     require: Require = None,
-    device: Device = "auto",
-    threads: Threads = 0,
+    computing: Computing,
     overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    printing: Printing,
 ) -> None:
     """Evaluate runs on their held-out photos.
 
@@ -66,32 +65,23 @@ def evaluate(
         raise typer.BadParameter(f"there is no {splats}", param_hint="--splats")
     if STDIN in runs and len(runs) > 1:
         raise typer.BadParameter("- cannot be combined with other runs", param_hint="RUNS")
-    console = Console(quiet=quiet, json_lines=json)
-    requirements = requirements_of(require)
-    cores, torch_device = thread_count(threads), device_name(device)
+    console, requirements = printing.console, requirements_of(require)
+    resources, output = computing.resources, Output(overwrite=overwrite)
+    _ = resources.torch_device  # refuses an unknown one before anything is read
 
     def measure(folder: Path) -> dict[str, Any]:
-        with console.callbacks("evaluate") as callbacks:
-            evaluation = evaluate_run(
-                folder,
-                device=torch_device,
-                threads=cores,
-                overwrite=overwrite,
-                predictions=save_predictions,
-                **callbacks,
-            )
-        print_numbers(folder, evaluation, console)
-        console.result(evaluation.path, evaluation.metrics)
-        return evaluation.metrics
+        with console.stage("evaluate") as reporter:
+            found = evaluate_run(folder, output, predictions=save_predictions, resources=resources, reporter=reporter)
+        show_evaluation(found, console)
+        return found.metrics
 
-    def work(folder: Path, one_of_many: bool) -> None:
-        found = measure(folder)
+    def work(given: Given) -> None:
+        found = measure(given.path)
         if splats is not None:
-            with console.callbacks("evaluate splats") as callbacks:
-                of_splats = evaluate_splats(folder, splats, threads=cores, overwrite=overwrite, **callbacks)
-            print_beside_field(found, of_splats, console)
-            console.result(of_splats.path, of_splats.metrics)
-        check_requirements(Run(folder), found, requirements)
+            with console.stage("evaluate splats") as reporter:
+                of_splats = evaluate_splats(given.path, splats, output, resources=resources, reporter=reporter)
+            show_evaluation(of_splats, console, field=found)
+        check_requirements(Run(given.path), found, requirements)
 
     if len(runs) == 1:
         for_each_input(runs[0], work, command="evaluate")
@@ -115,14 +105,19 @@ def requirements_of(text: str | None) -> "tuple[Requirement, ...]":
         raise typer.BadParameter(str(error), param_hint="--require") from error
 
 
-def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None:
-    """Print new metrics in a few lines and a table; print nothing about metrics kept from an earlier call."""
+def show_evaluation(evaluation: "Evaluation", console: Console, *, field: dict[str, Any] | None = None) -> None:
+    """Print metrics, those of splats beside those of the field, and their path."""
+    if field is not None:
+        _print_beside_field(field, evaluation, console)
+    elif not evaluation.is_kept:
+        _print_numbers(evaluation.path.parent, evaluation.metrics, console)
+    console.result(evaluation.path, evaluation.metrics)
+
+
+def _print_numbers(run: Path, metrics: dict[str, Any], console: Console) -> None:
+    """Print the metrics of a run in a few lines and a table."""
     from nerfcli.evaluate.billboards import GeometryEvidence
     from nerfcli.evaluate.ledger import Entry, summary_line
-
-    if evaluation.is_kept:
-        return
-    metrics = evaluation.metrics
 
     mean, kinds = metrics["mean"], metrics["kinds"]
     console.note(
@@ -150,7 +145,7 @@ def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None
         console.warn(text)
 
 
-def print_beside_field(field: dict[str, Any], splats: "Evaluation", console: Console) -> None:
+def _print_beside_field(field: dict[str, Any], splats: "Evaluation", console: Console) -> None:
     """Print the metrics of splats below those of the field, as rendered in 8 bit."""
     rows = [
         (

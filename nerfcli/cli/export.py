@@ -1,23 +1,96 @@
 """nerfcli export: export a run as a page, a mesh, points or splats."""
 
 import math
-from pathlib import Path
-from typing import Annotated
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nerfcli.cli.batch import STDIN, for_each_input
-from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, one_of, seconds_from_text
-from nerfcli.cli.render_options import finite
-from nerfcli.machine import device_name, thread_count
+from nerfcli.cli.batch import STDIN, Given, for_each_input
+from nerfcli.cli.console import command
+from nerfcli.cli.options import Computing, Printing, Writing, finite, one_of, refuse_unused, seconds_from_text
+
+if TYPE_CHECKING:
+    from nerfcli.export.extent import SurfaceSettings
+    from nerfcli.workflows.splats import SplatSettings
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """Options of meshes and points."""
+
+    box: Annotated[
+        str | None,
+        typer.Option(help="Exported region X0,Y0,Z0,X1,Y1,Z1, in scene units.  [default: the subject of the photos]"),
+    ] = None
+    voxel_size: Annotated[
+        float | None,
+        typer.Option(help="Size of a voxel in scene units.  [default: the resolution of the photos]"),
+    ] = None
+    faces: Annotated[
+        int | None,
+        typer.Option(help="Maximum number of triangles of a mesh.  [default: 300000]", min=4, show_default=False),
+    ] = None
+
+    def settings(self) -> "SurfaceSettings":
+        """Return the settings that the options select.
+
+        Raises:
+            typer.BadParameter: a value cannot be parsed, or is no size.
+        """
+        from nerfcli.export.extent import FACES, SurfaceSettings
+
+        finite(self.voxel_size, "--voxel-size")
+        if self.voxel_size is not None and self.voxel_size <= 0:
+            raise typer.BadParameter(f"{self.voxel_size:g} is not a positive size", param_hint="--voxel-size")
+        box = None if self.box is None else box_of(self.box)
+        return SurfaceSettings(box, self.voxel_size, faces=self.faces or FACES)
+
+
+@dataclass(frozen=True)
+class SplatOptions:
+    """Options of splats."""
+
+    count: Annotated[
+        int | None,
+        typer.Option(help="Largest number of splats.  [default: by photos and budget]", min=100, max=10_000_000),
+    ] = None
+    budget: Annotated[
+        str | None, typer.Option(help="Time to refine splats on the training photos.  [default: 60s]")
+    ] = None
+    sh: Annotated[
+        int | None,
+        typer.Option(help="Degree of the harmonics by which colours of splats vary.  [default: 2]", min=0, max=3),
+    ] = None
+    frame: Annotated[
+        str | None, typer.Option(help="Of splats: viewer (y down, as viewers expect) or scene.  [default: viewer]")
+    ] = None
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on refining the splats of the run, to a larger --budget.")
+    ] = False
+
+    def settings(self) -> "SplatSettings":
+        """Return the settings that the options select.
+
+        Raises:
+            typer.BadParameter: a value cannot be parsed.
+        """
+        from nerfcli.workflows.splats import SplatSettings
+
+        return SplatSettings(
+            self.count,
+            60.0 if self.budget is None else seconds_from_text(self.budget),
+            2 if self.sh is None else self.sh,
+            one_of(self.frame or "viewer", ("viewer", "scene"), "--frame"),
+            self.resume,
+        )
 
 
 @command
 def export(
     run: Annotated[str, typer.Argument(help="Run folder written by train, or - to read paths from standard input.")],
     to: Annotated[str, typer.Option("--to", help="What to export: page, mesh, points or splats.")],
-    output: Output = None,
+    *,
     form: Annotated[
         str | None,
         typer.Option(
@@ -25,40 +98,11 @@ def export(
             help="File format if -o does not determine it: ply, glb, obj, spz, html.",
         ),
     ] = None,
-    box: Annotated[
-        str | None,
-        typer.Option(help="Exported region X0,Y0,Z0,X1,Y1,Z1, in scene units.  [default: the subject of the photos]"),
-    ] = None,
-    voxel_size: Annotated[
-        float | None,
-        typer.Option(help="Size of a voxel in scene units.  [default: the resolution of the photos]"),
-    ] = None,
-    faces: Annotated[
-        int | None,
-        typer.Option(help="Maximum number of triangles of a mesh.  [default: 300000]", min=4, show_default=False),
-    ] = None,
-    count: Annotated[
-        int | None,
-        typer.Option(help="Largest number of splats.  [default: by photos and budget]", min=100, max=10_000_000),
-    ] = None,
-    budget: Annotated[
-        str | None, typer.Option(help="Time to refine splats on the training photos.  [default: 60s]")
-    ] = None,
-    sh: Annotated[
-        int | None,
-        typer.Option(help="Degree of the harmonics by which colours of splats vary.  [default: 2]", min=0, max=3),
-    ] = None,
-    frame: Annotated[
-        str | None, typer.Option(help="Of splats: viewer (y down, as viewers expect) or scene.  [default: viewer]")
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on refining the splats of the run, to a larger --budget.")
-    ] = False,
-    device: Device = "auto",
-    threads: Threads = 0,
-    overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    surface: SurfaceOptions,
+    splats: SplatOptions,
+    writing: Writing,
+    computing: Computing,
+    printing: Printing,
 ) -> None:
     """Export a run: page, mesh, points, splats.
 
@@ -85,68 +129,43 @@ def export(
       nerfcli export photos-scene-run --to splats -o kitchen.spz --budget 2m
       nerfcli export photos-scene-run --to splats -o kitchen.html --budget 5m --resume
     """
-    from nerfcli.export.extent import FACES, SurfaceSettings
     from nerfcli.workflows.export import TARGETS, default_target, export_run
-    from nerfcli.workflows.splats import SplatSettings
 
-    console = Console(quiet=quiet, json_lines=json)
     one_of(to, TARGETS, "--to")
     suffix = None if form is None else f".{form.lstrip('.').lower()}"
     if suffix is not None:
         one_of(suffix[1:], [kind[1:] for kind in TARGETS[to]], "--format")
-    finite(voxel_size, "--voxel-size")
-    if voxel_size is not None and voxel_size <= 0:
-        raise typer.BadParameter(f"{voxel_size:g} is not a positive size", param_hint="--voxel-size")
-    unused = {
-        "--faces": (faces is not None and to != "mesh", "meshes"),
-        "--voxel-size": (voxel_size is not None and to not in ("mesh", "points"), "meshes and points"),
-        **{
-            option: (to != "splats" and value not in (None, False), "splats")
-            for option, value in {
-                "--count": count,
-                "--budget": budget,
-                "--sh": sh,
-                "--frame": frame,
-                "--resume": resume,
-            }.items()
-        },
-    }
-    for option, (is_unused, suited) in unused.items():
-        if is_unused:
-            raise typer.BadParameter(f"it is for {suited}; remove it", param_hint=option)
+    _refuse_unused(to, surface, splats)
+    output = writing.output
     if suffix is not None and output is not None and run != STDIN and output.suffix.lower() not in ("", suffix):
         raise typer.BadParameter(f"{form!r} contradicts -o {output}; remove one of them", param_hint="--format")
-    if frame is not None:
-        one_of(frame, ("viewer", "scene"), "--frame")
-    splats = SplatSettings(
-        count=count,
-        budget_seconds=60.0 if budget is None else seconds_from_text(budget),
-        degree=2 if sh is None else sh,
-        frame=frame or "viewer",
-        resume=resume,
-    )
-    settings = SurfaceSettings(box=None if box is None else box_of(box), voxel_size=voxel_size, faces=faces or FACES)
+    geometry, gaussians, console = surface.settings(), splats.settings(), printing.console
 
-    def work(folder: Path, one_of_many: bool) -> None:
-        target = output
-        if output is None or one_of_many:
-            usual = default_target(folder, to, suffix)
-            target = usual if output is None else output / usual.name
-        with console.callbacks(f"export {to}") as callbacks:
+    def work(given: Given) -> None:
+        target = writing.named(given, default_target(given.path, to, suffix))
+        with console.stage(f"export {to}") as reporter:
             written = export_run(
-                folder,
+                given.path,
                 target,
                 to=to,
-                settings=settings,
-                splats=splats,
-                device=device_name(device),
-                threads=thread_count(threads),
-                overwrite=overwrite,
-                **callbacks,
+                settings=geometry,
+                splats=gaussians,
+                resources=computing.resources,
+                reporter=reporter,
             )
         console.result(written)
 
     for_each_input(run, work, command="export")
+
+
+def _refuse_unused(to: str, surface: SurfaceOptions, splats: SplatOptions) -> None:
+    unused = {
+        "--faces": (surface.faces is not None and to != "mesh", "meshes"),
+        "--voxel-size": (surface.voxel_size is not None and to not in ("mesh", "points"), "meshes and points"),
+    }
+    for name, value in vars(splats).items():
+        unused[f"--{name}"] = (to != "splats" and value not in (None, False), "splats")
+    refuse_unused(unused, "it is for {}; remove it")
 
 
 def box_of(text: str) -> tuple[float, ...]:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from nerfcli.cli.batch import for_each_input
+from nerfcli.cli.batch import Given, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Json
 from nerfcli.machine import thread_count
@@ -58,11 +58,15 @@ def info(
         typer.echo(json_text.dumps(described) if json else "\n".join(lines_of(described)))
         return
 
-    def work(folder: Path, one_of_many: bool) -> None:
-        content = describe(folder)
-        console.facts(folder, content, "\n".join([str(folder), *(f"  {line}" for line in lines_of(content))]))
+    def work(given: Given) -> None:
+        show_facts(given.path, describe(given.path), console)
 
     for_each_input(path, work, command="info")
+
+
+def show_facts(path: Path, content: dict[str, Any], console: Console) -> None:
+    """Print the facts about a path, one per line below it, or as a line of JSON."""
+    console.facts(path, content, "\n".join([str(path), *(f"  {line}" for line in lines_of(content))]))
 
 
 def lines_of(facts: dict[str, Any]) -> list[str]:

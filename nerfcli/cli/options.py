@@ -1,13 +1,22 @@
-"""Options shared by several commands, and the parsers of their values."""
+"""Options shared by several commands, alone and as records, and the parsers of their values."""
 
+import math
 import re
 from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
 from nerfcli.captures.holdout import check_holdout
+from nerfcli.cli.batch import Given
+from nerfcli.cli.console import Console
+from nerfcli.machine import Resources
+from nerfcli.output import Output as Destination
+
+if TYPE_CHECKING:
+    from nerfcli.training.runs.settings import TrainSettings
 
 Word = TypeVar("Word", str, str | None)
 
@@ -65,10 +74,6 @@ Holdout = Annotated[
         show_default=False,
     ),
 ]
-Strict = Annotated[
-    bool,
-    typer.Option("--strict", help="Estimate poses from training photos only; locate held-out photos afterwards."),
-]
 FieldKind = Annotated[
     str | None,
     typer.Option("--field", help="Type of field: hash, voxels or mlp.  [default: hash]"),
@@ -81,7 +86,6 @@ Contraction = Annotated[
     str,
     typer.Option(help="Map distant space into a ball (l2), or not at all (none); auto: none with alpha."),
 ]
-Memory = Annotated[str | None, typer.Option(help="Memory limit: 4GB, 500MB.  [default: 4/5 of the machine's memory]")]
 DeviceMemory = Annotated[
     str | None,
     typer.Option(
@@ -94,6 +98,84 @@ DeviceMemory = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print results as JSON Lines on stdout instead of paths.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show only warnings and errors.")]
+
+
+@dataclass(frozen=True)
+class Writing:
+    """Where the results of a command go; `command` makes options of the fields, as of those of the other records."""
+
+    output: Output = None
+    overwrite: Overwrite = False
+
+    def of(self, given: Given, suffix: str) -> Destination:
+        """Return where the result of an input goes: by default beside it, with a suffix added to its name."""
+        path = Destination(self.output if not given.one_of_many else None).beside(given.path, suffix)
+        if self.output is not None and given.one_of_many:
+            path = self.output / path.name
+        return Destination(path, self.overwrite)
+
+    def inside(self, given: Given, suffix: str) -> Destination:
+        """Return the folder for the results of an input, one of its own for each of several; by default none."""
+        return self.of(given, suffix) if self.output is not None else Destination(None, self.overwrite)
+
+    def named(self, given: Given, usual: Path) -> Destination:
+        """Return where the result of an input goes: by default to `usual`, of several to a path of that name."""
+        path = usual if self.output is None else self.output / usual.name if given.one_of_many else self.output
+        return Destination(path, self.overwrite)
+
+
+@dataclass(frozen=True)
+class Computing:
+    """What a command uses of the machine."""
+
+    device: Device = "auto"
+    threads: Threads = 0
+
+    @property
+    def resources(self) -> Resources:
+        """The threads and the device."""
+        return Resources(self.threads, self.device)
+
+
+@dataclass(frozen=True)
+class Training(Computing):
+    """How a command that trains does it."""
+
+    downscale: Downscale = "auto"
+    seed: Seed = 0
+
+    def settings(self, budget: str | None, steps: int | None = None) -> "TrainSettings":
+        """Return the settings of a training whose components are selected.
+
+        Raises:
+            typer.BadParameter: a value cannot be parsed.
+        """
+        from nerfcli.training.runs.settings import TrainSettings, sizes_for
+
+        return TrainSettings(
+            budget_seconds=None if budget is None else seconds_from_text(budget),
+            steps=steps,
+            downscale=downscale_factor(self.downscale),
+            seed=self.seed,
+            device=self.resources.torch_device,
+            threads=self.resources.cores,
+            model="auto",
+            **sizes_for(self.resources.torch_device),
+        )
+
+
+@dataclass(frozen=True)
+class Printing:
+    """How a command prints its results and messages."""
+
+    json: Json = False
+    quiet: Quiet = False
+
+    @property
+    def console(self) -> Console:
+        """Where everything is printed."""
+        return Console(quiet=self.quiet, json_lines=self.json)
+
 
 # A shorter time must have a unit.
 FEWEST_PLAIN_SECONDS = 10.0
@@ -123,6 +205,27 @@ def some_of(text: str, choices: Collection[str], option: str) -> tuple[str, ...]
     if unknown := [name for name in chosen if name not in choices]:
         raise typer.BadParameter(f"{unknown[0]!r}; choose from {', '.join(choices)}", param_hint=option)
     return chosen
+
+
+def finite(value: float | None, option: str) -> None:
+    """Refuse NaN and infinity, which the bounds of an option do not exclude.
+
+    Raises:
+        typer.BadParameter: the value is NaN or infinite.
+    """
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not a finite number", param_hint=option)
+
+
+def refuse_unused(unused: dict[str, tuple[bool, str]], words: str) -> None:
+    """Refuse options that nothing would use; by option, whether that is so, and with what it works.
+
+    Raises:
+        typer.BadParameter: there is one.
+    """
+    for option, (is_unused, suited) in unused.items():
+        if is_unused:
+            raise typer.BadParameter(words.format(suited), param_hint=option)
 
 
 def seconds_from_text(text: str, option: str = "--budget") -> float:

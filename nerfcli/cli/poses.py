@@ -1,20 +1,19 @@
 """nerfcli poses: from photos to a scene."""
 
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from nerfcli.cli import options
-from nerfcli.cli.batch import for_each_input, result_path
-from nerfcli.cli.console import Console, command
-from nerfcli.machine import thread_count
+from nerfcli.cli.batch import Given, for_each_input
+from nerfcli.cli.console import command
+from nerfcli.machine import Resources
 
-# The minimum is the number of photos that structure from motion needs.
-Frames = Annotated[
-    int | None,
-    typer.Option(help="Number of frames to use from a video.  [default: 120, or all of a shorter one]", min=4),
-]
+if TYPE_CHECKING:
+    from nerfcli.poses.input.settings import PoseSettings
+
 Intrinsics = Annotated[
     Path | None,
     typer.Option(
@@ -27,47 +26,105 @@ Subfolders = Annotated[
         "--subfolders", help="Use the photos in all subfolders, such as left/ and right/; each has its own camera."
     ),
 ]
-Quality = Annotated[str, typer.Option(help="fast, default or best: image size and number of features.")]
+
+
+@dataclass(frozen=True)
+class PhotoOptions:
+    """Options of what photos there are, and of how much is computed of each."""
+
+    # The minimum is the number of photos that structure from motion needs.
+    frames: Annotated[
+        int | None,
+        typer.Option(help="Number of frames to use from a video.  [default: 120, or all of a shorter one]", min=4),
+    ] = None
+    subfolders: Subfolders = False
+    quality: Annotated[str, typer.Option(help="fast, default or best: image size and number of features.")] = "default"
+    intrinsics: Intrinsics = None
+    holdout: options.Holdout = None
+
+    def settings(self, seed: int, threads: int) -> "PoseSettings":
+        """Return the settings that the options select.
+
+        Raises:
+            typer.BadParameter: a value cannot be parsed.
+        """
+        from nerfcli.captures.holdout import DEFAULT_HOLDOUT
+        from nerfcli.poses.input.settings import QUALITIES, PoseSettings
+
+        quality = QUALITIES[options.one_of(self.quality, QUALITIES, "--quality")]
+        return PoseSettings(
+            *(*quality, seed, threads),
+            holdout=options.holdout_rule(self.holdout) or DEFAULT_HOLDOUT,
+            subfolders=self.subfolders,
+        )
+
+
+@dataclass(frozen=True)
+class MatchingOptions:
+    """Options of features, pairs, lenses and acceptance."""
+
+    masks: Annotated[Path | None, typer.Option(help="Folder of masks named after the photos; black is ignored.")] = None
+    max_size: Annotated[
+        int | None,
+        typer.Option(help="Longer side of images for feature extraction, in pixels.  [default: by --quality]", min=100),
+    ] = None
+    pairing: Annotated[
+        str, typer.Option(help="Which pairs of photos to match: auto, exhaustive, sequential, retrieval or spatial.")
+    ] = "auto"
+    pairs: Annotated[
+        Path | None, typer.Option(help="File with the pairs of photos to match, two names per line.", dir_okay=False)
+    ] = None
+    camera_model: Annotated[
+        str, typer.Option(help="auto, or a COLMAP camera model: SIMPLE_RADIAL, OPENCV, EQUIRECTANGULAR...")
+    ] = "auto"
+    strict: Annotated[
+        bool,
+        typer.Option("--strict", help="Estimate poses from training photos only; locate held-out photos afterwards."),
+    ] = False
+    min_registered: Annotated[float, typer.Option(help="Fraction of photos that must register.", min=0, max=1)] = 0.5
+    accept_refused: Annotated[
+        bool, typer.Option("--accept-refused", help="Write the scene even if the checks refuse the poses.")
+    ] = False
+
+    def added_to(self, settings: "PoseSettings") -> "PoseSettings":
+        """Return the settings with these.
+
+        Raises:
+            typer.BadParameter: a value is unknown, or two exclude each other.
+        """
+        from nerfcli.poses.input.pairs import PAIRINGS
+        from nerfcli.poses.input.settings import CAMERA_MODELS
+
+        options.one_of(self.camera_model, CAMERA_MODELS, "--camera-model")
+        options.one_of(self.pairing, PAIRINGS, "--pairing")
+        if self.pairs is not None and self.pairing != "auto":
+            raise typer.BadParameter("cannot be combined with --pairs; remove --pairing", param_hint="--pairing")
+        return replace(
+            settings,
+            max_image_size=self.max_size or settings.max_image_size,
+            camera_model=self.camera_model,
+            min_registered=self.min_registered,
+            pairing=self.pairing,
+            pairs_file=None if self.pairs is None else str(self.pairs.absolute()),
+            masks=str(self.masks.resolve()) if self.masks else None,
+            strict=self.strict,
+            accept_refused=self.accept_refused,
+        )
 
 
 @command
 def poses(
     photos: Annotated[str, typer.Argument(help="Folder of photos or a video, or - to read paths from standard input.")],
-    output: options.Output = None,
-    frames: Frames = None,
-    subfolders: Subfolders = False,
-    masks: Annotated[
-        Path | None, typer.Option(help="Folder of masks named after the photos; black is ignored.")
-    ] = None,
-    quality: Quality = "default",
-    max_size: Annotated[
-        int | None,
-        typer.Option(help="Longer side of images for feature extraction, in pixels.  [default: by --quality]", min=100),
-    ] = None,
-    pairing: Annotated[
-        str, typer.Option(help="Which pairs of photos to match: auto, exhaustive, sequential, retrieval or spatial.")
-    ] = "auto",
-    pairs: Annotated[
-        Path | None, typer.Option(help="File with the pairs of photos to match, two names per line.", dir_okay=False)
-    ] = None,
-    camera_model: Annotated[
-        str, typer.Option(help="auto, or a COLMAP camera model: SIMPLE_RADIAL, OPENCV, EQUIRECTANGULAR...")
-    ] = "auto",
-    intrinsics: Intrinsics = None,
-    holdout: options.Holdout = None,
-    strict: options.Strict = False,
-    min_registered: Annotated[float, typer.Option(help="Fraction of photos that must register.", min=0, max=1)] = 0.5,
-    accept_refused: Annotated[
-        bool, typer.Option("--accept-refused", help="Write the scene even if the checks refuse the poses.")
-    ] = False,
+    *,
+    writing: options.Writing,
+    taken: PhotoOptions,
+    matching: MatchingOptions,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show what would be done and how long it would take.")
     ] = False,
     seed: options.Seed = 0,
     threads: options.Threads = 0,
-    overwrite: options.Overwrite = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    printing: options.Printing,
 ) -> None:
     """Estimate camera poses and intrinsics by structure from motion.
 
@@ -90,84 +147,37 @@ def poses(
       nerfcli poses photos/kitchen --intrinsics calibration/cameras.txt
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
-    from nerfcli.captures.holdout import DEFAULT_HOLDOUT
-    from nerfcli.memory import default_memory_limit
-    from nerfcli.poses.input.pairs import PAIRINGS
-    from nerfcli.poses.input.settings import CAMERA_MODELS, PoseSettings
     from nerfcli.poses.workspace import database_bytes
-    from nerfcli.workflows.poses import (
-        estimate_poses,
-        folder_of_photos,
-        folder_with_frames,
-        given_intrinsics,
-        plan_scene,
-        without_suffix,
-    )
+    from nerfcli.workflows.poses import estimate_poses, folder_with_frames, plan_scene, without_suffix
 
-    options.one_of(camera_model, CAMERA_MODELS, "--camera-model")
-    options.one_of(pairing, PAIRINGS, "--pairing")
-    if pairs is not None and pairing != "auto":
-        raise typer.BadParameter("cannot be combined with --pairs; remove --pairing", param_hint="--pairing")
-    if intrinsics is not None and camera_model != "auto":
+    if taken.intrinsics is not None and matching.camera_model != "auto":
         raise typer.BadParameter(
             "cannot be combined with --intrinsics, which gives the camera models; remove --camera-model",
             param_hint="--camera-model",
         )
-    console = Console(quiet=quiet, json_lines=json)
-    usual_size, features = sizes_of(quality)
-    settings = PoseSettings(
-        max_image_size=usual_size if max_size is None else max_size,
-        max_features=features,
-        seed=seed,
-        threads=thread_count(threads),
-        camera_model=camera_model,
-        min_registered=min_registered,
-        pairing=pairing,
-        pairs_file=None if pairs is None else str(pairs.absolute()),
-        masks=str(masks.resolve()) if masks else None,
-        holdout=options.holdout_rule(holdout) or DEFAULT_HOLDOUT,
-        strict=strict,
-        accept_refused=accept_refused,
-        subfolders=subfolders,
-    )
+    console, resources = printing.console, Resources(threads)
+    settings = matching.added_to(taken.settings(seed, resources.cores))
 
-    def work(source: Path, one_of_many: bool) -> None:
-        scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
+    def work(given: Given) -> None:
+        scene = writing.of(Given(without_suffix(given.path), given.one_of_many), "-scene")
         if dry_run:
-            folder = folder_with_frames(source, scene)
-            given = given_intrinsics(intrinsics, folder)
-            with console.callbacks(f"poses {folder.name}") as callbacks:
-                plan = plan_scene(folder, settings, intrinsics=given, **callbacks)
-            console.facts(source, plan.to_json(), f"{source}: {plan.describe()}")
+            folder = folder_with_frames(given.path, scene.at(given.path))
+            with console.stage(f"poses {folder.name}") as reporter:
+                plan = plan_scene(folder, settings, intrinsics=taken.intrinsics, reporter=reporter)
+            console.facts(given.path, plan.to_json(), f"{given.path}: {plan.describe()}")
             return
-        with console.callbacks(f"extract frames of {source.name}") as callbacks:
-            folder = folder_of_photos(source, scene, frames=frames, overwrite=overwrite, **callbacks)
-        given = given_intrinsics(intrinsics, folder)
-        with console.callbacks(f"poses {folder.name}") as callbacks:
-            estimate_poses(
-                folder,
-                scene,
-                settings,
-                memory_bytes=default_memory_limit(),
-                intrinsics=given,
-                overwrite=overwrite,
-                warn=console.warn,
-                **callbacks,
-            )
-        if size := database_bytes(scene):
-            path = scene / "database.db"
+        done = estimate_poses(
+            given.path,
+            scene,
+            settings,
+            frames=taken.frames,
+            intrinsics=taken.intrinsics,
+            resources=resources,
+            reporter=console.reporter,
+        )
+        if size := database_bytes(done):
+            path = done / "database.db"
             console.note(f"{path} keeps features and matches ({size / 1e6:.0f} MB) so that other settings run faster")
-        console.result(scene)
+        console.result(done)
 
     for_each_input(photos, work, command="poses")
-
-
-def sizes_of(quality: str) -> tuple[int, int]:
-    """Return (max_image_size, max_features) of a quality.
-
-    Raises:
-        typer.BadParameter: there is no such quality.
-    """
-    from nerfcli.poses.input.settings import QUALITIES
-
-    return QUALITIES[options.one_of(quality, QUALITIES, "--quality")]

@@ -1,18 +1,260 @@
 """nerfcli render: render pictures, depth maps and videos of a run."""
 
-from dataclasses import replace
+import re
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nerfcli.cli import options, render_options
-from nerfcli.cli.batch import for_each_input
-from nerfcli.cli.console import Console, command
-from nerfcli.machine import device_name, thread_count
+from nerfcli.cli.batch import Given, for_each_input
+from nerfcli.cli.console import command
+from nerfcli.cli.options import Computing, Printing, Writing, finite, one_of, refuse_unused, some_of
 
 if TYPE_CHECKING:
-    from nerfcli.workflows.views import Views
+    from nerfcli.render.depth import DepthRequest
+    from nerfcli.render.job import ExportSettings, VideoSettings
+    from nerfcli.workflows.views import PictureOptions, Views
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Options of the cameras, and of the size and lens of the pictures."""
+
+    cameras: Annotated[
+        str,
+        typer.Option(help="test, train, orbit, ellipse, spiral, interpolate, or any capture that convert reads."),
+    ] = "test"
+    through: Annotated[
+        str | None,
+        typer.Option(help="Photos a.jpg,b.jpg,... that define the path, in this order."),
+    ] = None
+    count: Annotated[int, typer.Option(help="Number of views of orbit, ellipse, spiral and interpolate.", min=2)] = 60
+    max_size: Annotated[
+        int | None,
+        typer.Option(help="Maximum longer side of the pictures, in pixels.  [default: training resolution]", min=8),
+    ] = None
+    width: Annotated[
+        int | None,
+        typer.Option(help="Width of the pictures in pixels; intrinsics are scaled accordingly.", min=1, max=65536),
+    ] = None
+    height: Annotated[
+        int | None,
+        typer.Option(
+            help="Height of the pictures in pixels; with --width, pictures are cropped, never stretched.",
+            min=1,
+            max=65536,
+        ),
+    ] = None
+    lens: Annotated[
+        str | None,
+        typer.Option(help="Lens model: pinhole, fisheye (equidistant) or equirectangular (360 degrees, 2:1)."),
+    ] = None
+    fov: Annotated[float | None, typer.Option(help="Horizontal field of view of --lens, in degrees.")] = None
+    crop: Annotated[
+        str | None, typer.Option(help="Render only the window X,Y,WIDTH,HEIGHT of the pictures, in pixels.")
+    ] = None
+    frames: Annotated[
+        str | None,
+        typer.Option(
+            help="START:STOP[:STEP], counted from 0, or K/N, every N-th from K: render only these; no videos."
+        ),
+    ] = None
+    cameras_only: Annotated[
+        bool,
+        typer.Option("--cameras-only", help="Render nothing; only write cameras.json and camera_path.json."),
+    ] = False
+
+    def views(self) -> "Views":
+        """Return the views that the options select.
+
+        Raises:
+            typer.BadParameter: a value is unknown or cannot be parsed, or two exclude each other.
+        """
+        from nerfcli.workflows.views import Views
+
+        if self.max_size is not None and (self.width is not None or self.height is not None):
+            raise typer.BadParameter("cannot be combined with --width or --height", param_hint="--max-size")
+        part = None if self.frames is None else frame_range(self.frames)
+        return Views(self.cameras, self.count, self.through, self.max_size, self._look(), part)
+
+    def _look(self) -> "PictureOptions":
+        from nerfcli.cameras.framing import LENSES
+        from nerfcli.workflows.views import PictureOptions
+
+        one_of(self.lens, LENSES, "--lens")
+        if self.fov is not None and self.lens is None:
+            raise typer.BadParameter("needs --lens", param_hint="--fov")
+        window = None
+        if self.crop is not None:
+            match = re.fullmatch(r"(\d+),(\d+),(\d+),(\d+)", self.crop.replace(" ", ""))
+            if match is None:
+                raise typer.BadParameter(f"{self.crop!r}; write X,Y,WIDTH,HEIGHT in pixels", param_hint="--crop")
+            x, y, crop_width, crop_height = (int(part) for part in match.groups())
+            window = (x, y, crop_width, crop_height)
+        return PictureOptions(self.width, self.height, self.lens, self.fov, window)
+
+
+@dataclass(frozen=True)
+class DepthOptions:
+    """Options of the definition of depth, and of where there is none."""
+
+    depth: Annotated[
+        str,
+        typer.Option(help="Definition of depth: conditional, moment, background, max-weight, median or quantile:0.05."),
+    ] = "conditional"
+    depth_axis: Annotated[
+        str | None,
+        typer.Option(help="ray: along the ray; z: along the optical axis.  [default: z, ray for panoramas]"),
+    ] = None
+    min_opacity: Annotated[
+        float,
+        typer.Option(help="Pixels with less opacity have no depth (NaN).", min=0, max=1),
+    ] = 0.5
+    min_views: Annotated[
+        int, typer.Option(help="Pixels whose surface fewer training photos see have no depth (NaN).", min=0)
+    ] = 0
+    min_parallax: Annotated[
+        float,
+        typer.Option(
+            help="Pixels whose surface no two training photos see at this angle, in degrees, have no depth (NaN).",
+            min=0,
+            max=180,
+        ),
+    ] = 0.0
+    background_distance: Annotated[
+        float | None, typer.Option(help="Distance of light that passes, for --depth background, in scene units.", min=0)
+    ] = None
+
+    def request(self, outputs: tuple[str, ...]) -> "DepthRequest":
+        """Return the definition of depth that the options select; along z where no axis is given.
+
+        Raises:
+            typer.BadParameter: a value is unknown or not finite, or limits are given without depth.
+        """
+        from nerfcli.render.depth import AXES, CONVENTIONS, DepthRequest, is_convention
+
+        if not is_convention(self.depth):
+            choices = f"{', '.join(CONVENTIONS)} or quantile:Q with 0 < Q < 1"
+            raise typer.BadParameter(f"{self.depth!r}; choose {choices}", param_hint="--depth")
+        one_of(self.depth_axis, AXES, "--depth-axis")
+        finite(self.background_distance, "--background-distance")
+        finite(self.min_opacity, "--min-opacity")
+        finite(self.min_parallax, "--min-parallax")
+        if (self.min_views or self.min_parallax) and "depth" not in outputs:
+            hint = "--min-views" if self.min_views else "--min-parallax"
+            raise typer.BadParameter("it removes depth; add depth to --outputs", param_hint=hint)
+        axis = self.depth_axis or "z"
+        return DepthRequest(
+            self.depth, axis, self.min_opacity, self.background_distance, self.min_views, self.min_parallax
+        )
+
+
+@dataclass(frozen=True)
+class FileOptions:
+    """Options of the files: what they hold, their formats, videos, and how exactly they are rendered."""
+
+    outputs: Annotated[
+        str,
+        typer.Option(
+            help="Any of rgb, depth, opacity, spread, disagreement, coverage, parallax, lower, upper, confidence, "
+            "with commas between them."
+        ),
+    ] = "rgb,depth,opacity"
+    depth_format: Annotated[
+        str,
+        typer.Option(
+            help="Any of tiff, exr, npy (float32; exr holds all outputs of a view) and png16 (16-bit integers, in "
+            "addition to float32)."
+        ),
+    ] = "tiff"
+    step: Annotated[
+        float,
+        typer.Option(
+            help="Length of the steps along rays, relative to training: 2 is about twice as fast, 0.5 more exact.",
+            min=0.05,
+            max=20,
+        ),
+    ] = 1.0
+    rgba: Annotated[
+        bool,
+        typer.Option(
+            "--rgba", help="Write colour without background, with opacity as alpha (straight; EXR premultiplied)."
+        ),
+    ] = False
+    video: Annotated[
+        bool, typer.Option("--video", help="Write a video of each output; same as --video-format mp4.")
+    ] = False
+    video_format: Annotated[
+        str | None, typer.Option(help="mp4 (H.264), gif, or both with a comma between them; implies --video.")
+    ] = None
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Frames per second of the video.  [default: 24, or that of a camera path]", min=1, max=240),
+    ] = None
+    check_accuracy: Annotated[
+        bool,
+        typer.Option("--check-accuracy", help="Measure the error of every picture, not only of the first and last."),
+    ] = False
+
+    @property
+    def writes_video(self) -> bool:
+        """Whether videos are written."""
+        return self.video or self.video_format is not None
+
+    def settings(self, depth: DepthOptions, cameras: str) -> "ExportSettings":
+        """Return the settings that the options select.
+
+        Raises:
+            typer.BadParameter: a value is unknown, or two exclude each other.
+        """
+        from nerfcli.render.job import OUTPUTS, ExportSettings
+
+        outputs = some_of(self.outputs, OUTPUTS, "--outputs")
+        request = depth.request(outputs)
+        finite(self.step, "--step")
+        return ExportSettings(
+            outputs,
+            request,
+            self._formats(outputs, depth.depth),
+            self._videos(self.frames_per_second(cameras)) if self.writes_video else None,
+            self.step,
+            self.rgba,
+            self.check_accuracy,
+        )
+
+    def frames_per_second(self, cameras: str) -> float:
+        """Return the frame rate, by default that of the file of cameras."""
+        from nerfcli.captures.formats.camera_path import DEFAULT_FPS
+        from nerfcli.workflows.views import file_fps
+
+        return self.fps or file_fps(cameras) or DEFAULT_FPS
+
+    def _formats(self, outputs: tuple[str, ...], convention: str) -> tuple[str, ...]:
+        from nerfcli.render.job import FORMATS
+
+        hint = "--depth-format"
+        chosen = some_of(self.depth_format, FORMATS, hint)
+        if "png16" in chosen and "depth" not in outputs:
+            raise typer.BadParameter("png16 is a depth format; add depth to --outputs", param_hint=hint)
+        if "png16" in chosen and convention == "moment":
+            raise typer.BadParameter(
+                "png16 uses 0 for no depth, but the moment of an empty ray is 0; use another format", param_hint=hint
+            )
+        return chosen
+
+    def _videos(self, fps: float) -> "VideoSettings":
+        from nerfcli.render.files.film import ENCODERS, GIF_FASTEST_FPS
+        from nerfcli.render.job import VideoSettings
+
+        chosen = tuple(dict.fromkeys((self.video_format or "mp4").split(",")))
+        for name in chosen:
+            one_of(name, ENCODERS, "--video-format")
+        if "gif" in chosen and fps > GIF_FASTEST_FPS:
+            raise typer.BadParameter(
+                f"{fps:g}; a gif plays at {GIF_FASTEST_FPS:g} frames per second at most", param_hint="--fps"
+            )
+        return VideoSettings(chosen, fps)
 
 
 @command
@@ -21,102 +263,16 @@ def render(
         str,
         typer.Argument(help="Run folder written by train, a .ply or .spz of splats, or - to read paths from stdin."),
     ],
-    cameras: Annotated[
-        str,
-        typer.Option(help="test, train, orbit, ellipse, spiral, interpolate, or any capture that convert reads."),
-    ] = "test",
-    through: Annotated[
-        str | None, typer.Option(help="Photos a.jpg,b.jpg,... that define the path, in this order.")
-    ] = None,
-    outputs: Annotated[
-        str,
-        typer.Option(
-            help="Any of rgb, depth, opacity, spread, disagreement, coverage, parallax, lower, upper, confidence, "
-            "with commas between them."
-        ),
-    ] = "rgb,depth,opacity",
-    depth: Annotated[
-        str,
-        typer.Option(help="Definition of depth: conditional, moment, background, max-weight, median or quantile:0.05."),
-    ] = "conditional",
-    depth_axis: Annotated[
-        str | None,
-        typer.Option(help="ray: along the ray; z: along the optical axis.  [default: z, ray for panoramas]"),
-    ] = None,
-    min_opacity: Annotated[
-        float, typer.Option(help="Pixels with less opacity have no depth (NaN).", min=0, max=1)
-    ] = 0.5,
-    min_views: Annotated[
-        int, typer.Option(help="Pixels whose surface fewer training photos see have no depth (NaN).", min=0)
-    ] = 0,
-    min_parallax: Annotated[
-        float,
-        typer.Option(
-            help="Pixels whose surface no two training photos see at this angle, in degrees, have no depth (NaN).",
-            min=0,
-            max=180,
-        ),
-    ] = 0.0,
-    background_distance: Annotated[
-        float | None, typer.Option(help="Distance of light that passes, for --depth background, in scene units.", min=0)
-    ] = None,
-    depth_format: render_options.DepthFormat = "tiff",
-    step: render_options.Step = 1.0,
-    rgba: render_options.Rgba = False,
-    video: Annotated[
-        bool, typer.Option("--video", help="Write a video of each output; same as --video-format mp4.")
-    ] = False,
-    video_format: Annotated[
-        str | None, typer.Option(help="mp4 (H.264), gif, or both with a comma between them; implies --video.")
-    ] = None,
-    count: Annotated[int, typer.Option(help="Number of views of orbit, ellipse, spiral and interpolate.", min=2)] = 60,
-    fps: Annotated[
-        float | None,
-        typer.Option(help="Frames per second of the video.  [default: 24, or that of a camera path]", min=1, max=240),
-    ] = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(
-            help="START:STOP[:STEP], counted from 0, or K/N, every N-th from K: render only these; no videos."
-        ),
-    ] = None,
-    cameras_only: Annotated[
-        bool,
-        typer.Option("--cameras-only", help="Render nothing; only write cameras.json and camera_path.json."),
-    ] = False,
-    max_size: Annotated[
-        int | None,
-        typer.Option(help="Maximum longer side of the pictures, in pixels.  [default: training resolution]", min=8),
-    ] = None,
-    width: Annotated[
-        int | None,
-        typer.Option(help="Width of the pictures in pixels; intrinsics are scaled accordingly.", min=1, max=65536),
-    ] = None,
-    height: Annotated[
-        int | None,
-        typer.Option(
-            help="Height of the pictures in pixels; with --width, pictures are cropped, never stretched.",
-            min=1,
-            max=65536,
-        ),
-    ] = None,
-    lens: Annotated[
-        str | None,
-        typer.Option(help="Lens model: pinhole, fisheye (equidistant) or equirectangular (360 degrees, 2:1)."),
-    ] = None,
-    fov: Annotated[float | None, typer.Option(help="Horizontal field of view of --lens, in degrees.")] = None,
-    crop: Annotated[
-        str | None, typer.Option(help="Render only the window X,Y,WIDTH,HEIGHT of the pictures, in pixels.")
-    ] = None,
+    *,
+    seen: ViewOptions,
+    depths: DepthOptions,
+    files: FileOptions,
     splats: Annotated[
         Path | None, typer.Option(help="A .ply or .spz of splats to render instead of the run's field.")
     ] = None,
-    output: options.Output = None,
-    device: options.Device = "auto",
-    threads: options.Threads = 0,
-    overwrite: options.Overwrite = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    writing: Writing,
+    computing: Computing,
+    printing: Printing,
 ) -> None:
     """Render views of a run: colour, depth, opacity, videos.
 
@@ -155,119 +311,76 @@ def render(
       nerfcli render photos-scene-run --splats kitchen.ply --cameras orbit --video
       nerfcli render kitchen.ply --cameras camera_path.json --video
     """
-    values = dict(locals())
-    from nerfcli.captures.formats.camera_path import DEFAULT_FPS
-    from nerfcli.render.outputs import OUTPUTS, ExportSettings
     from nerfcli.splats.files import SUFFIXES
     from nerfcli.training.runs.run import load_run
-    from nerfcli.workflows.render import RENDERS, folder_name, render_run, render_splats
-    from nerfcli.workflows.views import Views, file_fps, usual_axis
+    from nerfcli.workflows.render import render_run, render_splats, write_cameras
+    from nerfcli.workflows.views import usual_axis
 
-    console = Console(quiet=quiet, json_lines=json)
-    chosen = options.some_of(outputs, OUTPUTS, "--outputs")
-    request = render_options.depth_request(
-        depth,
-        depth_axis,
-        outputs=chosen,
-        min_opacity=min_opacity,
-        background_distance=background_distance,
-        min_views=min_views,
-        min_parallax_deg=min_parallax,
-    )
-    formats = render_options.depth_formats(depth_format, outputs=chosen, convention=depth)
-    if max_size is not None and (width is not None or height is not None):
-        raise typer.BadParameter("cannot be combined with --width or --height", param_hint="--max-size")
-    render_options.finite(step, "--step")
-    look = render_options.look_of(width, height, lens=lens, fov_deg=fov, crop=crop)
-    writes_video = video or video_format is not None
-    _refuse_unused(values, outputs=chosen, writes_video=writes_video)
-    fps = fps or file_fps(cameras) or DEFAULT_FPS
-    part = None if frames is None else render_options.frame_range(frames)
-    usual = ExportSettings(
-        outputs=chosen,
-        depth=request,
-        formats=formats,
-        video=render_options.video_settings(video_format or "mp4", fps) if writes_video else None,
-        step=step,
-        rgba=rgba,
-    )
-    views = Views(cameras, count, through, max_size, look)
+    views, usual, console = seen.views(), files.settings(depths, seen.cameras), printing.console
+    _refuse_unused(seen, depths, files, usual.outputs)
 
-    def work(folder: Path, one_of_many: bool) -> None:
-        if folder.suffix.lower() in SUFFIXES:
-            for option, given in {"--cameras-only": cameras_only, "--splats": splats is not None}.items():
-                if given:
-                    raise typer.BadParameter(f"it works with a run, not with {folder}; remove it", param_hint=option)
-            settings = replace(usual, depth=replace(request, axis=depth_axis or "z"))
-            target = output if output is None or not one_of_many else output / folder.stem
-            with console.callbacks(f"render {views.name}") as callbacks:
-                written = render_splats(
-                    folder, target, views=views, settings=settings, threads=thread_count(threads), part=part,
-                    overwrite=overwrite, **callbacks,
-                )  # fmt: skip
-            for path in written:
-                console.result(path)
-            return
-        settings = replace(usual, depth=replace(request, axis=depth_axis or usual_axis(load_run(folder), views)))
-        name = f"{views.name}-cameras" if cameras_only else folder_name(views, settings)
-        target = folder / RENDERS / (name if splats is None else f"{name}-splats")
-        if output is not None:
-            target = output / folder.name if one_of_many else output
-        if cameras_only:
-            _write_cameras(folder, target, views, fps=fps, overwrite=overwrite, console=console)
-            return
-        with console.callbacks(f"render {views.name}") as callbacks:
-            written = render_run(
-                folder,
-                target,
-                views=views,
-                settings=settings,
-                splats=splats,
-                device=device_name(device),
-                threads=thread_count(threads),
-                part=part,
-                overwrite=overwrite,
-                **callbacks,
-            )
-        for path in written:
-            console.result(path)
+    def work(given: Given) -> None:
+        path, how = given.path, {"views": views, "settings": usual, "resources": computing.resources}
+        if path.suffix.lower() in SUFFIXES:
+            _refuse_of_runs(path, {"--cameras-only": seen.cameras_only, "--splats": splats is not None})
+            with console.stage(f"render {views.name}") as reporter:
+                output = writing.inside(replace(given, path=path.with_suffix("")), "")
+                written = render_splats(path, output, **how, reporter=reporter)
+        elif seen.cameras_only:
+            fps = files.frames_per_second(seen.cameras)
+            written = [write_cameras(path, writing.inside(given, ""), views, fps=fps, reporter=console.reporter)]
+        else:
+            axis = depths.depth_axis or usual_axis(load_run(path), views)
+            how["settings"] = replace(usual, depth=replace(usual.depth, axis=axis))
+            with console.stage(f"render {views.name}") as reporter:
+                written = render_run(path, writing.inside(given, ""), splats=splats, **how, reporter=reporter)
+        for result in written:
+            console.result(result)
 
     for_each_input(run, work, command="render")
 
 
-def _refuse_unused(given: dict[str, Any], *, outputs: tuple[str, ...], writes_video: bool) -> None:
-    """Refuse options that nothing would use, and alpha in videos; `given` has the values of all parameters, by name.
+def _refuse_of_runs(path: Path, options: dict[str, bool]) -> None:
+    for option, is_given in options.items():
+        if is_given:
+            raise typer.BadParameter(f"it works with a run, not with {path}; remove it", param_hint=option)
 
-    Raises:
-        typer.BadParameter: there is one.
-    """
+
+def _refuse_unused(seen: ViewOptions, depths: DepthOptions, files: FileOptions, outputs: tuple[str, ...]) -> None:
+    """Refuse options that nothing would use, and alpha in videos."""
     from nerfcli.workflows.views import PATHS, Views
 
-    rgba, depth, background = given["rgba"], given["depth"], given["background_distance"]
+    writes_fps = files.writes_video or seen.cameras_only
+    is_background = depths.depth == "background"
     unused = {
-        "--fps": (given["fps"] is not None and not (writes_video or given["cameras_only"]), "--video"),
-        "--depth": (depth != "conditional" and set(outputs) <= {"rgb", "opacity"}, "--outputs depth"),
-        "--background-distance": (background is not None and depth != "background", "--depth background"),
-        "--rgba": (rgba and "rgb" not in outputs, "--outputs rgb"),
-        "--count": (given["count"] != Views.count and given["cameras"] not in PATHS, f"--cameras {', '.join(PATHS)}"),
+        "--fps": (files.fps is not None and not writes_fps, "--video"),
+        "--depth": (depths.depth != "conditional" and set(outputs) <= {"rgb", "opacity"}, "--outputs depth"),
+        "--background-distance": (depths.background_distance is not None and not is_background, "--depth background"),
+        "--rgba": (files.rgba and "rgb" not in outputs, "--outputs rgb"),
+        "--count": (seen.count != Views.count and seen.cameras not in PATHS, f"--cameras {', '.join(PATHS)}"),
     }
-    for option, (is_unused, needed) in unused.items():
-        if is_unused:
-            raise typer.BadParameter(f"it works with {needed}; add that, or remove it", param_hint=option)
-    if rgba and writes_video:
+    refuse_unused(unused, "it works with {}; add that, or remove it")
+    if files.rgba and files.writes_video:
         raise typer.BadParameter(
             "videos have no alpha channel; remove --rgba or the video options", param_hint="--rgba"
         )
 
 
-def _write_cameras(
-    folder: Path, target: Path, views: "Views", *, fps: float, overwrite: bool, console: Console
-) -> None:
-    """Write only the cameras of the views; see `workflows.views.write_frames`."""
-    from nerfcli.training.runs.run import Run
-    from nerfcli.workflows.views import chosen_frames, write_frames
+def frame_range(text: str) -> slice:
+    """Parse --frames: START:STOP or START:STOP:STEP, counted from 0, or K/N, every N-th view from the K-th.
 
-    run = Run(folder)
-    frames = chosen_frames(run, views, depth_hint=1.0 / run.model().training_from_scene.scale)
-    write_frames(frames, target, fps=fps, overwrite=overwrite, warn=console.warn)
-    console.result(target)
+    START and STOP may be left out; K counts from 1, as task numbers of array jobs do.
+
+    Raises:
+        typer.BadParameter: anything else, or nothing between start and stop.
+    """
+    if one_of_many := re.fullmatch(r"(\d+)/(\d+)", text.strip()):
+        number, count = map(int, one_of_many.groups())
+        if 1 <= number <= count:
+            return slice(number - 1, None, count)
+    match = re.fullmatch(r"(\d*):(\d*)(?::(\d+))?", text.strip())
+    start, stop, step = (int(part) if part else None for part in match.groups()) if match else (0, 0, 0)
+    if match is None or step == 0 or (stop is not None and stop <= (start or 0)):
+        message = f"{text!r}; write START:STOP or START:STOP:STEP, for example 100:200 or 0:120:4, or K/N, such as 1/8"
+        raise typer.BadParameter(message, param_hint="--frames")
+    return slice(start, stop, step)

@@ -1,14 +1,17 @@
 """nerfcli report: one page about one or more runs."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from nerfcli.cli.batch import STDIN, no_paths, stdin_paths
-from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads
-from nerfcli.machine import thread_count
+from nerfcli.cli.console import command
+from nerfcli.cli.options import Printing, Threads, Writing
+from nerfcli.machine import Resources
+from nerfcli.notices import silent
+from nerfcli.output import Output
 
 
 @command
@@ -16,11 +19,10 @@ def report(
     runs: Annotated[
         list[str], typer.Argument(help="Run folders written by train, or - to read paths from standard input.")
     ],
-    output: Output = None,
+    *,
+    writing: Writing,
     threads: Threads = 0,
-    overwrite: Overwrite = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    printing: Printing,
 ) -> None:
     """Write a self-contained HTML page about one or more runs.
 
@@ -36,16 +38,10 @@ def report(
     """
     from nerfcli.workflows.report import report_runs
 
-    console = Console(quiet=quiet, json_lines=json)
+    console, output = printing.console, Output(writing.output, writing.overwrite)
     paths = list(stdin_paths()) if runs == [STDIN] else [Path(run) for run in runs]
     if not paths:
         raise no_paths("report")
-    with console.progress("report") as update:
-        page = report_runs(
-            paths,
-            output,
-            threads=thread_count(threads),
-            overwrite=overwrite,
-            progress=update,
-        )
+    with console.stage("report") as reporter:
+        page = report_runs(paths, output, resources=Resources(threads), reporter=replace(reporter, note=silent))
     console.result(page)

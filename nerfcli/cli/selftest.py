@@ -8,7 +8,7 @@ import typer
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Quiet
 from nerfcli.errors import GATE_NOT_MET, UserError
-from nerfcli.machine import device_name, thread_count
+from nerfcli.machine import Resources
 
 if TYPE_CHECKING:
     from nerfcli.kernels.selftest.measure import Errors, Row
@@ -50,15 +50,14 @@ def selftest(
       nerfcli selftest --device cuda
       nerfcli selftest --device cpu --json | jq 'select(.verdict == "not met")'
     """
-    import torch
-
     from nerfcli.kernels.selftest.measure import MET, NOT_MET, by_formula
     from nerfcli.kernels.selftest.table import rows
 
     console = Console(quiet=quiet, json_lines=json)
-    torch.set_num_threads(thread_count(0))
+    resources = Resources(0, device)
+    resources.begin()
     begin, measured = time.perf_counter(), []
-    for row in rows(device_name(device), console.note):
+    for row in rows(resources.torch_device, console.note):
         measured.append(row)
         if json:
             console.fact(row.to_json())

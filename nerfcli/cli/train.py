@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from nerfcli.cli import options
-from nerfcli.cli.batch import STDIN, for_each_input, result_path
+from nerfcli.cli.batch import STDIN, Given, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.machine import device_name, is_first, is_one_of_several, local_rank_and_size, thread_count
 
@@ -110,7 +110,7 @@ def train(
     """
     from nerfcli.errors import UserError
     from nerfcli.field.kinds import KINDS
-    from nerfcli.memory import default_memory_limit
+    from nerfcli.machine import default_memory_limit
     from nerfcli.training.runs.components import Components, choose
     from nerfcli.training.runs.settings import TrainSettings, sizes_for
     from nerfcli.training.schedule import NOTES, table_of
@@ -158,7 +158,7 @@ def train(
         return shared if shared is None or on_gpu else shared // local_rank_and_size()[1]
 
     def train_one_scene(folder: Path, run: Path) -> None:
-        with console.callbacks(f"train {folder.name}") as callbacks:
+        with console.stage(f"train {folder.name}") as reporter:
             train_scene(
                 folder,
                 run,
@@ -167,8 +167,9 @@ def train(
                 resume=resume,
                 overwrite=overwrite,
                 holdout=rule,
-                warn=console.warn,
-                **callbacks,
+                notify=reporter.note,
+                warn=reporter.warn,
+                progress=reporter.progress,
             )
 
     def plan_one_scene(folder: Path) -> None:
@@ -181,12 +182,12 @@ def train(
             for note in NOTES:
                 console.note(note)
 
-    def work(folder: Path, one_of_many: bool) -> None:
-        run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
+    def work(given: Given) -> None:
+        run = options.Writing(output, overwrite).of(given, "-run").at(given.path)
         if dry_run:
-            plan_one_scene(folder)
+            plan_one_scene(given.path)
             return
-        train_one_scene(folder, run)
+        train_one_scene(given.path, run)
         if is_first():
             console.result(run)
 

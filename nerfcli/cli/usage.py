@@ -7,10 +7,8 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from nerfcli.cli.batch import example_of_many
-from nerfcli.cli.console import command
-from nerfcli.cli.removed import refuse_removed
-from nerfcli.cli.scans import refuse_scan
+from nerfcli.cli.batch import example_of_many, refuse_scan
+from nerfcli.cli.console import errors_explained
 
 # The class of click, or of typer's own copy of click, depending on the version of typer.
 _UsageError: Any = typer.BadParameter.__bases__[0]
@@ -32,12 +30,12 @@ class Program(TyperGroup):
     Otherwise typer ends it with the code of Ctrl-C after a SIGTERM, and with a traceback if stdout is full.
     """
 
-    @command
+    @errors_explained
     def make_context(self, *args: Any, **extra: Any) -> Any:
         """Parse the options before the command; see `TyperGroup.make_context`."""
         return super().make_context(*args, **extra)
 
-    @command
+    @errors_explained
     def invoke(self, ctx: Any) -> Any:
         """Parse and run the command; see `TyperGroup.invoke`."""
         return super().invoke(ctx)
@@ -46,14 +44,13 @@ class Program(TyperGroup):
 class Command(TyperCommand):
     """A command with more helpful usage errors.
 
-    They also say what replaces a removed option, name the commands that have an unknown one, show how to give several
-    inputs, describe a missing argument, and explain what is wrong with a number.
+    They name the commands that have an unknown option, show how to give several inputs, describe a missing argument,
+    and explain what is wrong with a number.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; see `TyperCommand.parse_args`."""
         name = " ".join(ctx.command_path.split()[1:]) or str(self.name)
-        refuse_removed(name, args)
         try:
             return super().parse_args(ctx, args)
         except _UsageError as error:

@@ -7,7 +7,7 @@ import typer
 
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Threads
-from nerfcli.machine import thread_count
+from nerfcli.machine import Resources
 
 
 @command
@@ -39,6 +39,7 @@ def view(
       nerfcli view photos-scene-run
       nerfcli view photos-scene-run --port 9000 --no-browser
     """
+    from nerfcli.viewer.server import Address
     from nerfcli.workflows.view import view_run
 
     console = Console(quiet=False, json_lines=False)
@@ -49,4 +50,4 @@ def view(
             console.note(f"from another machine: {from_elsewhere}, then the same address there")
         console.note("Ctrl-C ends the server")
 
-    view_run(run, host=host, port=port, threads=thread_count(threads), browser=browser, on_ready=on_ready)
+    view_run(run, Address(host, port), browser=browser, resources=Resources(threads), on_ready=on_ready)

@@ -9,7 +9,8 @@ from nerfcli.ct.formats.scan_options import ScanOptions
 from nerfcli.ct.recognise import is_scan
 from nerfcli.ct.scan import load_scan, save_scan
 from nerfcli.errors import UserError
-from nerfcli.notices import Notify, silent
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 
 # Suffixes of scan files, which the name of a scan folder may not have.
 _FILE_SUFFIXES = (".h5", ".hdf5", ".nxs", ".mat", ".npy", ".txt", ".json", ".tif", ".tiff", ".xtekct", ".log")
@@ -17,11 +18,10 @@ _FILE_SUFFIXES = (".h5", ".hdf5", ".nxs", ".mat", ".npy", ".txt", ".json", ".tif
 
 def convert_scan(
     source: Path,
-    target: Path,
+    output: Output,
     *,
     given: ScanOptions = ScanOptions(),
-    overwrite: bool = False,
-    notify: Notify = silent,
+    reporter: Reporter = Reporter(),
 ) -> dict[str, Any]:
     """Write a scan as a scan folder, and return its record as plain values.
 
@@ -29,21 +29,22 @@ def convert_scan(
 
     Args:
         source: a file or folder in a known format.
-        target: the folder.
+        output: the folder, whose path is given.
 
     Raises:
-        UserError: the scan cannot be read or written, `target` exists, or what is read back is damaged.
+        UserError: the scan cannot be read or written, the output exists, or what is read back is damaged.
     """
+    target = output.at(source)
     if target.suffix.lower() in _FILE_SUFFIXES:
         raise UserError(f"{target}: a scan is written as a folder", f"give a folder, such as {target.stem}")
-    if target.exists() and not (overwrite and is_scan(target)):
+    if target.exists() and not (output.overwrite and is_scan(target)):
         what = "add --overwrite to replace it" if is_scan(target) else "choose another output path"
         raise UserError(f"{target} exists", what)
     if target.exists() and target.resolve() == source.resolve():
         raise UserError(f"{target} is the input itself", "choose another output path")
     scan = read_scan(source, given)
-    notify(f"{source}: {scan.history.get('format')}, {in_words(scan)}")
+    reporter.note(f"{source}: {scan.history.get('format')}, {in_words(scan)}")
     for note in scan.history.get("notes", ()):
-        notify(note)
+        reporter.note(note)
     save_scan(target, scan)
     return {"from": scan.history.get("format"), **facts_of(load_scan(target))}

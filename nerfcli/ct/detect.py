@@ -18,7 +18,7 @@ from nerfcli.ct.formats.scan_options import ScanOptions
 from nerfcli.ct.quick import highest_contrast_row
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
-from nerfcli.notices import Notify, Progress, no_progress, silent
+from nerfcli.notices import Progress, Reporter, no_progress
 
 # Least ratio of the rms for a verdict, besides significance: smaller differences come from how a fit treats noise.
 LEAST_RATIO = 1.05
@@ -119,17 +119,15 @@ def judge(scan: Scan, *, progress: Progress = no_progress) -> Judgement:
     )
 
 
-def detect_scan(
-    source: Path, *, given: ScanOptions = ScanOptions(), notify: Notify = silent, progress: Progress = no_progress
-) -> Judgement:
+def detect_scan(source: Path, *, given: ScanOptions = ScanOptions(), reporter: Reporter = Reporter()) -> Judgement:
     """Judge direction of rotation, mirroring and centre of rotation by how well they predict the data.
 
     Raises:
         UserError: the scan cannot be read, or has too few views.
     """
     scan = read_scan(source, given)
-    notify(f"{source}: {scan.history.get('format')}, {in_words(scan)}")
-    return judge(scan, progress=progress)
+    reporter.note(f"{source}: {scan.history.get('format')}, {in_words(scan)}")
+    return judge(scan, progress=reporter.progress)
 
 
 _CONE = (

@@ -21,8 +21,9 @@ from nerfcli.ct.result import METRICS, Reconstruction, load_reconstruction, scan
 from nerfcli.ct.scan import Scan
 from nerfcli.ct.truth import load_truth
 from nerfcli.errors import UserError
-from nerfcli.machine import thread_count
-from nerfcli.notices import Notify, Progress, no_progress, silent
+from nerfcli.machine import Resources
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 
 # Number of layers along each axis over which SSIM is averaged.
 SSIM_LAYERS = 24
@@ -73,19 +74,18 @@ class ScanEvaluation(NamedTuple):
 
 def evaluate_scan(
     run: str | Path,
+    output: Output = Output(),
     *,
-    threads: int = 0,
-    overwrite: bool = False,
     baselines: bool = True,
     reference: str | Path | None = None,
-    notify: Notify = silent,
-    progress: Progress = no_progress,
+    resources: Resources = Resources(),
+    reporter: Reporter = Reporter(),
 ) -> ScanEvaluation:
     """Write RUN/metrics.json: errors of held-out projections and, if the scan names its true volume, of the volume.
 
     Args:
         run: the folder that `train_scan` wrote.
-        threads: number of CPU threads; 0 for all.
+        output: the file to write, RUN/metrics.json by default.
         baselines: also measure filtered back-projection and SART with total variation on the same views.
         reference: folder of another reconstruction, usually from more views, to compare volumes with. It is not the
             truth: it has errors too, and errors common to both do not show.
@@ -95,17 +95,17 @@ def evaluate_scan(
             of the existing metrics.
     """
     run = Path(run)
-    torch.set_num_threads(thread_count(threads))
+    resources.begin()
     result = load_reconstruction(run)
     compared = None if reference is None else _reference_of(Path(reference), result.unit)
     described = None if compared is None else {"run": str(reference), "passes": compared.passes}
-    path = run / METRICS
-    if path.exists() and not overwrite:
+    path = output.at(run / METRICS)
+    if path.exists() and not output.overwrite:
         kept = read_json(path, needed=("methods",), hint="measure again with --overwrite")
         if described not in (None, kept.get("reference")):
             raise UserError(f"{path} was measured without the reference {reference}", "measure again with --overwrite")
         if kept.get("scan_digest") == result.scan_digest and kept.get("passes") == result.passes:
-            notify(f"{path} is kept; add --overwrite to measure again")
+            reporter.note(f"{path} is kept; add --overwrite to measure again")
             return ScanEvaluation(path, kept, True)
     scan = scan_of(result, run)
     geometry = scan.geometry.corrected(result.used["centre"], result.used["tilt"])
@@ -124,18 +124,18 @@ def evaluate_scan(
             else asdict(score_volume(volume, result.grid, compared.volume, compared.grid)),
         }
 
-    progress(0.0, "held-out views")
+    reporter.progress(0.0, "held-out views")
     measure("nerfcli", np.asarray(result.volume))
     if baselines:
         views = scan.training_views
         integrals = logarithms(scan, result.used.get("air"))
-        progress(0.3, "filtered back-projection")
+        reporter.progress(0.3, "filtered back-projection")
         try:
             filtered = filtered_back_projection(geometry.select(views), integrals, result.grid)
             measure("filtered back-projection", filtered.clamp_min(0).numpy())
         except UserError as error:
-            notify(f"no filtered back-projection: {error.message}")
-        progress(0.5, "SART with total variation")
+            reporter.note(f"no filtered back-projection: {error.message}")
+        reporter.progress(0.5, "SART with total variation")
         measure(
             "SART with total variation", sart_total_variation(geometry.select(views), integrals, result.grid).numpy()
         )

@@ -21,7 +21,8 @@ from nerfcli.ct.marks import MEANINGS, UNSEEN, marks_in_words
 from nerfcli.ct.recognise import VOLUMES
 from nerfcli.ct.result import load_reconstruction, refuse_existing
 from nerfcli.errors import UserError
-from nerfcli.notices import Notify, silent
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 
 _NIFTI_HEADER = 352
 _NIFTI_UNITS = {"m": 1, "mm": 2, "um": 3}
@@ -48,7 +49,7 @@ class VolumeFile:
 
 
 def export_scan(
-    run: str | Path, target: str | Path, *, water: float | None = None, overwrite: bool = False, notify: Notify = silent
+    run: str | Path, output: Output = Output(), *, water: float | None = None, reporter: Reporter = Reporter()
 ) -> list[Path]:
     """Write the volume of a reconstruction as .nrrd, .mha, .nii or .tif, and its marks beside it.
 
@@ -57,13 +58,13 @@ def export_scan(
 
     Args:
         run: the folder that `train_scan` wrote.
-        target: the file; its suffix determines the format.
+        output: the file, whose suffix determines the format; RUN-volume.nrrd by default.
         water: attenuation of water in 1 / unit, to write Hounsfield units, 1000 (mu / water - 1); None for attenuation.
 
     Raises:
         UserError: there is no reconstruction, or a file exists.
     """
-    target = Path(target)
+    target = output.beside(Path(run), f"-volume{VOLUMES[0]}")
     result = load_reconstruction(Path(run))
     marks = np.asarray(result.marks)
     values = np.where(marks & UNSEEN, np.float32(np.nan), result.volume).astype(np.float32)
@@ -71,7 +72,7 @@ def export_scan(
     if water is not None:
         values, quantity = (1000 * (values / np.float32(water) - 1)).astype(np.float32), "HU"
     beside = target.with_name(f"{target.stem}-marks{target.suffix}")
-    refuse_existing(target, beside, overwrite=overwrite)
+    refuse_existing(output, target, beside)
     write_volume(target, VolumeFile(values, result.grid, result.unit, quantity))
     written = [target]
     if marks.any():
@@ -79,7 +80,7 @@ def export_scan(
         write_volume(beside, VolumeFile(marks, result.grid, result.unit, quantity))
         written.append(beside)
         for words in marks_in_words(marks):
-            notify(f"{beside.name}: {words}")
+            reporter.note(f"{beside.name}: {words}")
     return written
 
 

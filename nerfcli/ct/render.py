@@ -13,10 +13,11 @@ from nerfcli.ct.marks import MEANINGS, UNSEEN
 from nerfcli.ct.reconstruct import Projector
 from nerfcli.ct.result import Reconstruction, load_reconstruction, refuse_existing, scan_of
 from nerfcli.errors import UserError
-from nerfcli.machine import thread_count
-from nerfcli.notices import Notify, Progress, no_progress, silent
+from nerfcli.machine import Resources
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.photos.images import write_png
-from nerfcli.render.files.preview import coloured
+from nerfcli.render.presentation import coloured
 
 # Outputs that can be rendered from a reconstruction.
 OUTPUTS = ("projection", "transmission", "residual")
@@ -26,24 +27,23 @@ RESIDUAL_RANGE = 4.0
 
 def render_scan(
     run: str | Path,
-    target: str | Path,
+    output: Output = Output(),
     *,
     outputs: tuple[str, ...] = ("projection",),
     views: str = "test",
     slices: tuple[tuple[str, float], ...] = (),
-    threads: int = 0,
-    overwrite: bool = False,
-    notify: Notify = silent,
-    progress: Progress = no_progress,
+    resources: Resources = Resources(),
+    reporter: Reporter = Reporter(),
 ) -> list[Path]:
     """Write projections of a reconstruction, or slices through it, as float32 TIFF with a PNG to look at.
 
     Args:
         run: the folder that `train_scan` wrote.
+        output: the folder to write, RUN/renders by default.
         outputs: some of `OUTPUTS`: line integrals, transmissions, and (measured - predicted) in units of the noise.
         views: "test" for the held-out ones, "train" for the fitted ones.
         slices: (axis, position in the scan's unit); if given, slices and their marks replace the projections.
-        threads: number of CPU threads; 0 for all.
+        resources: threads.
 
     Returns:
         The paths of the float files.
@@ -51,12 +51,13 @@ def render_scan(
     Raises:
         UserError: there is no reconstruction or no held-out view, a slice is outside the volume, or a file exists.
     """
-    run, target = Path(run), Path(target)
-    torch.set_num_threads(thread_count(threads))
+    run = Path(run)
+    target = output.at(run / "renders")
+    resources.begin()
     result = load_reconstruction(run)
     if slices:
         cuts = {target / f"{name}.tif": cut for axis, at in slices for name, cut in _slice(result, axis, at).items()}
-        refuse_existing(*cuts, overwrite=overwrite)
+        refuse_existing(output, *cuts)
         for path, (values, high) in cuts.items():
             # Picture rows run downwards, but the vertical axis of a slice points up.
             _write_picture(path, values[::-1].copy(), 0.0, high)
@@ -70,7 +71,7 @@ def render_scan(
     volume = torch.from_numpy(np.array(result.volume))
     top = float(np.nanmax(scan.line_integrals(chosen)))
     paths = {(view, name): target / name / f"{view:04d}.tif" for view in chosen for name in outputs}
-    refuse_existing(*paths.values(), overwrite=overwrite)
+    refuse_existing(output, *paths.values())
     for number, view in enumerate(chosen):
         index = np.array([number])
         integrals = projector.forward(volume, index)
@@ -82,8 +83,8 @@ def render_scan(
         for name in outputs:
             values, low, high = pictures[name]
             _write_picture(paths[view, name], values.view(geometry.rows, geometry.columns).numpy(), low, high)
-        progress((number + 1) / len(chosen), f"view {view}")
-    notify(f"{len(paths)} pictures of {len(chosen)} views; line integrals up to {top:.3g}")
+        reporter.progress((number + 1) / len(chosen), f"view {view}")
+    reporter.note(f"{len(paths)} pictures of {len(chosen)} views; line integrals up to {top:.3g}")
     return list(paths.values())
 
 

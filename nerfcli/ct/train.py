@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nerfcli.atomic import clear_leftovers
+from nerfcli.atomic import clear_leftovers, exclusive
 from nerfcli.ct.baselines import filtered_back_projection, filtered_misfit, logarithms
 from nerfcli.ct.calibrate import air_factors, beside_object, detector_tilt, found_noise
 from nerfcli.ct.centre import FEWEST_VIEWS, centre_of
@@ -33,10 +33,9 @@ from nerfcli.ct.result import (
 )
 from nerfcli.ct.scan import Scan, load_scan
 from nerfcli.errors import UserError
-from nerfcli.exclusive import exclusive
-from nerfcli.machine import thread_count
-from nerfcli.memory import default_memory_limit
-from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.machine import default_memory_limit, thread_count, use_threads
+from nerfcli.notices import Progress, Reporter
+from nerfcli.output import Output
 from nerfcli.version import __version__
 
 # Largest fraction of the time budget for estimates before the fit, and of the time left for the coarse start.
@@ -54,34 +53,33 @@ DRIFT = 3.0
 
 def train_scan(
     scan: str | Path,
-    run: str | Path,
+    output: Output,
     settings: ReconstructionSettings,
     *,
     resume: bool = False,
-    overwrite: bool = False,
-    notify: Notify = silent,
-    warn: Notify = warn_python,
-    progress: Progress = no_progress,
+    reporter: Reporter = Reporter(),
 ) -> Reconstruction:
     """Fit a volume to a scan, keep an existing one with the same settings, or refuse to touch another one.
 
     Args:
         scan: a folder that `nerfcli ct convert` wrote.
+        output: the folder to write, SCAN-run by default.
         settings: budget, and values that are not to be estimated from the scan.
-        resume: continue from the volume in `run`; start from the beginning if there is none.
+        resume: continue from the volume in the folder; start from the beginning if there is none.
 
     Raises:
-        UserError: the scan cannot be read, or `run` holds something else, or an interrupted fit without `resume`.
+        UserError: the scan cannot be read, or the folder holds something else, or an interrupted fit without `resume`.
         KeyboardInterrupt: passed on; the volume fitted so far has been written.
     """
-    folder, run = Path(scan), Path(run)
+    folder = Path(scan)
+    run = output.beside(folder, "-run")
     loaded = load_scan(folder)
-    earlier = load_reconstruction(run) if is_reconstruction(run) and not overwrite else None
+    earlier = load_reconstruction(run) if is_reconstruction(run) and not output.overwrite else None
     if earlier is not None:
         same = earlier.scan_digest == loaded.digest and _wanted(earlier.settings) == _wanted(settings)
         if same and earlier.complete:
             again = "give a larger --budget or --passes" if resume else "add --overwrite to fit again"
-            notify(f"{run} is kept: it is complete and has these settings; {again}")
+            reporter.note(f"{run} is kept: it is complete and has these settings; {again}")
             return earlier
         if same and not resume:
             raise UserError(
@@ -92,22 +90,26 @@ def train_scan(
             raise UserError(
                 f"{run} holds another reconstruction", "choose another folder with --output, or add --overwrite"
             )
-    elif _holds_something(run) and not (overwrite and is_reconstruction(run)):
+    elif _holds_something(run) and not (output.overwrite and is_reconstruction(run)):
         raise UserError(f"{run} exists and is not a reconstruction", "choose another folder with --output")
     with exclusive(run / LOCK, f"another nerfcli ct train is writing {run}"):
         clear_leftovers(run)
         if loaded.kind != "line_integral" and loaded.photons_per_value is None:
-            warn("photons per detector value not given: estimated from the noise of neighbouring pixels")
+            reporter.warn("photons per detector value not given: estimated from the noise of neighbouring pixels")
         threads = thread_count(settings.threads)
-        torch.set_num_threads(threads)
-        result, interrupt = _fit(loaded, folder, settings, earlier=earlier if resume else None, progress=progress)
+        use_threads(threads)
+        result, interrupt = _fit(
+            loaded, folder, settings, earlier=earlier if resume else None, progress=reporter.progress
+        )
         (run / METRICS).unlink(missing_ok=True)  # they belong to the volume that is replaced
         save_reconstruction(run, result)
     if interrupt is not None:
-        notify(f"the volume of pass {result.passes} is saved in {run}; to continue, add --resume to the same command")
+        reporter.note(
+            f"the volume of pass {result.passes} is saved in {run}; to continue, add --resume to the same command"
+        )
         raise interrupt
     for sentence in result.decisions:
-        notify(sentence)
+        reporter.note(sentence)
     return result
 
 

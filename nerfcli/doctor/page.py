@@ -1,4 +1,4 @@
-"""The diagnosis as one self-contained HTML page: findings, thumbnails, charts, and the match matrix."""
+"""Examine a capture; the diagnosis as one self-contained HTML page: findings, thumbnails, charts, the match matrix."""
 
 import re
 from collections.abc import Sequence
@@ -6,14 +6,19 @@ from html import escape
 from pathlib import Path
 from string import Template
 
+import cv2
 import numpy as np
 
-from nerfcli.doctor.examination import Diagnosis
+from nerfcli.captures.calibration import read_calibration
+from nerfcli.doctor.examination import Diagnosis, ExaminedCapture, estimated_seconds, examine
 from nerfcli.doctor.quality import BLURRED, STOPS_LOOK
-from nerfcli.errors import several
-from nerfcli.pages import page
+from nerfcli.errors import duration, several
+from nerfcli.machine import Resources
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.pages.findings import BAD, GOOD, LOOK, VERDICTS, Finding, worst
-from nerfcli.pages.page import data_uri, picture_rule, png_bytes
+from nerfcli.pages.page import Mark, claim_page, data_uri, picture_rule, png_bytes, write_page
+from nerfcli.pages.page import page_html as whole_page
 
 _WORDS = {GOOD: "good", LOOK: "worth a look", BAD: "fix this first"}
 
@@ -42,9 +47,9 @@ def page_html(diagnosis: Diagnosis) -> str:
     # Pictures are in rules of the style, so that a photo shown twice is stored once.
     rules = (picture_rule(f"p{index}", data_uri(photo.thumbnail, "jpeg")) for index, photo in enumerate(photos))
     thumbnails = "\n".join(rules)
-    return page.page_html(
+    return whole_page(
         title=_title(diagnosis.subject.path),
-        mark=page.Mark("doctor", diagnosis.subject.path),
+        mark=Mark("doctor", diagnosis.subject.path),
         style=f"{_STYLE}{thumbnails}\n",
         body=body,
     )
@@ -216,3 +221,32 @@ $findings
 <footer>Photos were checked at 1600 px and matched at 800 px. Blur that vanishes at that size, camera movement along the
 line of sight, and objects moving towards or away from the camera are not detected; repeated patterns may look like
 matches.</footer>""")
+
+
+def examine_capture(
+    capture: ExaminedCapture,
+    output: Output = Output(),
+    intrinsics: Path | None = None,
+    *,
+    resources: Resources = Resources(),
+    reporter: Reporter = Reporter(),
+) -> Diagnosis:
+    """Examine a capture and write its page.
+
+    Args:
+        capture: a folder of photos, or a scene; see `find_subject`.
+        output: the page, CAPTURE-doctor.html by default.
+        intrinsics: a file with the intrinsics of the cameras, if they are known.
+
+    Raises:
+        UserError: see `read_calibration` and `claim_page`.
+    """
+    calibration = None if intrinsics is None else read_calibration(intrinsics, images=capture.path)
+    page = output.beside(capture.path, "-doctor.html")
+    claim_page(output, page, Mark("doctor", capture.path), about="capture")
+    count, threads = len(capture.sources), resources.cores
+    reporter.note(f"{capture.path}: {count} photos, about {duration(estimated_seconds(count, threads))}")
+    cv2.setNumThreads(1)  # photos and pairs are processed in parallel; OpenCV's threads would only wait for each other
+    diagnosis = examine(capture, threads=threads, progress=reporter.progress, calibration=calibration)
+    write_page(page_html(diagnosis), page)
+    return diagnosis

@@ -18,8 +18,7 @@ from nerfcli.evaluate.metrics import SMALLEST, Perceptual, as_float, colour_alig
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.field.background import Background
 from nerfcli.field.exposure import exposed
-from nerfcli.render.pictures import RenderedPicture
-from nerfcli.render.renderable import Renderable
+from nerfcli.render.pictures import Renderable, RenderedPicture
 
 # A photo is far below the others if it lacks this many standard deviations, estimated by the median absolute deviation,
 # and this many dB. In sound runs the worst photo lacks up to 2 deviations and 2 dB; where views are uneven, 5 dB.

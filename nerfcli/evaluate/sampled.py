@@ -11,9 +11,8 @@ from nerfcli.evaluate.metrics import psnr, to_8_bit
 from nerfcli.evaluate.protocol import PROTOCOL, HeldOutPhoto, as_exposed, background_of, over_white
 from nerfcli.field.background import colours_behind
 from nerfcli.render.model import Model
-from nerfcli.render.rays import pixel_rays
-from nerfcli.render.renderable import Renderable
-from nerfcli.render.tracing import TOLERANCE, render_rays, uniform_cuts
+from nerfcli.render.pictures import Renderable
+from nerfcli.render.tracing import TOLERANCE, pixel_rays, render_rays, uniform_cuts
 
 SAMPLED_PIXELS = 2**14
 

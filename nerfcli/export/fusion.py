@@ -1,10 +1,10 @@
-"""Fuse depth maps into a truncated signed distance, averaged over the maps, in blocks near surfaces.
+"""Fuse depth maps into a truncated signed distance, averaged over the maps, in blocks near surfaces; or into points.
 
 In a view, the signed distance of a voxel is that from its centre to the tangent plane of the surface at its pixel,
 positive on the camera's side: (depth - z) / cosine_axis * cosine_surface. It is clamped to the truncation on the free
 side; voxels farther than that behind the surface get nothing from the view. Views are averaged by the pixel's weight,
 which decreases behind the surface, where there may be another side (Bylow et al. 2013, Real-time camera tracking and 3D
-reconstruction using SDFs).
+reconstruction using SDFs). The points are those that photos agree on, thinned.
 
 Source: Curless and Levoy 1996, A volumetric method for building complex models from range images, eq. 3 and 4; blocks
 as in Nießner et al. 2013, Real-time 3D reconstruction at scale using voxel hashing.
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from nerfcli.export.depth_views import DepthView, plane_rays
 from nerfcli.export.extent import Grid
+from nerfcli.render.coverage import largest_angle_deg, sees
 
 # Voxels along a side of a block.
 SIDE = 8
@@ -27,7 +28,7 @@ SIDE = 8
 TRUNCATION = 4.0
 # Rays see a surface from this opacity on, and free space only below 0.02; those between are not used.
 _OPAQUE = 0.5
-# Surfaces seen at a smaller cosine between normal and ray are not used.
+# Surfaces seen at a smaller cosine between normal and ray are not used: the depth changes too much within a pixel.
 _FLATTEST = 0.1
 
 
@@ -183,3 +184,82 @@ def _may_see(params: tuple[float, ...], size: tuple[int, int], middles: np.ndarr
         for edge, sign in ((low, 1.0), (high, -1.0)):
             inside &= sign * (focal * along - edge * z) / np.hypot(focal, edge) > -radius
     return inside
+
+
+# A depth counts if the pixel is at least this opaque, and median and mean differ by at most this fraction of it.
+_SOLID, _AGREEING = 0.9, 0.02
+# Fewest photos that must see a point.
+LEAST_PHOTOS = 2
+
+
+@dataclass(frozen=True)
+class Points:
+    """N surface points.
+
+    Args:
+        places: (N, 3) float64, scene's frame.
+        normals: (N, 3) float32 unit, towards the camera that saw the point best.
+        colours: (N, 3) uint8 sRGB, as that camera sees it.
+        photos: (N,) number of photos that see the point.
+        parallax_deg: (N,) the largest angle between the rays of two photos that see it.
+        spread: (N,) standard deviation of the depth distribution, scene units.
+    """
+
+    places: np.ndarray
+    normals: np.ndarray
+    colours: np.ndarray
+    photos: np.ndarray
+    parallax_deg: np.ndarray
+    spread: np.ndarray
+
+
+def agreed_points(
+    views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda fraction: None
+) -> Points:
+    """Return at most one point per voxel: the one with the smallest spread of depth, if two photos see it."""
+    places, normals, colours, spread = _thinned(views, grid)
+    seen = np.zeros((len(places), len(views)), dtype=bool)
+    for index, view in enumerate(views):
+        ray = places - view.frame.centre
+        facing = -(ray * normals).sum(axis=1)
+        seen[:, index] = sees(view.distances(), places)
+        seen[:, index] &= facing > _FLATTEST * np.linalg.norm(ray, axis=1)
+        on_progress((index + 1) / len(views))
+    photos = seen.sum(axis=1)
+    kept = photos >= LEAST_PHOTOS
+    return Points(
+        places=places[kept],
+        normals=normals[kept],
+        colours=colours[kept],
+        photos=photos[kept].astype(np.uint16),
+        parallax_deg=largest_angle_deg(seen[kept], places[kept], np.stack([view.frame.centre for view in views])),
+        spread=spread[kept],
+    )
+
+
+def _thinned(views: Sequence[DepthView], grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points with the smallest spread in each voxel, among reliable depths: the first fields of `Points`."""
+    parts: list[tuple[np.ndarray, ...]] = []
+    for view in views:
+        with np.errstate(invalid="ignore"):
+            sure = (view.opacity >= _SOLID) & (view.disagreement <= _AGREEING * view.depth)
+            sure &= np.isfinite(view.normals).all(-1)
+        places = view.points()[sure]
+        cells = np.floor((places - grid.low) / grid.voxel_size).astype(np.int64)
+        inside = ((cells >= 0) & (cells < grid.shape)).all(-1)
+        normals = view.normals[sure][inside] @ view.frame.world_from_cam[:3, :3].T
+        levels = np.rint(255 * np.clip(view.rgb[sure][inside], 0, 1)).astype(np.uint8)
+        keys = np.asarray(np.ravel_multi_index(tuple(cells[inside].T), grid.shape))
+        spread = np.nan_to_num(view.spread[sure][inside], nan=np.inf)
+        # Thin out each view first: most of its pixels share voxels with their neighbours.
+        best = _best(keys, spread)
+        parts.append((keys[best], places[inside][best], normals[best], levels[best], spread[best]))
+    keys, places, normals, levels, spread = (np.concatenate(column) for column in zip(*parts, strict=True))
+    best = _best(keys, spread)
+    return places[best], normals[best].astype(np.float32), levels[best], spread[best].astype(np.float32)
+
+
+def _best(keys: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Return the index of the smallest spread of each key, in the order of the keys."""
+    order = np.lexsort((spread, keys))
+    return order[np.unique(keys[order], return_index=True)[1]]

@@ -14,8 +14,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from nerfcli.atomic import atomic_path
+from nerfcli.atomic import atomic_path, refuse_read_only
 from nerfcli.errors import UserError
+from nerfcli.output import Output
 
 # An earlier page of the same kind is recognised by a mark within this many bytes from its beginning.
 _HEAD_BYTES = 4096
@@ -111,6 +112,19 @@ def is_made_from(path: Path, origin: str) -> bool:
 
 def _origin_html(origin: str) -> str:
     return f'<meta name="nerfcli-made-from" content="{origin}">'
+
+
+def claim_page(output: Output, path: Path, mark: Mark, *, about: str) -> None:
+    """Raise unless a page can be written at a path; see `refuse_foreign`, unless anything there may be replaced.
+
+    Raises:
+        UserError: the path is a folder, cannot be written, or holds something else.
+    """
+    if path.is_dir():
+        raise UserError(f"{path} is a folder", "give a file name for the page with -o")
+    if not output.overwrite:
+        refuse_foreign(path, mark, about=about)
+    refuse_read_only(path)
 
 
 def refuse_foreign(path: Path, mark: Mark, *, about: str) -> None:

@@ -16,11 +16,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from nerfcli.atomic import atomic_folder, clear_leftovers
+from nerfcli.atomic import atomic_folder, clear_leftovers, exclusive
 from nerfcli.captures.calibration import Calibration
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.errors import UserError
-from nerfcli.exclusive import exclusive
 from nerfcli.photos.images import list_photos, name_in
 from nerfcli.poses.input.job import database_path
 from nerfcli.poses.input.settings import PoseSettings

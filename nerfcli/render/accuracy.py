@@ -17,8 +17,7 @@ from nerfcli.field.background import colours_behind
 from nerfcli.kernels import RaysSeen
 from nerfcli.render.depth import DepthRequest, fractions, requested
 from nerfcli.render.pictures import RenderedPicture
-from nerfcli.render.rays import pixel_rays
-from nerfcli.render.tracing import render_rays, uniform_cuts
+from nerfcli.render.tracing import TOLERANCE, pixel_rays, render_rays, uniform_cuts
 from nerfcli.render.trained_field import TrainedField
 
 IN_WORDS = (
@@ -85,7 +84,7 @@ def truncation_bounds(picture: RenderedPicture, tolerance: float) -> dict[str, f
 
 @torch.no_grad()
 def measure_error(
-    model: TrainedField, frame: Frame, *, depth: DepthRequest | None, tolerance: float, seed: int = 0
+    model: TrainedField, frame: Frame, *, depth: DepthRequest | None, tolerance: float = TOLERANCE, seed: int = 0
 ) -> MeasuredError:
     """Render the centres of 256 random pixels with finer and finer intervals; the same pixels for the same seed.
 

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from nerfcli.cameras.frame import Frame
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import render_picture
+from nerfcli.render.pictures import RenderedPicture, render_picture
 
 # Neighbours whose depths differ by more than this fraction are not on the same surface.
 _STEP = 0.1
@@ -180,3 +180,24 @@ def small_frame(frame: Frame, max_size: int) -> Frame:
     factor = max(1.0, max(camera.width, camera.height) / max_size)
     size = (max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
     return replace(frame, camera=camera.resized(*size))
+
+
+def with_coverage(
+    picture: RenderedPicture, frame: Frame, *, axis: str, photo_depths: Sequence[DepthMap]
+) -> RenderedPicture:
+    """Return the picture with coverage and parallax of the points at its median depth.
+
+    Args:
+        picture: a picture with median depth.
+        photo_depths: depth maps of all training photos.
+    """
+    assert picture.median is not None
+    rays, _ = frame.camera.pixel_bearings()
+    if axis == "z":
+        ahead = rays[:, 2] > 0
+        rays = rays / np.where(ahead, rays[:, 2], 1.0)[:, None]
+    pose = frame.world_from_cam
+    points = (rays * picture.median.reshape(-1, 1)) @ pose[:3, :3].T + pose[:3, 3]
+    coverage, parallax = coverage_and_parallax(photo_depths, points)
+    shape = picture.median.shape
+    return replace(picture, coverage=coverage.reshape(shape), parallax=parallax.reshape(shape))

@@ -1,10 +1,11 @@
-"""A job: which views of which field to render; and whether a folder already holds the result."""
+"""A rendering job: which views of which field, its outputs and file formats; and whether a folder holds the result."""
 
 import hashlib
 import json
+import shutil
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -12,13 +13,143 @@ from typing import Any
 from nerfcli.atomic import read_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
+from nerfcli.output import Output
+from nerfcli.render import depth_errors
 from nerfcli.render.coverage import DepthMap
+from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
 from nerfcli.render.depth_errors import DepthErrors
-from nerfcli.render.files.film import check_encoders
-from nerfcli.render.outputs import ExportSettings
+from nerfcli.render.files.depth_pictures import CONVENTION_OF, QUANTITIES, DepthMeta
+from nerfcli.render.files.file_facts import RENDERS
+from nerfcli.render.files.film import ENCODERS, check_encoders
+from nerfcli.render.pictures import Renderable
 from nerfcli.version import __version__
 
-DESCRIPTION = "render.json"
+OUTPUTS = ("rgb", "depth", "opacity", *CONVENTION_OF)
+# Measured outputs, which are stored as floats, with previews in false colours.
+MEASURED = QUANTITIES
+# A file in format exr holds all requested outputs of a view.
+FLOAT_FORMATS = ("tiff", "exr", "npy")
+FORMATS = (*FLOAT_FORMATS, "png16")
+EXR_FOLDER, LEVELS_FOLDER = "exr", "depth16"
+# Background of pictures with alpha: their colours are then premultiplied and contain no background.
+BLACK = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class VideoSettings:
+    """Settings of the videos.
+
+    Args:
+        formats: some of `render.files.film.ENCODERS`; a video of each output in each.
+        fps: frames per second.
+    """
+
+    formats: tuple[str, ...] = ("mp4",)
+    fps: float = 24.0
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """Settings of an export.
+
+    Args:
+        outputs: some of `OUTPUTS`.
+        depth: the definition of depth, if "depth" is among the outputs.
+        formats: some of `FORMATS`, for measured outputs. 16-bit levels are computed from float files, which are kept.
+        step: length of the steps along rays, relative to those of the training.
+        rgba: colours without the background, with the opacity as straight alpha.
+        check_accuracy: measure the error of every picture, instead of the first and the last.
+    """
+
+    outputs: tuple[str, ...]
+    depth: DepthRequest
+    formats: tuple[str, ...] = ("tiff",)
+    video: VideoSettings | None = None
+    step: float = 1.0
+    rgba: bool = False
+    check_accuracy: bool = False
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The outputs that are measured, in the order of `MEASURED`."""
+        return tuple(output for output in MEASURED if output in self.outputs)
+
+    @property
+    def needs_visibility(self) -> bool:
+        """True if coverage and parallax of the surface are needed."""
+        wanted = {"coverage", "parallax"} & set(self.outputs)
+        return bool(wanted or self.depth.min_views or self.depth.min_parallax_deg or self.needs_errors)
+
+    @property
+    def needs_errors(self) -> bool:
+        """True if the measured errors of depth are needed."""
+        return bool({"lower", "upper", "confidence"} & set(self.outputs))
+
+    @property
+    def float_formats(self) -> tuple[str, ...]:
+        """The formats of floats: at least one, because previews and levels are made from them."""
+        return tuple(name for name in FLOAT_FORMATS if name in self.formats) or FLOAT_FORMATS[:1]
+
+    @property
+    def folders_of_formats(self) -> tuple[str, ...]:
+        """Folders of files that hold all requested outputs of a view, and of 16-bit levels."""
+        exr = bool(self.measured) and "exr" in self.float_formats
+        return (*([EXR_FOLDER] if exr else []), *([LEVELS_FOLDER] if self.in_levels else []))
+
+    @property
+    def in_levels(self) -> bool:
+        """True if depth is also written as 16-bit levels."""
+        return "png16" in self.formats and "depth" in self.outputs
+
+    def pixel_settings(self) -> dict[str, Any]:
+        """Return the settings that determine the rendered numbers and their files, as plain values."""
+        settings = asdict(self)
+        del settings["video"]
+        for name in ("min_views", "min_parallax_deg"):
+            if not settings["depth"][name]:  # as in folders that were written before these settings existed
+                del settings["depth"][name]
+        if not self.check_accuracy:
+            del settings["check_accuracy"]
+        return settings | {"outputs": list(self.outputs), "formats": list(self.float_formats)}
+
+    def of_presentation(self) -> dict[str, Any]:
+        """Return the settings that determine the previews and videos made from these files, as plain values."""
+        video = None if self.video is None else asdict(self.video) | {"formats": list(self.video.formats)}
+        return {"levels": self.in_levels or None, "video": video}
+
+
+def depth_meta(model: Renderable, request: DepthRequest) -> DepthMeta:
+    """Return the definition of the depth that `request` asks for."""
+    return DepthMeta(
+        convention=request.convention,
+        axis=request.axis,
+        unit=model.unit,
+        unit_source=model.unit_source,
+        opacity_floor=effective_floor(request),
+        background_distance=request.background_distance if request.convention == "background" else None,
+        min_views=request.min_views,
+        min_parallax_deg=request.min_parallax_deg,
+    )
+
+
+def meaning_of(meta: DepthMeta, request: DepthRequest, output: str) -> DepthMeta:
+    """Return the definition of a measured output of a picture whose depth is defined by `meta`."""
+    level, tolerance = depth_errors.LEVEL, depth_errors.TOLERANCE
+    number = {"lower": level, "upper": level, "confidence": tolerance}.get(output)
+    convention = None if number is None else f"{output}:{number:g}"
+    return meta.of(output, opacity_floor=floor_of(request, output), convention=convention)
+
+
+def floor_of(request: DepthRequest, output: str) -> float:
+    """Return the opacity below which a pixel has no value in a measured output."""
+    match output:
+        case "depth":
+            return effective_floor(request)
+        case "spread":
+            return request.min_opacity
+    return max(request.min_opacity, MEDIAN)  # all others need the median, too
+
+
 _IN_WORDS = {"levels": "16-bit levels", "video": "videos"}
 
 
@@ -97,6 +228,15 @@ class RenderJob:
             return [folder / output for output in (*self.settings.outputs, *self.settings.folders_of_formats)]
         return [folder / f"{output}.{form}" for form in video.formats for output in self.settings.outputs]
 
+    def remove_other_presentation(self, folder: Path) -> None:
+        """Remove videos and 16-bit levels of a finished folder that are not wanted."""
+        if not self.settings.in_levels:
+            shutil.rmtree(folder / LEVELS_FOLDER, ignore_errors=True)
+        wanted = self.results(folder) if self.settings.video else []
+        for path in (folder / f"{output}.{form}" for output in OUTPUTS for form in ENCODERS):
+            if path not in wanted:
+                path.unlink(missing_ok=True)
+
     def check(self) -> None:
         """Refuse a job that would fail only after the last picture is rendered.
 
@@ -114,17 +254,23 @@ class RenderJob:
                 "remove the video options, or choose cameras of a single size",
             )
 
-    def is_held_by(self, folder: Path) -> bool:
-        """Return whether the finished folder already holds this job, pictures and presentation.
+    def measures(self, index: int) -> bool:
+        """Return whether the error of a frame's rendering is measured."""
+        return self.settings.check_accuracy or index in (0, len(self.frames) - 1)
+
+    def is_kept_in(self, folder: Path, output: Output) -> bool:
+        """Return whether the finished folder holds this job, pictures and presentation, and stays.
 
         It is also False if the folder holds the same pictures and nothing would be replaced, as when videos are added.
 
         Raises:
-            UserError: it holds another job.
+            UserError: it holds something else that may not be replaced.
         """
-        made = _made(folder)
-        if made is None:
+        if folder.is_file() or (folder.is_dir() and not (folder / RENDERS).exists() and any(folder.iterdir())):
+            raise UserError(f"{folder} exists and does not contain renders", "choose another folder with -o")
+        if output.overwrite or not (folder / RENDERS).exists():
             return False
+        made = _made(folder)
         wanted = self.key()
         del wanted["nerfcli"]
         depth, there = wanted["settings"]["depth"], made.get("settings", {}).get("depth")
@@ -135,46 +281,32 @@ class RenderJob:
                 f"{folder} contains depth with another definition: {', '.join(differing)}",
                 "choose another folder with -o, or add --overwrite to replace the whole folder",
             )
-        if any(made.get(key) != value for key, value in wanted.items()):
-            raise UserError(f"{folder} exists", "add --overwrite to replace it, or choose another folder with -o")
+        output.keeps(folder, lambda: all(made.get(key) == value for key, value in wanted.items()))
         presentation = self.settings.of_presentation()
         differing = [key for key, value in presentation.items() if made.get(key) != value]
         if not differing:
             return True
-        if self.shares_pictures_with(folder) and all(made.get(key) is None for key in differing):
+        if self.facts_in(folder) is not None and all(made.get(key) is None for key in differing):
             return False
         raise UserError(
             f"{folder} contains the same pictures with different {' and '.join(_IN_WORDS[key] for key in differing)}",
             "add --overwrite to write them again from the pictures, which are kept, or choose another folder with -o",
         )
 
-    def shares_pictures_with(self, folder: Path) -> bool:
-        """Return whether a finished folder holds the same pictures, with other 16-bit files or videos."""
+    def facts_in(self, folder: Path) -> dict[str, Any] | None:
+        """Return the facts about the frames of a finished folder with the same pictures and other videos or levels."""
+        if not (folder / RENDERS).exists():
+            return None
         try:
             made = _made(folder)
         except UserError:  # a damaged description cannot be compared; everything is rendered again
-            return False
-        if made is None or "files" not in made:
-            return False
+            return None
+        same = all(made.get(key) == value for key, value in self.key().items())
         presentation = self.settings.of_presentation()
-        return all(made.get(key) == value for key, value in self.key().items()) and any(
-            made.get(key) != value for key, value in presentation.items()
-        )
+        return made["facts"] if same and any(made.get(key) != value for key, value in presentation.items()) else None
 
 
-def _made(folder: Path) -> dict[str, Any] | None:
-    """Return the description of a finished folder; None if there is none."""
-    if not (folder / DESCRIPTION).exists():
-        return None
+def _made(folder: Path) -> dict[str, Any]:
+    """Return the description of a finished folder."""
     hint = "add --overwrite to render again, or choose another folder with -o"
-    return read_json(folder / DESCRIPTION, needed=("settings",), hint=hint)
-
-
-def refuse_foreign(folder: Path) -> None:
-    """Refuse a path that is taken by something other than an export.
-
-    Raises:
-        UserError: it is a file, or a folder with other contents.
-    """
-    if folder.is_file() or (folder.is_dir() and not (folder / DESCRIPTION).exists() and any(folder.iterdir())):
-        raise UserError(f"{folder} exists and does not contain renders", "choose another folder with -o")
+    return read_json(folder / RENDERS, needed=("settings", "facts"), hint=hint)

@@ -1,7 +1,6 @@
 """A trained field that renders pictures, and the file that holds it."""
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,7 @@ from nerfcli.field.checkpoint import read_checkpoint, refuse_non_finite, save_te
 from nerfcli.field.kinds import fresh_field, settings_from_json
 from nerfcli.render.accuracy import measure_error
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.pictures import RenderedPicture, render_picture
-from nerfcli.render.tracing import TOLERANCE
+from nerfcli.render.pictures import render_picture
 from nerfcli.render.trained_field import Marching, TrainedField
 
 FORMAT = "nerfcli field 2"
@@ -28,22 +26,13 @@ BACKGROUND = "background.logits"
 
 @dataclass(frozen=True)
 class Model(TrainedField):
-    """A trained field that renders pictures, see `TrainedField` for its data."""
+    """A trained field that renders pictures, see `TrainedField` for its data and `render_picture` for `render`."""
 
-    def render(
-        self,
-        frame: Frame,
-        *,
-        background: Background,
-        depth: DepthRequest | None = None,
-        on_tile: Callable[[int], None] | None = None,
-    ) -> RenderedPicture:
-        """Render a frame, see `render_picture`."""
-        return render_picture(self, frame, background=background, depth=depth, on_tile=on_tile)
+    render = render_picture
 
     def measured_error(self, frame: Frame, *, depth: DepthRequest | None) -> dict[str, float]:
         """Return the measured error of the rendering, see `measure_error`."""
-        return measure_error(self, frame, depth=depth, tolerance=TOLERANCE).to_json()
+        return measure_error(self, frame, depth=depth).to_json()
 
 
 def save_model(path: Path, model: Model) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -12,8 +13,7 @@ from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.background import Background, colours_behind
 from nerfcli.kernels import RayTermination
 from nerfcli.render.depth import DepthRequest, disagreement, fractions, median, requested, spread
-from nerfcli.render.rays import PictureRays, successive_rays
-from nerfcli.render.tracing import TOLERANCE, render_rays
+from nerfcli.render.tracing import TOLERANCE, PictureRays, render_rays, successive_rays
 from nerfcli.render.trained_field import TrainedField
 
 RAYS_PER_TILE = 2**14
@@ -209,3 +209,42 @@ def depth_maps_of(
     distances = requested(depth, ends, background_distance=background_distance * factor)
     maps = (distances, spread(depth, ends), disagreement(depth, ends), median(depth, ends))
     return tuple(torch.where(valid & ahead, values, torch.nan) for values in maps)
+
+
+class Renderable(Protocol):
+    """A model of a scene, in the scene's frame; `Model` and `splats.render.SplatScene` are such."""
+
+    @property
+    def background(self) -> Background:
+        """SRGB behind everything, for pictures without alpha."""
+        ...
+
+    @property
+    def unit(self) -> str:
+        """Unit of length, "arbitrary" or "metre"."""
+        ...
+
+    @property
+    def unit_source(self) -> str | None:
+        """How the metre is known; None where unknown."""
+        ...
+
+    @property
+    def thread_safe(self) -> bool:
+        """Whether several threads may render it at the same time."""
+        ...
+
+    def render(
+        self,
+        frame: Frame,
+        *,
+        background: Background,
+        depth: DepthRequest | None = None,
+        on_tile: Callable[[int], None] | None = None,
+    ) -> RenderedPicture:
+        """Render a frame; see `render_picture`."""
+        ...
+
+    def measured_error(self, frame: Frame, *, depth: DepthRequest | None) -> dict[str, float]:
+        """Return numbers on the accuracy of the rendering; see `accuracy`."""
+        ...

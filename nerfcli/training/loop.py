@@ -1,15 +1,12 @@
 """The training of a scene from photos to checkpoint, within a budget of time or steps; masks of what is left out."""
 
-import resource
 import shutil
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from nerfcli import distributed, kernels
 from nerfcli.atomic import cannot_write
@@ -17,6 +14,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.errors import LOST_RANK, UserError
 from nerfcli.field.kinds import field_bytes
 from nerfcli.interrupts import deferred_interrupts
+from nerfcli.machine import peak_resident_bytes, use_threads
 from nerfcli.photos.masks import write_masks
 from nerfcli.training.checkpoints import (
     Checkpoints,
@@ -115,7 +113,7 @@ def train(
             that cannot be written, or another process that has ended; a checkpoint has then been written.
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
-    torch.set_num_threads(settings.threads)
+    use_threads(settings.threads)
     kernels.prepare(notify, settings.device)
     saved, begun = distributed.from_first(lambda: read_checkpoint(run, settings) if resume else (None, None))
     # A training resumed with a larger budget keeps its number of rows.
@@ -213,7 +211,7 @@ def _run(
             "rays": totals.rays,
             "samples_per_second": round(samples_per_second),
             "rays_per_second": round(rays_per_second),
-            "peak_memory_bytes": peak_memory_bytes(),
+            "peak_memory_bytes": peak_resident_bytes(),
             "rollbacks": fitting.rollbacks,
         }
         append_log(run, entry)
@@ -252,9 +250,3 @@ def _run(
         # An interrupt may come before the last steps are logged, and a resumed training may have no step left to log.
         if totals.seconds > logged_seconds:
             log()
-
-
-def peak_memory_bytes() -> int:
-    """Return the peak resident memory of this process."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere else

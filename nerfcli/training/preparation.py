@@ -16,9 +16,9 @@ from nerfcli import distributed
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.loading import refuse_without_training_photos
 from nerfcli.errors import UserError
+from nerfcli.machine import default_memory_limit
 from nerfcli.matching.correspondences import SharedFeatures
 from nerfcli.matching.tracks import triangulate
-from nerfcli.memory import default_memory_limit
 from nerfcli.photos.exif import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.training.evidence import LEARN_FOCAL, Evidence, TrainingPhotos, collect_evidence, tracks_of_model
 from nerfcli.training.extent import Extent, choose_extent, lacks_depth

@@ -23,6 +23,7 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.kinds import settings_from_json
+from nerfcli.machine import use_threads
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.extent import Extent
 from nerfcli.training.fitting import Fitting, StepResult, TrainingInputs
@@ -265,7 +266,7 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
             "give a failure-STEP.safetensors file of a run",
         )
     settings = replace(TrainSettings.from_json(description["settings"]), device="cpu")
-    torch.set_num_threads(settings.threads)
+    use_threads(settings.threads)
     size = settings_from_json(description["state"]["field"])
     marching, parallax = Marching(**description["marching"]), description.get("parallax", 1.0)
     extent = Extent(size.contraction, Similarity.identity(), marching, parallax=parallax)

@@ -18,7 +18,7 @@ import torch
 from nerfcli.atomic import cannot_write
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.memory import resident_bytes
+from nerfcli.machine import resident_bytes
 from nerfcli.training.runs.settings import TrainSettings
 
 
@@ -55,7 +55,7 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     step = 7 * field_bytes(settings) + 6000 * settings.samples_per_step
     # To decode a photo: Pillow's picture, the array, and the intermediate results of downscaling.
     rest = 12 * largest * min(settings.threads, len(frames)) + step
-    return MemoryNeeds(photos, step, rest + resident_bytes(os.getpid()))
+    return MemoryNeeds(photos, step, rest + resident_bytes())
 
 
 def field_bytes(settings: TrainSettings) -> int:
@@ -111,7 +111,7 @@ class InFiles:
 
     def release_pages(self) -> None:
         """Release pages if too much memory is resident."""
-        if resident_bytes(os.getpid()) > self._limit:
+        if resident_bytes() > self._limit:
             for pages in self._maps:
                 with suppress(AttributeError, ValueError):  # not available on every system
                     pages.madvise(mmap.MADV_DONTNEED)

@@ -19,8 +19,7 @@ from nerfcli.render.model import Model
 from nerfcli.render.tracing import TOLERANCE
 from nerfcli.version import __version__
 from nerfcli.viewer.packing import PackedField
-from nerfcli.viewer.pictures import PagePhotos, frustum_depth, view_of
-from nerfcli.viewer.proof import Proof
+from nerfcli.viewer.pictures import Proof, frustum_depth, view_of
 
 FORMAT = "nerfcli page 1"
 SCRIPTS = ("geometry.js", "field.js", "render.js", "schedule.js", "walk.js", "path.js", "overlay.js", "check.js")
@@ -47,54 +46,40 @@ class PageNumbers:
         return cls(description, "\n".join(starmap(array_element, arrays.items())))
 
 
-def page_html(
-    model: Model,
-    numbers: PageNumbers,
-    *,
-    run: Path,
-    frames: Sequence[Frame],
-    photos: PagePhotos,
-    box: Sequence[float],
-) -> str:
+def page_html(scene: dict[str, Any], numbers: PageNumbers) -> str:
     """Return the text of a page that needs no server.
 
     Args:
+        scene: see `scene_of`, with the photos of `pictures.page_photos`.
         numbers: its field, and the proof that the page compares its rendering with.
-        run: the folder; the page shows its name.
-        frames: pinhole frames, at least one; the first view is that of the middle one.
-        box: low and high corner of the initial crop box, scene units.
     """
-    scene = _scene(model, run=run, frames=frames, photos=photos.entries, box=box) | numbers.description
-    return _html(scene, numbers.elements, run=run, connect=False)
+    return _html(scene | numbers.description, numbers.elements, connect=False)
 
 
-def live_page_html(
-    model: Model,
-    *,
-    run: Path,
-    frames: Sequence[Frame],
-    photos: Sequence[dict[str, Any]],
-    box: Sequence[float],
-    version: int,
-    refusal: str | None,
-) -> str:
+def live_page_html(scene: dict[str, Any], *, version: int, refusal: str | None, far: float) -> str:
     """Return the text of a page that fetches its field and pictures from the server that sent it.
 
     Args:
-        model, run, frames, box: as for `page_html`.
-        photos: see `pictures.fetched_photos`.
+        scene: see `scene_of`, with the photos of `pictures.fetched_photos`.
         version: version of the field, see `server.PageData.version`.
         refusal: reason why the page cannot draw this field itself; None if it can.
+        far: end of the rays, training frame.
     """
-    scene = _scene(model, run=run, frames=frames, photos=photos, box=box)
-    scene |= {"live": {"refusal": refusal, "version": version}, "march": {"far": model.marching.far}}
-    return _html(scene, "", run=run, connect=True)
+    live = {"live": {"refusal": refusal, "version": version}, "march": {"far": far}}
+    return _html(scene | live, "", connect=True)
 
 
-def _scene(
+def scene_of(
     model: Model, *, run: Path, frames: Sequence[Frame], photos: Sequence[dict[str, Any]], box: Sequence[float]
 ) -> dict[str, Any]:
-    """Return the plain values that both kinds of page contain."""
+    """Return the plain values that both kinds of page contain.
+
+    Args:
+        run: the folder; the page shows its name.
+        frames: pinhole frames, at least one; the first view is that of the middle one.
+        photos: entries of `pictures`.
+        box: low and high corner of the initial crop box, scene units.
+    """
     size = 1.0 / model.training_from_scene.scale
     home = view_of(frames[len(frames) // 2])
     unit = {"metre": "metres", "arbitrary": "arbitrary units"}.get(model.unit, model.unit)
@@ -117,7 +102,7 @@ def _scene(
     }
 
 
-def _html(scene: dict[str, Any], numbers: str, *, run: Path, connect: bool) -> str:
+def _html(scene: dict[str, Any], numbers: str, *, connect: bool) -> str:
     """Assemble the HTML page around a scene description."""
     shaders = "".join(
         f'<script type="x-shader/x-fragment" id="{part}">{_text(f"{part}.glsl")}</script>' for part in ("trace", "show")
@@ -135,7 +120,7 @@ def _html(scene: dict[str, Any], numbers: str, *, run: Path, connect: bool) -> s
     script = "\n".join(_text(part).replace('"use strict";\n', "") for part in parts)
     return page.page_html(
         title=scene["run"],
-        mark=page.Mark("page", run),
+        mark=page.Mark("page", Path(scene["run"])),
         style=_text("page.css"),
         body=body,
         script=f'"use strict";\n{script}',

@@ -20,10 +20,10 @@ import torch
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.field.background import colours_behind
+from nerfcli.machine import use_threads
 from nerfcli.render.depth import MEDIAN
 from nerfcli.render.model import Model
-from nerfcli.render.rays import pixel_rays
-from nerfcli.render.tracing import render_rays
+from nerfcli.render.tracing import pixel_rays, render_rays
 
 # Target times of a tile, and of the first picture of a view, which is as coarse as needed to be done in that time.
 TILE_SECONDS = 0.02
@@ -208,7 +208,7 @@ class Painter:
                     del self._newest[client]
 
     def _work(self) -> None:
-        torch.set_num_threads(self._threads)  # OpenMP keeps a thread count for each calling thread
+        use_threads(self._threads)  # OpenMP keeps a thread count for each calling thread
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting)

@@ -1,4 +1,4 @@
-"""The photos of a run for its page: all cameras, and pictures of as many and as large as space permits."""
+"""Pictures of the page: photos of the run, and reference pictures by which a page checks its own."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -6,14 +6,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial import KDTree
 
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of
 from nerfcli.pages.page import data_uri, jpeg_bytes
 from nerfcli.photos.loading import load_photo, pinhole_of, undistorted
+from nerfcli.render.depth import DepthRequest
 from nerfcli.render.held_out_exposure import log_gains_of
 from nerfcli.render.model import Model
+from nerfcli.render.pictures import render_picture
 
 # Longer sides to try, in pixels, and the JPEG quality.
 LONGEST_PX = (800, 640, 480, 360, 280, 200, 140)
@@ -46,7 +50,6 @@ def page_photos(
     test: Sequence[Frame],
     *,
     room_bytes: int,
-    threads: int = 1,
     on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> PagePhotos:
     """Return the photos of a run, undistorted to pinhole cameras, sorted by name.
@@ -60,7 +63,7 @@ def page_photos(
     shown = [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST_PICTURES)).astype(int))]
     longest = _longest(frames, shown, room_bytes)
     pictures = {}
-    with ThreadPoolExecutor(max(1, threads)) as pool:
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         of = shown if longest else []
         encoded = pool.map(lambda index: jpeg_bytes(_small_photo(frames[index][0], longest), quality=QUALITY), of)
         for count, (index, jpeg) in enumerate(zip(of, encoded, strict=True)):
@@ -155,3 +158,66 @@ def _small_photo(frame: Frame, longest_px: int) -> np.ndarray:
         alpha = pixels[..., 3:] / _WHITE
         pixels = np.rint(pixels[..., :3] * alpha + _WHITE * (1 - alpha)).astype(np.uint8)
     return pixels
+
+
+WIDTH, HEIGHT = 64, 48
+CAMERAS = 3
+FRACTION = 0.25
+# Maps of the proof after the colour, in this order; see `compare` in check.js.
+MAPS = (
+    *("opacity", "conditional", "median", "max-weight", "moment", "background", "quantile"),
+    *("spread", "disagreement"),
+)
+
+
+@dataclass(frozen=True)
+class Proof:
+    """Reference pictures for the page.
+
+    Args:
+        description: cameras and maps, plain values.
+        expected: float32, by camera, then map, then row; depths along the optical axis in scene units, NaN where
+            undefined.
+    """
+
+    description: dict[str, Any]
+    expected: np.ndarray
+
+
+def make_proof(model: Model, frames: Sequence[Frame]) -> Proof:
+    """Render the proof of a model: small pinhole pictures of a few frames, spread evenly.
+
+    Args:
+        frames: pinhole frames, at least one.
+    """
+    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, CAMERAS).astype(int))]
+    small = [Frame(frame.name, _small(frame.camera), frame.world_from_cam) for frame in chosen]
+    columns = [values for frame in small for values in _maps(model, frame)]
+    description = {
+        "width": WIDTH,
+        "height": HEIGHT,
+        "share": FRACTION,
+        "maps": list(MAPS),
+        "cameras": [view_of(frame) for frame in small],
+    }
+    return Proof(description, np.concatenate(columns).astype("<f4"))
+
+
+def _small(camera: Camera) -> Camera:
+    """Return a 64 x 48 pinhole camera with the view cropped to that aspect ratio."""
+    scale = max(WIDTH / camera.width, HEIGHT / camera.height)
+    return Camera.pinhole(WIDTH, HEIGHT, camera.focal_px * scale)
+
+
+def _maps(model: Model, frame: Frame) -> list[np.ndarray]:
+    """Render the colour and `MAPS` of one camera as `nerfcli render` does, each flattened."""
+    farthest = model.marching.far / model.training_from_scene.scale
+    pictures = {}
+    for name in ("conditional", "max-weight", "moment", "background", "quantile"):
+        convention = f"quantile:{FRACTION}" if name == "quantile" else name
+        request = DepthRequest(convention, "z", background_distance=farthest)
+        pictures[name] = render_picture(model, frame, background=model.background, depth=request)
+    first = pictures["conditional"]
+    maps = {name: getattr(first, name) for name in ("opacity", "median", "spread", "disagreement")}
+    maps |= {name: picture.depth for name, picture in pictures.items()}
+    return [first.rgb.reshape(-1), *(np.asarray(maps[name]).reshape(-1) for name in MAPS)]

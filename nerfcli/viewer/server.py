@@ -6,6 +6,7 @@ import secrets
 import socket
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Protocol
@@ -47,13 +48,29 @@ class PageData(Protocol):
         ...
 
 
+# Only this machine can reach it.
+LOCAL = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the server listens.
+
+    Args:
+        host: an address of this machine; the default can be reached only from it.
+        port: None for the first free one from `FIRST_PORT` on.
+    """
+
+    host: str = LOCAL
+    port: int | None = None
+
+
 class PageServer(ThreadingHTTPServer):
     """Serves a show.
 
     Args:
         show: the data source.
-        host: the address to listen on.
-        port: the port; None for the first free one from `FIRST_PORT` on.
+        address: where to listen.
 
     Raises:
         UserError: the port is taken, or the address does not exist.
@@ -63,7 +80,8 @@ class PageServer(ThreadingHTTPServer):
     # On Windows this option would let a second server take the port of the first.
     allow_reuse_address = sys.platform != "win32"
 
-    def __init__(self, show: PageData, *, host: str, port: int | None):
+    def __init__(self, show: PageData, address: Address):
+        host, port = address.host, address.port
         self.show = show
         self.token = secrets.token_urlsafe(16)
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -24,7 +24,9 @@ from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
 from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.evaluate.sampled import SampledPixels
-from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.machine import default_memory_limit
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.photos.exif import mean_log_exposure, relative_log_exposures
 from nerfcli.photos.images import read_image
 from nerfcli.training.runs.files import STATE
@@ -37,25 +39,20 @@ _SAME = "; the same pixels for all variants of a seed, other pixels for each see
 
 def ablate_scene(
     path: Path,
-    folder: Path,
+    output: Output,
     settings: TrainSettings,
     *,
     seeds: int,
     only: tuple[str, ...] = (),
-    memory_bytes: int | None = None,
-    overwrite: bool = False,
-    notify: Notify = silent,
-    warn: Notify = warn_python,
-    progress: Progress = no_progress,
+    reporter: Reporter = Reporter(),
 ) -> dict[str, Any]:
     """Train and measure every variant with every seed, continue an earlier call, and write the table after each.
 
     Args:
-        folder: the folder to write the table and the runs into.
+        output: the folder to write the table and the runs into, SCENE-ablation by default.
         settings: of all trainings; with `model` "auto", the components are first selected for the scene.
         seeds: number of seeds, counted up from the seed of the settings.
         only: components to vary; all if empty.
-        memory_bytes: limit of a training's resident memory, or of the memory that it uses on a GPU.
 
     Returns:
         The content of ablation.json.
@@ -66,20 +63,21 @@ def ablate_scene(
     scene = load_scene(path)
     if not scene.test_frames:
         raise UserError(f"{path} has no held-out photos", "by default every 8th photo is held out; check its split")
+    folder = output.beside(path, "-ablation")
     refuse_foreign(folder)
 
     def trained(name: str, settings: TrainSettings) -> Run:
         """Return a run with these settings, trained now or by an earlier call."""
         target = folder / RUNS / f"{name}-{settings.seed}"
-        resume = not overwrite and was_interrupted(path, target, settings)
+        resume = not output.overwrite and was_interrupted(path, target, settings)
         run = train_scene(
             path,
             target,
             settings,
-            memory_bytes=memory_bytes,
+            memory_bytes=default_memory_limit(settings.device),
             resume=resume,
-            overwrite=overwrite,
-            warn=warn,
+            overwrite=output.overwrite,
+            warn=reporter.warn,
         )
         # The training state is three times as large as the field, and complete trainings are not resumed.
         (target / STATE).unlink(missing_ok=True)
@@ -91,22 +89,22 @@ def ablate_scene(
     rows = rows_of(measured, compared)
     write_results(folder, rows, measured, about)
     if settings.model == "auto":
-        progress(0.0, "selecting components for this scene")
+        reporter.progress(0.0, "selecting components for this scene")
         run = trained(AUTO, settings)
         compared.append(Variant(AUTO, settings.components))
         measured.append(_measured(run, AUTO, settings))
         settings = replace(settings, model="default", components=run.components, fixed=())
         about["chosen"] = asdict(settings.components)
-        notify(_line(measured[-1]))
+        reporter.note(_line(measured[-1]))
     models = [Variant(CHOSEN, settings.components)]
     models += variants(settings.components, _capture(scene), only=only)
     compared[:0] = models
     todo = [(seed, one) for seed in range(settings.seed, settings.seed + seeds) for one in models]
     for number, (seed, variant) in enumerate(todo):
-        progress(number / len(todo), f"{variant.name}, seed {seed} ({number + 1} of {len(todo)})")
+        reporter.progress(number / len(todo), f"{variant.name}, seed {seed} ({number + 1} of {len(todo)})")
         wanted = replace(settings, components=variant.components, seed=seed)
         measured.append(_measured(trained(variant.name, wanted), variant.name, wanted))
-        notify(_line(measured[-1]))
+        reporter.note(_line(measured[-1]))
         about["complete"] = number + 1 == len(todo)
         rows = rows_of(measured, compared)
         write_results(folder, rows, measured, about)

@@ -13,7 +13,7 @@ from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.captures.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.captures.world_frame import WorldFrame, in_world_frame
 from nerfcli.errors import several
-from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.notices import Reporter
 from nerfcli.photos.images import HEIC_SUFFIXES
 
 
@@ -25,8 +25,7 @@ def convert_capture(
     given: UserInputs = UserInputs(),
     overrides: ConventionOverrides = ConventionOverrides(),
     world: WorldFrame = WorldFrame(),
-    notify: Notify = silent,
-    warn: Notify = warn_python,
+    reporter: Reporter = Reporter(),
 ) -> tuple[Conversion, dict[str, Any]]:
     """Convert one capture; return the conversion, and its record as plain values.
 
@@ -40,17 +39,17 @@ def convert_capture(
     """
     to = wanted.form.name
     form, found, capture = load(source, given, overrides)
-    notify(f"{found}: {form.name}, {contents(capture)}")
+    reporter.note(f"{found}: {form.name}, {contents(capture)}")
     for text in describe_rescaling(other_sizes(capture)):
-        notify(f"{text.removesuffix(': rescaled')}; written to {to} unchanged")
+        reporter.note(f"{text.removesuffix(': rescaled')}; written to {to} unchanged")
     if text := _describe_outside(capture):
-        warn(text)
+        reporter.warn(text)
     moved = in_world_frame(capture, world)
     scale = moved.scale
     if scale is not None:
         error = "" if scale.standard_error is None else f" ± {scale.standard_error:.2g}"
         unit = "%" if scale.residual_unit == "percent" else "m"
-        notify(
+        reporter.note(
             f"one scene unit is {scale.metres_per_unit:.6g}{error} metres, from {scale.source}; residual "
             f"{scale.rms_residual:.2g} {unit}" + (f"; {scale.details}" if scale.details else "")
         )
@@ -58,15 +57,15 @@ def convert_capture(
     wanted = replace(wanted, form=recording(wanted.form, {"source": str(found), **frame}))
     done = convert(moved.capture, target, source_format=form.name, wanted=wanted)
     for text in done.notes:
-        notify(text)
+        reporter.note(text)
     if to != "nerfcli" and any(
         f.image is not None and f.image.suffix.lower() in HEIC_SUFFIXES for f in done.capture.frames
     ):
-        notify("the photos are HEIC, which many other programs cannot read")
+        reporter.note("the photos are HEIC, which many other programs cannot read")
     for loss in done.losses:
-        warn(f"{to} cannot hold {loss}")
+        reporter.warn(f"{to} cannot hold {loss}")
     if done.loss_px > TOLERANCE_PX:
-        warn(f"dropping lens parameters shifts pixels by up to {done.loss_px:.3g} px")
+        reporter.warn(f"dropping lens parameters shifts pixels by up to {done.loss_px:.3g} px")
     return done, _record(done, to) | frame
 
 
@@ -90,8 +89,7 @@ def detect_convention(
     *,
     given: UserInputs = UserInputs(),
     overrides: ConventionOverrides = ConventionOverrides(),
-    notify: Notify = silent,
-    progress: Progress = no_progress,
+    reporter: Reporter = Reporter(),
 ) -> tuple[Format, detect.Detection]:
     """Detect the format of a capture, and the convention that its numbers follow.
 
@@ -99,8 +97,8 @@ def detect_convention(
         UserError: the capture cannot be read, or there is too little evidence.
     """
     form, found, capture = load(source, given, overrides)
-    notify(f"{found}: {form.name}, {contents(capture)}")
-    return form, detect.detect(in_pixels(capture, STORED).capture, axes=form.axes, progress=progress)
+    reporter.note(f"{found}: {form.name}, {contents(capture)}")
+    return form, detect.detect(in_pixels(capture, STORED).capture, axes=form.axes, progress=reporter.progress)
 
 
 def options_of(found: detect.Detection) -> str:

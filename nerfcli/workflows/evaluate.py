@@ -7,8 +7,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from nerfcli.atomic import atomic_folder, clear_leftovers, read_json, refuse_read_only, write_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import GATE_NOT_MET, UserError
@@ -18,8 +16,9 @@ from nerfcli.evaluate.predictions import INFO, PREDICTIONS, predictions_are_ther
 from nerfcli.evaluate.protocol import PROTOCOL, ComparedImages, Extras, evaluate_model
 from nerfcli.evaluate.requirements import WHY_ABSENT, Requirement, known_numbers, unmet
 from nerfcli.evaluate.run_photos import held_out_photos_of, training_billboards
-from nerfcli.machine import device_name, thread_count
-from nerfcli.notices import Notify, Progress, no_progress, silent
+from nerfcli.machine import Resources
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.render.job import file_names
 from nerfcli.training.runs.files import LOG
 from nerfcli.training.runs.run import Run
@@ -44,13 +43,11 @@ class Evaluation:
 
 def evaluate_run(
     run: str | Path,
+    output: Output = Output(),
     *,
-    device: str = "auto",
-    threads: int = 0,
-    overwrite: bool = False,
     predictions: str | None = None,
-    notify: Notify = silent,
-    progress: Progress = no_progress,
+    resources: Resources = Resources(),
+    reporter: Reporter = Reporter(),
 ) -> Evaluation:
     """Write RUN/metrics.json, or keep an existing one of the same checkpoint.
 
@@ -61,46 +58,39 @@ def evaluate_run(
 
     Args:
         run: the folder that `train_scene` wrote.
-        device: "auto", "cpu", "cuda" or "cuda:1".
-        threads: number of CPU threads; 0 for all.
-        overwrite: measure again.
+        output: the file to write, RUN/metrics.json by default.
         predictions: "png" saves the compared pictures in RUN/predictions, "float" also unrounded ones; None saves none.
-        notify: called with lines for the user.
-        progress: called with the fraction of the rays that is done, and a short text.
+        resources: threads and device.
+        reporter: told what happens, and the fraction of the rays that is done.
 
     Raises:
         UserError: the folder is not a run, its split is not the one it was trained with, a photo cannot be read, or
             existing metrics are of another checkpoint or lack the predictions.
     """
     trained = Run(Path(run))
-    cores, torch_device = thread_count(threads), device_name(device)
-    torch.set_num_threads(cores)
+    path, torch_device, cores = output.at(trained.metrics_path), resources.torch_device, resources.begin()
     trained.check_split()
     clear_leftovers(trained.path)
     model = trained.model(torch_device)
     checkpoint = model.sha256
     assert checkpoint is not None
-    if trained.metrics_path.exists() and not overwrite:
-        metrics = _kept(trained.metrics_path, checkpoint, predictions=predictions)
-        made_by = metrics["protocol"].split(":")[0]
-        older = "" if made_by == PROTOCOL else f" (by {made_by})"
-        notify(f"{trained.metrics_path} is kept{older}: it is up to date; add --overwrite to evaluate again")
-        return Evaluation(trained.metrics_path, metrics, is_kept=True)
+    if (kept := _kept(path, checkpoint, output, reporter, predictions=predictions)) is not None:
+        return kept
 
     summary = trained.summary
     if summary is None:
         raise UserError(f"{trained.path} has no {LOG}, which records the training time", "train again with --overwrite")
-    refuse_read_only(trained.metrics_path)
+    refuse_read_only(path)
     test = trained.cameras.test
     held_out = held_out_photos_of(trained.config, test, model, threads=cores)
-    perceptual = find_perceptual(notify)
-    billboards = training_billboards(trained, notify=notify)
-    progress(0.0, "")
+    perceptual = find_perceptual(reporter.note)
+    billboards = training_billboards(trained, notify=reporter.note)
+    reporter.progress(0.0, "")
     with saved_predictions(trained.path, test, predictions, checkpoint=checkpoint) as keep:
         metrics = evaluate_model(
             model,
             held_out,
-            on_image=lambda done, total: progress(done / total, f"of {total} rays"),
+            on_image=lambda done, total: reporter.progress(done / total, f"of {total} rays"),
             extras=Extras(trained.cameras.train, perceptual, billboards, keep),
         )
     metrics["training"] = asdict(summary)
@@ -109,45 +99,42 @@ def evaluate_run(
     metrics["split_sha256"] = trained.config.split_sha256
     metrics["device"] = f"{torch_device}, {cores} threads, {platform.machine()}"
     metrics["checkpoint_sha256"] = checkpoint
-    write_json(trained.metrics_path, metrics)
-    return Evaluation(trained.metrics_path, metrics, is_kept=False)
+    write_json(path, metrics)
+    return Evaluation(path, metrics, is_kept=False)
 
 
 def evaluate_splats(
     run: str | Path,
     splats: str | Path,
+    output: Output = Output(),
     *,
-    threads: int = 0,
-    overwrite: bool = False,
-    notify: Notify = silent,
-    progress: Progress = no_progress,
+    resources: Resources = Resources(),
+    reporter: Reporter = Reporter(),
 ) -> Evaluation:
     """Measure splats on the held-out photos of a run by the protocol of `evaluate_run`: RUN/metrics-FILE.json.
 
     Args:
         run: the folder that `train_scene` wrote.
         splats: a .ply or .spz.
-        threads, overwrite, notify, progress: see `evaluate_run`.
+        output: the file to write, RUN/metrics-FILE.json by default.
+        resources, reporter: see `evaluate_run`.
 
     Raises:
         UserError: as for `evaluate_run`, or the splats cannot be read.
     """
-    trained, file, cores = Run(Path(run)), Path(splats), thread_count(threads)
-    torch.set_num_threads(cores)
+    trained, file, cores = Run(Path(run)), Path(splats), resources.begin()
     trained.check_split()
-    scene, digest = load_splats(file, notify=notify), file_digest(file)
-    path = trained.path / f"metrics-{file.name}.json"
-    if path.exists() and not overwrite:
-        metrics = _kept(path, digest, predictions=None)
-        notify(f"{path} is kept: it is up to date; add --overwrite to evaluate again")
-        return Evaluation(path, metrics, is_kept=True)
+    scene, digest = load_splats(file, notify=reporter.note), file_digest(file)
+    path = output.at(trained.path / f"metrics-{file.name}.json")
+    if (kept := _kept(path, digest, output, reporter)) is not None:
+        return kept
     refuse_read_only(path)
     held_out = held_out_photos_of(trained.config, trained.cameras.test, trained.model(), threads=cores)
     metrics = evaluate_model(
         scene,
         held_out,
-        on_image=lambda done, total: progress(done / total, f"of {total} pixels"),
-        extras=Extras(trained.cameras.train, find_perceptual(notify)),
+        on_image=lambda done, total: reporter.progress(done / total, f"of {total} pixels"),
+        extras=Extras(trained.cameras.train, find_perceptual(reporter.note)),
     )
     metrics["splats"] = {"file": file.name, "count": len(scene.gaussians), "degree": scene.gaussians.degree}
     metrics["device"] = f"cpu, {cores} threads, {platform.machine()}"
@@ -196,8 +183,12 @@ def saved_predictions(
         write_json(folder / INFO, {"checkpoint_sha256": checkpoint, "kind": kind, "files": stems})
 
 
-def _kept(path: Path, checkpoint: str, *, predictions: str | None) -> dict[str, Any]:
-    """Return existing metrics; raise if they are of another checkpoint or lack the predictions."""
+def _kept(
+    path: Path, checkpoint: str, output: Output, reporter: Reporter, *, predictions: str | None = None
+) -> Evaluation | None:
+    """Return existing metrics that stay; raise if they are of another checkpoint or lack the predictions."""
+    if output.overwrite or not path.exists():
+        return None
     metrics = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to evaluate again")
     if metrics.get("checkpoint_sha256") != checkpoint:
         raise UserError(f"{path} belongs to an earlier checkpoint or file", "add --overwrite to replace it")
@@ -205,4 +196,7 @@ def _kept(path: Path, checkpoint: str, *, predictions: str | None) -> dict[str, 
         path.with_name(PREDICTIONS), predictions, checkpoint=checkpoint
     ):
         raise UserError(f"{path} was written without saved predictions", "add --overwrite to evaluate again")
-    return metrics
+    made_by = metrics["protocol"].split(":")[0]
+    older = "" if made_by == PROTOCOL else f" (by {made_by})"
+    reporter.note(f"{path} is kept{older}: it is up to date; add --overwrite to evaluate again")
+    return Evaluation(path, metrics, is_kept=True)

@@ -1,25 +1,32 @@
 """Export a run to files that other programs open: a page, a mesh, points, splats."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 
-from nerfcli.atomic import cannot_write, refuse_read_only
 from nerfcli.errors import UserError
-from nerfcli.export.extent import SurfaceSettings, check_box, scene_box
-from nerfcli.machine import device_name, thread_count
-from nerfcli.notices import Notify, Progress, no_progress, part_of, silent
+from nerfcli.export.depth_views import DepthView, depth_views, spread_frames, surface_colours
+from nerfcli.export.extent import MOST_VIEWS, Grid, SurfaceSettings, automatic_voxel, check_box, scene_box
+from nerfcli.export.fusion import agreed_points, fuse
+from nerfcli.export.meshes import Mesh, simplified, surface_of, without_small_pieces, write_glb, write_obj
+from nerfcli.machine import Resources
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.pages.page import write_page
 from nerfcli.photos.loading import pinhole_frame
+from nerfcli.ply import write_ply
+from nerfcli.render.coverage import coverage_and_parallax
 from nerfcli.render.model import Model
 from nerfcli.training.runs.run import Run
+from nerfcli.version import __version__
 from nerfcli.viewer.packing import pack_model, seen_cells
-from nerfcli.viewer.page import PageNumbers, page_html
-from nerfcli.viewer.pictures import page_photos
-from nerfcli.viewer.proof import make_proof
-from nerfcli.workflows.export_geometry import export_mesh, export_points
+from nerfcli.viewer.page import PageNumbers, page_html, scene_of
+from nerfcli.viewer.pictures import make_proof, page_photos
 from nerfcli.workflows.photo_depths import photo_depths
-from nerfcli.workflows.splats import SplatSettings, export_splats
+from nerfcli.workflows.splats import SplatSettings, export_splats, y_up_from_scene
 
 # Maximum size of a page; the field comes first, and photos get the rest.
 PAGE_BYTES = 9_700_000
@@ -30,21 +37,17 @@ TARGETS = {
     "points": (".ply",),
     "splats": (".ply", ".spz", ".html"),
 }
-SURFACE, SPLATS = SurfaceSettings(), SplatSettings()
 
 
 def export_run(
     run: str | Path,
-    target: str | Path | None = None,
+    output: Output = Output(),
     *,
     to: str,
-    settings: SurfaceSettings = SURFACE,
-    splats: SplatSettings = SPLATS,
-    device: str = "auto",
-    threads: int = 0,
-    overwrite: bool = False,
-    notify: Notify = silent,
-    progress: Progress = no_progress,
+    settings: SurfaceSettings = SurfaceSettings(),
+    splats: SplatSettings = SplatSettings(),
+    resources: Resources = Resources(),
+    reporter: Reporter = Reporter(),
 ) -> Path:
     """Export a run to a file that other programs open.
 
@@ -54,38 +57,36 @@ def export_run(
 
     Args:
         run: the folder that `train_scene` wrote.
-        target: the file to write, whose suffix chooses among the formats of `to`; beside the run by default.
+        output: the file to write, whose suffix chooses among the formats of `to`; beside the run by default.
         to: one of `TARGETS`.
         settings: region and resolution of a geometry.
         splats: number, refinement and frame of splats.
-        device: "auto", "cpu", "cuda" or "cuda:1".
-        threads: number of CPU threads; 0 for all.
-        overwrite: replace an existing export at `target`.
-        notify: called with lines for the user.
-        progress: called with the fraction of the work that is done, and a short text.
+        resources: threads and device.
+        reporter: told what happens, and the fraction of the work that is done.
 
     Returns:
         The path that was written.
 
     Raises:
-        UserError: the run does not exist, `target` exists, or the field cannot be exported this way.
+        UserError: the run does not exist, the output exists, or the field cannot be exported this way.
     """
-    trained, torch_device = Run(Path(run)), device_name(device)
-    path = Path(target) if target is not None else default_target(trained.path, to)
+    trained, torch_device = Run(Path(run)), resources.torch_device
+    path = output.at(default_target(trained.path, to))
     suffixes = TARGETS[to]
     if path.suffix.lower() not in suffixes:
         raise UserError(f"{path} does not have the suffix of a {to}", f"use one of {', '.join(suffixes)}", exit_code=2)
     if settings.box is not None:
         check_box(settings.box)
     _ = trained.config
-    _refuse_existing(path, overwrite=overwrite)
-    torch.set_num_threads(thread_count(threads))
+    output.claim_file(path)
+    resources.begin()
     model = trained.model(torch_device)
-    progress(0.0, "")
+    reporter.progress(0.0, "")
     if to == "splats":
-        export_splats(trained, model, path, settings=splats, notify=notify, progress=progress)
+        export_splats(trained, model, path, settings=splats, reporter=reporter)
     else:
-        _EXPORTS[to](trained, model, path, settings=settings, notify=notify, progress=progress)
+        write = {"page": _export_page, "mesh": _export_mesh, "points": _export_points}[to]
+        write(trained, model, path, settings=settings, reporter=reporter)
     return path
 
 
@@ -96,36 +97,16 @@ def default_target(run: Path, to: str, suffix: str | None = None) -> Path:
     return (run if run.name not in ("", "..") else place).with_name(name + (suffix or TARGETS[to][0]))
 
 
-def _refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Refuse an output path that exists, unless it may be replaced; create its parent folder.
-
-    Raises:
-        UserError: the path exists, or cannot be written.
-    """
-    if path.is_dir():
-        raise UserError(f"{path} is a folder", "give a file name with -o")
-    if path.exists() and not overwrite:
-        raise UserError(f"{path} exists", "add --overwrite to replace it, or choose another path with -o")
-    if not path.resolve().parent.is_dir():
-        try:
-            path.resolve().parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise cannot_write(path, error) from error
-    refuse_read_only(path)
-
-
-def _export_page(
-    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
-) -> None:
+def _export_page(run: Run, model: Model, path: Path, *, settings: SurfaceSettings, reporter: Reporter) -> None:
     """Write the run as a page."""
     packed = pack_model(model)
     cameras = run.cameras
     frames = [pinhole_frame(frame) for frame in (*cameras.train, *cameras.test)]
     box = settings.box or scene_box(model, frames)
     proof = make_proof(model, frames)
-    progress(0.1, "depths of the training photos")
-    depths = part_of(progress, 0.1, 0.4, "depths of the training photos")
-    seen = photo_depths(run, model, on_progress=depths, notify=notify)
+    reporter.progress(0.1, "depths of the training photos")
+    depths = reporter.part(0.1, 0.4, "depths of the training photos")
+    seen = photo_depths(run, model, on_progress=depths, notify=reporter.note)
     numbers = PageNumbers.of(packed, proof, seen_cells(model, seen))
     text_bytes = len(numbers.elements)
     photos = page_photos(
@@ -133,18 +114,134 @@ def _export_page(
         cameras.train,
         cameras.test,
         room_bytes=PAGE_BYTES - text_bytes - 150_000,
-        threads=torch.get_num_threads(),
-        on_progress=part_of(progress, 0.4, 1.0, "photos"),
+        on_progress=reporter.part(0.4, 1.0, "photos"),
     )
     if photos.missing:
-        notify(f"{photos.missing} photos are missing: the page shows only their cameras")
+        reporter.note(f"{photos.missing} photos are missing: the page shows only their cameras")
     if text_bytes > PAGE_BYTES:
-        notify(f"the field alone needs {text_bytes / 1e6:.0f} MB of text: the page is large and contains no photos")
-    write_page(page_html(model, numbers, run=run.path, frames=frames, photos=photos, box=box), path)
+        reporter.note(
+            f"the field alone needs {text_bytes / 1e6:.0f} MB of text: the page is large and contains no photos"
+        )
+    scene = scene_of(model, run=run.path, frames=frames, photos=photos.entries, box=box)
+    write_page(page_html(scene, numbers), path)
 
 
-_EXPORTS = {
-    "page": _export_page,
-    "mesh": export_mesh,
-    "points": export_points,
-}
+FORMAT = "nerfcli geometry 1"
+FRAME = "of the scene, as its cameras have it"
+PARALLAX = "largest angle between the rays of two photos that see the point"
+# Fraction of the work that is spent on rendering depths.
+_DEPTHS = 0.7
+
+
+def _export_mesh(run: Run, model: Model, path: Path, *, settings: SurfaceSettings, reporter: Reporter) -> None:
+    """Write the surface as .ply, .glb or .obj."""
+    views, grid = _seen(run, model, settings, reporter)
+    fused = fuse(views, grid, on_progress=reporter.part(_DEPTHS, 0.9, "fuses"))
+    mesh = without_small_pieces(surface_of(fused, on_progress=reporter.part(0.9, 0.95, "marches")))
+    if not len(mesh.faces):
+        raise UserError("no surface found in the box", "use another --box, a larger --voxel-size, or train longer")
+    found = len(mesh.faces)
+    mesh = simplified(mesh, settings.faces, threads=torch.get_num_threads())
+    reporter.progress(0.97, "colours")
+    colours = surface_colours(model, mesh.vertices, mesh.normals, voxel_size=grid.voxel_size)
+    description = _description(run, model, "mesh", grid) | {
+        "faces_before_simplification": found,
+        "made_by": "truncated signed distances of median depths, marching cubes",
+    }
+    seen: dict[str, np.ndarray] = {}
+    if path.suffix.lower() == ".ply":
+        photos, parallax = coverage_and_parallax([view.distances() for view in views], mesh.vertices)
+        seen = {"photos": photos.astype(np.uint16), "parallax_deg": parallax}
+        description |= {"parallax_deg": PARALLAX}
+    _write_mesh(path, mesh, colours, description, seen=seen, y_up=y_up_from_scene(run))
+    of_found = f" of {found}" if found != len(mesh.faces) else ""
+    reporter.note(f"{len(mesh.faces)} triangles{of_found}, {_grid_in_words(grid, model)}")
+
+
+def _export_points(run: Run, model: Model, path: Path, *, settings: SurfaceSettings, reporter: Reporter) -> None:
+    """Write points of the surfaces as .ply."""
+    views, grid = _seen(run, model, settings, reporter)
+    points = agreed_points(views, grid, on_progress=reporter.part(_DEPTHS, 1.0, "compares"))
+    if not len(points.places):
+        raise UserError("no two photos see the same point in the box", "use another --box, or train longer")
+    columns = dict(zip("xyz", points.places.T, strict=True))
+    columns |= dict(zip(("nx", "ny", "nz"), points.normals.T, strict=True))
+    columns |= dict(zip(("red", "green", "blue"), points.colours.T, strict=True))
+    columns |= {"photos": points.photos, "parallax_deg": points.parallax_deg, "spread": points.spread}
+    described = _description(run, model, "points", grid) | {
+        "parallax_deg": PARALLAX,
+        "spread": "standard deviation of where the light of the pixel ends, in the unit",
+    }
+    write_ply(path, columns, description=described)
+    reporter.note(f"{len(points.places)} points that two photos or more see, {_grid_in_words(grid, model)}")
+
+
+def _seen(run: Run, model: Model, settings: SurfaceSettings, reporter: Reporter) -> tuple[list[DepthView], Grid]:
+    """Return depth maps of the training cameras, and the grid to fuse them in."""
+    chosen = spread_frames(run.cameras.train, MOST_VIEWS)
+    box = settings.box or scene_box(model, run.cameras.train)
+    views = depth_views(
+        model, chosen, max_size=settings.max_size, on_progress=reporter.part(0.02, _DEPTHS, "renders depths")
+    )
+    return views, Grid.over(box, settings.voxel_size or automatic_voxel(views, box))
+
+
+def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any]:
+    """Return the description that an exported file contains."""
+    return {
+        "format": FORMAT,
+        "holds": kind,
+        "frame": FRAME,
+        "box": [*grid.low.tolist(), *grid.high.tolist()],
+        "voxel_size": grid.voxel_size,
+        **_provenance_of(run, model),
+    }
+
+
+def _provenance_of(run: Run, model: Model) -> dict[str, Any]:
+    """Return the unit of lengths and the run of an exported file."""
+    return {
+        "unit": model.unit,
+        "unit_source": model.unit_source,
+        "nerfcli": __version__,
+        "run": run.path.resolve().name,
+        "field_sha256": model.sha256,
+    }
+
+
+def _grid_in_words(grid: Grid, model: Model) -> str:
+    return f"{'x'.join(map(str, grid.shape))} voxels of {grid.voxel_size:.4g} {_unit_of(model)}"
+
+
+def _unit_of(model: Model) -> str:
+    """Return the unit of lengths, for messages."""
+    return "m" if model.unit == "metre" else "units of the scene"
+
+
+def _write_mesh(
+    path: Path,
+    mesh: Mesh,
+    colours: np.ndarray,
+    description: Mapping[str, Any],
+    *,
+    seen: Mapping[str, np.ndarray],
+    y_up: np.ndarray,
+) -> None:
+    match path.suffix.lower():
+        case ".glb":
+            write_glb(
+                path,
+                mesh.vertices,
+                mesh.faces,
+                normals=mesh.normals,
+                colours=colours,
+                y_up_from_frame=y_up,
+                description=description,
+            )
+        case ".obj":
+            write_obj(path, mesh.vertices, mesh.faces, colours=colours, description=description)
+        case _:
+            columns = dict(zip("xyz", mesh.vertices.T, strict=True))
+            columns |= dict(zip(("nx", "ny", "nz"), mesh.normals.astype("<f4").T, strict=True))
+            columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
+            write_ply(path, {**columns, **seen}, faces=mesh.faces, description=description)

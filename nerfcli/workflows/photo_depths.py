@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from nerfcli.atomic import atomic_path, digest, read_sealed, write_sealed
 from nerfcli.cameras.frame import Frame
@@ -60,7 +61,6 @@ def depth_errors(
     model: Model,
     photos: Sequence[DepthMap],
     *,
-    threads: int,
     on_progress: Callable[[float], None],
     notify: Notify,
 ) -> DepthErrors:
@@ -72,7 +72,7 @@ def depth_errors(
     expected = _digest(model.sha256, [*run.cameras.train, *run.cameras.test])
     errors = _read_depth_errors(run.path, expected=expected)
     if errors is None:
-        errors = measure_depth_errors(run, model, photos, threads=threads, on_progress=on_progress)
+        errors = measure_depth_errors(run, model, photos, threads=torch.get_num_threads(), on_progress=on_progress)
         try:
             write_sealed(run.path / DEPTH_ERRORS, {"format": ERRORS_FORMAT, "digest": expected, **errors.to_json()})
         except UserError as error:

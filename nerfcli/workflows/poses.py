@@ -5,7 +5,9 @@ from pathlib import Path
 from nerfcli.captures.calibration import Calibration, read_calibration
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.errors import UserError, duration
-from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.machine import Resources
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.input.plan import Plan, TimeEstimate
 from nerfcli.poses.input.settings import PoseSettings
@@ -34,76 +36,105 @@ _STAGES = {
 
 def estimate_poses(
     photos: str | Path,
-    scene: str | Path,
+    output: Output = Output(),
     settings: PoseSettings = PoseSettings(),
     *,
-    memory_bytes: int | None = None,
-    intrinsics: Calibration | None = None,
-    overwrite: bool = False,
-    notify: Notify = silent,
-    warn: Notify = warn_python,
-    progress: Progress = no_progress,
+    frames: int | None = None,
+    intrinsics: str | Path | None = None,
+    resources: Resources = Resources(),
+    reporter: Reporter = Reporter(),
 ) -> Path:
     """Estimate the poses of one scene, or keep a scene that was made from the same photos with the same settings.
 
     Example:
         >>> import nerfcli
-        >>> folder = nerfcli.estimate_poses("photos", "photos-scene")
+        >>> folder = nerfcli.estimate_poses("photos", nerfcli.Output("photos-scene"))
         >>> len(nerfcli.load_scene(folder).train_frames)
 
     Args:
-        photos: a folder of photos; for a video see `folder_of_photos`.
-        scene: the folder to write.
+        photos: a folder of photos, or a video, whose sharpest frames are first written beside the scene.
+        output: the folder to write; PHOTOS-scene by default.
         settings: features, pairs, seed, threads; by default those of `nerfcli poses`.
-        memory_bytes: limit of the memory of structure from motion; None for no limit.
-        intrinsics: known intrinsics of the cameras, see `given_intrinsics`; None to estimate them.
-        overwrite: replace an existing scene at `scene`.
-        notify, warn: called with lines for the user.
-        progress: called with the fraction done and a short text.
+        frames: number of frames to use from a video; None for 120.
+        intrinsics: file with intrinsics of the cameras, which are kept; None to estimate them.
+        resources: limit of the memory of structure from motion; the threads are those of the settings.
+        reporter: told what happens.
 
     Returns:
         The folder of the scene.
 
     Raises:
-        UserError: see `nerfcli.poses.structure_from_motion.estimate_poses`; or a different scene exists at `scene`.
+        UserError: see `extract_frames`, `read_calibration` and `nerfcli.poses.structure_from_motion.estimate_poses`; or
+            a different scene exists at the output.
     """
-    folder, target = Path(photos), Path(scene)
-    if (target / SCENE_FILE).exists() and not overwrite:
-        if is_same_scene(target, folder, settings, given=intrinsics):
-            notify(
-                f"{target} is kept: it is complete and has these photos and settings; add --overwrite to estimate "
-                "poses again"
+    source = Path(photos)
+    target = output.beside(without_suffix(source), "-scene")
+    folder = source
+    if source.is_file():
+        folder = frames_folder(target)
+        with reporter.stage(f"extract frames of {source.name}") as told:
+            extract_frames(
+                source,
+                folder,
+                count=frames,
+                overwrite=output.overwrite,
+                notify=told.note,
+                progress=told.progress,
             )
-            return target
-        raise UserError(f"{target} exists", "add --overwrite to replace it, or choose another folder with -o")
+    elif frames is not None:
+        reporter.note(f"{source} is not a video: using all of its photos and ignoring --frames")
+    calibration = _given_intrinsics(intrinsics, folder)
+    with reporter.stage(f"poses {folder.name}") as told:
+        return _estimated(folder, target, settings, calibration, output, resources=resources, reporter=told)
+
+
+def _estimated(
+    folder: Path,
+    target: Path,
+    settings: PoseSettings,
+    given: Calibration | None,
+    output: Output,
+    *,
+    resources: Resources,
+    reporter: Reporter,
+) -> Path:
+    """Estimate the poses of a folder of photos; see `estimate_poses`."""
+    if (target / SCENE_FILE).exists() and output.keeps(
+        target, lambda: is_same_scene(target, folder, settings, given=given)
+    ):
+        reporter.note(
+            f"{target} is kept: it is complete and has these photos and settings; add --overwrite to estimate poses "
+            "again"
+        )
+        return target
     time_estimate: TimeEstimate | None = None
 
     def planned(plan: Plan) -> None:
         nonlocal time_estimate
-        notify(plan.describe())
+        reporter.note(plan.describe())
         time_estimate = TimeEstimate(plan)
 
     def on_stage(stage: str, done: int, total: int) -> None:
         fraction, left = (0.0, None) if time_estimate is None else time_estimate.update(stage, done, total)
         about = "" if left is None else f", about {duration(left)} left"
-        progress(fraction, f"({done} of {total} {_STAGES[stage]}{about})")
+        reporter.progress(fraction, f"({done} of {total} {_STAGES[stage]}{about})")
 
     report = structure_from_motion.estimate_poses(
         folder,
         target,
         settings=settings,
-        notify=notify,
+        notify=reporter.note,
         progress=on_stage,
-        memory_bytes=memory_bytes,
+        memory_bytes=resources.memory_limit(),
         planned=planned,
-        given=intrinsics,
+        given=given,
     )
     left_out = [image for image in report.images if not image.registered]
     for image in left_out[:8]:
-        warn(f"{image.name} was not registered: {image.reason}")
+        reporter.warn(f"{image.name} was not registered: {image.reason}")
     if len(left_out) > 8:
-        warn(f"{len(left_out) - 8} more are listed in {target / 'poses_report.json'}")
-    notify(
+        reporter.warn(f"{len(left_out) - 8} more are listed in {target / 'poses_report.json'}")
+    reporter.note(
         f"{target}: {report.registered} of {report.total} photos registered in {report.seconds['total']:.0f} s, "
         f"mean reprojection error {report.mean_reprojection_error_px:.2f} px"
     )
@@ -114,9 +145,8 @@ def plan_scene(
     folder: Path,
     settings: PoseSettings,
     *,
-    intrinsics: Calibration | None = None,
-    notify: Notify = silent,
-    progress: Progress = no_progress,
+    intrinsics: str | Path | None = None,
+    reporter: Reporter = Reporter(),
 ) -> Plan:
     """Plan what `estimate_poses` would do with a folder of photos, and how long it would take.
 
@@ -126,40 +156,17 @@ def plan_scene(
     photos, grouped, _, plan = plan_poses(
         folder,
         settings=settings,
-        progress=lambda stage, done, total: progress(done / max(total, 1), _STAGES[stage]),
-        given=intrinsics,
+        progress=lambda stage, done, total: reporter.progress(done / max(total, 1), _STAGES[stage]),
+        given=_given_intrinsics(intrinsics, folder),
     )
     for note in photo_notes(photos, grouped):
-        notify(note)
+        reporter.note(note)
     return plan
 
 
 def without_suffix(source: Path) -> Path:
     """Return the path that results are named after: clip for clip.mp4, the folder itself for a folder."""
     return source.with_suffix("") if source.is_file() else source
-
-
-def folder_of_photos(
-    source: Path,
-    scene: Path,
-    *,
-    frames: int | None = None,
-    overwrite: bool = False,
-    notify: Notify = silent,
-    progress: Progress = no_progress,
-) -> Path:
-    """Return the folder of photos: `source` itself or, for a video, the extracted frames beside `scene`.
-
-    Raises:
-        UserError: see `extract_frames`.
-    """
-    if not source.is_file():
-        if frames is not None:
-            notify(f"{source} is not a video: using all of its photos and ignoring --frames")
-        return source
-    folder = frames_folder(scene)
-    extract_frames(source, folder, count=frames, overwrite=overwrite, notify=notify, progress=progress)
-    return folder
 
 
 def folder_with_frames(source: Path, scene: Path) -> Path:
@@ -177,10 +184,6 @@ def folder_with_frames(source: Path, scene: Path) -> Path:
     return folder
 
 
-def given_intrinsics(file: Path | None, photos: Path) -> Calibration | None:
-    """Read the intrinsics of the photos in a folder from a file; None without a file.
-
-    Raises:
-        UserError: see `read_calibration`.
-    """
-    return None if file is None else read_calibration(file, images=photos)
+def _given_intrinsics(file: str | Path | None, photos: Path) -> Calibration | None:
+    """Read the intrinsics of the photos in a folder from a file; None without a file."""
+    return None if file is None else read_calibration(Path(file), images=photos)

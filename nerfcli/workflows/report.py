@@ -3,18 +3,16 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
-from nerfcli.atomic import refuse_read_only
 from nerfcli.errors import UserError
 from nerfcli.evaluate.report.page import mark_of, origin_of, page_html
 from nerfcli.evaluate.report.run_facts import captures_of, labels_of, read_facts
 from nerfcli.evaluate.report.views import common_names, look_at
 from nerfcli.evaluate.run_photos import held_out_photos_of
-from nerfcli.machine import device_name, thread_count
-from nerfcli.notices import Notify, Progress, no_progress, part_of, silent
-from nerfcli.pages.page import is_made_from, refuse_foreign, write_page
-from nerfcli.render.outputs import depth_meta
+from nerfcli.machine import Resources
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
+from nerfcli.pages.page import claim_page, is_made_from, write_page
+from nerfcli.render.job import depth_meta
 from nerfcli.training.runs.files import REPORT
 from nerfcli.training.runs.run import load_run
 from nerfcli.workflows.photo_depths import photo_depths
@@ -26,34 +24,28 @@ MOST_VIEWS = 8
 
 def report_runs(
     runs: Sequence[Path],
-    page: Path | None = None,
+    output: Output = Output(),
     *,
-    device: str = "auto",
-    threads: int = 0,
-    overwrite: bool = False,
     keep: bool = False,
-    notify: Notify = silent,
-    progress: Progress = no_progress,
+    resources: Resources = Resources(),
+    reporter: Reporter = Reporter(),
 ) -> Path:
     """Write a page about one or more runs, and return its path.
 
     Args:
         runs: folders that training wrote, at least one.
-        page: the file to write; by default RUN/report.html, or report.html beside the first of several runs.
-        device, threads: to render with; 0 threads for all.
-        overwrite: replace any existing file, even if it is not a report on these runs.
+        output: the file to write, by default RUN/report.html, or report.html beside the first of several runs. A report
+            on these runs is replaced in any case; another file only if it may be overwritten.
         keep: keep a page that was made from the same files with the same options.
+        resources: threads and device to render with.
+        reporter: told what happens.
 
     Raises:
         UserError: a folder is not a run, its photos cannot be read, or the page's path holds something else.
     """
-    target = page or (runs[0] / REPORT if len(runs) == 1 else runs[0].resolve().parent / REPORT)
-    if target.is_dir():
-        raise UserError(f"{target} is a folder", "give a file name for the page with -o")
-    if not overwrite:
-        refuse_foreign(target, mark_of(runs), about="report")
-    refuse_read_only(target)
-    torch.set_num_threads(thread_count(threads))
+    target = output.at(runs[0] / REPORT if len(runs) == 1 else runs[0].resolve().parent / REPORT)
+    claim_page(output, target, mark_of(runs), about="report")
+    cores = resources.begin()
     opened, facts, hashes = [], [], []
     for path, label in zip(runs, labels_of(runs), strict=True):
         run = load_run(path)
@@ -62,8 +54,8 @@ def report_runs(
         facts.append(read_facts(run, label, checkpoint_sha256=hashes[-1]))
     depth = usual_depth(opened[0], Views("test"))
     origin = origin_of(facts, hashes, views=MOST_VIEWS, depth=depth)
-    if keep and not overwrite and is_made_from(target, origin):
-        notify(f"{target} is kept: it is up to date; add --overwrite to write it again")
+    if keep and not output.overwrite and is_made_from(target, origin):
+        reporter.note(f"{target} is kept: it is up to date; add --overwrite to write it again")
         return target
     names = [[] for _ in runs]
     for capture in captures_of(facts):
@@ -71,19 +63,19 @@ def report_runs(
         for index in capture:
             names[index] = shared
     looks, meanings = [], []
-    progress(0.0, "")
+    reporter.progress(0.0, "")
     for index, (run, described) in enumerate(zip(opened, facts, strict=True)):
-        on_progress = part_of(progress, index / len(runs), (index + 1) / len(runs), described.label)
-        model = run.model(device_name(device))
+        on_progress = reporter.part(index / len(runs), (index + 1) / len(runs), described.label)
+        model = run.model(resources.torch_device)
         if model.sha256 != hashes[index]:
             raise UserError(
                 f"{run.field_path} was replaced while the report was written",
                 "run the command again when the training is complete",
             )
         frames = [frame for frame in run.cameras.test if frame.name in names[index]]
-        held_out = held_out_photos_of(run.config, frames, model, threads=thread_count(threads))
+        held_out = held_out_photos_of(run.config, frames, model, threads=cores)
         compared = [photo for photo in held_out if photo.used is None or photo.used.any()]
-        photos = photo_depths(run, model, on_progress=lambda fraction: None, notify=notify)
+        photos = photo_depths(run, model, on_progress=lambda fraction: None, notify=reporter.note)
         looks.append(look_at(model, compared, depth=depth, photo_depths=photos, on_progress=on_progress))
         meanings.append(depth_meta(model, depth))
     write_page(page_html(facts, looks, depths=meanings, origin=origin), target)

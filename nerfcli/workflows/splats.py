@@ -8,24 +8,32 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nerfcli.cameras.rigid import Similarity
+from nerfcli.cameras.layout import up_direction
+from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
 from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.interrupts import deferred_interrupts
-from nerfcli.notices import Notify, Progress, part_of, silent
+from nerfcli.notices import Notify, Reporter, silent
 from nerfcli.photos.loading import LoadedPhoto, load_photos, pinhole_of
 from nerfcli.render.model import Model
 from nerfcli.splats.files import read_splats, write_splat_page, write_splats
 from nerfcli.splats.gaussians import rows_of
-from nerfcli.splats.refine import Refinement, pictures_beside, refine, share_of_pictures, splat_photos
+from nerfcli.splats.refine import (
+    Refinement,
+    RunSplats,
+    load_splat_state,
+    pictures_beside,
+    refine,
+    save_splats,
+    share_of_pictures,
+    splat_photos,
+)
 from nerfcli.splats.render import SplatScene, near_of
 from nerfcli.splats.start import count_for, gaussians_of_field
-from nerfcli.splats.state import RunSplats, load_splat_state, save_splats
 from nerfcli.training.runs.files import SPLATS
 from nerfcli.training.runs.run import Run
 from nerfcli.version import __version__
-from nerfcli.workflows.export_geometry import y_up_from_scene
 
 FORMAT = "nerfcli splat file 1"
 # Photos of the training that the field and the splats are compared on.
@@ -61,8 +69,7 @@ def export_splats(
     path: Path,
     *,
     settings: SplatSettings,
-    notify: Notify,
-    progress: Progress,
+    reporter: Reporter,
 ) -> None:
     """Write the splats of a run as .ply, .spz or .html; make and refine them first if the run does not have them.
 
@@ -76,7 +83,7 @@ def export_splats(
             "remove it, or write a .ply",
             exit_code=2,
         )
-    splats = run_splats(run, model, settings=settings, notify=notify, progress=progress)
+    splats = run_splats(run, model, settings=settings, reporter=reporter)
     file_from_scene = Similarity.identity() if settings.frame == "scene" else viewer_from_scene(run)
     gaussians = splats.gaussians().moved(file_from_scene)
     if path.suffix.lower() == ".html":
@@ -88,7 +95,7 @@ def export_splats(
             world_from_cam=file_from_scene.apply_pose(run.cameras.train[0].world_from_cam),
             fov_deg=camera.fov_deg[1],
             background=splats.background,
-            notify=notify,
+            notify=reporter.note,
         )
         return
     turned = "that of the scene" if settings.frame == "scene" else "that of the scene, turned so that y points down"
@@ -103,8 +110,19 @@ def export_splats(
         "run": run.path.resolve().name,
         "field_sha256": model.sha256,
     }
-    write_splats(path, gaussians, description=description, notify=notify)
-    notify(f"{len(gaussians)} splats of degree {splats.degree}, {path.stat().st_size / 1e6:.1f} MB, frame: {turned}")
+    write_splats(path, gaussians, description=description, notify=reporter.note)
+    reporter.note(
+        f"{len(gaussians)} splats of degree {splats.degree}, {path.stat().st_size / 1e6:.1f} MB, frame: {turned}"
+    )
+
+
+def y_up_from_scene(run: Run) -> np.ndarray:
+    """Return the rotation that turns the up direction of the cameras to +y."""
+    up = up_direction(run.cameras.train)
+    aside = np.eye(3)[np.argmin(np.abs(up))]
+    # The axes (right, down, ahead) of a camera whose down direction is -up.
+    right, down, ahead = look_at(np.zeros(3), np.cross(up, aside), up)[:3, :3].T
+    return np.stack([right, -down, -ahead])
 
 
 def viewer_from_scene(run: Run) -> Similarity:
@@ -112,7 +130,7 @@ def viewer_from_scene(run: Run) -> Similarity:
     return Similarity(1.0, np.diag([1.0, -1.0, -1.0]) @ y_up_from_scene(run), np.zeros(3))
 
 
-def run_splats(run: Run, model: Model, *, settings: SplatSettings, notify: Notify, progress: Progress) -> RunSplats:
+def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Reporter) -> RunSplats:
     """Return the splats of a run, made from its field and refined on its training photos, or those that it has.
 
     Splats that the run has are returned as they are if they belong to its field and were made with these settings.
@@ -122,18 +140,18 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, notify: Notif
     """
     kept = _kept(run, model, settings)
     if kept is not None and kept.refinement.seconds >= settings.budget_seconds:
-        notify(f"the splats of {run.path} are used: refined for {kept.refinement.seconds:.0f} s")
+        reporter.note(f"the splats of {run.path} are used: refined for {kept.refinement.seconds:.0f} s")
         return kept
     if model.device.type != "cpu":
-        notify("splats are refined on the CPU; the GPU renders the field that they start from")
+        reporter.note("splats are refined on the CPU; the GPU renders the field that they start from")
     loaded = load_photos(
         run.cameras.train, factor=run.config.downscale, threads=torch.get_num_threads(), masks=run.components.masks
     )
-    splats = kept or _started(run, model, loaded, settings=settings, progress=progress)
-    pictures = pictures_beside(model, loaded, on_progress=part_of(progress, _MAPS, _START, "pictures of the field"))
+    splats = kept or _started(run, model, loaded, settings=settings, reporter=reporter)
+    pictures = pictures_beside(model, loaded, on_progress=reporter.part(_MAPS, _START, "pictures of the field"))
     frame = {"splats_from_scene": model.training_from_scene, "near": near_of(splats.refinement.rows[:, :3])}
     began = splats.refinement.seconds / settings.budget_seconds
-    on_step = part_of(progress, _START, 1.0, f"refines {len(splats.refinement.rows)} splats")
+    on_step = reporter.part(_START, 1.0, f"refines {len(splats.refinement.rows)} splats")
     with deferred_interrupts() as interrupts:
         refine(
             splats.refinement,
@@ -144,13 +162,13 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, notify: Notif
             seconds=settings.budget_seconds,
             on_step=lambda fraction: on_step((fraction - began) / (1.0 - began)),
             is_ended=lambda: interrupts.came is not None,
-            notify=notify,
+            notify=reporter.note,
         )
         save_splats(run.path / SPLATS, splats)
         if interrupts.came is not None:
-            notify("the splats are saved; the same command with --resume goes on")
+            reporter.note("the splats are saved; the same command with --resume goes on")
         interrupts.raise_if_pending()
-    notify(compared_in_words(model, loaded, splats))
+    reporter.note(compared_in_words(model, loaded, splats))
     return splats
 
 
@@ -178,7 +196,7 @@ def _kept(run: Run, model: Model, settings: SplatSettings) -> RunSplats | None:
 
 
 def _started(
-    run: Run, model: Model, loaded: Sequence[LoadedPhoto], *, settings: SplatSettings, progress: Progress
+    run: Run, model: Model, loaded: Sequence[LoadedPhoto], *, settings: SplatSettings, reporter: Reporter
 ) -> RunSplats:
     """Return the first splats of a field."""
     core_seconds = settings.budget_seconds * torch.get_num_threads()
@@ -189,7 +207,7 @@ def _started(
         count=count,
         degree=settings.degree,
         with_gains=run.components.exposure != "none",
-        on_progress=part_of(progress, 0.0, _MAPS, "depths of the training photos"),
+        on_progress=reporter.part(0.0, _MAPS, "depths of the training photos"),
     )
     rows = rows_of(start.gaussians.moved(model.training_from_scene))
     assert model.sha256 is not None

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 from nerfcli import distributed
-from nerfcli.atomic import clear_leftovers
+from nerfcli.atomic import clear_leftovers, exclusive
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.loading import (
     describe_source,
@@ -18,7 +18,6 @@ from nerfcli.captures.loading import (
 )
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, listed, several
-from nerfcli.exclusive import exclusive
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import chosen_size, closing_steps
 from nerfcli.machine import is_one_of_several

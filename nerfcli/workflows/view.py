@@ -17,36 +17,33 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.export.extent import scene_box
+from nerfcli.machine import Resources
 from nerfcli.photos.loading import pinhole_frame
 from nerfcli.render.model import Model, load_model
 from nerfcli.training.runs.files import CONFIG, FIELD
 from nerfcli.training.runs.run import Run, no_run
 from nerfcli.viewer.packing import pack_model
-from nerfcli.viewer.page import live_page_html
+from nerfcli.viewer.page import live_page_html, scene_of
 from nerfcli.viewer.painter import Painter, view_from_json
-from nerfcli.viewer.pictures import fetched_photos, photo_jpeg
-from nerfcli.viewer.proof import make_proof
-from nerfcli.viewer.server import PageServer
-
-LOCAL = "127.0.0.1"
+from nerfcli.viewer.pictures import fetched_photos, make_proof, photo_jpeg
+from nerfcli.viewer.server import LOCAL, Address, PageServer
 
 
 def view_run(
     run: str | Path,
+    address: Address = Address(),
     *,
-    threads: int,
-    host: str = LOCAL,
-    port: int | None = None,
     browser: bool = False,
+    resources: Resources = Resources(),
     on_ready: Callable[[str, str], None],
 ) -> None:
     """Serve the page of a run until interrupted.
 
     Args:
         run: the folder that `train_scene` wrote, or is writing.
-        threads: number of CPU threads for pictures.
-        host: address to listen on; the default can be reached only from this machine.
-        port: to listen on; None for the first free one from 8123 on.
+        address: where to listen.
+        browser: open the page in a browser, if this machine has a screen.
+        resources: threads for pictures.
         on_ready: called with the page's address and the command that makes it work on another machine ("" for none).
 
     Raises:
@@ -56,8 +53,9 @@ def view_run(
     path = Path(run)
     if not (path / CONFIG).exists():
         raise no_run(path)
+    host = address.host
     local = host in (LOCAL, "0.0.0.0", "::", "::1", "localhost")
-    with PageServer(RunData(path, threads=threads), host=host, port=port) as server:
+    with PageServer(RunData(path, resources), address) as server:
         url = server.url(LOCAL if host in ("0.0.0.0", "::") else host)
         on_ready(url, _from_elsewhere(server.port) if local else "")
         if browser:
@@ -80,16 +78,16 @@ class RunData:
     """Data of a run for the server, see `viewer.server.PageData`.
 
     Args:
-        threads: number of CPU threads for pictures.
+        resources: threads for pictures.
     """
 
-    def __init__(self, path: Path, *, threads: int):
+    def __init__(self, path: Path, resources: Resources):
         self._path = path
         self._lock = threading.RLock()
         self._stamp, self._version = (0, 0), 0
         self._loaded: tuple[int, Model] | None = None
         self._encoded: tuple[int, bytes] | None = None
-        self._painter = Painter(self.model, threads=threads)
+        self._painter = Painter(self.model, threads=resources.cores)
 
     def version(self) -> int:
         with self._lock:
@@ -102,15 +100,9 @@ class RunData:
         version, model = self.model()
         cameras = Run(self._path).cameras
         frames = self._frames()
-        return live_page_html(
-            model,
-            run=self._path,
-            frames=frames,
-            photos=fetched_photos(model, cameras.train, cameras.test),
-            box=_box(model, frames),
-            version=version,
-            refusal=_refusal(model),
-        )
+        photos = fetched_photos(model, cameras.train, cameras.test)
+        scene = scene_of(model, run=self._path, frames=frames, photos=photos, box=_box(model, frames))
+        return live_page_html(scene, version=version, refusal=_refusal(model), far=model.marching.far)
 
     def field(self) -> bytes:
         version, model = self.model()

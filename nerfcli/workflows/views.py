@@ -20,6 +20,7 @@ from nerfcli.captures.formats.transforms import write_transforms
 from nerfcli.captures.loading import with_photos_on_disk
 from nerfcli.errors import UserError
 from nerfcli.notices import Notify, warn_python
+from nerfcli.output import Output
 from nerfcli.photos.loading import downscaled_camera
 from nerfcli.render.depth import DepthRequest
 from nerfcli.training.runs.run import Run
@@ -80,6 +81,7 @@ class Views:
         through: comma-separated names of the photos that a path goes through or around; None for all training photos.
         max_size: maximum longer side of the pictures, in pixels; None for no maximum.
         look: size, lens and crop of the pictures.
+        part: render only these of the views, for a later call to complete; None for all.
     """
 
     cameras: str
@@ -87,6 +89,7 @@ class Views:
     through: str | None = None
     max_size: int | None = None
     look: PictureOptions = PictureOptions()
+    part: slice | None = None
 
     @property
     def name(self) -> str:
@@ -189,9 +192,7 @@ def file_fps(cameras: str) -> float | None:
     return None if found is None else read_path(found).fps
 
 
-def write_frames(
-    frames: Sequence[Frame], target: Path, *, fps: float, overwrite: bool = False, warn: Notify = warn_python
-) -> None:
+def write_frames(frames: Sequence[Frame], output: Output, *, fps: float, warn: Notify = warn_python) -> None:
     """Write views into a folder: cameras.json, in transforms format, and camera_path.json for nerfstudio's viewer.
 
     Raises:
@@ -199,9 +200,10 @@ def write_frames(
     """
     views = tuple(replace(frame, image=None, mask=None, split=None) for frame in frames)
     capture = Capture(views, np.zeros((0, 3)), (), None, "camera-path")
-    if there := [target / name for name in _FRAME_FILES if (target / name).exists() and not overwrite]:
-        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another folder with -o")
+    target = output.at(Path())
     listed, path = (target / name for name in _FRAME_FILES)
+    for file in (listed, path):
+        output.keeps(file, lambda: False)
     for loss in losses_camera_path(capture):
         warn(f"{path.name} cannot hold {loss}; use {listed.name} instead")
     try:

@@ -1,14 +1,16 @@
-"""Commands for X-ray scans: `nerfcli ct`, one file per command."""
+"""Commands for X-ray scans: `nerfcli ct`."""
 
 import typer
 
-from nerfcli.cli.ct import convert, doctor, evaluate, export, info, render, train
+from nerfcli.cli.ct import scans, volumes
 from nerfcli.cli.usage import Command
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
-for _module in (convert, doctor, train, evaluate, render, export, info):
-    _name = _module.__name__.rsplit(".", 1)[-1]
-    app.command(_name, cls=Command)(getattr(_module, _name))
+for _command in (
+    *(scans.convert, scans.doctor, scans.train),
+    *(volumes.evaluate, volumes.render, volumes.export, scans.info),
+):
+    app.command(_command.__name__, cls=Command)(_command)
 
 
 @app.callback()

@@ -18,8 +18,8 @@ from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.quick import highest_contrast_row, predicted, reconstructed
 from nerfcli.ct.scan import Scan
-from nerfcli.errors import UserError
-from nerfcli.notices import Notify, Progress, no_progress, silent
+from nerfcli.notices import Progress, Reporter, no_progress
+from nerfcli.output import Output
 from nerfcli.pages import page as pages
 from nerfcli.pages.findings import BAD, GOOD, LOOK, VERDICTS, Finding, as_json, verdict_above, worst
 from nerfcli.pages.page import data_uri, jpeg_bytes
@@ -146,21 +146,17 @@ def examine_scan(scan: Scan, *, progress: Progress = no_progress) -> ScanDiagnos
     return ScanDiagnosis(sample, tuple(findings), tuple(not_checked))
 
 
-def examine(
-    source: Path, page: Path, *, overwrite: bool = False, notify: Notify = silent, progress: Progress = no_progress
-) -> ScanDiagnosis:
+def examine(source: Path, output: Output = Output(), *, reporter: Reporter = Reporter()) -> ScanDiagnosis:
     """Run all checks of a scan in any format, and write a page of the findings, atomically.
 
     Raises:
         UserError: the scan cannot be read, or the page's path holds something else.
     """
-    if page.is_dir():
-        raise UserError(f"{page} is a folder", "give the page's file name with -o")
-    if not overwrite:
-        pages.refuse_foreign(page, pages.Mark("doctor", source), about="scan")
+    page = output.beside(source, "-doctor.html")
+    pages.claim_page(output, page, pages.Mark("doctor", source), about="scan")
     scan = read_scan(source)
-    notify(f"{source}: {in_words(scan)}")
-    diagnosis = examine_scan(scan, progress=progress)
+    reporter.note(f"{source}: {in_words(scan)}")
+    diagnosis = examine_scan(scan, progress=reporter.progress)
     pages.write_page(page_html(diagnosis, source), page)
     return diagnosis
 

@@ -37,7 +37,7 @@ from nerfcli.pages.page import data_uri, fitted, jpeg_bytes
 from nerfcli.photos.colours import levels_of
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.depth_pictures import DepthMeta
-from nerfcli.render.files.preview import coloured
+from nerfcli.render.presentation import coloured
 from nerfcli.version import __version__
 
 _COLUMNS = (

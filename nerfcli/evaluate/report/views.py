@@ -10,12 +10,11 @@ from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
 from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
 from nerfcli.evaluate.report.run_facts import RunFacts
 from nerfcli.photos.colours import levels_of
-from nerfcli.render.coverage import DepthMap, small_frame
+from nerfcli.render.coverage import DepthMap, small_frame, with_coverage
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.files.preview import coloured
 from nerfcli.render.model import Model
-from nerfcli.render.one_frame import with_coverage
 from nerfcli.render.pictures import render_picture
+from nerfcli.render.presentation import coloured
 
 # Mean absolute difference of the channels at the last colour of error maps, sRGB in [0, 1].
 ERROR_RANGE = 0.2

@@ -14,7 +14,7 @@ from typing import Any
 
 from nerfcli import child
 from nerfcli.errors import OUT_OF_MEMORY, UserError, duration
-from nerfcli.memory import resident_bytes
+from nerfcli.machine import resident_bytes
 from nerfcli.poses.judge.checks import UNDERWAY
 
 _STAGES = {

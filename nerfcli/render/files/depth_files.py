@@ -4,7 +4,7 @@ TIFF, NPY and 16-bit PNG hold one map each; OpenEXR holds all requested maps of 
 16-bit levels are computed last, from the floats, because all frames share the length of a level.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,19 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.render.files.depth_pictures import DepthMeta, difference_of, mixed
 from nerfcli.render.files.file_facts import depth_meta_of
-from nerfcli.render.files.float_maps import CHANNELS, read_exr, read_npy, read_tiff, write_exr, write_npy, write_tiff
-from nerfcli.render.files.levels import LARGEST_LEVEL, chosen_scale, write_png16
-from nerfcli.render.files.preview import quantiles
-from nerfcli.render.job import with_suffix
-from nerfcli.render.outputs import EXR_FOLDER, FLOAT_FORMATS, LEVELS_FOLDER, ExportSettings, meaning_of
+from nerfcli.render.files.float_maps import (
+    CHANNELS,
+    LARGEST_LEVEL,
+    chosen_scale,
+    read_exr,
+    read_npy,
+    read_tiff,
+    write_exr,
+    write_npy,
+    write_png16,
+    write_tiff,
+)
+from nerfcli.render.job import EXR_FOLDER, FLOAT_FORMATS, LEVELS_FOLDER, ExportSettings, meaning_of, with_suffix
 from nerfcli.render.pictures import RenderedPicture
 
 # Levels are chosen by this quantile of the depths of a clip, and reach up to this many times as far.
@@ -45,40 +53,30 @@ def frame_meta(
     return replace(meta, view=view, provenance=dict(provenance), error_bounds=dict(error_bounds))
 
 
-def write_maps(
-    picture: RenderedPicture, folder: Path, name: str, *, settings: ExportSettings, meta: DepthMeta
-) -> list[Path]:
+def write_maps(picture: RenderedPicture, folder: Path, name: str, *, settings: ExportSettings, meta: DepthMeta) -> None:
     """Write the maps of a picture in the float formats of `settings`; each file atomically.
 
     Args:
         name: file name without suffix, with "/" between folders.
         meta: the definition of the depth of this frame, see `frame_meta`.
 
-    Returns:
-        The files, complete.
-
     Raises:
         UserError: a file cannot be written.
     """
     maps = {output: _map_of(picture, output) for output in settings.measured}
     metas = {output: meaning_of(meta, settings.depth, output) for output in maps}
-    written: list[Path] = []
     for file_format in settings.float_formats:
         if file_format == "exr":
             path = map_path(folder, "", name, file_format)
             colour = {"rgb": picture.rgb} if "rgb" in settings.outputs else {}
             write_exr(path, {**colour, **maps, "opacity": picture.opacity}, _meta_of_layers(metas))
-            written.append(path)
             continue
         for output, values in maps.items():
             path = map_path(folder, output, name, file_format)
             if file_format == "npy":
                 write_npy(path, values, metas[output])
-                written.append(path.with_suffix(".json"))
             else:
                 write_tiff(path, values, metas[output])
-            written.append(path)
-    return written
 
 
 def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
@@ -164,3 +162,54 @@ def _meta_of_layers(metas: Mapping[str, DepthMeta]) -> DepthMeta:
     first, *others = metas.values()
     layers = {meta.quantity: {"convention": meta.convention, "opacity_floor": meta.opacity_floor} for meta in others}
     return replace(first, layers={**layers, "opacity": {"convention": "1 - transmittance"}})
+
+
+# Values with the same upper 16 bits are counted together.
+_HALF = 2**16
+
+
+def quantiles(maps: Callable[[], Iterable[np.ndarray]], fractions: Sequence[float]) -> list[float]:
+    """Return exact quantiles of all finite values of many arrays, in memory that does not depend on their number.
+
+    Floats are ordered by their bits. The first pass counts all values by their upper 16 bits; the second pass counts
+    the values in the bins that contain a quantile by their lower 16 bits.
+
+    Args:
+        maps: returns the arrays, float32 of any shape; called twice, and must return the same both times.
+        fractions: in [0, 1].
+
+    Returns:
+        For each fraction, the smallest value that at least this fraction of all values does not exceed; an empty list
+        if there is no finite value.
+    """
+    upper_counts = np.zeros(_HALF, dtype=np.int64)
+    for values in maps():
+        upper_counts += np.bincount(_ordered(values) >> 16, minlength=_HALF)
+    total = int(upper_counts.sum())
+    if total == 0:
+        return []
+    ranks = [min(max(int(np.ceil(fraction * total)) - 1, 0), total - 1) for fraction in fractions]
+    below = np.cumsum(upper_counts)
+    uppers = [int(np.searchsorted(below, rank, side="right")) for rank in ranks]
+    lower_counts = {upper: np.zeros(_HALF, dtype=np.int64) for upper in uppers}
+    for values in maps():
+        keys = _ordered(values)
+        for upper, counts in lower_counts.items():
+            counts += np.bincount(keys[keys >> 16 == upper] & (_HALF - 1), minlength=_HALF)
+    found = []
+    for rank, upper in zip(ranks, uppers, strict=True):
+        within = rank - int(below[upper] - upper_counts[upper])
+        lower = int(np.searchsorted(np.cumsum(lower_counts[upper]), within, side="right"))
+        found.append(_value(upper * _HALF + lower))
+    return found
+
+
+def _ordered(values: np.ndarray) -> np.ndarray:
+    """Return the finite values as uint32 in the same order; the bits of negative floats are inverted."""
+    bits = np.ascontiguousarray(values[np.isfinite(values)], dtype=np.float32).view(np.uint32)
+    return np.where(bits >> 31 == 1, ~bits, bits | np.uint32(1 << 31))
+
+
+def _value(key: int) -> float:
+    bits = key ^ (1 << 31) if key >> 31 else ~key & 0xFFFFFFFF
+    return float(np.array(bits, dtype=np.uint32).view(np.float32))

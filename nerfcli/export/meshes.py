@@ -1,0 +1,346 @@
+"""Meshes: marching cubes over signed distances, simplification; GLB and OBJ files, and the facts that files state."""
+
+import json
+import struct
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+
+from nerfcli.atomic import atomic_path
+from nerfcli.errors import UserError
+from nerfcli.export.fusion import SIDE, FusedVolume
+from nerfcli.photos.colours import linear_light
+from nerfcli.ply import comments_of, description_in, read_ply_header, read_ply_mesh, write_ply
+
+# Voxels along a side of a brick, the unit of marching.
+_BRICK = 8 * SIDE
+# A voxel counts as seen from this weight on; cubes with an unseen corner have no surface.
+SEEN = 0.5
+# Connected pieces with a smaller fraction of the faces are noise.
+_SMALLEST_PIECE = 0.002
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles.
+
+    Args:
+        vertices: (V, 3) float64, the scene's frame and unit.
+        faces: (F, 3) int64 vertex indices, anticlockwise as seen from outside.
+        normals: (V, 3) unit, outwards; 0 if all faces of a vertex have zero area.
+        colours: (V, 3) uint8 sRGB, or None.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    colours: np.ndarray | None = None
+
+
+def surface_of(fused: FusedVolume, *, on_progress: Callable[[float], None] = lambda fraction: None) -> Mesh:
+    """Return the mesh on which the signed distance is 0, between seen voxels."""
+    keys, vertices, faces, count = [], [], [], 0
+    bricks = np.argwhere(_any_block(fused.index)) * _BRICK
+    for done, first in enumerate(bricks):
+        found = _march(fused, first)
+        on_progress((done + 1) / len(bricks))
+        if found is None:
+            continue
+        places, triangles = found
+        # A vertex is on a grid edge: two of its coordinates are exact integers. Edges are unique keys of vertices.
+        whole = places == np.round(places)
+        keys.append(np.where(whole, 2 * np.round(places), 2 * np.floor(places) + 1).astype(np.int64) + 2 * first)
+        vertices.append(places + first)
+        faces.append(triangles.astype(np.int64) + count)
+        count += len(places)
+    if not faces:
+        return mesh_of(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    _, chosen, inverse = np.unique(np.concatenate(keys), axis=0, return_index=True, return_inverse=True)
+    places = np.concatenate(vertices)[chosen]
+    triangles = inverse.reshape(-1)[np.concatenate(faces)]
+    return mesh_of(fused.grid.centres(places), triangles)
+
+
+def mesh_of(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = None) -> Mesh:
+    """Return a mesh with normals, without degenerate triangles (two equal corners) and unused vertices."""
+    proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    used, packed = np.unique(faces[proper], return_inverse=True)
+    vertices, faces = vertices[used], packed.reshape(-1, 3)
+    corners = vertices[faces]
+    # The length is twice the area, so large triangles count more.
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], across)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    return Mesh(vertices, faces, normals, None if colours is None else colours[used])
+
+
+def without_small_pieces(mesh: Mesh, fraction: float = _SMALLEST_PIECE) -> Mesh:
+    """Return the mesh without connected pieces of fewer than this fraction of all faces."""
+    if not len(mesh.faces):
+        return mesh
+    first, second = mesh.faces[:, 0], mesh.faces[:, 1:]
+    links = coo_matrix(
+        (np.ones(2 * len(first), bool), (np.repeat(first, 2), second.reshape(-1))), shape=(len(mesh.vertices),) * 2
+    )
+    _, piece = connected_components(links, directed=False)
+    of_faces = piece[first]
+    large = np.bincount(of_faces, minlength=piece.max() + 1) >= fraction * len(first)
+    return mesh_of(mesh.vertices, mesh.faces[large[of_faces]], mesh.colours)
+
+
+def _any_block(index: np.ndarray) -> np.ndarray:
+    """Mark the bricks of 8^3 blocks that contain a block."""
+    size = _BRICK // SIDE
+    padded = np.pad(index >= 0, [(0, -length % size) for length in index.shape])
+    x, y, z = (length // size for length in padded.shape)
+    return np.asarray(padded.reshape(x, size, y, size, z, size).any(axis=(1, 3, 5)))
+
+
+def _march(fused: FusedVolume, first: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the vertices of a brick, in voxels from `first`, and its triangles; None if it has no surface."""
+    shape = tuple(int(min(_BRICK + 1, total - at)) for at, total in zip(first, fused.grid.shape, strict=True))
+    if min(shape) < 2:
+        return None
+    distance, weight = fused.dense((int(first[0]), int(first[1]), int(first[2])), (shape[0], shape[1], shape[2]))
+    seen = weight >= SEEN
+    cubes = seen[:-1, :-1, :-1].copy()
+    negative = np.zeros(cubes.shape, np.int8)
+    for corner in np.ndindex(2, 2, 2):
+        part = tuple(slice(at, at + length) for at, length in zip(corner, cubes.shape, strict=True))
+        cubes &= seen[part]
+        negative += distance[part] < 0
+    if not (cubes & (negative > 0) & (negative < 8)).any():
+        return None
+    mask = np.zeros(shape, dtype=bool)
+    mask[1:, 1:, 1:] = cubes  # the library reads the mask at a cube's last corner
+    vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=mask, allow_degenerate=False)
+    return vertices.astype(np.float64), faces
+
+
+def simplified(mesh: Mesh, faces: int, *, threads: int) -> Mesh:
+    """Simplify a mesh to about `faces` faces; one with no more than that is returned unchanged.
+
+    Source: Garland and Heckbert 1997, Surface simplification using quadric error metrics; COLMAP's implementation.
+    """
+    if len(mesh.faces) <= faces:
+        return mesh
+    # COLMAP's files have float32 positions, which would lose millimetres in a scene far from its origin.
+    middle = mesh.vertices.mean(axis=0)
+    with tempfile.TemporaryDirectory() as folder:
+        given, made = Path(folder) / "given.ply", Path(folder) / "made.ply"
+        columns: dict[str, np.ndarray] = dict(zip("xyz", (mesh.vertices - middle).astype("<f4").T, strict=True))
+        write_ply(given, columns, faces=mesh.faces)
+        options = pycolmap.MeshSimplificationOptions()
+        options.target_face_ratio = faces / len(mesh.faces)
+        options.num_threads = threads
+        pycolmap.simplify_mesh(given, made, options)
+        vertices, triangles = read_ply_mesh(made)
+    return mesh_of(vertices.astype(np.float64) + middle, triangles)
+
+
+# Component types and chunk types of glTF 2.0.
+_FLOAT, _USHORT, _UINT = 5126, 5123, 5125
+_JSON, _BINARY = 0x4E4F534A, 0x004E4942
+# Float positions are stored relative to their mean if it is at least this many times their extent from the origin.
+_FAR = 1000.0
+
+
+def write_obj(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, *, colours: np.ndarray, description: Mapping[str, Any]
+) -> None:
+    """Write a mesh as OBJ, atomically, with a colour after each position, which most programs can read.
+
+    Args:
+        vertices: (N, 3).
+        faces: (F, 3).
+        colours: (N, 3) uint8 sRGB.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    rows = np.concatenate([vertices, colours / 255.0], axis=1)
+    with atomic_path(path) as partial, partial.open("w", encoding="utf-8") as file:
+        file.writelines(f"# {line}\n" for line in comments_of(description))
+        file.writelines("v %.9g %.9g %.9g %.4f %.4f %.4f\n" % tuple(row) for row in rows.tolist())  # noqa: UP031 - faster
+        file.writelines("f %d %d %d\n" % tuple(row) for row in (faces + 1).tolist())  # noqa: UP031 - faster
+
+
+def write_glb(
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    normals: np.ndarray,
+    colours: np.ndarray,
+    y_up_from_frame: np.ndarray,
+    description: Mapping[str, Any],
+) -> None:
+    """Write a mesh as binary glTF 2.0, atomically.
+
+    Positions keep their frame; the root node rotates them to glTF's +Y up. Colours are converted to linear light, as
+    glTF requires, and the material is unlit because the colours already contain the scene's lighting.
+
+    Args:
+        vertices: (N, 3).
+        faces: (F, 3).
+        normals: (N, 3) unit.
+        colours: (N, 3) uint8 sRGB.
+        y_up_from_frame: (3, 3) rotation.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    middle = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
+    size = np.abs(vertices - middle).max(initial=0.0)
+    if np.abs(middle).max() < _FAR * size:
+        middle = np.zeros(3)
+    positions = (vertices - middle).astype("<f4")
+    light = np.full((len(vertices), 4), 65535, "<u2")
+    light[:, :3] = np.rint(65535 * linear_light(colours / 255.0))
+    parts = [positions.tobytes(), normals.astype("<f4").tobytes(), light.tobytes(), faces.astype("<u4").tobytes()]
+    starts = np.cumsum([0, *(len(part) for part in parts)])
+    turn = np.eye(4)
+    turn[:3, :3] = y_up_from_frame
+    content = {
+        "asset": {"version": "2.0", "generator": "nerfcli", "extras": dict(description)},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [
+            {"name": "turn to +Y up", "matrix": turn.T.reshape(-1).tolist(), "children": [1]},
+            {"name": "mesh, in the frame of the scene", "mesh": 0, "translation": middle.tolist()},
+        ],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}, "indices": 3, "material": 0}]}
+        ],
+        "materials": [{"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}],
+        "buffers": [{"byteLength": int(starts[-1])}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": int(start), "byteLength": len(part), "target": 34963 if index == 3 else 34962}
+            for index, (start, part) in enumerate(zip(starts[:-1], parts, strict=True))
+        ],
+        "accessors": [
+            {
+                "bufferView": 0,
+                "componentType": _FLOAT,
+                "type": "VEC3",
+                "count": len(vertices),
+                "min": positions.min(axis=0, initial=np.inf).tolist() if len(vertices) else [0, 0, 0],
+                "max": positions.max(axis=0, initial=-np.inf).tolist() if len(vertices) else [0, 0, 0],
+            },
+            {"bufferView": 1, "componentType": _FLOAT, "type": "VEC3", "count": len(vertices)},
+            {"bufferView": 2, "componentType": _USHORT, "normalized": True, "type": "VEC4", "count": len(vertices)},
+            {"bufferView": 3, "componentType": _UINT, "type": "SCALAR", "count": 3 * len(faces)},
+        ],
+    }
+    text = json.dumps(content, ensure_ascii=True, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary = b"".join(parts)
+    binary += b"\0" * (-len(binary) % 4)
+    chunks = struct.pack("<II", len(text), _JSON) + text + struct.pack("<II", len(binary), _BINARY) + binary
+    with atomic_path(path) as partial:
+        partial.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def read_glb_json(path: Path) -> dict[str, Any]:
+    """Read the JSON of a binary glTF.
+
+    Raises:
+        UserError: it is not a binary glTF, or truncated.
+    """
+    data = path.read_bytes()
+    try:
+        magic, version, length = struct.unpack_from("<4sII", data)
+        size, kind = struct.unpack_from("<II", data, 12)
+        if magic != b"glTF" or version != 2 or length > len(data) or kind != _JSON:
+            raise ValueError("its header is not that of glTF 2.0")
+        content = json.loads(data[20 : 20 + size])
+    except (struct.error, ValueError) as error:
+        raise UserError(f"{path} is no GLB file, or cut short: {error}", "export it once more") from error
+    return content
+
+
+# Note for files without a description.
+NOT_STATED = "unit and frame"
+SUFFIXES = (".ply", ".glb", ".obj")
+
+
+def is_splat_file(path: Path) -> bool:
+    """Return whether a file is a .spz, or a .ply whose points have colours by direction.
+
+    Raises:
+        UserError: the header of a .ply is damaged.
+    """
+    suffix = path.suffix.lower()
+    if not path.is_file() or suffix not in (".spz", ".ply"):
+        return False
+    return suffix == ".spz" or "f_dc_0" in read_ply_header(path).vertex_properties
+
+
+def model_facts(path: Path) -> dict[str, Any]:
+    """Return the facts about a file: kind, format, counts, and what nerfcli wrote into it: unit, frame, run, ...
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    if not path.is_file():
+        raise UserError(f"there is no {path}", "give a file that exists")
+    match path.suffix.lower():
+        case ".ply":
+            header = read_ply_header(path)
+            counts = _counts("PLY", header.count("vertex"), header.count("face") or None)
+            return {**_described(header.comments), **counts, "properties": " ".join(header.vertex_properties)}
+        case ".glb":
+            return _glb_facts(path)
+        case _:
+            return _obj_facts(path)
+
+
+def _glb_facts(path: Path) -> dict[str, Any]:
+    content = read_glb_json(path)
+    described = content.get("asset", {}).get("extras") or {"not_stated": NOT_STATED}
+    try:
+        primitive = content["meshes"][0]["primitives"][0]
+        positions = content["accessors"][primitive["attributes"]["POSITION"]]
+        faces = content["accessors"][primitive["indices"]]["count"] // 3
+        return {
+            **described,
+            **_counts("GLB", positions["count"], faces),
+            "low": positions["min"],
+            "high": positions["max"],
+        }
+    except (KeyError, IndexError, TypeError):  # written by another program: it may contain anything
+        return {**described, "kind": "mesh", "format": "GLB", "note": "its first mesh has no list of triangles"}
+
+
+def _obj_facts(path: Path) -> dict[str, Any]:
+    counts, comments = {"v": 0, "f": 0}, []
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for line in file:
+            word = line.partition(" ")[0]
+            if word in counts:
+                counts[word] += 1
+            elif word == "#":
+                comments.append(line[1:].strip())
+    if not counts["v"]:
+        raise UserError(f"{path} has no vertices", "copy or export it once more")
+    return {**_described(comments), **_counts("OBJ", counts["v"], counts["f"])}
+
+
+def _counts(form: str, vertices: int, faces: int | None) -> dict[str, Any]:
+    return {"kind": "mesh" if faces else "points", "format": form, "vertices": vertices, "faces": faces}
+
+
+def _described(comments: Sequence[str]) -> dict[str, Any]:
+    return description_in(comments) or {"not_stated": NOT_STATED}

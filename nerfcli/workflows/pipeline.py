@@ -1,0 +1,141 @@
+"""All stages on one page: poses, training, evaluation, splats, pictures, report."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from nerfcli.machine import Resources
+from nerfcli.notices import Reporter
+from nerfcli.output import Output, beside
+from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.render.job import OUTPUTS, ExportSettings, VideoSettings
+from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.settings import TrainSettings, sizes_for
+from nerfcli.workflows import train
+from nerfcli.workflows.evaluate import Evaluation, evaluate_run, evaluate_splats
+from nerfcli.workflows.export import default_target, export_run
+from nerfcli.workflows.poses import estimate_poses, without_suffix
+from nerfcli.workflows.render import render_run
+from nerfcli.workflows.report import report_runs
+from nerfcli.workflows.splats import SplatSettings
+from nerfcli.workflows.views import Views, usual_depth
+
+
+@dataclass(frozen=True)
+class PipelineResult:
+    """What `run_pipeline` made.
+
+    Args:
+        scene: the folder with poses.
+        run: the trained field.
+        evaluation, evaluation_of_splats: metrics on the held-out photos.
+        splats: a .ply.
+        renders: folders of the held-out views, and videos of an orbit around the splats.
+        report: a page about all this.
+    """
+
+    scene: Path
+    run: Run
+    evaluation: Evaluation
+    splats: Path
+    evaluation_of_splats: Evaluation
+    renders: list[Path]
+    report: Path
+
+
+def run_pipeline(
+    photos: str | Path,
+    output: Output = Output(),
+    *,
+    poses: PoseSettings = PoseSettings(),
+    training: TrainSettings | None = None,
+    frames: int | None = None,
+    intrinsics: Path | None = None,
+    resources: Resources = Resources(),
+    reporter: Reporter = Reporter(),
+    show: Callable[[Path | Evaluation], None] = lambda result: None,
+) -> PipelineResult:
+    """Go from photos to a trained field, its metrics, splats, pictures, a video and a report; keep completed stages.
+
+    Example:
+        >>> import nerfcli
+        >>> done = nerfcli.run_pipeline("photos", nerfcli.Output("kitchen"))
+        >>> done.evaluation.metrics["mean"]["psnr"], done.report
+
+    Args:
+        photos: a folder of photos, or a video.
+        output: the folder for scene/, run/ and run-splats.ply; by default PHOTOS-scene, ... beside the photos.
+        poses, training: settings of the stages; by default those of `nerfcli run`. Splats are refined for half of the
+            budget of the training.
+        frames: number of frames to use from a video; None for 120.
+        intrinsics: file with intrinsics of the cameras, which are kept; None to estimate them.
+        resources: threads, device and memory of all stages.
+        reporter: told what happens, stage by stage.
+        show: called with each result as soon as it is complete.
+
+    Raises:
+        UserError: as the functions of the stages do. After a KeyboardInterrupt, the same call continues.
+    """
+    scene_path = beside(without_suffix(Path(photos)), "-scene") if output.path is None else Path(output.path) / "scene"
+    run_path = beside(scene_path, "-run") if output.path is None else Path(output.path) / "run"
+    device, again = resources.torch_device, output.overwrite
+    usual_training = TrainSettings(budget_seconds=120.0, model="auto", **sizes_for(device))
+    settings = replace(training or usual_training, threads=resources.cores, device=device)
+
+    scene = estimate_poses(
+        photos,
+        Output(scene_path, again),
+        replace(poses, threads=resources.cores),
+        frames=frames,
+        intrinsics=intrinsics,
+        resources=resources,
+        reporter=reporter,
+    )
+    with reporter.stage(f"train {scene.name}") as told:
+        run = _trained(scene, Output(run_path, again), settings, resources.memory_limit(device), told)
+    usual = Output(overwrite=again)
+    with reporter.stage("evaluate") as told:
+        evaluation = evaluate_run(run.path, usual, resources=resources, reporter=told)
+    for result in (scene, run.path, evaluation):
+        show(result)
+
+    splats = default_target(run.path, "splats")
+    if again or not splats.exists():
+        half = SplatSettings(budget_seconds=(settings.budget_seconds or 2 * SplatSettings.budget_seconds) / 2)
+        with reporter.stage("export splats") as told:
+            export_run(run.path, usual, to="splats", splats=half, resources=resources, reporter=told)
+    with reporter.stage("evaluate splats") as told:
+        of_splats = evaluate_splats(run.path, splats, usual, resources=resources, reporter=told)
+    for result in (of_splats, splats):
+        show(result)
+
+    renders = []
+    for views, outputs, shown in ((Views("test"), OUTPUTS[:3], None), (Views("orbit"), OUTPUTS[:2], splats)):
+        wanted = ExportSettings(outputs, usual_depth(run, views), video=VideoSettings() if shown else None)
+        with reporter.stage(f"render {views.name}") as told:
+            written = render_run(
+                run.path, usual, views=views, settings=wanted, splats=shown, resources=resources, reporter=told
+            )
+        for path in written:
+            show(path)
+        renders += written
+    with reporter.stage("report") as told:
+        report = report_runs([run.path], usual, keep=True, resources=resources, reporter=told)
+    show(report)
+    return PipelineResult(scene, run, evaluation, splats, of_splats, renders, report)
+
+
+def _trained(scene: Path, output: Output, settings: TrainSettings, memory_bytes: int | None, told: Reporter) -> Run:
+    """Train, or go on with a training that was interrupted."""
+    path = output.at(scene)
+    return train.train_scene(
+        scene,
+        path,
+        settings,
+        memory_bytes=memory_bytes,
+        resume=not output.overwrite and train.was_interrupted(scene, path, settings),
+        overwrite=output.overwrite,
+        notify=told.note,
+        warn=told.warn,
+        progress=told.progress,
+    )
