@@ -1,4 +1,4 @@
-"""Effects of kills: poses, train and render, killed repeatedly at random moments.
+"""Effects of kills: poses, train, render and evaluate, killed repeatedly at random moments.
 
     python benchmarks/kills.py --count 20 -o kills.csv
 
@@ -39,6 +39,7 @@ TOLD = {
     "poses": ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"),
     "train": ("field.safetensors", "cameras.json", "config.json"),
 }
+TIMED = ("metrics.json",)  # of the other commands
 WRITING = (".partial-", "-journal", "-wal")  # parts of file names; the last two are of SQLite
 LOOK_EVERY_SECONDS = 0.002
 
@@ -58,7 +59,7 @@ def commands(place: Path, run: Path | None) -> list[TimedCommand]:
     """Write the captures and return the commands.
 
     These are: poses of 12 small photos of the desk; 200 steps on spheres; 60 small pictures of a run on spheres, or of
-    a copy of `run`.
+    a copy of `run`; evaluation of a copy of that run, with its pictures, which stand in the run.
     """
     make_capture(place / "capture")
     photos, capture = place / "photos", place / "capture"
@@ -76,12 +77,19 @@ def commands(place: Path, run: Path | None) -> list[TimedCommand]:
         TimedCommand("poses", ("poses", photos, "--quality", "fast", "--seed", "1"), (photos,)),
         TimedCommand("train", ("train", capture / "scene", "--steps", "200"), (capture / "scene", capture / "photos")),
         TimedCommand("render", ("render", shown, *views), (shown,)),
+        TimedCommand("evaluate", ("evaluate", "--save-predictions", "png"), (shown,)),
     ]
 
 
 def started(given: TimedCommand, output: Path) -> subprocess.Popen[str]:
     """Start the command in a separate process; a training resumes if there is a state."""
-    words = [*given.words, "-o", output, "--threads", "1", "--quiet"]
+    words = [*given.words, "--threads", "1", "--quiet"]
+    if given.name != "evaluate":
+        words += ["-o", output]
+    else:
+        words.append(output)
+        if not output.exists():
+            shutil.copytree(given.inputs[0], output, ignore=shutil.ignore_patterns("metrics.json", "predictions"))
     if given.name == "train" and (output / "state.safetensors").exists():
         words.append("--resume")
     command = [sys.executable, "-c", PROGRAM, *map(str, words)]
@@ -137,7 +145,7 @@ def killed(process: subprocess.Popen[str], output: Path, *, after: float, writin
 def differing(name: str, whole: Path, part: Path) -> list[str]:
     """Return the files that differ between two results or are missing, and leftovers of unfinished writing."""
     one, other = digests(whole), digests(part)
-    names = TOLD.get(name) or sorted(one.keys() | other.keys())
+    names = TOLD.get(name) or sorted(file for file in one.keys() | other.keys() if Path(file).name not in TIMED)
     leftovers = [file for file in other if "partial" in file or "unfinished" in file]
     return [file for file in names if one.get(file) != other.get(file) or file not in one] + leftovers
 
@@ -146,7 +154,7 @@ def differing(name: str, whole: Path, part: Path) -> list[str]:
 def kills(
     count: Annotated[int, typer.Option(help="Kills of each command.", min=1)] = 20,
     seed: int = 0,
-    only: Annotated[str, typer.Option(help="Some of poses,train,render.")] = "poses,train,render",
+    only: Annotated[str, typer.Option(help="Some of them.")] = "poses,train,render,evaluate",
     run: Annotated[Path | None, typer.Option(help="A run to render, in place of a small one; it is copied.")] = None,
     output: Annotated[Path, typer.Option("-o", help="CSV with a line per kill.")] = Path("kills.csv"),
 ) -> None:
