@@ -146,10 +146,11 @@ def _ascii_rows(path: Path, start: int, num_before: int, count: int, dtype: np.d
     table = np.zeros(count, dtype)
     try:
         values = np.array(rows, dtype=np.float64).reshape(count, len(names))
-    except ValueError as error:
+        with np.errstate(invalid="raise"):
+            for column, name in enumerate(names):
+                table[name] = values[:, column]
+    except (ValueError, FloatingPointError) as error:
         raise UserError(f"{path}: {error}", _HINT) from error
-    for column, name in enumerate(names):
-        table[name] = values[:, column]
     return table
 
 

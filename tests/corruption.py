@@ -5,6 +5,7 @@ returns a sound capture. It never raises anything else, hangs, or allocates much
 """
 
 import json
+import re
 import signal
 import tracemalloc
 from collections.abc import Callable, Iterator
@@ -74,24 +75,24 @@ def corrupted_binary(data: bytes, rng: np.random.Generator) -> bytes:
 
 def corrupted_text(data: bytes, rng: np.random.Generator) -> bytes:
     """Return damaged text: truncated, words replaced, dropped or doubled, lines dropped or doubled, bytes damaged."""
-    lines = data.decode("utf-8").split("\n")
+    lines = data.decode("utf-8", "surrogateescape").split("\n")
     filled = [index for index, line in enumerate(lines) if line.strip() and not line.startswith("#")]
     kind = int(rng.integers(0, 7))
     if kind == 0 or not filled:
         return data[: int(rng.integers(0, len(data)))]
     index = filled[int(rng.integers(0, len(filled)))]
-    words = lines[index].split(" ")
-    at = int(rng.integers(0, len(words)))
+    words = re.split(r"([ ,=<>\"]+)", lines[index])  # at even indices, between what separates them
+    at = 2 * int(rng.integers(0, (len(words) + 1) // 2))
     if kind in (1, 2):
         words[at] = _WORDS[int(rng.integers(0, len(_WORDS)))]
     elif kind == 3:
-        words = words[:at] + words[at + 1 :]
+        words = words[:at] + words[at + 2 :]
     elif kind == 4:
-        words = words[: at + 1] + words[at:]
-    lines[index] = " ".join(words)
+        words = words[: at + 2] + words[at:]
+    lines[index] = "".join(words)
     if kind == 5:
         lines = lines[:index] + lines[index + 1 :] if rng.random() < 0.5 else lines[: index + 1] + lines[index:]
-    damaged = "\n".join(lines).encode()
+    damaged = "\n".join(lines).encode("utf-8", "surrogateescape")
     return corrupted_binary(damaged, rng) if kind == 6 else damaged
 
 
@@ -115,18 +116,13 @@ def corrupted_json(data: bytes, rng: np.random.Generator) -> bytes:
     return json.dumps(content).encode()
 
 
-def assert_refused_or_sound(read: Callable[[], Capture], path: Path) -> bool:
-    """Assert that `read` refuses the damaged file or returns a sound capture; return whether it refused.
-
-    Args:
-        read: reads the damaged capture.
-        path: the damaged file, which an error must name; their folder for a format of several files.
-    """
-    refusal, capture = None, None
+def assert_refused_or_sound(read: Callable[[], None], folder: Path) -> bool:
+    """Assert that `read` refuses damaged files of a folder, or finds them sound; return whether it refused."""
+    refusal = None
     tracemalloc.start()
     try:
         with _at_most(MOST_SECONDS):
-            capture = read()
+            read()
     except UserError as error:
         refusal = error
     finally:
@@ -134,11 +130,9 @@ def assert_refused_or_sound(read: Callable[[], Capture], path: Path) -> bool:
         tracemalloc.stop()
     assert peak < MOST_BYTES
     if refusal is None:
-        assert capture is not None
-        assert_sound(capture)
         return False
     assert refusal.exit_code == BAD_INPUT
-    assert str(path) in refusal.message, refusal.message
+    assert str(folder) in refusal.message, refusal.message
     assert "\n" not in refusal.message + refusal.hint
     assert len(refusal.message) < 1000
     return True
@@ -200,25 +194,3 @@ def _at_most(seconds: int) -> Iterator[None]:
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
-
-
-def count_refused(
-    path: Path,
-    damage: Callable[[bytes, np.random.Generator], bytes],
-    read: Callable[[], Capture],
-    *,
-    times: int = 200,
-    seed: int = 0,
-    named: Path | None = None,
-) -> int:
-    """Damage a file again and again, and return how often `read` refused it; otherwise it must give a sound capture.
-
-    Args:
-        named: path that an error must name; None for that of the file.
-    """
-    data, rng = path.read_bytes(), np.random.default_rng(seed)
-    refused = 0
-    for _ in range(times):
-        path.write_bytes(damage(data, rng))
-        refused += assert_refused_or_sound(read, named or path)
-    return refused

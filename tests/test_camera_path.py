@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from corruption import corrupted_json, count_refused
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -221,8 +220,3 @@ def test_damaged_views_are_reported_with_their_number(tmp_path, more, what):
     with pytest.raises(UserError, match=what) as caught:
         read_path(written(tmp_path, content(camera_path=[good, {**good, **more}])))
     assert "path.json: camera_path[1]" in caught.value.message
-
-
-def test_two_hundred_damaged_files_are_refused_or_sound(tmp_path):
-    path = written(tmp_path, content(fps=24, seconds=1.0))
-    assert count_refused(path, corrupted_json, lambda: parse_camera_path(path)) > 100

@@ -1,4 +1,4 @@
-"""PLY files of points and of cameras: by hand in all encodings, against pycolmap's, two hundred kinds of damage."""
+"""PLY files of points and of cameras: by hand in all encodings, and against pycolmap's."""
 
 import struct
 from dataclasses import replace
@@ -7,9 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 from captures import CAMERAS, ring
-from corruption import corrupted_binary, corrupted_text, count_refused
 
-from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import write_colmap_binary
 from nerfcli.captures.formats.ply import losses_ply, read_points, write_points
 from nerfcli.errors import UserError
@@ -118,16 +116,3 @@ def test_what_is_no_cloud_is_refused(tmp_path, data, what):
     with pytest.raises(UserError, match=what) as caught:
         read_points(tmp_path / "a.ply")
     assert str(tmp_path / "a.ply") in caught.value.message
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_two_hundred_corruptions(tmp_path, encoding):
-    path = tmp_path / "a.ply"
-    path.write_bytes(by_hand(encoding))
-    frame = ring(CAMERAS["PINHOLE"], num_frames=1).frames
-
-    def read() -> Capture:
-        points, colours = read_points(path)
-        return Capture(frame, points, (), None, "ply", colours=colours)
-
-    assert count_refused(path, corrupted_text if encoding == "ascii" else corrupted_binary, read, seed=10) > 80

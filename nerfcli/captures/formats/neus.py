@@ -116,8 +116,11 @@ def find_neus(path: Path) -> Path | None:
     found = named(*FILES)(path) if path.is_dir() else path
     if found is None or found.suffix.lower() != ".npz" or not zipfile.is_zipfile(found):
         return None
-    with zipfile.ZipFile(found) as archive:
-        return found if f"{FIRST}.npy" in archive.namelist() else None
+    try:
+        with zipfile.ZipFile(found) as archive:
+            return found if f"{FIRST}.npy" in archive.namelist() else None
+    except zipfile.BadZipFile as error:
+        raise UserError(f"{found} cannot be read: {error}", "it is damaged: copy it again") from error
 
 
 FORMAT = Format(

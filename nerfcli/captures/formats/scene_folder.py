@@ -211,7 +211,7 @@ def _listed_bounds(content: dict[str, Any], path: Path) -> dict[str, tuple[float
     listed = content.get("depth_bounds") or {}
     try:
         bounds = {name: (float(near), float(far)) for name, (near, far) in dict(listed).items()}
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UserError(
             f"{path}: depth_bounds are not pairs of numbers", 'expected {"a.jpg": [near, far], ...}'
         ) from error

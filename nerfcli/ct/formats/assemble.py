@@ -69,7 +69,11 @@ def scan_of(found: ReaderOutput, given: ScanOptions) -> Scan:
     unit, placed = _in_millimetres(found, given)
     if given.mirrored:
         placed = replace(placed, mirrored=not placed.mirrored) if isinstance(placed, Circle) else placed.mirrored()
-    geometry = placed.geometry() if isinstance(placed, Circle) else placed
+    try:
+        with np.errstate(over="raise", divide="raise", invalid="raise"):
+            geometry = placed.geometry() if isinstance(placed, Circle) else placed
+    except FloatingPointError as error:
+        raise UserError(f"{found.path}: distances or sizes are too large or too small", "correct them") from error
     if values.shape != (geometry.views, geometry.rows, geometry.columns):
         views, rows, columns = values.shape
         raise UserError(

@@ -5,6 +5,7 @@ Lengths have no unit: the volume is about 2 wide.
 """
 
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -89,7 +90,7 @@ def _projection(file: Path, frame: dict[str, Any]) -> np.ndarray:
         array = np.load(place, allow_pickle=False)
     except FileNotFoundError as error:
         raise UserError(f"{place} does not exist", f"{R2_GAUSSIAN} lists it: restore the projection") from error
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:
         raise UserError(f"{place} cannot be read: {error}", "it is damaged: export it again") from error
     if array.ndim != 2:
         raise UserError(f"{place} has shape {array.shape}", "a projection is rows x columns")

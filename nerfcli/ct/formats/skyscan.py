@@ -79,6 +79,8 @@ def _white(fields: Statement, values: np.ndarray, notes: list[str]) -> float:
     if "Reference Intensity" in fields:
         return fields.positive("Reference Intensity")
     depth = fields.number("Depth (bits)", 16 if float(values.max()) > 255 else 8)
+    if not 1 <= depth <= 32:
+        raise UserError(f"{fields.path}: Depth (bits) is {depth:g}", "a detector has 8 to 16 bits: correct the log")
     notes.append(f"the log has no Reference Intensity: the largest {depth:g}-bit value is taken for the open beam")
     return 2.0**depth - 1
 

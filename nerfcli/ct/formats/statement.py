@@ -44,9 +44,9 @@ class Statement:
         return float(found[0])
 
     def positive(self, name: str) -> float:
-        """Return a number above 0."""
+        """Return a number above 0 that is a normal one in float32."""
         value = self.number(name)
-        if not (np.isfinite(value) and value > 0):
+        if not float(np.finfo(np.float32).tiny) <= value <= float(np.finfo(np.float32).max):
             raise UserError(f"{self.path}: {name} is {value:g}", "expected a number above 0")
         return value
 

@@ -43,7 +43,10 @@ def read_transmission_transforms(path: Path, given: ScanOptions = ScanOptions())
             f"{folder}: {len(frames)} frames in the transforms, but {TRANSFORMS_GEOMETRY} states {expected}",
             "a transform is missing",
         )
-    poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
+    try:
+        poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise UserError(f"{folder}: transforms without numbers", "each frame has a 4 x 4 matrix of numbers") from error
     if poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
         raise UserError(f"{folder}: transforms of shape {poses.shape[1:]}", "each frame has a 4 x 4 matrix of numbers")
     right, up, back, source = (poses[:, :3, k] for k in range(4))
@@ -84,7 +87,11 @@ def _frames(folder: Path) -> tuple[list[dict[str, Any]], Statement]:
         if not isinstance(listed, list) or not listed:
             raise UserError(f"{folder / name} has no frames", _HINT)
         for frame in listed:
-            if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= set(frame):
+            if (
+                not isinstance(frame, dict)
+                or "transform_matrix" not in frame
+                or not isinstance(frame.get("file_path"), str)
+            ):
                 raise UserError(f"{folder / name}: a frame lacks file_path or transform_matrix", _HINT)
             frames.append({**frame, "part": name})
     assert lens is not None
