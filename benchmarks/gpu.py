@@ -89,8 +89,10 @@ def timed(function: Callable[[], Any], device: Any, repeats: int) -> float:
 def correct(dry: bool) -> str:
     """Run the tests of the kernels; raise an error with the end of their output if one fails."""
     only = ["-k", "adam_rows"] if dry else []
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "tests/triton_kernels.py", *only]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    suite = ("tests/triton_kernels.py", "tests/test_kernels.py", *only)
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *suite]
+    environment = {**os.environ, "NERFCLI_KERNELS": "triton_cuda"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, cwd=ROOT)
     if done.returncode:
         raise RuntimeError(done.stdout[-2000:])
     return "agree"

@@ -99,7 +99,7 @@ def run_tests(tree: Path, group: Group, log: Path) -> None:
     sys.path[:0] = [str(tree), str(tree / "tests")]
     keep_machine_code(tree / "nerfcli" / "kernels" / "numba_cpu")
     if "triton" in group.tests:
-        os.environ["TRITON_INTERPRET"] = "1"
+        os.environ |= {"TRITON_INTERPRET": "1", "NERFCLI_KERNELS": "triton_cuda"}
     selected = ("-k", group.selected) if group.selected else ()
     with log.open("w") as file, redirect_stdout(file), redirect_stderr(file):
         code = pytest.main(

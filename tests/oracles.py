@@ -41,31 +41,3 @@ def quadrature_of_squares(density, starts, ends, steps=20000):
         second += (t * t * s * np.exp(-(depth + s * (t - t0)))).sum() * h
         depth += s * (t1 - t0)
     return second
-
-
-def trilinear_hash(point, table, resolutions, primes=(1, 2654435761, 805459861)):
-    """Return the hash-grid features of one point, with hashes in Python integers."""
-    out = []
-    rows = table.shape[1]
-    for level, resolution in enumerate(resolutions):
-        scaled = [min(max(float(c), 0.0), 1.0) * resolution for c in point]
-        cell = [min(math.floor(s), resolution - 1) for s in scaled]
-        total = np.zeros(table.shape[2])
-        for corner in range(8):
-            bits = [corner >> axis & 1 for axis in range(3)]
-            weight = 1.0
-            vertex = []
-            for axis in range(3):
-                inside = scaled[axis] - cell[axis]
-                weight *= inside if bits[axis] else 1.0 - inside
-                vertex.append(cell[axis] + bits[axis])
-            if (resolution + 1) ** 3 <= rows:
-                row = (vertex[2] * (resolution + 1) + vertex[1]) * (resolution + 1) + vertex[0]
-            else:
-                row = 0
-                for v, prime in zip(vertex, primes, strict=True):
-                    row ^= (v * prime) % 2**32
-                row %= rows
-            total = total + weight * table[level, row]
-        out.append(total)
-    return np.concatenate(out)

@@ -1,18 +1,15 @@
 """Depth conventions against quadrature and float64, and in degenerate cases."""
 
-import itertools
 import math
 from decimal import Decimal, localcontext
 
-import numpy as np
 import pytest
 import torch
-from conftest import TOLERANCE
 from hypothesis import given
 from hypothesis import strategies as st
 from oracles import quadrature_of_end_density, quadrature_of_squares
 
-from nerfcli.kernels import RayTermination, numba_cpu, reference
+from nerfcli.kernels import numba_cpu, reference
 from nerfcli.kernels.reference import depth
 from nerfcli.render.depth import DepthRequest, disagreement, fractions, requested, spread
 
@@ -118,36 +115,6 @@ def test_gradients_are_finite_at_the_extremes():
     assert isinstance(total, torch.Tensor)
     (gradient,) = torch.autograd.grad(total, density)
     assert torch.isfinite(gradient).all()
-
-
-def many_rays(seed, counts, *, low, high):
-    """Packed float32 rays whose optical depths per interval are log-uniform, with empty intervals and gaps."""
-    random = np.random.default_rng(seed)
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    starts, ends = (np.empty(offsets[-1]) for _ in range(2))
-    for first, last in itertools.pairwise(offsets):
-        edges = np.cumsum(random.uniform(0.01, 1.0, 2 * (last - first))) + 0.5
-        starts[first:last], ends[first:last] = edges[::2], edges[1::2]
-    starts, ends = starts.astype(np.float32), ends.astype(np.float32)
-    density = 10 ** random.uniform(low, high, len(starts)) * (random.uniform(size=len(starts)) > 0.1)
-    return torch.tensor(density, dtype=torch.float32), torch.tensor(starts), torch.tensor(ends), torch.tensor(offsets)
-
-
-@pytest.mark.parametrize("counts", [[], [0], [1], [5, 0, 1], [123, 1, 0, 7, 40] * 5])
-@pytest.mark.parametrize(("low", "high"), [(-12, -3), (-3, 1), (-1, 6), (-12, 6)])
-def test_the_fast_kernel_agrees_with_the_definition_in_float64(counts, low, high):
-    density, starts, ends, offsets = many_rays(3, counts, low=low, high=high)
-    fractions = (0.9, 0.05, 0.5)
-    fast = numba_cpu.ray_termination(density, starts, ends, offsets=offsets, fractions=fractions)
-    exact = depth.ray_termination(
-        density.double(), starts.double(), ends.double(), offsets=offsets, fractions=fractions
-    )
-    for name, value, wanted in zip(RayTermination._fields, fast, exact, strict=True):
-        assert value.dtype == torch.float32
-        torch.testing.assert_close(
-            value.double(), wanted, rtol=TOLERANCE[torch.float32], atol=torch.finfo(torch.float32).tiny, equal_nan=True,
-            msg=lambda text, name=name: f"{name}: {text}",
-        )  # fmt: skip
 
 
 def test_median_crossing_in_a_later_interval_and_through_a_gap():

@@ -5,10 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from conftest import TOLERANCE
 from hypothesis import given
 from hypothesis import strategies as st
-from oracles import march_through_slabs, trilinear_hash
 
 from nerfcli import kernels
 from nerfcli.kernels import March, Rays, reference
@@ -26,33 +24,6 @@ def random_rays(seed, counts, dtype=torch.float64):
     return density, lengths, rgb, offsets
 
 
-@pytest.mark.parametrize("counts", [[5], [0, 3, 1, 0, 7], [0], [0, 0], [1, 123]])
-def test_composite_against_double_loop(counts):
-    density, lengths, rgb, offsets = random_rays(1, counts)
-    background = torch.rand(len(counts), 3, dtype=torch.float64)
-    colour, transmittance, weights = reference.composite(density, rgb, lengths, offsets=offsets, background=background)
-    for ray in range(len(counts)):
-        own = slice(int(offsets[ray]), int(offsets[ray + 1]))
-        expected = march_through_slabs(density[own].numpy(), lengths[own].numpy(), rgb[own].numpy(), background[ray])
-        np.testing.assert_allclose(weights[own], expected[0], rtol=1e-13)
-        np.testing.assert_allclose(transmittance[ray], expected[1], rtol=1e-13)
-        np.testing.assert_allclose(colour[ray], expected[2], rtol=1e-12)
-
-
-@pytest.mark.parametrize("counts", [[5], [0, 3, 1, 0, 7], [0], [1, 40]])
-def test_distortion_against_double_loop(counts):
-    weights, lengths, _, offsets = random_rays(3, counts)
-    ends = lengths.cumsum(0)
-    starts = ends - lengths
-    actual = reference.distortion(weights, starts, ends, offsets)
-    for ray in range(len(counts)):
-        own = range(int(offsets[ray]), int(offsets[ray + 1]))
-        middles = (starts + ends) / 2
-        expected = sum(float(weights[i] * weights[j] * (middles[i] - middles[j]).abs()) for i in own for j in own)
-        expected += sum(float(weights[i] ** 2 * lengths[i]) / 3 for i in own)
-        assert math.isclose(float(actual[ray]), expected, rel_tol=1e-12, abs_tol=1e-15)
-
-
 def test_distortion_of_two_points_is_their_distance():
     places = torch.tensor([0.25, 2.0], dtype=torch.float64)
     weights = torch.tensor([0.3, 0.6], dtype=torch.float64, requires_grad=True)
@@ -61,15 +32,6 @@ def test_distortion_of_two_points_is_their_distance():
     starts = torch.tensor([0.0, 1.0], dtype=torch.float64)
     offsets = torch.tensor([0, 2])
     assert torch.autograd.gradcheck(lambda w: reference.distortion(w, starts, starts + 0.5, offsets), (weights,))
-
-
-def test_no_rays_at_all():
-    empty = torch.zeros(0, dtype=torch.float64)
-    colour, transmittance, weights = reference.composite(
-        empty, empty.reshape(0, 3), empty, offsets=torch.zeros(1, dtype=torch.int64), background=torch.ones(3)
-    )
-    assert colour.shape == (0, 3)
-    assert transmittance.shape == weights.shape == (0,)
 
 
 @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 6), at=st.floats(0.01, 0.99))
@@ -99,25 +61,6 @@ def test_composite_gradcheck():
 
 RESOLUTIONS = (4, 7, 40)
 ROWS = 512  # the first two levels fit densely (125 vertices, and 512), the last is hashed
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_hash_encode_against_python_integers(dtype):
-    g = torch.Generator().manual_seed(0)
-    table = torch.rand(3, ROWS, 4, generator=g, dtype=dtype)
-    points = torch.rand(40, 3, generator=g, dtype=dtype)
-    points[:4] = torch.tensor([[0, 0, 0], [1, 1, 1], [0.25, 0.5, 1], [-0.5, 2, 0.3]], dtype=dtype)
-    encoded = reference.hash_encode(points, table, RESOLUTIONS)
-    expected = np.array([trilinear_hash(p, table.double().numpy(), RESOLUTIONS) for p in points.double().numpy()])
-    # A float32 coordinate times 40 cells is off by 40 eps of a cell.
-    np.testing.assert_allclose(encoded.double().numpy(), expected, atol=40 * TOLERANCE[dtype])
-
-
-def test_hash_encode_reads_no_row_that_is_no_vertex():
-    table = torch.full((1, ROWS, 4), torch.nan)
-    table[0, :125] = 1.0
-    points = torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 0.5], [7.0, -3.0, 1.0]])
-    assert torch.equal(reference.hash_encode(points, table, (4,)), torch.ones(3, 4))
 
 
 def test_hash_encode_leaves_levels_out():

@@ -31,13 +31,15 @@ from nerfcli.kernels.triton_cuda.cubin import Cubin, UnexpectedCodeError, compil
 from nerfcli.kernels.triton_cuda.launch import Variant
 
 HERE = Path(__file__).parent
+# The first replaces parts of Triton's interpreter by faster ones, for both.
+SUITE = (sys.executable, "-m", "pytest", "-p", "no:cacheprovider", HERE / "triton_kernels.py", HERE / "test_kernels.py")
 CUOBJDUMP, NVDISASM = (Path(nvidia.__file__).parent / "bin" / name for name in ("cuobjdump", "nvdisasm"))
 # Shared memory of an Ampere, Ada or Blackwell desktop card, in bytes per program.
 MOST_SHARED = 99 * 1024
 
 
 class Interpreted(NamedTuple):
-    """The tests of `triton_kernels` in the interpreter: exit code, output, and the variants that they launched."""
+    """The tests of the GPU kernels in the interpreter: exit code, output, and the variants that they launched."""
 
     code: int
     output: str
@@ -48,8 +50,8 @@ class Interpreted(NamedTuple):
 def interpreted(tmp_path_factory: pytest.TempPathFactory) -> Interpreted:
     path = tmp_path_factory.mktemp("triton") / "variants.json"
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", HERE / "triton_kernels.py"],
-        env={**os.environ, "TRITON_INTERPRET": "1", "NERFCLI_VARIANTS": str(path)},
+        [*SUITE, "-x"],
+        env={**os.environ, "NERFCLI_KERNELS": "triton_cuda", "TRITON_INTERPRET": "1", "NERFCLI_VARIANTS": str(path)},
         capture_output=True,
         text=True,
         check=False,
@@ -123,9 +125,16 @@ def test_kernels_agree_with_the_reference_on_a_gpu():
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     plain = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", HERE / "triton_kernels.py"]
+    plain["NERFCLI_KERNELS"] = "triton_cuda"
     for _ in range(2):
-        done = subprocess.run(command, env=plain, capture_output=True, text=True, check=False, cwd=HERE.parent)
+        done = subprocess.run(
+            SUITE,
+            env=plain,
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=HERE.parent,
+        )
         assert done.returncode == 0, done.stdout + done.stderr
 
 

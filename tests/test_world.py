@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 from examples import examples
+from frame_rays import frame_rays
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -153,3 +155,15 @@ def test_origins():
 def test_what_is_no_direction_or_place_is_refused(make, what):
     with pytest.raises(UserError, match=what):
         make()
+
+
+def test_rays_a_million_units_from_the_origin_keep_their_digits():
+    """The similarity to the training frame is applied in float64: steps are right to 8 roundings of a place."""
+    centre, offset = np.array([1e6, -1e6, 1e6]), np.array([0.25, 0.125, -0.5])
+    frame = Frame("a", Camera.pinhole(8, 6, 8.0), rigid.from_parts(np.eye(3), centre + offset))
+    rays = frame_rays(frame, Similarity(1.0, np.eye(3), -centre), torch.device("cpu"))
+    distances = torch.arange(1, 1025) * (3**0.5 / 1024)
+    steps = (rays.origin + rays.directions[0] * distances[:, None]).double().diff(dim=0).norm(dim=1)
+    exact = rays.directions[0].double() * distances.double()[:, None]
+    wanted = (torch.from_numpy(offset) + exact).diff(dim=0).norm(dim=1)
+    torch.testing.assert_close(steps, wanted, rtol=0, atol=8 * 2.0**-24 * 2.5)

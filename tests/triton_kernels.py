@@ -1,6 +1,6 @@
-"""The GPU kernels against the reference in float64: values and gradients, on odd sizes, in every branch.
+"""What the GPU kernels have beside the operations of `test_kernels`, against the reference in float64.
 
-`test_triton_kernels` runs this file in a separate process: in Triton's interpreter on the CPU, or on a GPU.
+`test_triton` runs both files in a separate process, this one first: in Triton's interpreter on the CPU, or on a GPU.
 """
 
 # pyrefly: ignore-errors[bad-argument-count]
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from test_kernels import DEVICE, RELATIVE, SIZES, assert_close, offsets_of, points_and_table
 from torch import Tensor
 from triton.language import core
 from triton.language.semantic import TritonSemantic
@@ -28,10 +29,8 @@ from nerfcli import kernels
 from nerfcli.kernels import (
     AdamStep,
     Backend,
-    BearingGrids,
     HashGrid,
     March,
-    PixelTable,
     Rays,
     Targets,
     reference,
@@ -40,15 +39,12 @@ from nerfcli.kernels import (
 from nerfcli.kernels.contraction import contract
 from nerfcli.kernels.selftest.measure import MET, Precision
 from nerfcli.kernels.selftest.table import OF_GPU, checks, row_of
-from nerfcli.kernels.triton_cuda import compositing, coordinates, depth, hash_grid, marching, networks, pixels, row_adam
-from nerfcli.kernels.triton_cuda import rays as along
+from nerfcli.kernels.triton_cuda import compositing, coordinates, hash_grid, marching, networks
 from nerfcli.kernels.triton_cuda.backend import TritonBackend
-from nerfcli.kernels.triton_cuda.launch import INTERPRETED, seen
+from nerfcli.kernels.triton_cuda.launch import seen
 
-DEVICE = torch.device("cpu" if INTERPRETED else "cuda")
-SIZES = [0, 1, 5, 123]
 # Relative tolerances: of float32, and of values that pass through float16 (11 bits) and sums of them.
-SINGLE, HALF = 1e-5, 6e-3
+SINGLE, HALF = RELATIVE, 6e-3
 
 
 @cache
@@ -114,66 +110,22 @@ def _interpreted_fast() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
-
-
-def assert_close(actual: Tensor | None, expected: Tensor | None, name: str, *, relative: float = SINGLE) -> None:
-    assert actual is not None, name
-    assert expected is not None, name
-    actual, expected = actual.detach().cpu().double(), expected.detach().cpu().double()
-    assert actual.shape == expected.shape, name
-    if actual.numel() == 0:
-        return
-    assert torch.isfinite(actual).all(), name
-    error = actual - expected
-    assert error.norm() <= relative * expected.norm() + 1e-30, (name, float(error.norm() / expected.norm()))
-    assert error.abs().max() <= relative * expected.abs().max() + 1e-30, name
-
-
 def on_device(*tensors: Tensor) -> Any:
     return tuple(tensor.to(DEVICE) for tensor in tensors)
 
 
-def offsets_of(samples: int, generator: torch.Generator) -> Tensor:
-    """Return offsets of rays of random sizes: some are empty, and one is longer than a Triton program's block."""
-    cuts = torch.randint(0, samples + 1, (max(1, samples // 9),), generator=generator).sort()[0]
-    cuts = cuts[cuts <= samples // 3]
-    return torch.cat([torch.tensor([0]), cuts, torch.tensor([samples // 3, samples, samples])])
-
-
-@pytest.mark.parametrize(("samples", "faded"), [(0, True), (1, False), (5, True), (123, False), (123, True)])
-def test_hash_encode(samples, faded, generator):
-    resolutions = (7, 0, 40)  # the first has as many vertices as the table has rows, the second is left out
-    table = torch.randn(3, 512, 4, generator=generator)
-    points = torch.rand(samples, 3, generator=generator) * 1.2 - 0.1  # some are clamped
-    points[::7, 0], points[1::7, 1] = 0.0, 1.0
-    gradient = torch.randn(samples, 12, generator=generator)
-    gradient[::5, 4:] = 0.0
-    widths = torch.rand(samples, generator=generator).pow(4) if faded else None
-    exact = [x.clone().requires_grad_() for x in (points, table)]
-    reference.hash_encode(exact[0], exact[1], resolutions, widths).backward(gradient)
-    fast = [x.to(DEVICE).requires_grad_() for x in (points, table)]
-    given = None if widths is None else widths.to(DEVICE)
-    encoded = hash_grid.hash_encode(fast[0], fast[1], resolutions, None, given)
-    encoded.backward(gradient.to(DEVICE))
-    assert_close(encoded, reference.hash_encode(points, table, resolutions, widths), "encoded")
-    for name, a, b in zip(("points", "table"), fast, exact, strict=True):
-        assert_close(a.grad, b.grad, name)
-    table_grad = torch.ones_like(fast[1].detach())
-    hash_grid.hash_encode(fast[0].detach(), fast[1], resolutions, table_grad, given).backward(gradient.to(DEVICE))
-    assert_close(table_grad - 1, exact[1].grad, "sink")
-    half = hash_grid.encode(fast[0].detach(), fast[1].detach().half(), resolutions, widths=given, dtype=torch.float16)
+@pytest.mark.parametrize("faded", [False, True])
+def test_hash_encode_fills_a_sink_and_writes_half_precision(faded, generator):
+    given = points_and_table(1.0, faded, 123, generator)
+    points, table, gradient = on_device(given["points"], given["table"], given["gradient"])
+    widths = given["widths"].to(DEVICE) if faded else None
+    resolutions, sink = (4, 7, 0, 40, 70), torch.ones_like(table)
+    encoded = hash_grid.hash_encode(points, table.requires_grad_(), resolutions, None, widths)
+    (wanted,) = torch.autograd.grad(encoded, table, gradient)
+    hash_grid.hash_encode(points, table, resolutions, sink, widths).backward(gradient)
+    assert_close(sink - 1, wanted, "sink")
+    half = hash_grid.encode(points, table.detach().half(), resolutions, widths=widths, dtype=torch.float16)
     assert_close(half.float(), encoded, "float16", relative=1e-3)
-
-
-def test_hash_encode_reads_no_row_that_is_no_vertex():
-    table = torch.full((1, 512, 4), torch.nan)
-    table[0, :125] = 1.0
-    points = torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 0.5], [7.0, -3.0, 1.0]])
-    encoded = hash_grid.hash_encode(*on_device(points, table), (4,))
-    assert torch.equal(encoded.cpu(), torch.ones(3, 4))
 
 
 def layers_of(hidden: int, generator: torch.Generator) -> list[Tensor]:
@@ -255,21 +207,6 @@ def exactly(rays: Rays, march: March) -> tuple[Rays, March]:
     return plain, march._replace(edges=march.edges.cpu().double(), occupied=march.occupied.cpu())
 
 
-@pytest.mark.parametrize(("count", "contraction"), [(0, "l2"), (1, "l2"), (5, "none"), (123, "l2")])
-def test_occupied_samples(count, contraction, generator):
-    given = rays_and_march(count, contraction, generator)
-    fast, exact = marching.occupied_samples(*given), reference.occupied_samples(*exactly(*given))
-    assert torch.equal(fast[3].cpu(), exact[3])
-    for name, a, b in zip(("starts", "ends", "coordinates"), fast, exact, strict=False):
-        assert_close(a, b, name)
-    index = along.ray_indices(fast[3])
-    assert torch.equal(index.cpu(), reference.ray_indices(exact[3]))
-    values = torch.randn(len(index), 3, generator=generator)
-    assert_close(
-        along.sum_along_rays(values.to(DEVICE), fast[3]), reference.sum_along_rays(values.double(), exact[3]), "sums"
-    )
-
-
 @pytest.mark.parametrize(("count", "room", "faded"), [(0, 0, False), (1, 0, True), (5, 1, True), (60, 2000, False)])
 def test_visible_samples(count, room, faded, generator):
     """With no, too little and too much room for candidates."""
@@ -344,70 +281,6 @@ def test_sample_coordinates(samples, contraction, reach, generator):
         assert_close(a.grad, b.grad, name, relative=2e-5)
 
 
-def samples_along(
-    samples: int, magnitude: float, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return density, colours, starts, ends and offsets.
-
-    At the smallest and the largest magnitudes, every 11th sample is a million times denser. At the others, rays absorb
-    along their whole length, also beyond the first block of a Triton program.
-    """
-    offsets = offsets_of(samples, generator)
-    density = torch.rand(samples, generator=generator) * magnitude
-    if not 1e-3 < magnitude < 10.0:
-        density[3::11] *= 1e6
-    starts = torch.arange(samples) * 0.11 + 0.05 * torch.rand(samples, generator=generator)
-    ends = starts + 0.05 * torch.rand(samples, generator=generator)
-    return density, torch.rand(samples, 3, generator=generator), starts, ends, offsets
-
-
-@pytest.mark.parametrize("samples", SIZES)
-@pytest.mark.parametrize("magnitude", [1e-6, 1.0, 100.0])
-def test_composite(samples, magnitude, generator):
-    density, rgb, starts, ends, offsets = samples_along(samples, magnitude, generator)
-    lengths, rays = ends - starts, len(offsets) - 1
-    background = torch.rand(rays, 3, generator=generator)
-    given = [torch.randn(s, generator=generator) for s in ((rays, 3), (rays,), (samples,))]
-
-    def run(function, dtype, device):
-        inputs = [x.to(device, dtype).clone().requires_grad_() for x in (density, rgb)]
-        out = function(
-            *inputs, lengths.to(device, dtype), offsets=offsets.to(device), background=background.to(device, dtype)
-        )
-        torch.stack([(a * b.to(device, dtype)).sum() for a, b in zip(out, given, strict=True)]).sum().backward()
-        return *out, *(x.grad for x in inputs)
-
-    cpu = torch.device("cpu")
-    fast, exact = run(compositing.composite, torch.float32, DEVICE), run(reference.composite, torch.float64, cpu)
-    for name, a, b in zip(("colour", "transmittance", "weights", "by density", "by rgb"), fast, exact, strict=True):
-        assert_close(a, b, name)
-    plain = [x.double() for x in (density, lengths)]
-    here = on_device(density, lengths, offsets)
-    assert_close(compositing.optical_depth_before(*here), reference.optical_depth_before(*plain, offsets), "before")
-    for name, a, b in zip(
-        ("weights", "passing"),
-        compositing.interval_weights(*here), reference.interval_weights(*plain, offsets), strict=True,
-    ):  # fmt: skip
-        assert_close(a, b, name)
-
-
-@pytest.mark.parametrize("samples", SIZES)
-@pytest.mark.parametrize("far", [0.0, 1e4])
-def test_distortion(samples, far, generator):
-    """Also far away, where differences of sums of weighted distances would have no digits left."""
-    density, _, starts, ends, offsets = samples_along(samples, 1.0, generator)
-    starts, ends = starts + far, ends + far
-    weights = reference.interval_weights(density, (ends - starts), offsets)[0]
-    gradient = torch.randn(len(offsets) - 1, generator=generator)
-    exact, fast = weights.double().requires_grad_(), weights.to(DEVICE).requires_grad_()
-    wanted = reference.distortion(exact, starts.double(), ends.double(), offsets)
-    found = compositing.distortion(fast, *on_device(starts, ends, offsets))
-    wanted.backward(gradient.double())
-    found.backward(gradient.to(DEVICE))
-    assert_close(found, wanted, "distortion")
-    assert_close(fast.grad, exact.grad, "gradient")
-
-
 def test_visits_leave_out_densities_that_are_not_a_number(generator):
     rays, march = rays_and_march(60, "l2", generator)
     table = 0.7 * torch.randn(8, 64, 4, generator=generator)
@@ -436,61 +309,6 @@ def test_contracted_distances(samples, generator):
     found = compositing.contracted_distances(*on_device(starts, ends))
     for distances, contracted in zip((starts, ends), found, strict=True):
         assert_close(contracted, reference.contracted_distance(distances.double()), "contracted distances")
-
-
-@pytest.mark.parametrize("samples", SIZES)
-@pytest.mark.parametrize("magnitude", [0.01, 3.0, 100.0])
-@pytest.mark.parametrize("fractions", [(), (0.9, 0.1, 0.5)])
-def test_ray_termination(samples, magnitude, fractions, generator):
-    density, _, starts, ends, offsets = samples_along(samples, magnitude, generator)
-    if samples == 123:
-        density[60:90] = 0.0
-    exact = reference.ray_termination(
-        *(x.double() for x in (density, starts, ends)), offsets=offsets, fractions=fractions
-    )
-    fast = depth.ray_termination(*on_device(density, starts, ends), offsets=offsets.to(DEVICE), fractions=fractions)
-    for name in exact._fields:
-        torch.testing.assert_close(
-            getattr(fast, name).cpu().double(), getattr(exact, name), rtol=2e-5, atol=1e-7, equal_nan=True,
-            msg=lambda text, name=name: f"{name} {text}",
-        )  # fmt: skip
-
-
-@pytest.mark.parametrize("rows", SIZES)
-@pytest.mark.parametrize("decay", [0.0, 0.3])
-def test_adam_rows(rows, decay, generator):
-    """Including rows in which only one feature has a gradient, or none."""
-    start = [torch.randn(1, rows, 4, generator=generator) for _ in range(4)]
-    start[3].square_()
-    start[1][:, 1::3] = 0.0
-    start[1][:, 2::5, 1:] = 0.0
-    step = AdamStep(3, 1e-2, (0.9, 0.99), 1e-15, decay)
-    exact, fast = [x.double() for x in start], [x.clone().to(DEVICE) for x in start]
-    half = fast[0].half()
-    reference.adam_rows(*exact, step=step)
-    row_adam.adam_rows(*fast, half=half, step=step)
-    for name, a, b in zip(("table", "gradient", "first", "second"), fast, exact, strict=True):
-        assert_close(a, b, name)
-    assert torch.equal(half, fast[0].half())
-
-
-@pytest.mark.parametrize("count", SIZES)
-@pytest.mark.parametrize(("photos", "channels", "with_grids"), [(1, 3, False), (5, 4, False), (3, 3, True)])
-def test_pixel_rays(count, photos, channels, with_grids, generator):
-    first = torch.arange(photos) * 12
-    bearings, poses = torch.randn(32, 3, generator=generator), torch.randn(photos, 4, 4, generator=generator)
-    colours = torch.randint(256, (photos * 12, channels), generator=generator, dtype=torch.uint8)
-    table = PixelTable(first, torch.arange(photos) % 2 * 12, bearings, poses, colours)
-    on_gpu = PixelTable(*on_device(*table[:5]))
-    if with_grids:  # photos of 4 x 3, two of them between the bearings of a grid of 5 x 4, the last one on its own
-        corners = torch.tensor([[0.25, 0.35, 0.15, 0.25], [0.1, 0.2, 0.3, 0.4], [1.0, 0.0, 0.0, 0.0]])
-        grids = BearingGrids(torch.tensor([[4, 5], [4, 5], [4, 4]]), corners)
-        table, on_gpu = table._replace(grids=grids), on_gpu._replace(grids=BearingGrids(*on_device(*grids)))
-    chosen = torch.randint(photos * 12, (count,), generator=generator)
-    found = pixels.pixel_rays(chosen.to(DEVICE), on_gpu)
-    wanted = reference.pixel_rays(chosen, table)
-    for name, a, b in zip(("origins", "directions", "colours"), found, wanted, strict=True):
-        assert_close(a, b, name)
 
 
 def whole(

@@ -1,13 +1,13 @@
 """The operations on hard cases: inputs, answers, errors and bounds.
 
-The answers come from the definitions in float64, on exactly the numbers of the tested precision. The tests compare the
-definitions themselves with answers of 60 digits.
+The answers come from the definitions in float64, on exactly the numbers of the tested precision. The tests run the same
+operations on the same inputs, also on random ones, and compare the definitions with answers of 60 digits.
 """
 
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import ModuleType
 
 import torch
@@ -21,7 +21,7 @@ from nerfcli.kernels.selftest.measure import Errors, Precision, largest_error
 
 BACKGROUND = COLOUR_GRADIENT = (1.0, 0.5, 0.25)
 TRANSMITTANCE_GRADIENT = 0.5
-FRACTIONS = (0.5, 0.05, 0.95)
+QUANTILES, FRACTIONS = tuple(textbook.QUANTILES), tuple(textbook.QUANTILES.values())
 RATE, BETAS, EPS = 0.01, (0.9, 0.99), 1e-15
 # From this pixel number on, float32 cannot distinguish neighbouring numbers.
 MANY = 2**24
@@ -31,17 +31,18 @@ Inputs = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of an operation.
+    """Result of an operation, by names.
 
     Args:
         values, gradients: outputs of the operation, and gradients of a weighted sum of them, if any.
-        sizes, value_sizes: magnitudes that errors of gradients and values are relative to; empty for their own.
+        sizes: magnitudes that errors of some of the gradients are relative to; those of others, to their own.
+        value_sizes: the same for values.
     """
 
-    values: tuple[Tensor, ...]
-    gradients: tuple[Tensor, ...] = ()
-    sizes: tuple[Tensor, ...] = ()
-    value_sizes: tuple[Tensor, ...] = ()
+    values: Inputs
+    gradients: Inputs = field(default_factory=dict)
+    sizes: Inputs = field(default_factory=dict)
+    value_sizes: Inputs = field(default_factory=dict)
 
 
 def exact(given: Tensor) -> Tensor:
@@ -57,9 +58,8 @@ def errors(got: Outcome, wanted: Outcome, *, tiny: float) -> Errors:
     return Errors(value, _largest(got.gradients, wanted.gradients, wanted.sizes, tiny=tiny))
 
 
-def _largest(got: Sequence[Tensor], wanted: Sequence[Tensor], sizes: Sequence[Tensor], *, tiny: float) -> float:
-    of = zip(got, wanted, sizes or wanted, strict=True)
-    return max(largest_error(values, answers, tiny=tiny, scale=size) for values, answers, size in of)
+def _largest(got: Inputs, wanted: Inputs, sizes: Inputs, *, tiny: float) -> float:
+    return max(largest_error(got[name], wanted[name], tiny=tiny, scale=sizes.get(name)) for name in got)
 
 
 def both(roundings: float, precision: Precision) -> Errors:
@@ -74,7 +74,7 @@ def gradients_of(function: Callable[[Tensor], Tensor], given: Tensor) -> Outcome
     weights = torch.tensor(COLOUR_GRADIENT if given.ndim == 2 else 1.0).to(values)
     (gradient,) = torch.autograd.grad((values * weights).sum(), given)
     size = gradient.abs().amax(-1, keepdim=True).expand_as(gradient) if given.ndim == 2 else gradient
-    return Outcome((values.detach(),), (gradient,), (size,))
+    return Outcome({"values": values.detach()}, {"gradient": gradient}, {"gradient": size})
 
 
 def _offsets(counts: Sequence[int], precision: Precision) -> Tensor:
@@ -123,27 +123,31 @@ def composite(module: ModuleType, given: Inputs) -> Outcome:
     colour, transmittance, weights = module.composite(
         density, rgb, given["lengths"], offsets=given["offsets"], background=given["background"]
     )
+    values = {"colour": colour.detach(), "transmittance": transmittance.detach(), "weights": weights.detach()}
     loss = (colour * given["colour_gradient"]).sum() + TRANSMITTANCE_GRADIENT * transmittance.sum()
     gradients = torch.autograd.grad(loss + (given["weights_gradient"] * weights).sum(), (density, rgb))
     counts = given["offsets"].diff().tolist()
-    values = ((rgb * given["colour_gradient"]).sum(1) + given["weights_gradient"]).detach()
+    gains = ((rgb * given["colour_gradient"]).sum(1) + given["weights_gradient"]).detach()
     behind = (given["background"] @ given["colour_gradient"] + TRANSMITTANCE_GRADIENT) * transmittance.detach()
     sizes = []
     columns = (
-        x.split(counts) for x in (density.detach() * given["lengths"], given["lengths"], values, weights.detach())
+        x.split(counts) for x in (density.detach() * given["lengths"], given["lengths"], gains, weights.detach())
     )
     for (own, lengths, value, weight), last in zip(zip(*columns, strict=True), behind, strict=True):
         seen = (weight * value).abs()
         sizes.append(lengths * ((-own.cumsum(0)).exp() * value.abs() + seen.flip(0).cumsum(0).flip(0) - seen + last))
-    answers = (colour.detach(), transmittance.detach(), weights.detach())
-    return Outcome(answers, gradients, (torch.cat(sizes) if sizes else density, gradients[1]))
+    return Outcome(
+        values,
+        dict(zip(("by density", "by rgb"), gradients, strict=True)),
+        {"by density": torch.cat(sizes) if sizes else density},
+    )
 
 
 def before(module: ModuleType, given: Inputs) -> Outcome:
     """Compute the optical depths in front of intervals."""
     density = _density_for(module, given)
     before = module.optical_depth_before(density, given["lengths"], offsets=given["offsets"])
-    return Outcome((before.detach(),), _by(before, density))
+    return Outcome({"before": before.detach()}, _by(before, density, "by density"))
 
 
 def distortion(module: ModuleType, given: Inputs) -> Outcome:
@@ -151,14 +155,16 @@ def distortion(module: ModuleType, given: Inputs) -> Outcome:
     weights = given["weights"].detach().requires_grad_()
     offsets = torch.tensor([0, len(weights)], device=weights.device)
     value = module.distortion(weights, given["starts"], given["ends"], offsets)
-    return Outcome((value.detach().reshape(1),), torch.autograd.grad(value.sum(), weights))
+    (gradient,) = torch.autograd.grad(value.sum(), weights)
+    return Outcome({"distortion": value.detach().reshape(1)}, {"by weights": gradient})
 
 
-def _by(values: Tensor, density: Tensor) -> tuple[Tensor, ...]:
+def _by(values: Tensor, density: Tensor, name: str) -> Inputs:
     """Return the gradient of the sum of the defined values by density; empty if the operation has none."""
     if not values.requires_grad:
-        return ()
-    return torch.autograd.grad(torch.where(values.isnan(), 0.0, values).sum(), density, retain_graph=True)
+        return {}
+    total = torch.where(values.isnan(), 0.0, values).sum()
+    return {name: torch.autograd.grad(total, density, retain_graph=True)[0]}
 
 
 def _density_for(module: ModuleType, given: Inputs) -> Tensor:
@@ -202,65 +208,71 @@ def depth_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Err
     return Errors(bound, 16 * bound)
 
 
-def ray_termination(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> Outcome:
-    """Compute the depths of rays that `columns` names."""
+def depths(module: ModuleType, given: Inputs) -> Outcome:
+    """Compute all depths of rays, and the gradients of their sums without what is undefined."""
     density = _density_for(module, given)
-    seen = module.ray_termination(
-        density, given["starts"], given["ends"], offsets=given["offsets"], fractions=FRACTIONS
-    )
-    named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
-    named |= {"conditional": seen.mean, "max-weight": seen.peak}
-    named |= dict(zip(("median", "0.05", "0.95"), seen.quantiles.unbind(1), strict=True))
-    return _depths([named[column] for column in columns], columns, given, density)
+    if module is textbook:
+        named = textbook.depth(density, given["starts"], given["ends"], offsets=given["offsets"])
+    else:
+        seen = module.ray_termination(
+            density, given["starts"], given["ends"], offsets=given["offsets"], fractions=FRACTIONS
+        )
+        named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
+        named |= {"conditional": seen.mean, "max-weight": seen.peak}
+        named |= dict(zip(QUANTILES, seen.quantiles.unbind(1), strict=True))
+    if "settled" in given:
+        settled = dict(zip(QUANTILES, given["settled"].to(density.device).unbind(1), strict=True))
+        named |= {name: torch.where(settled[name], named[name], 0.0) for name in QUANTILES}
+    gradients: Inputs = {}
+    for name, values in named.items():
+        gradients |= _by(values, density, name)
+    return Outcome({name: values.detach() for name, values in named.items()}, gradients)
 
 
-def textbook_depth(columns: tuple[str, ...], given: Inputs) -> Outcome:
-    """Compute the same depths by textbook formulas."""
-    density = given["density"].detach().requires_grad_()
-    named = textbook.depth(density, given["starts"], given["ends"], offsets=given["offsets"])
-    return _depths([named[column] for column in columns], columns, given, density)
-
-
-def _depths(values: list[Tensor], columns: tuple[str, ...], given: Inputs, density: Tensor) -> Outcome:
-    if columns[0] == "median":
-        settled = given["settled"].to(density.device)
-        values = [torch.where(settled[:, i], value, 0.0) for i, value in enumerate(values)]
+def ray_termination(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> Outcome:
+    """Compute the depths of rays that `columns` names; errors of gradients are relative to the largest of each ray."""
+    every = depths(module, given)
     # Errors of the gradient of a spread are relative to terms that cancel, whose magnitudes only the tests know.
-    differentiable = () if columns == ("spread",) else values
-    gradients = tuple(gradient for value in differentiable for gradient in _by(value, density))
-    counts = given["offsets"].diff()
-    sizes = tuple(
-        torch.cat([part.abs().max().expand_as(part) for part in gradient.split(counts.tolist()) if len(part)])
-        for gradient in gradients
-    )
-    return Outcome(tuple(value.detach() for value in values), gradients, sizes)
+    gradients = {name: every.gradients[name] for name in columns if name in every.gradients and name != "spread"}
+    counts = given["offsets"].diff().tolist()
+    sizes = {
+        name: torch.cat([part.abs().max().expand_as(part) for part in gradient.split(counts) if len(part)])
+        for name, gradient in gradients.items()
+    }
+    return Outcome({name: every.values[name] for name in columns}, gradients, sizes)
 
 
-def grid_inputs(points: Sequence[cases.Point], levels: int, precision: Precision) -> Inputs:
-    """Return points and a table of features."""
+def grid_inputs(points: Sequence[cases.Point], grids: tuple[int, ...], rounded: int, precision: Precision) -> Inputs:
+    """Return points, a table of features, cells per axis of its levels, and whether scaled places are rounded there."""
     places = torch.tensor(points).tolist()  # the numbers that float32 holds
     return {
         "points": precision.tensor(places),
-        "table": precision.tensor(cases.hash_table(levels)),
+        "table": precision.tensor(cases.hash_table(len(grids))),
         "gains": precision.tensor(cases.GAINS),
+        "grids": torch.tensor(grids),
+        "rounded": rounded * torch.tensor(grids),
     }
 
 
-def encode(grids: tuple[int, ...], rounded: int, module: ModuleType, given: Inputs) -> Outcome:
+def encode(module: ModuleType, given: Inputs) -> Outcome:
     """Interpolate features between the vertices of hash grids."""
-    points, table = given["points"], given["table"].detach().requires_grad_()
-    encoded = module.hash_encode(points, table, grids).view(len(points), len(grids), -1)
+    points, table, grids = given["points"], given["table"].detach().requires_grad_(), given["grids"].tolist()
+    encoded = module.hash_encode(points, table, tuple(grids)).view(len(points), len(grids), -1)
     (gradient,) = torch.autograd.grad((encoded * given["gains"]).sum(), table)
-    blur = 1.0 + rounded * torch.tensor(grids, dtype=torch.float64)
+    blur = 1.0 + given["rounded"].double()
     sizes = blur[:, None] * given["table"].abs().amax((1, 2)).cpu()[:, None].double()
     largest = (blur[:, None, None] * gradient.abs().amax(1, keepdim=True).cpu().double()).expand_as(gradient)
-    return Outcome((encoded.detach(),), (gradient,), (largest,), (sizes.expand_as(encoded),))
+    return Outcome(
+        {"encoded": encoded.detach()},
+        {"by table": gradient},
+        {"by table": largest},
+        {"encoded": sizes.expand_as(encoded)},
+    )
 
 
-def encode_in_half(grids: tuple[int, ...], given: Inputs) -> Outcome:
+def encode_in_half(given: Inputs) -> Outcome:
     """Interpolate the same features in half precision."""
-    half = {name: values.half() for name, values in given.items()}
-    return encode(grids, 0, reference, half)
+    return encode(reference, {name: x.half() if x.is_floating_point() else x for name, x in given.items()})
 
 
 def pixel_inputs(precision: Precision) -> Inputs:
@@ -283,7 +295,8 @@ def pixel_rays(module: ModuleType, given: Inputs) -> Outcome:
     """Compute the rays and colours of chosen pixels."""
     table = PixelTable(given["first_pixel"], given["first_bearing"], given["bearings"], given["poses"], given["photos"])
     origins, directions, colours = module.pixel_rays(given["chosen"], table)
-    return Outcome((origins, directions, colours), value_sizes=(origins, torch.ones_like(directions), colours))
+    values = {"origins": origins, "directions": directions, "colours": colours}
+    return Outcome(values, value_sizes={"directions": torch.ones_like(directions)})
 
 
 def density(module: ModuleType, given: Inputs) -> Outcome:
@@ -309,14 +322,14 @@ def adam(module: ModuleType, given: Inputs) -> Outcome:
     """Compute Adam's first step."""
     table, first, second = (torch.zeros_like(given["gradients"]) for _ in range(3))
     module.adam_rows(table, given["gradients"].clone(), first, second, step=AdamStep(1, RATE, BETAS, EPS))
-    return Outcome((table,))
+    return Outcome({"table": table})
 
 
 def adam_in_half(given: Inputs) -> Outcome:
     """Compute Adam's first step with its state in half precision."""
     half = given["gradients"].half()
     moment, square = 0.1 * half, 0.01 * half * half
-    return Outcome((-RATE * (moment / 0.1) / ((square / 0.01).sqrt() + EPS),))
+    return Outcome({"table": -RATE * (moment / 0.1) / ((square / 0.01).sqrt() + EPS)})
 
 
 def contract_inputs(radii: Sequence[float], precision: Precision) -> Inputs:
@@ -346,7 +359,7 @@ def chords(module: ModuleType, given: Inputs) -> Outcome:
     rays = Rays(origins, given["directions"], origins.new_zeros(len(origins)))
     march = March(given["edges"], given["occupied"], "none", 1e9)
     samples = module.visible_samples(rays, march, HashGrid(origins.new_zeros(8, 16, 4), (2,) * 8, _layers(origins)))
-    return Outcome((reference.sum_along_rays(samples.ends - samples.starts, samples.offsets),))
+    return Outcome({"chords": reference.sum_along_rays(samples.ends - samples.starts, samples.offsets)})
 
 
 def volume_inputs(thickness: float, precision: Precision) -> Inputs:
@@ -368,7 +381,12 @@ def project(module: ModuleType, given: Inputs) -> Outcome:
     (gradient,) = torch.autograd.grad((integrals * given["gains"]).sum(), volume)
     back = module.back_project(given["gains"], *lines, shape=cases.VOLUME_SHAPE, **grid)
     largest = gradient.abs().max().expand_as(gradient)
-    return Outcome((integrals.detach(), back), (gradient,), (largest,), (integrals.detach(), largest))
+    return Outcome(
+        {"integrals": integrals.detach(), "transpose": back},
+        {"by volume": gradient},
+        {"by volume": largest},
+        {"transpose": largest},
+    )
 
 
 def project_in_single(given: Inputs) -> Outcome:

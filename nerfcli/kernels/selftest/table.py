@@ -1,9 +1,9 @@
 """The table of hard cases: operation, inputs, bounds and the textbook's formula of each; all rows of the selftest."""
 
-import functools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from types import ModuleType
 
 import torch
@@ -82,17 +82,30 @@ def row_of(check: Check, precision: Precision) -> Row:
 
 def checks() -> Iterator[Check]:
     """Yield every hard case."""
+    yield from light_checks()
+    for cut, thick in (("thin", False), ("thick", True)):
+        rays = [ray for ray in cases.depth_rays() if (operations.optical_depth(ray) > 1) is thick]
+        for name, columns in DEPTHS:
+            yield depth_check(f"{name}; {cut} rays", columns, rays)
+    yield from look_up_checks()
+    yield from step_checks()
+    for thickness in cases.THICKNESSES:
+        yield volume_check(thickness)
+
+
+def light_checks() -> Iterator[Check]:
+    """Yield the cases of compositing, optical depths and distortion."""
     for group in cases.groups():
         yield Check(
             group.name,
             "composite",
-            functools.partial(operations.light_inputs, group.rays),
+            partial(operations.light_inputs, group.rays),
             operations.composite,
-            functools.partial(operations.light_bound, group.rays),
+            partial(operations.light_bound, group.rays),
             "u (8 + (n + 2) (1 + tau)), n and tau as far as light comes, compiled 8 u; twice for a gradient, relative "
             "to its terms",
             formula="1 - exp, cumulative product, 1 - sum of weights",
-            textbook=functools.partial(operations.composite, textbook),
+            textbook=partial(operations.composite, textbook),
         )
     yield Check(
         "optical depth in front of an interval that is 1e11 times as thick, 1 to 4096",
@@ -104,7 +117,7 @@ def checks() -> Iterator[Check]:
         ),
         "(n + 1) u: sums of n terms that are all positive, 16 in bfloat16; compiled 2 u: sums in float64",
         formula="cumulative sum less the own part",
-        textbook=functools.partial(operations.before, textbook),
+        textbook=partial(operations.before, textbook),
         no_gradient=VALUE_ONLY,
     )
     yield Check(
@@ -116,31 +129,39 @@ def checks() -> Iterator[Check]:
         "3 n u: sums of n terms that are all positive; compiled 8 u: sums in float64",
         (SINGLE, COMPILED),
         formula="difference of running sums",
-        textbook=functools.partial(operations.distortion, textbook),
+        textbook=partial(operations.distortion, textbook),
     )
-    for cut, thick in (("thin", False), ("thick", True)):
-        rays = [ray for ray in cases.depth_rays() if (operations.optical_depth(ray) > 1) is thick]
-        for name, columns in (
-            ("opacity and transmittance", ("opacity", "transmittance")),
-            ("mean depth, of next to no light and of none", ("conditional",)),
-            ("spread of depth, of shells and fog", ("spread",)),
-            ("mean depth of the interval that stops most light", ("max-weight",)),
-            ("median and quantiles, not reached and inside intervals", ("median", "0.05", "0.95")),
-        ):
-            yield Check(
-                f"{name}; {cut} rays",
-                "ray_termination",
-                lambda precision, rays=rays: operations.depth_inputs(operations.meaningful(rays, precision), precision),
-                functools.partial(operations.ray_termination, columns),
-                lambda precision, rays=rays, factor=4 if columns == ("spread",) else 1: operations.depth_bound(
-                    operations.meaningful(rays, precision), factor, precision
-                ),
-                "u (16 + (n + 2) (1 + tau)), compiled 16 u; of a spread 4 times that; 16 times for a gradient, "
-                "relative to the largest of its ray",
-                formula="weights by 1 - exp at midpoints, their sum clamped at 1e-10",
-                textbook=functools.partial(operations.textbook_depth, columns),
-                no_gradient=VALUE_ONLY,
-            )
+
+
+# The depths, grouped by what makes them hard.
+DEPTHS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("opacity and transmittance", ("opacity", "transmittance")),
+    ("mean depth, of next to no light and of none", ("conditional",)),
+    ("spread of depth, of shells and fog", ("spread",)),
+    ("mean depth of the interval that stops most light", ("max-weight",)),
+    ("median and quantiles, not reached and inside intervals", operations.QUANTILES),
+)
+
+
+def depth_check(case: str, columns: tuple[str, ...], rays: list[cases.Ray]) -> Check:
+    """Return the case of some depths of rays."""
+    factor = 4 if columns == ("spread",) else 1
+    return Check(
+        case,
+        "ray_termination",
+        lambda precision: operations.depth_inputs(operations.meaningful(rays, precision), precision),
+        partial(operations.ray_termination, columns),
+        lambda precision: operations.depth_bound(operations.meaningful(rays, precision), factor, precision),
+        "u (16 + (n + 2) (1 + tau)), compiled 16 u; of a spread 4 times that; 16 times for a gradient, "
+        "relative to the largest of its ray",
+        formula="weights by 1 - exp at midpoints, their sum clamped at 1e-10",
+        textbook=partial(operations.ray_termination, columns, textbook),
+        no_gradient=VALUE_ONLY,
+    )
+
+
+def look_up_checks() -> Iterator[Check]:
+    """Yield the cases of features of hash grids and of rays of pixels."""
     for name, points, grids, rounded in (
         ("hash grid on borders and corners of cells, and outside", cases.BORDERS, cases.EXACT_GRIDS, 0),
         ("hash grid of up to 2048 cells, between vertices", cases.BETWEEN, cases.FINE_GRIDS, 1),
@@ -148,14 +169,14 @@ def checks() -> Iterator[Check]:
         yield Check(
             name,
             "hash_encode",
-            functools.partial(operations.grid_inputs, points, len(grids)),
-            functools.partial(operations.encode, grids, rounded),
+            partial(operations.grid_inputs, points, grids, rounded),
+            operations.encode,
             lambda precision, n=len(points): Errors(16 * precision.unit, (16 + n) * precision.unit),
             "16 u, of a gradient 16 + n, relative to the largest of the level; where places are rounded as they are "
             "counted in cells, times the resolution",
             (SINGLE, COMPILED),
             formula="places, table and sums in float16",
-            textbook=functools.partial(operations.encode_in_half, grids),
+            textbook=operations.encode_in_half,
         )
     yield Check(
         "pixels beyond number 2^24, first, last and only ones of their photos",
@@ -168,6 +189,10 @@ def checks() -> Iterator[Check]:
         formula="numbers of pixels in float32",
         textbook=lambda given: operations.pixel_rays(reference, {**given, "chosen": given["chosen"].float().long()}),
     )
+
+
+def step_checks() -> Iterator[Check]:
+    """Yield the cases of densities, Adam, contraction and marching."""
     yield Check(
         "density of a logarithm from -1000 to 3e38",
         "density_from_log",
@@ -193,7 +218,7 @@ def checks() -> Iterator[Check]:
         yield Check(
             name,
             "contract",
-            functools.partial(operations.contract_inputs, radii),
+            partial(operations.contract_inputs, radii),
             lambda module, given: operations.gradients_of(kernels.contract, given["points"]),
             lambda precision: Errors(8 * precision.unit, 64 * precision.unit),
             "8 roundings u; of the gradient 64, relative to the largest of its point",
@@ -205,25 +230,28 @@ def checks() -> Iterator[Check]:
         yield Check(
             name,
             "visible_samples",
-            functools.partial(operations.march_inputs, full),
+            partial(operations.march_inputs, full),
             operations.chords,
             lambda precision: Errors(0.0),
             "exact: steps of 2^-7 are kept or not by their middles; nothing is divided by a direction",
             (SINGLE, COMPILED),
         )
+
+
+def volume_check(thickness: float) -> Check:
+    """Return the case of line integrals through a volume."""
     planes = max(cases.VOLUME_SHAPE)
-    for thickness in cases.THICKNESSES:
-        yield Check(
-            f"line integrals up to {thickness:g} and their transpose, source near and 4e6 voxels away",
-            "project",
-            functools.partial(operations.volume_inputs, thickness),
-            operations.project,
-            lambda precision: operations.both(4 if precision.compiled else 4 * planes + 4, precision),
-            "(4 n + 4) u: sums over n planes of 4 voxels, all positive; compiled 4 u: sums in float64",
-            (SINGLE, COMPILED),
-            formula="lines in float32",
-            textbook=operations.project_in_single,
-        )
+    return Check(
+        f"line integrals up to {thickness:g} and their transpose, source near and 4e6 voxels away",
+        "project",
+        partial(operations.volume_inputs, thickness),
+        operations.project,
+        lambda precision: operations.both(4 if precision.compiled else 4 * planes + 4, precision),
+        "(4 n + 4) u: sums over n planes of 4 voxels, all positive; compiled 4 u: sums in float64",
+        (SINGLE, COMPILED),
+        formula="lines in float32",
+        textbook=operations.project_in_single,
+    )
 
 
 def precisions(device: str) -> tuple[Precision, ...]:

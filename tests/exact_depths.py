@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from itertools import pairwise
 
-from hard_cases.exact import DIGITS
-from nerfcli.kernels.selftest.cases import Ray
+from exact_answers import DIGITS
 
-FRACTIONS = (0.5, 0.05, 0.95)
+from nerfcli.kernels.selftest.cases import Ray
+from nerfcli.kernels.selftest.textbook import QUANTILES
+
 # Optical depths below which sixty digits are too few for the closed forms: of mean and variance, and of the
 # variance's derivative.
 _THIN, _THIN_SLOPE = Decimal("1e-15"), Decimal("1e-6")
@@ -41,7 +42,7 @@ class RayTermination:
     """All depths of a ray by name, and the start of its heaviest interval.
 
     Args:
-        depths: opacity, transmittance, conditional, spread, max-weight, median and the quantiles of `FRACTIONS`.
+        depths: opacity, transmittance, conditional, spread, max-weight, and `QUANTILES`.
         anchor: start of the interval in which most light ends; NaN without light.
     """
 
@@ -106,13 +107,8 @@ def _ray_termination(numbers: _Numbers) -> RayTermination:
             depths["max-weight"] = _depth(one.mean, slopes, sizes)
         else:
             depths |= dict.fromkeys(("conditional", "spread", "max-weight"), _undefined(ray))
-        depths |= {quantile_name(fraction): _quantile(ray, intervals, _target(fraction)) for fraction in FRACTIONS}
+        depths |= {name: _quantile(ray, intervals, _target(fraction)) for name, fraction in QUANTILES.items()}
         return RayTermination(depths, float(intervals[near[0]].start) if near else float("nan"))
-
-
-def quantile_name(fraction: float) -> str:
-    """Return the name of the depth by which a fraction of all light has ended."""
-    return "median" if fraction == 0.5 else f"quantile:{fraction:g}"
 
 
 def is_settled(ray: Ray, fraction: float, *, within: float) -> bool:

@@ -1,1 +1,0 @@
-"""Hard cases with 60-digit or closed-form answers, for the reference and the compiled kernels."""
