@@ -25,7 +25,8 @@ from rich.table import Table
 
 from nerfcli import kernels
 from nerfcli.captures.loading import load_scene
-from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
+from nerfcli.evaluate.photos import HeldOutPhoto
+from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.held_out_exposure import log_gains_of
 from nerfcli.render.model import load_model
@@ -103,9 +104,9 @@ def fit(folder: Path, choice: str, *, seed: int, steps: int, downscale: int, sam
         HeldOutPhoto(photo.frame, photo.pixels, photo.used, log_gains=tuple(gain))
         for photo, gain in zip(photos, gains, strict=True)
     ]
-    mean = evaluate_model(model, held_out, on_image=lambda done, total: None)["mean"]
+    mean = evaluate_model(model, held_out, on_image=lambda done, total: None).mean
     found = " ".join(f"{name}={value}" for name, value in picked.items())
-    return Trained(folder.name, choice or "default", found, seed, steps, mean["psnr"], mean["ssim"], used, samples)
+    return Trained(folder.name, choice or "default", found, seed, steps, mean.psnr, mean.ssim or 0.0, used, samples)
 
 
 def print_table(trained: list[Trained]) -> None:

@@ -256,7 +256,7 @@ def quality(capture: Path, device: str, seconds: int, folder: Path, *, dry: bool
     ).metrics
     summary = run.summary
     assert summary is not None
-    return {"psnr": float(metrics["mean"]["psnr"]), "steps": summary.steps, "seconds": summary.seconds}
+    return {"psnr": float(metrics.mean.psnr), "steps": summary.steps, "seconds": summary.seconds}
 
 
 def pictures(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:

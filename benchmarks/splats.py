@@ -72,7 +72,7 @@ def measure(run: Path, budget: float, field: dict[str, float], *, resume: bool, 
     seconds = time.perf_counter() - began
     small = Output(run.with_name("a.spz"), overwrite=True)
     spz = export_run(run, small, to="splats", splats=SplatSettings(count, budget))
-    found, of_spz = (evaluate_splats(run, path, Output(overwrite=True)).metrics for path in (ply, spz))
+    found, of_spz = (evaluate_splats(run, path, Output(overwrite=True)).metrics.to_json() for path in (ply, spz))
     return Row(
         **field,
         run=run.name,
@@ -103,7 +103,7 @@ def main(
         for run in runs:
             with tempfile.TemporaryDirectory() as folder:
                 copy = Path(shutil.copytree(run, Path(folder) / run.name, ignore=shutil.ignore_patterns("splats.*")))
-                metrics = evaluate_run(copy).metrics
+                metrics = evaluate_run(copy).metrics.to_json()
                 field = {
                     "train_s": metrics["training"]["seconds"],
                     "field_psnr": metrics["mean"]["psnr"],

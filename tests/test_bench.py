@@ -35,7 +35,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import BAD_INPUT, INTERRUPTED
-from nerfcli.evaluate.protocol import HeldOutPhoto
+from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.machine import processor_name
 from nerfcli.render.model import Model

@@ -23,7 +23,8 @@ from nerfcli.evaluate.billboards import (
     random_pixels,
 )
 from nerfcli.evaluate.metrics import to_8_bit
-from nerfcli.evaluate.protocol import Extras, HeldOutPhoto, evaluate_model, over_white
+from nerfcli.evaluate.photos import HeldOutPhoto, over_white
+from nerfcli.evaluate.protocol import Extras, evaluate_model
 from nerfcli.photos.colours import psnr_of
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
@@ -195,9 +196,10 @@ def test_the_spheres_have_a_shape(spheres_run):
         on_image=lambda done, total: None,
         extras=Extras(billboards=Billboards(scene.train_frames, photos)),
     )
-    assert metrics["shape"]["shown"]
-    assert metrics["shape"]["gain_db"] > 5
-    assert metrics["shape"]["field_psnr"] == pytest.approx(metrics["mean"]["psnr"], abs=0.5)
+    assert metrics.shape is not None
+    assert metrics.shape.shown
+    assert metrics.shape.gain_db > 5
+    assert metrics.shape.field_psnr == pytest.approx(metrics.mean.psnr, abs=0.5)
 
 
 def test_a_comparison_that_cannot_be_computed_ends_no_evaluation(spheres_run, monkeypatch: pytest.MonkeyPatch):
@@ -216,9 +218,9 @@ def test_a_comparison_that_cannot_be_computed_ends_no_evaluation(spheres_run, mo
     monkeypatch.setattr(billboards, "colours", singular)
     plain = evaluate_model(model, held_out, on_image=lambda done, total: None)
     metrics = evaluate_model(model, held_out, on_image=lambda done, total: None, extras=Extras(billboards=billboards))
-    assert metrics["shape"] is None
-    assert metrics["warnings"] == ["the comparison with a model without geometry failed: LinAlgError: singular matrix"]
-    assert metrics["mean"] == plain["mean"]
+    assert metrics.shape is None
+    assert metrics.warnings == ("the comparison with a model without geometry failed: LinAlgError: singular matrix",)
+    assert metrics.mean == plain.mean
 
 
 def test_one_training_view_and_a_view_that_none_has_seen_are_no_trouble():

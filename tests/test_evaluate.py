@@ -16,7 +16,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit, whole_windows
-from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model, over_white
+from nerfcli.evaluate.photos import HeldOutPhoto, over_white
+from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.field.exposure import exposed
 
 EVERYTHING = np.ones((24, 32), dtype=bool)
@@ -138,28 +139,29 @@ def test_evaluation_of_an_empty_model_is_the_distance_to_its_background():
     clear = HeldOutPhoto(frame("b.png"), np.zeros((12, 16, 4), dtype=np.uint8), None)
     calls: list[tuple[int, int]] = []
     metrics = evaluate_model(model, [opaque, clear], on_image=lambda done, total: calls.append((done, total)))
-    first, second = metrics["images"]
-    assert (first["name"], second["name"]) == ("a.png", "b.png")
-    assert first["psnr"] == pytest.approx(-20 * math.log10(0.2))
-    assert (second["psnr"], second["ssim"]) == (100, 1)
-    assert first["pixels"] == 12 * 16
-    assert metrics["mean"]["psnr"] == pytest.approx((first["psnr"] + 100) / 2)
-    assert metrics["mean"]["ssim"] == pytest.approx((first["ssim"] + 1) / 2)
+    first, second = metrics.images
+    assert (first.name, second.name) == ("a.png", "b.png")
+    assert first.metrics.psnr == pytest.approx(-20 * math.log10(0.2))
+    assert (second.metrics.psnr, second.metrics.ssim) == (100, 1)
+    assert first.pixels == 12 * 16
+    assert metrics.mean.psnr == pytest.approx((first.metrics.psnr + 100) / 2)
+    assert first.metrics.ssim is not None
+    assert metrics.mean.ssim == pytest.approx((first.metrics.ssim + 1) / 2)
     assert calls[-1] == (2 * 12 * 16, 2 * 12 * 16)
-    assert metrics["render"]["seconds_per_image"] > 0
+    assert metrics.seconds_per_image > 0
     # White is saturated: photos on white give no colour correction.
-    assert second["psnr_colour_aligned"] is None
-    assert first["psnr_colour_aligned"] is not None
+    assert second.metrics.psnr_colour_aligned is None
+    assert first.metrics.psnr_colour_aligned is not None
 
 
 def test_the_gains_of_a_photo_are_applied_to_its_picture():
     model = fog(NOWHERE, Similarity.identity(), background=(0.2, 0.2, 0.2))
     pixels = np.full((12, 16, 3), 102, dtype=np.uint8)
     photo = HeldOutPhoto(frame("a.png"), pixels, None, log_gains=(0.1, 0.1, 0.1), gains_from="their mean")
-    (entry,) = evaluate_model(model, [photo], on_image=lambda done, total: None)["images"]
+    (entry,) = evaluate_model(model, [photo], on_image=lambda done, total: None).images
     given = round(255 * float(exposed(torch.tensor(0.2), torch.tensor(0.1))))
-    assert entry["psnr"] == pytest.approx(-20 * math.log10(0.4 - given / 255))
-    assert entry["exposure"] == {"from": "their mean", "log_gains": [0.1, 0.1, 0.1]}
+    assert entry.metrics.psnr == pytest.approx(-20 * math.log10(0.4 - given / 255))
+    assert entry.exposure == {"from": "their mean", "log_gains": [0.1, 0.1, 0.1]}
 
 
 def test_evaluation_of_fog_in_closed_form():
@@ -170,8 +172,8 @@ def test_evaluation_of_fog_in_closed_form():
     photo = HeldOutPhoto(narrow, np.zeros((3, 3, 4), dtype=np.uint8), None)  # white
     error, unrounded = 1 - round(255 * seen) / 255, 1 - seen
     metrics = evaluate_model(model, [photo], on_image=lambda done, total: None)
-    assert metrics["images"][0]["psnr"] == pytest.approx(-20 * math.log10(error))
-    assert metrics["images"][0]["psnr_float"] == pytest.approx(-20 * math.log10(unrounded), abs=1e-3)
+    assert metrics.images[0].metrics.psnr == pytest.approx(-20 * math.log10(error))
+    assert metrics.images[0].metrics.psnr_float == pytest.approx(-20 * math.log10(unrounded), abs=1e-3)
 
 
 def test_masked_pixels_do_not_count():
@@ -180,10 +182,10 @@ def test_masked_pixels_do_not_count():
     used[4, 5] = True
     pixels[4, 5] = 51
     metrics = evaluate_model(model, [HeldOutPhoto(frame("a"), pixels, used)], on_image=lambda done, total: None)
-    assert metrics["images"][0]["psnr"] == pytest.approx(-20 * math.log10(0.2))
-    assert (metrics["images"][0]["pixels"], metrics["images"][0]["masked_pixels"]) == (1, 12 * 16 - 1)
-    assert metrics["images"][0]["whole_windows"] == 0
-    assert metrics["mean"]["ssim"] is None
+    assert metrics.images[0].metrics.psnr == pytest.approx(-20 * math.log10(0.2))
+    assert (metrics.images[0].pixels, metrics.images[0].masked_pixels) == (1, 12 * 16 - 1)
+    assert metrics.images[0].whole_windows == 0
+    assert metrics.mean.ssim is None
 
 
 def test_a_mask_that_hides_a_whole_photo_is_reported():
@@ -195,12 +197,12 @@ def test_a_mask_that_hides_a_whole_photo_is_reported():
 def test_protocol_says_what_was_measured():
     model = fog(NOWHERE, Similarity.identity())
     photos = [HeldOutPhoto(frame(name), np.zeros((12, 16, 4), dtype=np.uint8), None) for name in ("x.png", "y.png")]
-    protocol = evaluate_model(model, photos, on_image=lambda done, total: None)["protocol"]
+    protocol = evaluate_model(model, photos, on_image=lambda done, total: None).protocol
     names = hashlib.sha256(b"x.png\ny.png").hexdigest()[:12]
     assert protocol.startswith(f"nerfcli-2: 2 held-out photos (names sha256 {names}) at 16x12, area-averaged")
     assert "RGBA on white" in protocol
     small = HeldOutPhoto(frame("x.png", 8, 6), np.zeros((6, 8, 3), dtype=np.uint8), None)
-    protocol = evaluate_model(model, [small], on_image=lambda done, total: None)["protocol"]
+    protocol = evaluate_model(model, [small], on_image=lambda done, total: None).protocol
     assert "1 held-out photos" in protocol
     assert "at 8x6" in protocol
     assert "RGBA" not in protocol

@@ -11,15 +11,17 @@ from hypothesis import strategies as st
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model, outlier_warnings, outliers
+from nerfcli.evaluate.metrics import Metrics
+from nerfcli.evaluate.photos import HeldOutPhoto
+from nerfcli.evaluate.protocol import PhotoMetrics, evaluate_model, outlier_warnings, outliers
 
 
-def images(*psnrs: float) -> list[dict[str, object]]:
-    return [{"name": f"{index}.jpg", "psnr": psnr} for index, psnr in enumerate(psnrs)]
+def images(*psnrs: float) -> list[PhotoMetrics]:
+    return [PhotoMetrics(f"{index}.jpg", Metrics(psnr)) for index, psnr in enumerate(psnrs)]
 
 
-def names(*psnrs: float) -> list[object]:
-    return [image["name"] for image in outliers(images(*psnrs))]
+def names(*psnrs: float) -> list[str]:
+    return [image.name for image in outliers(images(*psnrs))]
 
 
 def test_a_photo_far_below_the_others_is_named():
@@ -54,7 +56,7 @@ def test_photos_of_normal_spread_are_named_only_beyond_five_deviations(seed, cou
     low = outliers(images(*values))
     median = float(np.median(values))
     spread = float(np.median(np.abs(values - median)))
-    assert all(float(image["psnr"]) < median - max(6.0, 7.413 * spread) for image in low)
+    assert all(image.metrics.psnr < median - max(6.0, 7.413 * spread) for image in low)
 
 
 def test_evaluation_warns_of_a_photo_that_shows_something_else():
@@ -68,6 +70,6 @@ def test_evaluation_warns_of_a_photo_that_shows_something_else():
         for index, level in enumerate(levels)
     ]
     metrics = evaluate_model(model, held_out, on_image=lambda done, total: None)
-    assert len(metrics["warnings"]) == 1
-    assert "5.png" in metrics["warnings"][0]
-    assert evaluate_model(model, held_out[:5], on_image=lambda done, total: None)["warnings"] == []
+    assert len(metrics.warnings) == 1
+    assert "5.png" in metrics.warnings[0]
+    assert evaluate_model(model, held_out[:5], on_image=lambda done, total: None).warnings == ()

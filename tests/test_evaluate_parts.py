@@ -13,8 +13,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import look_at
 from nerfcli.evaluate import metrics
 from nerfcli.evaluate.ledger import leak_ledger, summary_line
-from nerfcli.evaluate.metrics import colour_aligned
-from nerfcli.evaluate.novelty import novelty
+from nerfcli.evaluate.metrics import Metrics, colour_aligned
+from nerfcli.evaluate.protocol import PhotoMetrics, RunMetrics, novelty
 from nerfcli.evaluate.requirements import known_numbers, parse_requirements, unmet
 from nerfcli.training.runs.components import Components, Selection
 from nerfcli.training.runs.run import RunConfig
@@ -138,9 +138,10 @@ def test_what_is_no_requirement_is_refused(text):
 
 
 def test_registered_is_the_share_of_photos_with_a_pose():
-    metrics = {"mean": {"psnr": 20.0}, "training": {"seconds": 5.0}, "render": {"seconds_per_image": 1.0}}
+    metrics = RunMetrics("nerfcli-2", Metrics(20.0), (PhotoMetrics("a.png", Metrics(20.0), seconds=1.0),))
     config = RunConfig(history={"registered": 9, "total": 12})
-    assert known_numbers(metrics, config)["registered"] == 0.75
+    found = known_numbers(metrics, config)
+    assert (found["registered"], found["psnr"], found["seconds_per_image"]) == (0.75, 20.0, 1.0)
     assert known_numbers(metrics, RunConfig(history={"from": "llff"}))["registered"] is None
 
 

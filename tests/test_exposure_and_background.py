@@ -13,7 +13,8 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
-from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
+from nerfcli.evaluate.photos import HeldOutPhoto
+from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.field.background import SphereBackground, colours_behind
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.exposure import Exposure, exposed, linear_from_srgb, srgb_from_linear
@@ -350,6 +351,6 @@ def test_empty_space_shows_the_background_by_direction_whatever_the_tile(capture
     truth = np.round(255 * exposed(torch.from_numpy(picture.rgb), torch.tensor(0.5)).clamp(0, 1).numpy())
     photo = HeldOutPhoto(frame, truth.astype(np.uint8), None, log_gains=(0.5, 0.5, 0.5), gains_from="EXIF")
     measured = evaluate_model(empty, [photo], on_image=lambda done, total: None)
-    assert measured["mean"]["psnr"] > 50
-    assert "exposures by EXIF," in measured["protocol"]
-    assert measured["images"][0]["exposure"] == {"from": "EXIF", "log_gains": [0.5, 0.5, 0.5]}
+    assert measured.mean.psnr > 50
+    assert "exposures by EXIF," in measured.protocol
+    assert measured.images[0].exposure == {"from": "EXIF", "log_gains": [0.5, 0.5, 0.5]}

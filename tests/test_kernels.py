@@ -204,8 +204,8 @@ def photos(channels: int, grids: bool, count: int, generator: torch.Generator) -
 
 def pixel_rays(module: ModuleType, given: Inputs) -> Inputs:
     grids = BearingGrids(given["widths"], given["corners"]) if "widths" in given else None
-    table = (given[name] for name in ("first_pixel", "first_bearing", "bearings", "poses", "colours"))
-    found = module.pixel_rays(given["chosen"], PixelTable(*table, grids))
+    table = {name: given[name] for name in ("first_pixel", "first_bearing", "bearings", "poses", "colours")}
+    found = module.pixel_rays(given["chosen"], PixelTable(**table, grids=grids))
     return dict(zip(("origins", "directions", "colours"), found, strict=True))
 
 

@@ -16,7 +16,10 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.captures.formats.run_cameras import RunCameras
-from nerfcli.evaluate.protocol import HeldOutPhoto
+from nerfcli.evaluate.ledger import Entry
+from nerfcli.evaluate.metrics import Metrics
+from nerfcli.evaluate.photos import HeldOutPhoto
+from nerfcli.evaluate.protocol import Novelty, PhotoMetrics, RunMetrics
 from nerfcli.evaluate.report.drawings import Curve, curves, from_above
 from nerfcli.evaluate.report.page import page_html
 from nerfcli.evaluate.report.run_facts import RunFacts, captures_of, labels_of, mismatches_of, warnings_of
@@ -34,7 +37,7 @@ from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.job import depth_meta
 from nerfcli.training.runs.components import Components, Decision, Selection
-from nerfcli.training.runs.files import LogEntry
+from nerfcli.training.runs.files import LogEntry, TrainingSummary
 from nerfcli.training.runs.run import RunConfig
 from nerfcli.training.runs.settings import TrainSettings
 
@@ -68,13 +71,12 @@ def facts(label: str = "a run", **changes: Any) -> RunFacts:
         label=label,
         config=RunConfig(scene=Path("kitchen-scene"), split_sha256="1"),
         log=[logged(10, 0.1), {**logged(20, 0.01), "heldout_psnr": 21.5}],
-        metrics={
-            "protocol": "nerfcli-1",
-            "mean": {"psnr": 23.456, "ssim": 0.75},
-            "images": [{"name": "a.png", "psnr": 23.456, "ssim": 0.75}],
-            "training": {"samples_per_second": 1.5e6},
-            "render": {"seconds_per_image": 0.25},
-        },
+        metrics=RunMetrics(
+            "nerfcli-1",
+            Metrics(23.456, 0.75),
+            (PhotoMetrics("a.png", Metrics(23.456, 0.75), seconds=0.25),),
+            training=TrainingSummary(10.0, 20, 1.5e6, 1e4, 10_000_000),
+        ),
         poses=None,
         frames=RunCameras((camera_at("b.png", (0, 0, -2)),), (camera_at("a.png", (0, 0, -2)),)),
         field_bytes=8_000_000,
@@ -103,7 +105,7 @@ def test_views_hold_the_photo_and_what_the_field_shows_of_it(seen):
     assert view.picture.shape == view.error.shape == (8, 10, 3)
     np.testing.assert_array_equal(view.picture[0, 0], np.rint(np.array([0.2, 0.4, 0.6]) * 255))  # beside the cube
     difference = (view.picture.astype(float) - photo) / 255.0
-    assert view.psnr == pytest.approx(-10 * np.log10(np.square(difference).mean()), abs=1e-9)
+    assert view.metrics.psnr == pytest.approx(-10 * np.log10(np.square(difference).mean()), abs=1e-9)
     assert 0.0 < view.with_depth < 1.0
     assert view.with_depth == np.isfinite(view.depth).mean()
     low, high = depth_range(look)
@@ -176,8 +178,9 @@ def two_captures(seen: tuple[list[HeldOutRenderings], np.ndarray]) -> str:
 
     def holding(label: str, image: str, psnr: float) -> RunFacts:
         frame = replace(camera_at("a.png", (0, 0, -2)), image=Path(image))
-        metrics = {**(facts().metrics or {}), "mean": {"psnr": psnr}}
-        return facts(label, frames=RunCameras((), (frame,)), metrics=metrics)
+        run = facts(label, frames=RunCameras((), (frame,)))
+        assert run.metrics is not None
+        return replace(run, metrics=replace(run.metrics, mean=Metrics(psnr)))
 
     runs = [holding("one", "x/a.png", 9.5), holding("two", "y/a.png", 30.0), holding("three", "x/a.png", 25.0)]
     assert captures_of(runs) == [[0, 2], [1]]
@@ -242,13 +245,12 @@ def test_the_page_shows_cameras_chosen_components_and_how_new_the_views_are(seen
     look, _ = seen
     run = facts()
     assert run.metrics is not None
-    view = {"nearest": "b.png", "distance_relative": 0.1234, "angle_deg": 5.67, "kind": "extrapolation"}
-    metrics = {
-        **run.metrics,
-        "images": [{"name": "a.png", "psnr": 20.0, "ssim": None, "view": view}],
-        "ledger": [{"stage": "poses", "saw_held_out": True, "how": "all photos were matched"}],
-        "kinds": {"extrapolation": {"images": 3, "psnr": 19.5}},
-    }
+    view = Novelty("b.png", 1.0, 0.1234, None, 5.67, "extrapolation")
+    metrics = replace(
+        run.metrics,
+        images=tuple(PhotoMetrics(name, Metrics(19.5), view=view) for name in ("a.png", "b.png", "c.png")),
+        ledger=(Entry("poses", True, "all photos were matched"),),
+    )
     decision = Decision("view", 0, 0.5, 0.1, None, -0.02, None, True, "so")
     chosen = replace(
         run, metrics=metrics, config=replace(run.config, selection=Selection(Components(), (decision,), 1.0))
@@ -273,7 +275,7 @@ def test_numbers_that_must_not_be_compared_are_named():
     assert list(mismatches_of([one, facts("b")])) == []
     assert one.metrics is not None
     foreign = replace(
-        one, config=RunConfig(split_sha256="2"), metrics={**one.metrics, "protocol": "x", "device": "cuda"}
+        one, config=RunConfig(split_sha256="2"), metrics=replace(one.metrics, protocol="x", device="cuda")
     )
     reported = list(mismatches_of([one, foreign]))
     assert len(reported) == 3

@@ -233,15 +233,16 @@ def test_splats_are_measured_by_the_protocol_of_fields(run: Path) -> None:
     """The number in the file is that of the picture that `render` writes."""
     ply = run.with_name("spheres-run-splats.ply")
     found = evaluate_splats(run, ply)
-    name = found.metrics["images"][0]["name"]
+    name = found.metrics.images[0].name
     folder = nerfcli.render_run(
         run, splats=ply, settings=ExportSettings(("rgb",), DepthRequest("median", "z"), rgba=False)
     )
     assert folder[0].parent.name == "test-splats"
     shown = read_image(next(folder[0].rglob(f"{Path(name).stem}.png")))
     assert shown.shape[:2] == (72, 96)
-    assert found.metrics["protocol"].startswith("nerfcli-2")
-    assert found.metrics["splats"]["count"] == len(nerfcli.load_splats(ply).gaussians)
+    assert found.metrics.protocol.startswith("nerfcli-2")
+    assert found.metrics.splats is not None
+    assert found.metrics.splats["count"] == len(nerfcli.load_splats(ply).gaussians)
     assert evaluate_splats(run, ply).is_kept
 
 

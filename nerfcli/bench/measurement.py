@@ -24,9 +24,8 @@ from nerfcli import machine
 from nerfcli.bench.results import Point, spread
 from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
-from nerfcli.evaluate.metrics import psnr, to_8_bit
-from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
-from nerfcli.evaluate.run_photos import held_out_photos_of
+from nerfcli.evaluate.metrics import compare
+from nerfcli.evaluate.photos import HeldOutPhoto, background_of, held_out_photos_of, paired
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.photos.images import downscale
 from nerfcli.photos.loading import downscaled_camera
@@ -338,7 +337,7 @@ def _errors(
     decibels, squares = [], []
     for photo, fine in zip(photos, converged, strict=True):
         picture = _render(model, photo, setting)
-        compared = compare(photo, picture)
-        decibels.append(psnr(to_8_bit(compared.rendered), compared.photo, used=compared.used))
-        squares.append(float(np.square(picture.rgb - fine, dtype=np.float64)[compared.used].mean()))
+        pair = paired(photo, picture)
+        decibels.append(compare(pair.rendered, pair.photo, used=pair.used).psnr)
+        squares.append(float(np.square(picture.rgb - fine, dtype=np.float64)[pair.used].mean()))
     return float(np.mean(decibels)), 255.0 * float(np.sqrt(np.mean(squares)))

@@ -1,7 +1,7 @@
 """nerfcli evaluate: metrics of runs on their held-out photos."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,7 @@ from nerfcli.cli.options import Computing, Overwrite, Printing, Require, one_of
 from nerfcli.output import Output
 
 if TYPE_CHECKING:
+    from nerfcli.evaluate.protocol import RunMetrics
     from nerfcli.evaluate.requirements import Requirement
     from nerfcli.workflows.evaluate import Evaluation
 
@@ -54,7 +55,7 @@ def evaluate(
       nerfcli evaluate first-run second-run third-run
       nerfcli evaluate photos-scene-run --splats photos-scene-run-splats.ply
     """
-    from nerfcli.evaluate.predictions import KINDS
+    from nerfcli.evaluate.photos import KINDS
     from nerfcli.training.runs.run import Run
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run, evaluate_splats
 
@@ -69,7 +70,7 @@ def evaluate(
     resources, output = computing.resources, Output(overwrite=overwrite)
     _ = resources.torch_device  # refuses an unknown one before anything is read
 
-    def measure(folder: Path) -> dict[str, Any]:
+    def measure(folder: Path) -> "RunMetrics":
         with console.stage("evaluate") as reporter:
             found = evaluate_run(folder, output, predictions=save_predictions, resources=resources, reporter=reporter)
         show_evaluation(found, console)
@@ -105,53 +106,52 @@ def requirements_of(text: str | None) -> "tuple[Requirement, ...]":
         raise typer.BadParameter(str(error), param_hint="--require") from error
 
 
-def show_evaluation(evaluation: "Evaluation", console: Console, *, field: dict[str, Any] | None = None) -> None:
+def show_evaluation(evaluation: "Evaluation", console: Console, *, field: "RunMetrics | None" = None) -> None:
     """Print metrics, those of splats beside those of the field, and their path."""
     if field is not None:
         _print_beside_field(field, evaluation, console)
     elif not evaluation.is_kept:
         _print_numbers(evaluation.path.parent, evaluation.metrics, console)
-    console.result(evaluation.path, evaluation.metrics)
+    console.result(evaluation.path, evaluation.metrics.to_json())
 
 
-def _print_numbers(run: Path, metrics: dict[str, Any], console: Console) -> None:
+def _print_numbers(run: Path, metrics: "RunMetrics", console: Console) -> None:
     """Print the metrics of a run in a few lines and a table."""
-    from nerfcli.evaluate.billboards import GeometryEvidence
-    from nerfcli.evaluate.ledger import Entry, summary_line
+    from nerfcli.evaluate.ledger import summary_line
 
-    mean, kinds = metrics["mean"], metrics["kinds"]
+    assert metrics.training is not None
+    mean, kinds = metrics.mean, metrics.kinds
     console.note(
-        f"{run}: PSNR {mean['psnr']:.2f} dB, SSIM {_number(mean['ssim'], 3)} on {len(metrics['images'])} held-out "
-        f"photos; trained {metrics['training']['seconds']:.0f} s, "
-        f"{metrics['render']['seconds_per_image']:.2f} s per picture"
+        f"{run}: PSNR {mean.psnr:.2f} dB, SSIM {_number(mean.ssim, 3)} on {len(metrics.images)} held-out photos; "
+        f"trained {metrics.training.seconds:.0f} s, {metrics.seconds_per_image:.2f} s per picture"
     )
+    numbers = mean.to_json()
     rows = [
-        (name, *(_number(mean.get(f"{measure}{key}"), digits) for measure, digits in _MEASURES))
+        (name, *(_number(numbers.get(f"{measure}{key}"), digits) for measure, digits in _MEASURES))
         for name, key in _COLUMNS.items()
-        if mean.get(f"psnr{key}") is not None
+        if numbers[f"psnr{key}"] is not None
     ]
     console.table(("", "PSNR", "SSIM", "LPIPS"), rows, styles={})
-    shape = None if metrics["shape"] is None else GeometryEvidence(**metrics["shape"])
-    if shape is not None and shape.shown:
-        console.note(shape.in_words())
+    if metrics.shape is not None and metrics.shape.shown:
+        console.note(metrics.shape.in_words())
     if kinds:
         where = {"interpolation": "between", "extrapolation": "beyond"}
         parts = [
-            f"{group['images']} {where[kind]} training views, {group['psnr']:.2f} dB" for kind, group in kinds.items()
+            f"{count} {where[kind]} training views, {of_kind.psnr:.2f} dB" for kind, (count, of_kind) in kinds.items()
         ]
         console.note(f"held-out views: {'; '.join(parts)}")
-    console.note(summary_line([Entry(**entry) for entry in metrics["ledger"]]))
-    for text in metrics["warnings"]:
+    console.note(summary_line(metrics.ledger))
+    for text in metrics.warnings:
         console.warn(text)
 
 
-def _print_beside_field(field: dict[str, Any], splats: "Evaluation", console: Console) -> None:
+def _print_beside_field(field: "RunMetrics", splats: "Evaluation", console: Console) -> None:
     """Print the metrics of splats below those of the field, as rendered in 8 bit."""
     rows = [
         (
             name,
-            *(_number(metrics["mean"][measure], digits) for measure, digits in _MEASURES),
-            f"{1000 * metrics['render']['seconds_per_image']:.0f}",
+            *(_number(metrics.mean.to_json()[measure], digits) for measure, digits in _MEASURES),
+            f"{1000 * metrics.seconds_per_image:.0f}",
         )
         for name, metrics in (("field", field), ("splats", splats.metrics))
     ]

@@ -4,7 +4,7 @@ A held-out photo that helped to find the cameras, the points or the scene's exte
 published number has such leaks; here each one is written down.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,7 +43,7 @@ def leak_ledger(config: RunConfig) -> list[Entry]:
     ]
 
 
-def summary_line(ledger: list[Entry]) -> str:
+def summary_line(ledger: Sequence[Entry]) -> str:
     """Summarize in one line which stages used the held-out photos, and for which it is unknown."""
     parts = []
     for answer, words in ((True, "used by"), (None, "perhaps used by"), (False, "not used by")):

@@ -1,4 +1,4 @@
-"""Similarity of a rendered picture to a photo: PSNR, SSIM, LPIPS where it is installed, and with colours aligned.
+"""Comparison of a rendered picture with a photo: PSNR, SSIM, LPIPS where it is installed, and with colours aligned.
 
 Colours are sRGB in [0, 1], as float or rounded to 8 bits. Pixels that do not count (masked, or without a ray) are
 left out entirely: from PSNR pixel by pixel, from SSIM with every window that contains one.
@@ -6,8 +6,11 @@ left out entirely: from PSNR pixel by pixel, from SSIM with every window that co
 
 import importlib
 import socket
-from collections.abc import Callable, Iterator
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +22,84 @@ from nerfcli.photos.colours import psnr_of
 # From Wang et al.: the Gaussian's standard deviation, and the width at which scikit-image cuts it off (3.5 sigma).
 SIGMA = 1.5
 WINDOW = 11
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Similarity of a picture to a photo, or the mean over photos; None where it was not measured.
+
+    Args:
+        psnr, ssim, lpips: of the picture rounded to 8 bits.
+        psnr_float, ssim_float: of the picture before rounding.
+        psnr_colour_aligned, ssim_colour_aligned, lpips_colour_aligned: after `colour_aligned`.
+    """
+
+    psnr: float
+    ssim: float | None = None
+    lpips: float | None = None
+    psnr_float: float | None = None
+    ssim_float: float | None = None
+    psnr_colour_aligned: float | None = None
+    ssim_colour_aligned: float | None = None
+    lpips_colour_aligned: float | None = None
+
+    @staticmethod
+    def mean(measured: Sequence["Metrics"]) -> "Metrics":
+        """Return the mean of each metric; None if one of them does not have it."""
+        values = {name: [getattr(metrics, name) for metrics in measured] for name in NAMES}
+        return Metrics(**{name: None if None in found else statistics.fmean(found) for name, found in values.items()})
+
+    @staticmethod
+    def from_json(content: Mapping[str, Any]) -> "Metrics":
+        """Return the metrics among plain values."""
+        return Metrics(**{name: content[name] for name in NAMES if name in content})
+
+    def to_json(self) -> dict[str, float | None]:
+        """Return plain values."""
+        return asdict(self)
+
+
+NAMES = tuple(field.name for field in fields(Metrics))
+
+
+def compare(rendered: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> Metrics:
+    """Compare a picture, rounded to 8 bits, with a photo: PSNR, and SSIM unless they are lists of pixels.
+
+    Args:
+        rendered: (H, W, 3) or (N, 3) float sRGB in [0, 1].
+        photo: the same shape, uint8.
+        used: (H, W) or (N,) bool, the pixels that count; at least one.
+    """
+    rounded = to_8_bit(rendered)
+    similarity = ssim(rounded, photo, used=used) if photo.ndim == 3 else None
+    return Metrics(psnr(rounded, photo, used=used), similarity)
+
+
+def compare_fully(
+    rendered: np.ndarray, photo: np.ndarray, *, used: np.ndarray, perceptual: "Perceptual | None", align: bool
+) -> Metrics:
+    """Compare a picture with a photo by all metrics.
+
+    Args:
+        rendered, photo, used: pictures, see `compare`.
+        align: whether colours may be aligned to those of the photo.
+    """
+    found = replace(
+        compare(rendered, photo, used=used),
+        lpips=_lpips(to_8_bit(rendered), photo, used=used, perceptual=perceptual),
+        psnr_float=psnr(rendered, photo, used=used),
+        ssim_float=ssim(rendered, photo, used=used),
+    )
+    if not align:
+        return found
+    corrected = colour_aligned(as_float(rendered), as_float(photo), used=used)
+    aligned = compare(corrected, photo, used=used)
+    return replace(
+        found,
+        psnr_colour_aligned=aligned.psnr,
+        ssim_colour_aligned=aligned.ssim,
+        lpips_colour_aligned=_lpips(to_8_bit(corrected), photo, used=used, perceptual=perceptual),
+    )
 
 
 def to_8_bit(picture: np.ndarray) -> np.ndarray:
@@ -88,7 +169,7 @@ def _window(shape: tuple[int, ...]) -> int:
 # Returns the distance of (picture, photo), both (H, W, 3) float in [0, 1].
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
 
-NAME = "LPIPS AlexNet v0.1"
+LPIPS_NAME = "LPIPS AlexNet v0.1"
 INSTALL = "pip install 'nerfcli[lpips]'"
 # AlexNet halves a picture so often that nothing is left of a smaller one.
 SMALLEST = 32
@@ -120,6 +201,13 @@ def find_perceptual(notify: Callable[[str], None]) -> Perceptual | None:
             return float(network(*(values.permute(2, 0, 1)[None] for values in pair)))
 
     return measure
+
+
+def _lpips(picture: np.ndarray, truth: np.ndarray, *, used: np.ndarray, perceptual: Perceptual | None) -> float | None:
+    if perceptual is None or min(used.shape) < SMALLEST:
+        return None
+    # The network needs whole pictures: both get the photo's colours where pixels do not count.
+    return perceptual(as_float(np.where(used[..., None], picture, truth)), as_float(truth))
 
 
 @contextmanager

@@ -1,98 +1,103 @@
-"""Evaluation of a run on its held-out photos: metrics, and the name of the protocol that produced them."""
+"""Evaluation of a run on its held-out photos: metrics, the name of the protocol that produced them, and warnings.
+
+A metric measured between training views shows how well a field fills gaps; one beyond them, what the field knows. So
+each held-out view comes with its distance and angle to the nearest training view.
+"""
 
 import hashlib
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.layout import focus_point
 from nerfcli.errors import UserError, listed
 from nerfcli.evaluate.billboards import Billboards, GeometryComparison, GeometryEvidence
-from nerfcli.evaluate.metrics import NAME as LPIPS_NAME
-from nerfcli.evaluate.metrics import SMALLEST, Perceptual, as_float, colour_aligned, psnr, ssim, to_8_bit, whole_windows
-from nerfcli.evaluate.novelty import novelty
-from nerfcli.field.background import Background
-from nerfcli.field.exposure import exposed
-from nerfcli.render.pictures import Renderable, RenderedPicture
+from nerfcli.evaluate.ledger import Entry
+from nerfcli.evaluate.metrics import LPIPS_NAME, Metrics, Perceptual, compare_fully, whole_windows
+from nerfcli.evaluate.photos import ComparedImages, HeldOutPhoto, background_of, paired
+from nerfcli.render.pictures import Renderable
+from nerfcli.training.runs.files import TrainingSummary
 
-# A photo is far below the others if it lacks this many standard deviations, estimated by the median absolute deviation,
-# and this many dB. In sound runs the worst photo lacks up to 2 deviations and 2 dB; where views are uneven, 5 dB.
-_DEVIATIONS, _LEAST_DB = 5.0, 6.0
-# Standard deviation of a normal distribution over its median absolute deviation.
-_NORMAL = 1.4826
-# Fewer photos do not show what is usual, and more than this fraction of them are no exceptions.
-_FEWEST, _MOST = 5, 0.25
+# A view is an extrapolation if its nearest training view is farther than this many typical distances between these...
+MOST_SPACINGS = 2.0
+# ...or differs in direction by more than this fraction of the field of view, so that less than half of it overlaps.
+MOST_TURN = 0.5
 
 
-def outliers(images: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return the images whose PSNR is far below the median of all, the lowest first.
+@dataclass(frozen=True)
+class Novelty:
+    """Novelty of one held-out view.
 
     Args:
-        images: with "name" and "psnr", as in metrics.json.
+        nearest: name of the training view whose centre is nearest.
+        distance: distance to it, scene units.
+        distance_relative: the same over the scene's radius (median distance of training views from their focus point).
+        spacings: the same over the median distance of a training view to the nearest other one; None if there is none.
+        angle_deg: angle between the optical axes of the two.
+        kind: "interpolation" or "extrapolation": see `MOST_SPACINGS` and `MOST_TURN`.
     """
-    if len(images) < _FEWEST:
-        return []
-    median = statistics.median(image["psnr"] for image in images)
-    deviation = _NORMAL * statistics.median(abs(image["psnr"] - median) for image in images)
-    limit = median - max(_LEAST_DB, _DEVIATIONS * deviation)
-    low = sorted((image for image in images if image["psnr"] < limit), key=lambda image: image["psnr"])
-    return low if len(low) <= _MOST * len(images) else []
+
+    nearest: str
+    distance: float
+    distance_relative: float | None
+    spacings: float | None
+    angle_deg: float
+    kind: str
 
 
-def outlier_warnings(images: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a warning that names the images far below the others; none if there are none."""
-    low = outliers(images)
-    if not low:
-        return []
-    median = statistics.median(image["psnr"] for image in images)
-    names = listed([f"{image['name']} ({image['psnr']:.1f} dB)" for image in low])
-    return [
-        f"far below the median of {median:.1f} dB: {names}. The pose may be wrong, or the photo shows what no "
-        "training photo does: nerfcli doctor SCENE checks poses, nerfcli report RUN shows the pictures"
-    ]
+def novelty(held_out: Sequence[Frame], training: Sequence[Frame]) -> list[Novelty]:
+    """Compute the novelty of each held-out view; `training` has at least one view."""
+    centres = np.array([frame.centre for frame in training])
+    radius = float(np.median(np.linalg.norm(centres - focus_point(training), axis=1)))
+    spacing = _spacing(centres)
+    found = []
+    for frame in held_out:
+        distances = np.linalg.norm(centres - frame.centre, axis=1)
+        # Of several views in one place, use the one with the most similar direction.
+        near = np.flatnonzero(distances <= distances.min() * (1 + 1e-9)).tolist()
+        angles = [_angle_deg(frame, training[index]) for index in near]
+        index = near[int(np.argmin(angles))]
+        distance, angle = float(distances[index]), min(angles)
+        spacings = distance / spacing if spacing else None
+        too_far = spacings is not None and spacings > MOST_SPACINGS
+        turned = angle > MOST_TURN * min(frame.camera.fov_deg)
+        found.append(
+            Novelty(
+                nearest=training[index].name,
+                distance=distance,
+                distance_relative=distance / radius if radius > 0 else None,
+                spacings=spacings,
+                angle_deg=angle,
+                kind="extrapolation" if too_far or turned else "interpolation",
+            )
+        )
+    return found
+
+
+def _spacing(centres: np.ndarray) -> float | None:
+    """Return the median distance from a centre to the nearest other one; None for fewer than two."""
+    if len(centres) < 2:
+        return None
+    nearest = []
+    for index, centre in enumerate(centres):
+        distances = np.linalg.norm(centres - centre, axis=1)
+        distances[index] = np.inf
+        nearest.append(float(distances.min()))
+    return float(np.median(nearest))
+
+
+def _angle_deg(one: Frame, other: Frame) -> float:
+    first, second = one.world_from_cam[:3, 2], other.world_from_cam[:3, 2]
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))
 
 
 PROTOCOL = "nerfcli-2"
-
-
-@dataclass(frozen=True)
-class HeldOutPhoto:
-    """A held-out photo at the resolution of the training.
-
-    Args:
-        frame: its camera and pose.
-        pixels: (H, W, 3 or 4) uint8 sRGB, straight alpha.
-        used: (H, W) bool; None for all pixels.
-        log_gains: logarithms of its gains relative to the model's pictures, from EXIF or from the training photos
-            around it, never from the photo itself; see `field.exposure`.
-        gains_from: the source of the gains, one of `held_out_exposure.SOURCES`.
-    """
-
-    frame: Frame
-    pixels: np.ndarray
-    used: np.ndarray | None
-    log_gains: tuple[float, ...] = (0.0, 0.0, 0.0)
-    gains_from: str = "none"
-
-
-@dataclass(frozen=True)
-class ComparedImages:
-    """A compared pair: rendered (H, W, 3) float sRGB, the photo (H, W, 3) uint8, and the mask of counted pixels (H, W).
-
-    on_white: whether the photo has alpha and is composited on white. There is then no colour correction: it ignores
-    saturated pixels, so it could turn white into any colour.
-    """
-
-    frame: Frame
-    rendered: np.ndarray
-    photo: np.ndarray
-    used: np.ndarray
-    on_white: bool
 
 
 @dataclass(frozen=True)
@@ -112,24 +117,136 @@ class Extras:
     keep: Callable[[ComparedImages], None] = lambda compared: None
 
 
+@dataclass(frozen=True)
+class PhotoMetrics:
+    """Metrics of a held-out photo.
+
+    Args:
+        pixels: number of pixels that count.
+        masked_pixels, pixels_without_ray: numbers of those that do not.
+        whole_windows: number of windows that SSIM is a mean of.
+        exposure: the gains that were applied to the picture, and their source.
+        seconds: time of rendering it.
+        view: its distance from the training views; None if these are not known.
+    """
+
+    name: str
+    metrics: Metrics
+    pixels: int = 0
+    masked_pixels: int = 0
+    pixels_without_ray: int = 0
+    whole_windows: int = 0
+    exposure: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    view: Novelty | None = None
+
+    @staticmethod
+    def from_json(content: Mapping[str, Any]) -> "PhotoMetrics":
+        """Return the metrics from plain values."""
+        given = known(PhotoMetrics, content)
+        if given.get("view") is not None:
+            given["view"] = Novelty(**known(Novelty, given["view"]))
+        return PhotoMetrics(metrics=Metrics.from_json(content), **given)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values."""
+        content = asdict(self)
+        metrics, view = content.pop("metrics"), content.pop("view")
+        return {"name": content.pop("name"), **metrics, **content, **({} if view is None else {"view": view})}
+
+
+@dataclass(frozen=True)
+class RunMetrics:
+    """All metrics of a run, or of splats, as in metrics.json.
+
+    Args:
+        protocol: what was measured and how.
+        mean: over the held-out photos.
+        shape: comparison with a model without geometry; None if it was not made.
+        training: summary of the training.
+        ledger: which stages used the held-out photos.
+        splats: file, count and degree, of splats.
+    """
+
+    protocol: str
+    mean: Metrics
+    images: tuple[PhotoMetrics, ...]
+    shape: GeometryEvidence | None = None
+    warnings: tuple[str, ...] = ()
+    training: TrainingSummary | None = None
+    ledger: tuple[Entry, ...] = ()
+    holdout: str | None = None
+    split_sha256: str | None = None
+    device: str = ""
+    checkpoint_sha256: str | None = None
+    splats: Mapping[str, Any] | None = None
+
+    @property
+    def seconds_per_image(self) -> float:
+        """Median time of rendering a photo."""
+        return statistics.median(image.seconds for image in self.images)
+
+    @property
+    def kinds(self) -> dict[str, tuple[int, Metrics]]:
+        """Number of views of each kind, interpolation and extrapolation, and their means."""
+        groups: dict[str, list[Metrics]] = {}
+        for image in self.images:
+            if image.view is not None:
+                groups.setdefault(image.view.kind, []).append(image.metrics)
+        return {kind: (len(group), Metrics.mean(group)) for kind, group in sorted(groups.items())}
+
+    @staticmethod
+    def from_json(content: Mapping[str, Any], path: Path) -> "RunMetrics":
+        """Return the metrics from plain values, also those of earlier versions.
+
+        Raises:
+            UserError: a number is missing, or not what it should be.
+        """
+        records = {"shape": GeometryEvidence, "training": TrainingSummary}
+        try:
+            given = known(RunMetrics, content)
+            for name, record in records.items():
+                if given.get(name) is not None:
+                    given[name] = record(**known(record, given[name]))
+            given["mean"] = Metrics.from_json(given["mean"])
+            given["images"] = tuple(map(PhotoMetrics.from_json, given["images"]))
+            given["ledger"] = tuple(Entry(**entry) for entry in given.get("ledger") or ())
+            given["warnings"] = tuple(given.get("warnings") or ())
+            return RunMetrics(**given)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise UserError(f"cannot read {path}: {error}", "add --overwrite to evaluate again") from error
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values; splats have no training of their own."""
+        seconds = [image.seconds for image in self.images]
+        kinds = {kind: {"images": count, **mean.to_json()} for kind, (count, mean) in self.kinds.items()}
+        times = {
+            "seconds_per_image": self.seconds_per_image,
+            "fastest_seconds": min(seconds),
+            "slowest_seconds": max(seconds),
+        }
+        plain = {**asdict(self), "images": [image.to_json() for image in self.images], "kinds": kinds, "render": times}
+        left_out = ("splats",) if self.splats is None else ("training", "ledger", "holdout", "split_sha256")
+        return {name: value for name, value in plain.items() if name not in left_out}
+
+
+def known(record: type, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a record among plain values."""
+    return {item.name: content[item.name] for item in fields(record) if item.name in content}
+
+
 def evaluate_model(
     model: Renderable,
     held_out: Sequence[HeldOutPhoto],
     *,
     on_image: Callable[[int, int], None],
     extras: Extras = Extras(),
-) -> dict[str, Any]:
-    """Compare the model with every held-out photo: metrics per photo, means, and render time.
-
-    Per photo: psnr, ssim and lpips of the 8-bit picture; psnr_float and ssim_float of the picture before rounding;
-    *_colour_aligned after `colour_aligned`. Unknown values are None.
+) -> RunMetrics:
+    """Compare the model with every held-out photo.
 
     Args:
         held_out: the photos, at least one.
         on_image: called with (rays done, total rays).
-
-    Returns:
-        The keys "protocol", "shape", "warnings", "mean", "images", "kinds" and "render" of metrics.json.
 
     Raises:
         UserError: nothing was held out, or a mask hides a whole photo.
@@ -149,39 +266,39 @@ def evaluate_model(
 
     views = novelty([photo.frame for photo in held_out], extras.training) if extras.training else None
     evidence = GeometryComparison(extras.billboards) if extras.billboards is not None else None
-    images, seconds = [], []
+    images = []
     for index, photo in enumerate(held_out):
         background = background_of(model, photo)
         began = time.perf_counter()
         picture = model.render(photo.frame, background=background, on_tile=on_tile)
-        seconds.append(time.perf_counter() - began)
-        compared = compare(photo, picture)
-        extras.keep(compared)
+        seconds = time.perf_counter() - began
+        pair = paired(photo, picture)
+        extras.keep(pair)
         if evidence is not None:
-            evidence.add(compared.frame, compared.rendered, compared.photo, compared.used)
-        entry: dict[str, Any] = {
-            "name": photo.frame.name,
-            **measured(compared, extras.perceptual),
-            **_counted(photo, picture, compared),
-            "exposure": {"from": photo.gains_from, "log_gains": list(photo.log_gains)},
-        }
-        if views is not None:
-            entry["view"] = asdict(views[index])
-        images.append(entry | {"seconds": seconds[-1]})
+            evidence.add(pair.frame, pair.rendered, pair.photo, pair.used)
+        images.append(
+            PhotoMetrics(
+                photo.frame.name,
+                compare_fully(
+                    pair.rendered, pair.photo, used=pair.used, perceptual=extras.perceptual, align=not pair.on_white
+                ),
+                pixels=int(pair.used.sum()),
+                masked_pixels=0 if photo.used is None else int((~photo.used).sum()),
+                pixels_without_ray=int((~picture.valid).sum()),
+                whole_windows=int(whole_windows(pair.used).sum()),
+                exposure={"from": photo.gains_from, "log_gains": list(photo.log_gains)},
+                seconds=seconds,
+                view=None if views is None else views[index],
+            )
+        )
     shape = evidence.shape() if evidence is not None else None
-    return {
-        "protocol": _protocol_name(held_out, extras),
-        "shape": asdict(shape) if shape is not None else None,
-        "warnings": [*_warnings(shape, evidence), *outlier_warnings(images)],
-        "mean": mean_of(images),
-        "images": images,
-        "kinds": _kinds(images),
-        "render": {
-            "seconds_per_image": statistics.median(seconds),
-            "fastest_seconds": min(seconds),
-            "slowest_seconds": max(seconds),
-        },
-    }
+    return RunMetrics(
+        _protocol_name(held_out, extras),
+        Metrics.mean([image.metrics for image in images]),
+        tuple(images),
+        shape,
+        (*_warnings(shape, evidence), *outlier_warnings(images)),
+    )
 
 
 def _warnings(shape: GeometryEvidence | None, evidence: GeometryComparison | None) -> list[str]:
@@ -190,105 +307,37 @@ def _warnings(shape: GeometryEvidence | None, evidence: GeometryComparison | Non
     return [shape.in_words()] if shape is not None and not shape.shown else []
 
 
-def mean_of(images: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
-    """Return the mean over images of each metric; None if an image does not have it."""
-    means: dict[str, float | None] = {}
-    for key in (key for key in images[0] if key.split("_")[0] in ("psnr", "ssim", "lpips")):
-        values = [image[key] for image in images if image[key] is not None]
-        means[key] = statistics.fmean(values) if len(values) == len(images) else None
-    return means
+# A photo is far below the others if it lacks this many standard deviations, estimated by the median absolute deviation,
+# and this many dB. In sound runs the worst photo lacks up to 2 deviations and 2 dB; where views are uneven, 5 dB.
+_DEVIATIONS, _LEAST_DB = 5.0, 6.0
+# Standard deviation of a normal distribution over its median absolute deviation.
+_NORMAL = 1.4826
+# Fewer photos do not show what is usual, and more than this fraction of them are no exceptions.
+_FEWEST, _MOST = 5, 0.25
 
 
-def background_of(model: Renderable, photo: HeldOutPhoto) -> Background:
-    """Return the background of pictures that are compared with a photo: white if the photo has alpha."""
-    return (1.0, 1.0, 1.0) if photo.pixels.shape[-1] == 4 else model.background
+def outliers(images: Sequence[PhotoMetrics]) -> list[PhotoMetrics]:
+    """Return the photos whose PSNR is far below the median of all, the lowest first."""
+    if len(images) < _FEWEST:
+        return []
+    median = statistics.median(image.metrics.psnr for image in images)
+    deviation = _NORMAL * statistics.median(abs(image.metrics.psnr - median) for image in images)
+    limit = median - max(_LEAST_DB, _DEVIATIONS * deviation)
+    low = sorted((image for image in images if image.metrics.psnr < limit), key=lambda image: image.metrics.psnr)
+    return low if len(low) <= _MOST * len(images) else []
 
 
-def over_white(pixels: np.ndarray) -> np.ndarray:
-    """Return RGBA composited on white as 8-bit RGB, as in published tables; RGB unchanged."""
-    if pixels.shape[-1] == 3:
-        return pixels
-    alpha = pixels[..., 3:].astype(np.float64) / 255.0
-    return to_8_bit(pixels[..., :3] / 255.0 * alpha + 1.0 - alpha)
-
-
-def compare(photo: HeldOutPhoto, picture: RenderedPicture) -> ComparedImages:
-    """Return a held-out photo with its rendered picture, to which the photo's gains are applied.
-
-    Raises:
-        UserError: a mask hides the whole photo.
-    """
-    used = picture.valid if photo.used is None else picture.valid & photo.used
-    if not used.any():
-        raise UserError(
-            f"no pixels of {photo.frame.name} are left to compare",
-            "check its mask: white pixels are used, black ones are ignored",
-        )
-    return ComparedImages(
-        photo.frame,
-        as_exposed(picture.rgb, photo.log_gains),
-        over_white(photo.pixels),
-        used,
-        photo.pixels.shape[-1] == 4,
-    )
-
-
-def as_exposed(rgb: np.ndarray, log_gains: tuple[float, ...]) -> np.ndarray:
-    """Return a picture with a photo's gains applied, clipped; unchanged if all gains are 1."""
-    if not any(log_gains):
-        return rgb
-    return exposed(torch.from_numpy(rgb), torch.tensor(log_gains)).clamp(0.0, 1.0).numpy()
-
-
-def measured(compared: ComparedImages, perceptual: Perceptual | None) -> dict[str, float | None]:
-    """Return the metrics of a compared pair, see `evaluate_model`."""
-    truth, used = compared.photo, compared.used
-    rounded = to_8_bit(compared.rendered)
-    raw = {
-        **_close(rounded, truth, used=used, suffix=""),
-        "lpips": _lpips(rounded, truth, used=used, perceptual=perceptual),
-        **_close(compared.rendered, truth, used=used, suffix="_float"),
-    }
-    if compared.on_white:
-        return {**raw, "psnr_colour_aligned": None, "ssim_colour_aligned": None, "lpips_colour_aligned": None}
-    corrected = to_8_bit(colour_aligned(as_float(compared.rendered), as_float(truth), used=used))
-    return {
-        **raw,
-        **_close(corrected, truth, used=used, suffix="_colour_aligned"),
-        "lpips_colour_aligned": _lpips(corrected, truth, used=used, perceptual=perceptual),
-    }
-
-
-def _close(picture: np.ndarray, truth: np.ndarray, *, used: np.ndarray, suffix: str) -> dict[str, float | None]:
-    return {
-        f"psnr{suffix}": psnr(picture, truth, used=used),
-        f"ssim{suffix}": ssim(picture, truth, used=used),
-    }
-
-
-def _lpips(picture: np.ndarray, truth: np.ndarray, *, used: np.ndarray, perceptual: Perceptual | None) -> float | None:
-    if perceptual is None or min(used.shape) < SMALLEST:
-        return None
-    # The network needs whole pictures: both get the photo's colours where pixels do not count.
-    return perceptual(as_float(np.where(used[..., None], picture, truth)), as_float(truth))
-
-
-def _counted(photo: HeldOutPhoto, picture: RenderedPicture, compared: ComparedImages) -> dict[str, int]:
-    return {
-        "pixels": int(compared.used.sum()),
-        "masked_pixels": 0 if photo.used is None else int((~photo.used).sum()),
-        "pixels_without_ray": int((~picture.valid).sum()),
-        "whole_windows": int(whole_windows(compared.used).sum()),
-    }
-
-
-def _kinds(images: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the means over the views of each kind, interpolation and extrapolation."""
-    groups: dict[str, list[Mapping[str, Any]]] = {}
-    for image in images:
-        if "view" in image:
-            groups.setdefault(image["view"]["kind"], []).append(image)
-    return {kind: {"images": len(group), **mean_of(group)} for kind, group in sorted(groups.items())}
+def outlier_warnings(images: Sequence[PhotoMetrics]) -> list[str]:
+    """Return a warning that names the images far below the others; none if there are none."""
+    low = outliers(images)
+    if not low:
+        return []
+    median = statistics.median(image.metrics.psnr for image in images)
+    names = listed([f"{image.name} ({image.metrics.psnr:.1f} dB)" for image in low])
+    return [
+        f"far below the median of {median:.1f} dB: {names}. The pose may be wrong, or the photo shows what no "
+        "training photo does: nerfcli doctor SCENE checks poses, nerfcli report RUN shows the pictures"
+    ]
 
 
 def _protocol_name(held_out: Sequence[HeldOutPhoto], extras: Extras) -> str:

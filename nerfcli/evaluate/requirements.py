@@ -4,16 +4,14 @@ import operator
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from nerfcli.evaluate.metrics import NAMES as MEASURED
+from nerfcli.evaluate.protocol import RunMetrics
 from nerfcli.training.runs.run import RunConfig
 
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 # Metrics that may be required: the means in metrics.json, the fraction of photos with a pose, and the run's times.
-NAMES = (
-    *(f"{measure}{version}" for measure in ("psnr", "ssim") for version in ("", "_colour_aligned", "_float")),
-    *("lpips", "lpips_colour_aligned", "registered", "training_seconds", "seconds_per_image"),
-)
+NAMES = (*MEASURED, "registered", "training_seconds", "seconds_per_image")
 # Why a number may be absent, and what to do.
 WHY_ABSENT = {
     "registered": "only scenes of nerfcli poses say how many photos were registered; leave this requirement out",
@@ -54,15 +52,15 @@ def parse_requirements(text: str) -> tuple[Requirement, ...]:
     return tuple(found)
 
 
-def known_numbers(metrics: Mapping[str, Any], config: RunConfig) -> dict[str, float | None]:
-    """Return the numbers of a run that requirements can refer to, from metrics.json and config.json."""
+def known_numbers(metrics: RunMetrics, config: RunConfig) -> dict[str, float | None]:
+    """Return the numbers of a run that requirements can refer to."""
     history = config.history or {}
     placed, photos = history.get("registered"), history.get("total")
     return {
-        **metrics["mean"],
+        **metrics.mean.to_json(),
         "registered": placed / photos if placed is not None and photos else None,
-        "training_seconds": metrics["training"]["seconds"],
-        "seconds_per_image": metrics["render"]["seconds_per_image"],
+        "training_seconds": None if metrics.training is None else metrics.training.seconds,
+        "seconds_per_image": metrics.seconds_per_image,
     }
 
 

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.evaluate.metrics import psnr, to_8_bit
-from nerfcli.evaluate.protocol import PROTOCOL, HeldOutPhoto, as_exposed, background_of, over_white
+from nerfcli.evaluate.metrics import compare
+from nerfcli.evaluate.photos import HeldOutPhoto, as_exposed, background_of, over_white
+from nerfcli.evaluate.protocol import PROTOCOL
 from nerfcli.field.background import colours_behind
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import Renderable
@@ -58,7 +59,7 @@ class SampledPixels:
             rgb, valid = render_sampled(model, photo, pixels, cuts=cuts, tolerance=TOLERANCE)
             truth = over_white(photo.pixels).reshape(-1, 3)[pixels]
             if valid.any():
-                values.append(psnr(to_8_bit(as_exposed(rgb, photo.log_gains)), truth, used=valid))
+                values.append(compare(as_exposed(rgb, photo.log_gains), truth, used=valid).psnr)
         return float(np.mean(values))
 
     def psnr_of_pictures(self, model: Renderable) -> float:
@@ -69,7 +70,7 @@ class SampledPixels:
             rgb, valid = picture.rgb.reshape(-1, 3)[pixels], picture.valid.ravel()[pixels]
             truth = over_white(photo.pixels).reshape(-1, 3)[pixels]
             if valid.any():
-                values.append(psnr(to_8_bit(as_exposed(rgb, photo.log_gains)), truth, used=valid))
+                values.append(compare(as_exposed(rgb, photo.log_gains), truth, used=valid).psnr)
         return float(np.mean(values))
 
 

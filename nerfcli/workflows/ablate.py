@@ -22,7 +22,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import find_model, parse_colmap
 from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
-from nerfcli.evaluate.run_photos import held_out_photos_of
+from nerfcli.evaluate.photos import held_out_photos_of
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.machine import default_memory_limit
 from nerfcli.notices import Reporter

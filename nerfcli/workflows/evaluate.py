@@ -3,19 +3,25 @@
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from nerfcli.atomic import atomic_folder, clear_leftovers, read_json, refuse_read_only, write_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import GATE_NOT_MET, UserError
 from nerfcli.evaluate.ledger import leak_ledger
 from nerfcli.evaluate.metrics import find_perceptual
-from nerfcli.evaluate.predictions import INFO, PREDICTIONS, predictions_are_there, save_compared
-from nerfcli.evaluate.protocol import PROTOCOL, ComparedImages, Extras, evaluate_model
+from nerfcli.evaluate.photos import (
+    INFO,
+    PREDICTIONS,
+    ComparedImages,
+    held_out_photos_of,
+    predictions_are_there,
+    save_compared,
+    training_billboards,
+)
+from nerfcli.evaluate.protocol import PROTOCOL, Extras, RunMetrics, evaluate_model
 from nerfcli.evaluate.requirements import WHY_ABSENT, Requirement, known_numbers, unmet
-from nerfcli.evaluate.run_photos import held_out_photos_of, training_billboards
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
 from nerfcli.output import Output
@@ -31,13 +37,12 @@ class Evaluation:
 
     Args:
         path: RUN/metrics.json.
-        metrics: its content; for a run: protocol, means, values per photo, and the rest that `nerfcli evaluate --help`
-            lists.
+        metrics: its content.
         is_kept: whether the file already existed.
     """
 
     path: Path
-    metrics: dict[str, Any]
+    metrics: RunMetrics
     is_kept: bool
 
 
@@ -54,7 +59,7 @@ def evaluate_run(
     Example:
         >>> import nerfcli
         >>> evaluation = nerfcli.evaluate_run("photos-scene-run")
-        >>> evaluation.metrics["mean"]["psnr"]
+        >>> evaluation.metrics.mean.psnr
 
     Args:
         run: the folder that `train_scene` wrote.
@@ -93,13 +98,16 @@ def evaluate_run(
             on_image=lambda done, total: reporter.progress(done / total, f"of {total} rays"),
             extras=Extras(trained.cameras.train, perceptual, billboards, keep),
         )
-    metrics["training"] = asdict(summary)
-    metrics["ledger"] = [asdict(entry) for entry in leak_ledger(trained.config)]
-    metrics["holdout"] = trained.config.holdout
-    metrics["split_sha256"] = trained.config.split_sha256
-    metrics["device"] = f"{torch_device}, {cores} threads, {platform.machine()}"
-    metrics["checkpoint_sha256"] = checkpoint
-    write_json(path, metrics)
+    metrics = replace(
+        metrics,
+        training=summary,
+        ledger=tuple(leak_ledger(trained.config)),
+        holdout=trained.config.holdout,
+        split_sha256=trained.config.split_sha256,
+        device=f"{torch_device}, {cores} threads, {platform.machine()}",
+        checkpoint_sha256=checkpoint,
+    )
+    write_json(path, metrics.to_json())
     return Evaluation(path, metrics, is_kept=False)
 
 
@@ -136,14 +144,17 @@ def evaluate_splats(
         on_image=lambda done, total: reporter.progress(done / total, f"of {total} pixels"),
         extras=Extras(trained.cameras.train, find_perceptual(reporter.note)),
     )
-    metrics["splats"] = {"file": file.name, "count": len(scene.gaussians), "degree": scene.gaussians.degree}
-    metrics["device"] = f"cpu, {cores} threads, {platform.machine()}"
-    metrics["checkpoint_sha256"] = digest
-    write_json(path, metrics)
+    metrics = replace(
+        metrics,
+        splats={"file": file.name, "count": len(scene.gaussians), "degree": scene.gaussians.degree},
+        device=f"cpu, {cores} threads, {platform.machine()}",
+        checkpoint_sha256=digest,
+    )
+    write_json(path, metrics.to_json())
     return Evaluation(path, metrics, is_kept=False)
 
 
-def check_requirements(run: Run, metrics: dict[str, Any], requirements: Sequence[Requirement]) -> None:
+def check_requirements(run: Run, metrics: RunMetrics, requirements: Sequence[Requirement]) -> None:
     """Raise if a requirement is not met.
 
     Raises:
@@ -172,7 +183,7 @@ def saved_predictions(
     """Yield a function that saves one comparison in RUN/predictions; the folder appears when all are saved.
 
     Args:
-        kind: one of `evaluate.predictions.KINDS`; None to save nothing.
+        kind: one of `evaluate.photos.KINDS`; None to save nothing.
     """
     if kind is None:
         yield lambda compared: None
@@ -189,14 +200,15 @@ def _kept(
     """Return existing metrics that stay; raise if they are of another checkpoint or lack the predictions."""
     if output.overwrite or not path.exists():
         return None
-    metrics = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to evaluate again")
-    if metrics.get("checkpoint_sha256") != checkpoint:
+    content = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to evaluate again")
+    metrics = RunMetrics.from_json(content, path)
+    if metrics.checkpoint_sha256 != checkpoint:
         raise UserError(f"{path} belongs to an earlier checkpoint or file", "add --overwrite to replace it")
     if predictions is not None and not predictions_are_there(
         path.with_name(PREDICTIONS), predictions, checkpoint=checkpoint
     ):
         raise UserError(f"{path} was written without saved predictions", "add --overwrite to evaluate again")
-    made_by = metrics["protocol"].split(":")[0]
+    made_by = metrics.protocol.split(":")[0]
     older = "" if made_by == PROTOCOL else f" (by {made_by})"
     reporter.note(f"{path} is kept{older}: it is up to date; add --overwrite to evaluate again")
     return Evaluation(path, metrics, is_kept=True)

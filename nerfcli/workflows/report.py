@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nerfcli.errors import UserError
+from nerfcli.evaluate.photos import held_out_photos_of
 from nerfcli.evaluate.report.page import mark_of, origin_of, page_html
 from nerfcli.evaluate.report.run_facts import captures_of, labels_of, read_facts
 from nerfcli.evaluate.report.views import common_names, look_at
-from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
 from nerfcli.output import Output

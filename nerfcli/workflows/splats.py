@@ -11,7 +11,7 @@ import torch
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
-from nerfcli.evaluate.protocol import HeldOutPhoto
+from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.notices import Notify, Reporter, silent

@@ -15,11 +15,10 @@ from nerfcli.evaluate.report.tables import (
     capture_html,
     last_logged,
     ledger_html,
-    metric,
+    measured,
     numbers_html,
     photos_html,
     registered,
-    render_time,
     selection_html,
     settings_html,
 )
@@ -43,10 +42,10 @@ from nerfcli.version import __version__
 _COLUMNS = (
     ("photos", lambda run: str(len(run.frames.train) + len(run.frames.test))),
     ("poses found", registered),
-    ("PSNR, dB", metric("psnr", "{:.2f}")),
-    ("SSIM", metric("ssim", "{:.4f}")),
+    ("PSNR, dB", measured(lambda found: found.mean.psnr, "{:.2f}")),
+    ("SSIM", measured(lambda found: found.mean.ssim, "{:.4f}")),
     ("training, s", last_logged("seconds", "{:.1f}")),
-    ("s per picture", render_time("{:.2f}")),
+    ("s per picture", measured(lambda found: found.seconds_per_image, "{:.2f}")),
     ("warnings", lambda run: str(sum(1 for _ in warnings_of(run)))),
 )
 
@@ -71,7 +70,7 @@ def _aligned(name: str) -> str:
 def _thumbnails(look: Sequence[HeldOutRenderings]) -> str:
     if not look:
         return ""
-    view = sorted(look, key=lambda view: view.psnr)[len(look) // 2]
+    view = sorted(look, key=lambda view: view.metrics.psnr)[len(look) // 2]
     both = np.hstack([fitted(view.photo, 120), fitted(view.picture, 120)])
     source = data_uri(jpeg_bytes(both), "jpeg")
     return f'<img class="thumbnail" alt="{escape(view.name)} and its rendering" src="{source}">'
@@ -95,7 +94,9 @@ def origin_of(runs: Sequence[RunFacts], hashes: Sequence[str], *, views: int, de
         hashes: digests of their fields.
         views, depth: number of held-out photos to show, and the depth that is shown.
     """
-    facts = [[run.label, run.config.to_json(), run.log, run.metrics, run.poses] for run in runs]
+    facts = [
+        [run.label, run.config.to_json(), run.log, run.metrics and run.metrics.to_json(), run.poses] for run in runs
+    ]
     return digest([__version__, list(hashes), facts, views, asdict(depth)])
 
 
@@ -148,7 +149,7 @@ def _warnings_html(runs: Sequence[RunFacts]) -> str:
 
 
 def _structure(view: HeldOutRenderings) -> str:
-    return "not known" if view.ssim is None else f"{view.ssim:.3f}"
+    return "not known" if view.metrics.ssim is None else f"{view.metrics.ssim:.3f}"
 
 
 def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[HeldOutRenderings]]) -> list[tuple[float, float]]:
@@ -174,7 +175,7 @@ def _views_html(
         first = seen[0][1]
         height, width = first.photo.shape[:2]
         facts = "; ".join(
-            f"{run.label + ': ' if len(runs) > 1 else ''}{view.psnr:.2f} dB, SSIM {_structure(view)}, "
+            f"{run.label + ': ' if len(runs) > 1 else ''}{view.metrics.psnr:.2f} dB, SSIM {_structure(view)}, "
             f"depth in {100 * view.with_depth:.0f} % of the pixels"
             for run, view, _ in seen
         )

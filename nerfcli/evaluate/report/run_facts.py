@@ -8,6 +8,7 @@ from typing import Any
 
 from nerfcli.captures.formats.run_cameras import RunCameras
 from nerfcli.errors import UserError, listed, several
+from nerfcli.evaluate.protocol import RunMetrics
 from nerfcli.training.runs.files import LogEntry
 from nerfcli.training.runs.run import Run, RunConfig
 
@@ -32,7 +33,7 @@ class RunFacts:
     label: str
     config: RunConfig
     log: list[LogEntry]
-    metrics: dict[str, Any] | None
+    metrics: RunMetrics | None
     poses: dict[str, Any] | None
     frames: RunCameras
     field_bytes: int
@@ -48,8 +49,9 @@ def read_facts(run: Run, label: str, *, checkpoint_sha256: str) -> RunFacts:
     Raises:
         UserError: it is not a run, or one of its files cannot be read.
     """
-    metrics = _json(run.metrics_path)
-    if metrics is not None and metrics.get("checkpoint_sha256") != checkpoint_sha256:
+    content = _json(run.metrics_path)
+    metrics = None if content is None else RunMetrics.from_json(content, run.metrics_path)
+    if metrics is not None and metrics.checkpoint_sha256 != checkpoint_sha256:
         metrics = None
     return RunFacts(
         path=run.path,
@@ -90,7 +92,7 @@ def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
     if facts.metrics is None:
         yield "evaluation", "this checkpoint was not evaluated: run nerfcli evaluate"
     else:
-        yield from (("evaluation", text) for text in facts.metrics.get("warnings", []))
+        yield from (("evaluation", text) for text in facts.metrics.warnings)
 
 
 def captures_of(runs: Sequence[RunFacts]) -> list[list[int]]:
@@ -117,9 +119,9 @@ def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:
     measured = [run for run in runs if run.metrics is not None]
     if any(len({runs[i].config.split_sha256 for i in capture}) > 1 for capture in captures_of(runs)):
         yield "the runs have different held-out photos"
-    if len({(run.metrics or {}).get("protocol") for run in measured}) > 1:
+    if len({run.metrics.protocol for run in measured if run.metrics}) > 1:
         yield "the runs were evaluated by different protocols"
-    if len({(run.metrics or {}).get("device") for run in measured}) > 1:
+    if len({run.metrics.device for run in measured if run.metrics}) > 1:
         yield "the runs were evaluated on different machines or threads: compare errors, not times"
 
 

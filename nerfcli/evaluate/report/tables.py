@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any, Literal
 
+from nerfcli.evaluate.protocol import Novelty, RunMetrics
 from nerfcli.evaluate.report.run_facts import RunFacts, captures_of
 from nerfcli.pages.page import table
 
@@ -29,40 +30,37 @@ def _columns(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Callable[[RunFa
 
 def _protocols_html(runs: Sequence[RunFacts]) -> str:
     """Return the evaluation protocols, each once."""
-    protocols = dict.fromkeys(str(run.metrics["protocol"]) for run in runs if run.metrics)
+    protocols = dict.fromkeys(run.metrics.protocol for run in runs if run.metrics)
     return "".join(f'<p class="legend"><b>protocol</b> {escape(protocol)}</p>' for protocol in protocols)
 
 
-def metric(key: str, form: str) -> Callable[[RunFacts], str]:
-    """Return a formatter of a mean over the held-out photos; it gives "" if there is none."""
-    return _of("mean", key, form)
+def measured(read: Callable[[RunMetrics], float | None], form: str) -> Callable[[RunFacts], str]:
+    """Return a formatter of a number among the metrics; it gives "" if there is none."""
+
+    def text(run: RunFacts) -> str:
+        value = None if run.metrics is None else read(run.metrics)
+        return "" if value is None else form.format(value)
+
+    return text
 
 
-def _of(part: str, key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
+def _of_poses(part: str, key: str, form: str) -> Callable[[RunFacts], str]:
     def read(run: RunFacts) -> str:
-        content: dict[str, Any] = (run.metrics if part in ("mean", "training", "render") else run.poses) or {}
+        content: dict[str, Any] = run.poses or {}
         value = content.get(part, content).get(key) if part else content.get(key)
-        return form.format(value / scale) if isinstance(value, int | float) else ""
+        return form.format(value) if isinstance(value, int | float) else ""
 
     return read
-
-
-def render_time(form: str) -> Callable[[RunFacts], str]:
-    """Return a formatter of the seconds per picture; it gives "" if they were not measured."""
-    return _of("render", "seconds_per_image", form)
 
 
 def _of_kind(kind: str) -> Callable[[RunFacts], str]:
     def read(run: RunFacts) -> str:
-        group = (run.metrics or {}).get("kinds", {}).get(kind)
-        return f"{group['psnr']:.2f} dB ({group['images']})" if group else ""
+        if run.metrics is None or kind not in run.metrics.kinds:
+            return ""
+        count, mean = run.metrics.kinds[kind]
+        return f"{mean.psnr:.2f} dB ({count})"
 
     return read
-
-
-def _shape(run: RunFacts) -> str:
-    shape = (run.metrics or {}).get("shape")
-    return f"{shape['gain_db']:+.2f} dB" if shape else ""
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -108,7 +106,7 @@ def photos_html(runs: Sequence[RunFacts]) -> str:
 
 
 def _photos_html(runs: Sequence[RunFacts], *, of_many: bool) -> str:
-    by_run = [{image["name"]: image for image in (run.metrics or {}).get("images", [])} for run in runs]
+    by_run = [{image.name: image for image in (run.metrics.images if run.metrics else ())} for run in runs]
     names = sorted({name for images in by_run for name in images})
     if not names:
         return ""
@@ -120,29 +118,28 @@ def _photos_html(runs: Sequence[RunFacts], *, of_many: bool) -> str:
     for name in names:
         row = [name]
         for images in by_run:
-            image = images.get(name, {})
-            row += [_number(image.get("psnr"), 2), _number(image.get("ssim"), 4)]
-        view = next((images[name]["view"] for images in by_run if "view" in images.get(name, {})), None)
+            found = images[name].metrics if name in images else None
+            row += ["", ""] if found is None else [_number(found.psnr, 2), _number(found.ssim, 4)]
+        view = next((images[name].view for images in by_run if name in images and images[name].view), None)
         rows.append([*row, *_novelty(view)])
     columns += ["nearest training view", "distance / scene radius", "degrees between", "type of view"]
     return table(columns, rows, numbers=range(1, len(columns)))
 
 
-def _novelty(view: dict[str, Any] | None) -> list[str]:
+def _novelty(view: Novelty | None) -> list[str]:
     """Format how far a held-out view is from the nearest training view."""
     if view is None:
         return ["", "", "", ""]
-    distance, angle = _number(view.get("distance_relative"), 3), _number(view.get("angle_deg"), 1)
-    return [str(view.get("nearest") or ""), distance, angle, str(view.get("kind") or "")]
+    return [view.nearest, _number(view.distance_relative, 3), _number(view.angle_deg, 1), view.kind]
 
 
 def ledger_html(runs: Sequence[RunFacts]) -> str:
     """Format a table of the stages that used the held-out photos."""
     words = {True: "yes", False: "no", None: "not known"}
     rows = [
-        (run.label, entry["stage"], words[entry["saw_held_out"]], entry["how"])
+        (run.label, entry.stage, words[entry.saw_held_out], entry.how)
         for run in runs
-        for entry in (run.metrics or {}).get("ledger", [])
+        for entry in (run.metrics.ledger if run.metrics else ())
     ]
     if not rows:
         return "<p>Unknown: the run was not evaluated.</p>"
@@ -195,20 +192,26 @@ def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, str]:
 
 
 _NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
-    ("PSNR on held-out photos", metric("psnr", "{:.2f} dB")),
-    ("SSIM", metric("ssim", "{:.4f}")),
-    ("LPIPS", metric("lpips", "{:.4f}")),
-    ("PSNR after colour alignment", metric("psnr_colour_aligned", "{:.2f} dB")),
+    ("PSNR on held-out photos", measured(lambda found: found.mean.psnr, "{:.2f} dB")),
+    ("SSIM", measured(lambda found: found.mean.ssim, "{:.4f}")),
+    ("LPIPS", measured(lambda found: found.mean.lpips, "{:.4f}")),
+    ("PSNR after colour alignment", measured(lambda found: found.mean.psnr_colour_aligned, "{:.2f} dB")),
     ("PSNR on views between training views (interpolation)", _of_kind("interpolation")),
     ("PSNR on views beyond training views (extrapolation)", _of_kind("extrapolation")),
-    ("gain over billboards (a model without geometry)", _shape),
+    (
+        "gain over billboards (a model without geometry)",
+        measured(lambda found: None if found.shape is None else found.shape.gain_db, "{:+.2f} dB"),
+    ),
     ("training", last_logged("seconds", "{:.1f} s")),
     ("steps", last_logged("step", "{:,.0f}")),
-    ("samples per second", _of("training", "samples_per_second", "{:.2f} M", _MEGA)),
+    (
+        "samples per second",
+        measured(lambda found: found.training.samples_per_second / _MEGA if found.training else None, "{:.2f} M"),
+    ),
     ("peak memory", last_logged("peak_memory_bytes", "{:.0f} MB", _MEGA)),
     ("checkpoint", lambda run: f"{run.field_bytes / _MEGA:.1f} MB"),
-    ("time per picture", render_time("{:.2f} s")),
-    ("measured on", lambda run: str((run.metrics or {}).get("device", ""))),
+    ("time per picture", measured(lambda found: found.seconds_per_image, "{:.2f} s")),
+    ("measured on", lambda run: run.metrics.device if run.metrics else ""),
 )
 
 
@@ -222,9 +225,9 @@ _CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
     ("poses found", registered),
     ("result", _verdict),
     ("lenses", _lenses),
-    ("points", _of("", "points", "{:,.0f}")),
-    ("mean reprojection error", _of("", "mean_reprojection_error_px", "{:.2f} px")),
-    ("blur due to pose uncertainty, median", _of("pose_blur_px", "median", "{:.2f} px")),
-    ("blur due to pose uncertainty, maximum", _of("pose_blur_px", "largest", "{:.2f} px")),
-    ("time of structure from motion", _of("seconds", "total", "{:.0f} s")),
+    ("points", _of_poses("", "points", "{:,.0f}")),
+    ("mean reprojection error", _of_poses("", "mean_reprojection_error_px", "{:.2f} px")),
+    ("blur due to pose uncertainty, median", _of_poses("pose_blur_px", "median", "{:.2f} px")),
+    ("blur due to pose uncertainty, maximum", _of_poses("pose_blur_px", "largest", "{:.2f} px")),
+    ("time of structure from motion", _of_poses("seconds", "total", "{:.0f} s")),
 )

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
-from nerfcli.evaluate.protocol import HeldOutPhoto, background_of, compare
+from nerfcli.evaluate.metrics import Metrics, compare, to_8_bit
+from nerfcli.evaluate.photos import HeldOutPhoto, background_of, paired
 from nerfcli.evaluate.report.run_facts import RunFacts
 from nerfcli.photos.colours import levels_of
 from nerfcli.render.coverage import DepthMap, small_frame, with_coverage
@@ -34,7 +34,7 @@ class HeldOutRenderings:
         photo, picture, error: (H, W, 3) uint8 sRGB; RGBA photos on white.
         depth: (H, W) in the unit of the scene, NaN where there is none.
         coverage: (h, w) number of training photos that see the surface, in a smaller picture; NaN where there is none.
-        psnr, ssim: of the picture against the photo over the used pixels, as in `evaluate`; SSIM may be unknown.
+        metrics: PSNR and SSIM, as in `evaluate`.
     """
 
     name: str
@@ -43,8 +43,7 @@ class HeldOutRenderings:
     error: np.ndarray
     depth: np.ndarray
     coverage: np.ndarray
-    psnr: float
-    ssim: float | None
+    metrics: Metrics
 
     @property
     def with_depth(self) -> float:
@@ -58,8 +57,8 @@ def common_names(runs: Sequence[RunFacts], count: int) -> list[str]:
     for run in runs[1:]:
         held_out = {frame.name for frame in run.frames.test}
         names = [name for name in names if name in held_out]
-    measured = next((run.metrics for run in runs if run.metrics is not None), {})
-    quality = {image["name"]: image["psnr"] for image in measured.get("images", [])}
+    measured = next((run.metrics.images for run in runs if run.metrics is not None), ())
+    quality = {image.name: image.metrics.psnr for image in measured}
     return spread_evenly(names, count, quality=quality)
 
 
@@ -81,18 +80,18 @@ def look_at(
     for photo in held_out:
         picture = render_picture(model, photo.frame, background=background_of(model, photo), depth=depth)
         assert picture.depth is not None
-        compared = compare(photo, picture)
-        rendered, used = to_8_bit(compared.rendered), compared.used
+        pair = paired(photo, picture)
+        metrics = compare(pair.rendered, pair.photo, used=pair.used)
+        rendered = to_8_bit(pair.rendered)
         views.append(
             HeldOutRenderings(
                 name=photo.frame.name,
-                photo=compared.photo,
+                photo=pair.photo,
                 picture=rendered,
-                error=error_map(rendered, compared.photo, used=used),
+                error=error_map(rendered, pair.photo, used=pair.used),
                 depth=picture.depth,
                 coverage=_coverage_map(model, photo.frame, photo_depths),
-                psnr=psnr(rendered, compared.photo, used=used),
-                ssim=ssim(rendered, compared.photo, used=used),
+                metrics=metrics,
             )
         )
         on_progress(len(views) / len(held_out))

@@ -1,0 +1,183 @@
+"""Held-out photos, loaded as for the training; their pairs with rendered pictures, compared and saved.
+
+Saved pairs have the layout of nerfbaselines, for evaluation with other programs:
+
+predictions/color/NAME.png         the rendered picture, 8 bit sRGB
+predictions/gt-color/NAME.png      the photo as it was compared: upright, averaged to the size of the training
+predictions/mask/NAME.png          255 where pixels count; only where some do not
+predictions/color-float/NAME.npy   the rendered picture before rounding, float32; only on request
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import UserError
+from nerfcli.evaluate.billboards import Billboards, reduction
+from nerfcli.evaluate.metrics import to_8_bit
+from nerfcli.field.background import Background
+from nerfcli.field.exposure import exposed
+from nerfcli.photos.images import write_png
+from nerfcli.photos.loading import downscaled_camera, load_photos
+from nerfcli.render.held_out_exposure import gain_sources, log_gains_of
+from nerfcli.render.model import Model
+from nerfcli.render.pictures import Renderable, RenderedPicture
+from nerfcli.training.runs.run import Run, RunConfig
+
+
+@dataclass(frozen=True)
+class HeldOutPhoto:
+    """A held-out photo at the resolution of the training.
+
+    Args:
+        frame: its camera and pose.
+        pixels: (H, W, 3 or 4) uint8 sRGB, straight alpha.
+        used: (H, W) bool; None for all pixels.
+        log_gains: logarithms of its gains relative to the model's pictures, from EXIF or from the training photos
+            around it, never from the photo itself; see `field.exposure`.
+        gains_from: the source of the gains, one of `held_out_exposure.SOURCES`.
+    """
+
+    frame: Frame
+    pixels: np.ndarray
+    used: np.ndarray | None
+    log_gains: tuple[float, ...] = (0.0, 0.0, 0.0)
+    gains_from: str = "none"
+
+
+@dataclass(frozen=True)
+class ComparedImages:
+    """A compared pair: rendered (H, W, 3) float sRGB, the photo (H, W, 3) uint8, and the mask of counted pixels (H, W).
+
+    on_white: whether the photo has alpha and is composited on white. There is then no colour correction: it ignores
+    saturated pixels, so it could turn white into any colour.
+    """
+
+    frame: Frame
+    rendered: np.ndarray
+    photo: np.ndarray
+    used: np.ndarray
+    on_white: bool
+
+
+def background_of(model: Renderable, photo: HeldOutPhoto) -> Background:
+    """Return the background of pictures that are compared with a photo: white if the photo has alpha."""
+    return (1.0, 1.0, 1.0) if photo.pixels.shape[-1] == 4 else model.background
+
+
+def over_white(pixels: np.ndarray) -> np.ndarray:
+    """Return RGBA composited on white as 8-bit RGB, as in published tables; RGB unchanged."""
+    if pixels.shape[-1] == 3:
+        return pixels
+    alpha = pixels[..., 3:].astype(np.float64) / 255.0
+    return to_8_bit(pixels[..., :3] / 255.0 * alpha + 1.0 - alpha)
+
+
+def paired(photo: HeldOutPhoto, picture: RenderedPicture) -> ComparedImages:
+    """Return a held-out photo with its rendered picture, to which the photo's gains are applied.
+
+    Raises:
+        UserError: a mask hides the whole photo.
+    """
+    used = picture.valid if photo.used is None else picture.valid & photo.used
+    if not used.any():
+        raise UserError(
+            f"no pixels of {photo.frame.name} are left to compare",
+            "check its mask: white pixels are used, black ones are ignored",
+        )
+    return ComparedImages(
+        photo.frame,
+        as_exposed(picture.rgb, photo.log_gains),
+        over_white(photo.pixels),
+        used,
+        photo.pixels.shape[-1] == 4,
+    )
+
+
+def as_exposed(rgb: np.ndarray, log_gains: tuple[float, ...]) -> np.ndarray:
+    """Return a picture with a photo's gains applied, clipped; unchanged if all gains are 1."""
+    if not any(log_gains):
+        return rgb
+    return exposed(torch.from_numpy(rgb), torch.tensor(log_gains)).clamp(0.0, 1.0).numpy()
+
+
+def held_out_photos(
+    frames: Sequence[Frame], model: Model, *, downscale: int, masks: str, threads: int
+) -> list[HeldOutPhoto]:
+    """Load photos as for training, each with its gains relative to the model, from EXIF or from its neighbours.
+
+    Args:
+        frames: with their images and masks.
+        model: the model that they are compared with.
+        downscale: the factor of the training.
+        masks: the meaning of black in masks, see `Components`.
+
+    Raises:
+        UserError: a photo cannot be read.
+    """
+    photos = load_photos(frames, factor=downscale, threads=threads, masks=masks)
+    exposed = zip(photos, log_gains_of(frames, model).tolist(), gain_sources(frames, model), strict=True)
+    return [
+        HeldOutPhoto(photo.frame, photo.pixels, photo.used, log_gains=tuple(gains), gains_from=source)
+        for photo, gains, source in exposed
+    ]
+
+
+def held_out_photos_of(config: RunConfig, frames: Sequence[Frame], model: Model, *, threads: int) -> list[HeldOutPhoto]:
+    """Load held-out photos of a run; see `held_out_photos`."""
+    masks = config.components.masks
+    return held_out_photos(frames, model, downscale=config.downscale, masks=masks, threads=threads)
+
+
+def training_billboards(run: Run, *, notify: Callable[[str], None]) -> Billboards | None:
+    """Build the billboards of a run's training photos; None, with a line for the user, if a photo cannot be read."""
+    factor, masks = run.config.downscale, run.components.masks
+    small, cameras = [], []
+    try:
+        for frame in run.cameras.train:
+            trained = replace(frame, camera=downscaled_camera(frame.camera, factor))
+            (photo,) = load_photos([frame], factor=factor * reduction(trained), threads=1, masks=masks)
+            cameras.append(photo.frame)
+            small.append(over_white(photo.pixels))
+    except UserError as error:
+        notify(f"no comparison with a model without geometry: {error}")
+        return None
+    return Billboards(cameras, small)
+
+
+PREDICTIONS = "predictions"
+INFO = "info.json"
+# Choices: 8-bit pictures only, or unrounded ones, too.
+KINDS = ("png", "float")
+
+
+def save_compared(folder: Path, stem: str, compared: ComparedImages, *, kind: str) -> None:
+    """Write the 8-bit picture, the photo and, where pixels are left out, the mask.
+
+    Args:
+        folder: the folder of predictions.
+        stem: the name of the files, without suffix; subfolders are created.
+        kind: one of `KINDS`.
+    """
+    write_png(folder / "color" / f"{stem}.png", to_8_bit(compared.rendered))
+    write_png(folder / "gt-color" / f"{stem}.png", compared.photo)
+    if not compared.used.all():
+        write_png(folder / "mask" / f"{stem}.png", compared.used.astype(np.uint8) * 255)
+    if kind == "float":
+        path = folder / "color-float" / f"{stem}.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, compared.rendered.astype(np.float32))
+
+
+def predictions_are_there(folder: Path, kind: str, *, checkpoint: str) -> bool:
+    """Return whether predictions of this checkpoint are saved, including unrounded ones if `kind` is "float"."""
+    try:
+        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return info.get("checkpoint_sha256") == checkpoint and kind in (info.get("kind"), "png")
