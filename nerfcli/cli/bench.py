@@ -53,7 +53,7 @@ def bench(
     console = printing.console
 
     def work(given: Given) -> None:
-        output = writing.of(given, "-bench")
+        output = writing.beside(given, "-bench")
         content = bench_one(given.path, output, seconds, resources=computing.resources, console=console)
         console.result(output.at(given.path) / "bench.csv", content)
 

@@ -67,7 +67,7 @@ def doctor(
                 f"{path} is a run: doctor examines photos and scenes",
                 "nerfcli report RUN shows how many photos see what; render has --outputs coverage,parallax",
             )
-        page = writing.of(given, "-doctor.html")
+        page = writing.beside(given, "-doctor.html")
         with console.stage(f"doctor {path.name}") as reporter:
             diagnosis = examine_capture(
                 find_subject(path, subfolders=subfolders), page, intrinsics, resources=resources, reporter=reporter

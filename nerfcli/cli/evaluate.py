@@ -67,7 +67,7 @@ def evaluate(
     if STDIN in runs and len(runs) > 1:
         raise typer.BadParameter("- cannot be combined with other runs", param_hint="RUNS")
     console, requirements = printing.console, requirements_of(require)
-    resources, output = computing.resources, Output(overwrite=overwrite)
+    resources, output = computing.resources, Output(None, overwrite)
     _ = resources.torch_device  # refuses an unknown one before anything is read
 
     def measure(folder: Path) -> "RunMetrics":

@@ -107,7 +107,7 @@ class Writing:
     output: Output = None
     overwrite: Overwrite = False
 
-    def of(self, given: Given, suffix: str) -> Destination:
+    def beside(self, given: Given, suffix: str) -> Destination:
         """Return where the result of an input goes: by default beside it, with a suffix added to its name."""
         path = Destination(self.output if not given.one_of_many else None).beside(given.path, suffix)
         if self.output is not None and given.one_of_many:
@@ -116,7 +116,7 @@ class Writing:
 
     def inside(self, given: Given, suffix: str) -> Destination:
         """Return the folder for the results of an input, one of its own for each of several; by default none."""
-        return self.of(given, suffix) if self.output is not None else Destination(None, self.overwrite)
+        return self.beside(given, suffix) if self.output is not None else Destination(None, self.overwrite)
 
     def named(self, given: Given, usual: Path) -> Destination:
         """Return where the result of an input goes: by default to `usual`, of several to a path of that name."""

@@ -183,7 +183,7 @@ def train(
                 console.note(note)
 
     def work(given: Given) -> None:
-        run = options.Writing(output, overwrite).of(given, "-run").at(given.path)
+        run = options.Writing(output, overwrite).beside(given, "-run").at(given.path)
         if dry_run:
             plan_one_scene(given.path)
             return

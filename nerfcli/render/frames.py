@@ -55,21 +55,19 @@ def render_job(
     output: Output,
     *,
     part: slice | None = None,
-    threads: int = 1,
     reporter: Reporter = Reporter(),
 ) -> list[Path]:
     """Render the frames of a job that are missing; without `part`, write the outputs that need all of them, too.
 
     Layout: rgb/NAME.png, depth/NAME.tiff with depth/NAME.png to look at, opacity/NAME.png; exr/NAME.exr,
     depth16/NAME.png; rgb.mp4, depth.mp4, opacity.mp4; render.json. The colours of all depth previews share one range,
-    so that a video does not flicker. The files depend on the model and the job alone. Memory does not grow with the
-    number of frames.
+    so that a video does not flicker. The files depend on the model and the job alone, not on the threads, which are as
+    many as torch's. Memory does not grow with the number of frames.
 
     Args:
         output: the folder to write, whose path is given; it appears, or is replaced, when it is complete. The pictures
             of a folder that differs only in videos and levels stay.
         part: which frames; several machines that share a disk may render different ones at the same time.
-        threads: number of threads.
         reporter: told what happens, and the fraction of the rays that is done.
 
     Returns:
@@ -92,7 +90,7 @@ def render_job(
     job.check()
     unfinished.create(folder)
     if part is not None:
-        _render_missing(model, job, chosen, unfinished, threads=threads, reporter=reporter)
+        _render_missing(model, job, chosen, unfinished, reporter)
         there = sum(map(unfinished.has, job.names))
         words = f"{there} of {len(frames)} frames are complete"
         reporter.note(f"{words}; the same command without --frames renders the others")
@@ -102,11 +100,11 @@ def render_job(
         if facts is not None:
             reporter.progress(1.0, f"of {len(frames)} frames")
             job.remove_other_presentation(folder)
-            _write_presentation(model, job, folder, facts, threads=threads, reporter=reporter)
+            _write_presentation(model, job, folder, facts, reporter)
         else:
-            _render_missing(model, job, chosen, unfinished, threads=threads, reporter=reporter)
+            _render_missing(model, job, chosen, unfinished, reporter)
             facts = {name: unfinished.facts(name) for name in job.names}
-            _write_presentation(model, job, unfinished.files, facts, threads=threads, reporter=reporter)
+            _write_presentation(model, job, unfinished.files, facts, reporter)
             unfinished.finish(folder)
         unfinished.discard()
     return job.results(folder)
@@ -165,15 +163,13 @@ def _render_missing(
     job: RenderJob,
     chosen: Sequence[int],
     unfinished: _Unfinished,
-    *,
-    threads: int,
     reporter: Reporter,
 ) -> None:
     """Render the chosen frames that are missing, several at a time; the first exception stops all after their tile."""
     missing = [index for index in chosen if not unfinished.has(job.names[index])]
     total = sum(map(job.rays, chosen))
     done = total - sum(map(job.rays, missing))
-    stopped, lock, before = threading.Event(), threading.Lock(), torch.get_num_threads()
+    stopped, lock, threads = threading.Event(), threading.Lock(), torch.get_num_threads()
     reporter.progress(0.0, "")
     if done:
         count = len(chosen) - len(missing)
@@ -204,7 +200,7 @@ def _render_missing(
             pool.shutdown(wait=False, cancel_futures=True)
             raise
         finally:
-            use_threads(before)
+            use_threads(threads)
 
 
 def _render_frame(
@@ -233,11 +229,11 @@ def _render_frame(
 
 
 def _write_presentation(
-    model: Renderable, job: RenderJob, folder: Path, facts: dict[str, Any], *, threads: int, reporter: Reporter
+    model: Renderable, job: RenderJob, folder: Path, facts: dict[str, Any], reporter: Reporter
 ) -> None:
     """Write what needs all frames beside their files: previews, 16-bit levels, videos, and last the description."""
     meta = depth_meta(model, job.settings.depth)
-    ranges = write_previews(folder, job, meta, threads=threads)
+    ranges = write_previews(folder, job, meta)
     levels = {}
     if job.settings.in_levels:
         written = write_levels(folder, job.names, meaning=meta)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from nerfcli.photos.colours import levels_of
@@ -119,14 +120,11 @@ def _tick_labels(lo: float, hi: float, *, suffix: str) -> list[str]:
     return [f"<= {numbers[0]}", *numbers[1:-1], f">= {numbers[-1]}"]
 
 
-def write_previews(
-    folder: Path, job: RenderJob, meta: DepthMeta, *, threads: int = 1
-) -> dict[str, tuple[float, float]]:
+def write_previews(folder: Path, job: RenderJob, meta: DepthMeta) -> dict[str, tuple[float, float]]:
     """Write a false-colour PNG beside each measured file, with one range per output.
 
     Args:
         folder: holds the complete files of every frame.
-        threads: number of previews that are written at the same time.
 
     Returns:
         The range of each measured output, in the unit of `meta`.
@@ -137,13 +135,11 @@ def write_previews(
     ranges = {}
     for output in job.settings.measured:
         meaning = meaning_of(meta, job.settings.depth, output)
-        ranges[output] = _write_previews_of(output, folder, job, meaning, threads=threads)
+        ranges[output] = _write_previews_of(output, folder, job, meaning)
     return ranges
 
 
-def _write_previews_of(
-    output: str, folder: Path, job: RenderJob, meaning: DepthMeta, *, threads: int
-) -> tuple[float, float]:
+def _write_previews_of(output: str, folder: Path, job: RenderJob, meaning: DepthMeta) -> tuple[float, float]:
     """Write the previews of one output, and return its range."""
     kept: dict[str, np.ndarray] = {}
 
@@ -163,7 +159,7 @@ def _write_previews_of(
         picture = preview(read(name), meaning, lo=lo, hi=hi)
         write_png(_picture(folder, output, name), picture, metadata=metadata)
 
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         list(pool.map(write, job.names))
     return lo, hi
 

@@ -92,7 +92,7 @@ def run_pipeline(
         reporter=reporter,
     )
     with reporter.stage(f"train {scene.name}") as told:
-        run = _trained(scene, Output(run_path, again), settings, resources.memory_limit(device), told)
+        run = _trained(scene, Output(run_path, again), settings, resources, told)
     usual = Output(overwrite=again)
     with reporter.stage("evaluate") as told:
         evaluation = evaluate_run(run.path, usual, resources=resources, reporter=told)
@@ -125,14 +125,14 @@ def run_pipeline(
     return PipelineResult(scene, run, evaluation, splats, of_splats, renders, report)
 
 
-def _trained(scene: Path, output: Output, settings: TrainSettings, memory_bytes: int | None, told: Reporter) -> Run:
+def _trained(scene: Path, output: Output, settings: TrainSettings, resources: Resources, told: Reporter) -> Run:
     """Train, or go on with a training that was interrupted."""
     path = output.at(scene)
     return train.train_scene(
         scene,
         path,
         settings,
-        memory_bytes=memory_bytes,
+        memory_bytes=resources.memory_limit(settings.device),
         resume=not output.overwrite and train.was_interrupted(scene, path, settings),
         overwrite=output.overwrite,
         notify=told.note,

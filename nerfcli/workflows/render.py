@@ -76,7 +76,8 @@ def render_run(
     trained, torch_device = Run(Path(run)), resources.torch_device
     settings = usual_settings(load_run(run), views) if settings is None else settings
     name = folder_name(views, settings) + ("-splats" if splats is not None else "")
-    folder, cores = output.at(trained.path / RENDERS / name), resources.begin()
+    folder = output.at(trained.path / RENDERS / name)
+    resources.begin()
     model = trained.model(torch_device)
     shown: Model | SplatScene = model.stretched(settings.step)
     seen = ()
@@ -101,7 +102,7 @@ def render_run(
     if "depth" in settings.outputs and settings.depth.axis == "z":
         refuse_z_depth_for_equirectangular(frames, notify=reporter.note)
     job = RenderJob(tuple(frames), settings, provenance, seen, errors)
-    return render_job(shown, job, replace(output, path=folder), part=views.part, threads=cores, reporter=reporter)
+    return render_job(shown, job, replace(output, path=folder), part=views.part, reporter=reporter)
 
 
 def render_splats(
@@ -137,7 +138,7 @@ def render_splats(
             "leave them out, or render the run: nerfcli render RUN --splats FILE",
             exit_code=2,
         )
-    cores = resources.begin()
+    resources.begin()
     splats = load_splats(path, notify=reporter.note)
     frames = frames_of_file(views)
     if "depth" in settings.outputs and settings.depth.axis == "z":
@@ -145,7 +146,7 @@ def render_splats(
     provenance = {"cameras": views.cameras, "splats": path.name, "splats_sha256": file_digest(path)}
     folder = output.at(path.with_name(f"{path.stem}-{RENDERS}") / folder_name(views, settings))
     job = RenderJob(tuple(frames), settings, provenance)
-    return render_job(splats, job, replace(output, path=folder), part=views.part, threads=cores, reporter=reporter)
+    return render_job(splats, job, replace(output, path=folder), part=views.part, reporter=reporter)
 
 
 def write_cameras(

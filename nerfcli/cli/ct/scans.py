@@ -170,7 +170,7 @@ def doctor(
     def work(given: Given) -> None:
         from nerfcli.ct.checks.examine import examine
 
-        page = writing.of(given, "-doctor.html")
+        page = writing.beside(given, "-doctor.html")
         with console.stage(f"doctor {given.path.name}") as reporter:
             diagnosis = examine(given.path, page, reporter=reporter)
         show_findings(diagnosis, page.at(given.path), diagnosis.record, console)
@@ -268,7 +268,7 @@ def train(
         from nerfcli.ct.train import train_scan
 
         _refuse_other_formats(given.path)
-        run = writing.of(given, "-run")
+        run = writing.beside(given, "-run")
         with console.stage(f"train {given.path.name}") as reporter:
             train_scan(given.path, run, settings, resume=resume, reporter=reporter)
         console.result(run.at(given.path))

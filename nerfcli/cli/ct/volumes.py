@@ -45,7 +45,7 @@ def evaluate(
     """
     from nerfcli.ct.evaluate import evaluate_scan
 
-    console, output, resources = printing.console, Output(overwrite=overwrite), Resources(threads)
+    console, output, resources = printing.console, Output(None, overwrite), Resources(threads)
 
     def work(given: Given) -> None:
         with console.stage("evaluate") as reporter:
