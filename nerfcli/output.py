@@ -40,6 +40,16 @@ class Output:
             return True
         raise UserError(f"{path} exists", "add --overwrite to replace it, or choose another folder with -o")
 
+    def refuse_existing(self, *paths: Path) -> None:
+        """Refuse files if one of them is there and may not be replaced.
+
+        Raises:
+            UserError: one is.
+        """
+        there = [path for path in paths if path.exists()]
+        if there and not self.overwrite:
+            raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another path with -o")
+
     def claim_file(self, path: Path) -> None:
         """Refuse a file that cannot be written or is there and may not be replaced; create its folder.
 
@@ -48,8 +58,7 @@ class Output:
         """
         if path.is_dir():
             raise UserError(f"{path} is a folder", "give a file name with -o")
-        if path.exists() and not self.overwrite:
-            raise UserError(f"{path} exists", "add --overwrite to replace it, or choose another path with -o")
+        self.refuse_existing(path)
         try:
             path.resolve().parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -19,7 +19,7 @@ from nerfcli.atomic import atomic_path
 from nerfcli.ct.grid import VoxelGrid
 from nerfcli.ct.marks import MEANINGS, UNSEEN, marks_in_words
 from nerfcli.ct.recognise import VOLUMES
-from nerfcli.ct.result import load_reconstruction, refuse_existing
+from nerfcli.ct.result import load_reconstruction
 from nerfcli.errors import UserError
 from nerfcli.notices import Reporter
 from nerfcli.output import Output
@@ -72,7 +72,7 @@ def export_scan(
     if water is not None:
         values, quantity = (1000 * (values / np.float32(water) - 1)).astype(np.float32), "HU"
     beside = target.with_name(f"{target.stem}-marks{target.suffix}")
-    refuse_existing(output, target, beside)
+    output.refuse_existing(target, beside)
     write_volume(target, VolumeFile(values, result.grid, result.unit, quantity))
     written = [target]
     if marks.any():

@@ -11,7 +11,7 @@ from nerfcli.ct.grid import VoxelGrid
 from nerfcli.ct.likelihood import Likelihood, likelihood_of
 from nerfcli.ct.marks import MEANINGS, UNSEEN
 from nerfcli.ct.reconstruct import Projector
-from nerfcli.ct.result import Reconstruction, load_reconstruction, refuse_existing, scan_of
+from nerfcli.ct.result import Reconstruction, load_reconstruction, scan_of
 from nerfcli.errors import UserError
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
@@ -57,7 +57,7 @@ def render_scan(
     result = load_reconstruction(run)
     if slices:
         cuts = {target / f"{name}.tif": cut for axis, at in slices for name, cut in _slice(result, axis, at).items()}
-        refuse_existing(output, *cuts)
+        output.refuse_existing(*cuts)
         for path, (values, high) in cuts.items():
             # Picture rows run downwards, but the vertical axis of a slice points up.
             _write_picture(path, values[::-1].copy(), 0.0, high)
@@ -71,7 +71,7 @@ def render_scan(
     volume = torch.from_numpy(np.array(result.volume))
     top = float(np.nanmax(scan.line_integrals(chosen)))
     paths = {(view, name): target / name / f"{view:04d}.tif" for view in chosen for name in outputs}
-    refuse_existing(output, *paths.values())
+    output.refuse_existing(*paths.values())
     for number, view in enumerate(chosen):
         index = np.array([number])
         integrals = projector.forward(volume, index)

@@ -17,7 +17,6 @@ from nerfcli.ct.likelihood import with_noise
 from nerfcli.ct.recognise import DESCRIPTION, MEASUREMENT, is_reconstruction
 from nerfcli.ct.scan import Scan, array_digest, load_scan, read_array
 from nerfcli.errors import UserError
-from nerfcli.output import Output
 
 VOLUME = "volume.npy"
 MARKS = "marks.npy"
@@ -194,10 +193,3 @@ def scan_of(result: Reconstruction, run: Path) -> Scan:
     if scan.digest != result.scan_digest:
         raise UserError(f"{result.scan} has changed since {run} was trained", "train again with --overwrite")
     return with_noise(scan, lower=lower) if (lower := result.used.get("noise_lower", 1.0)) > 1 else scan
-
-
-def refuse_existing(output: Output, *paths: Path) -> None:
-    """Raise unless none of the files exists, or they may be replaced."""
-    there = [path for path in paths if path.exists()]
-    if there and not output.overwrite:
-        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another path with -o")

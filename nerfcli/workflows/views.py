@@ -202,8 +202,7 @@ def write_frames(frames: Sequence[Frame], output: Output, *, fps: float, warn: N
     capture = Capture(views, np.zeros((0, 3)), (), None, "camera-path")
     target = output.at(Path())
     listed, path = (target / name for name in _FRAME_FILES)
-    for file in (listed, path):
-        output.keeps(file, lambda: False)
+    output.refuse_existing(listed, path)
     for loss in losses_camera_path(capture):
         warn(f"{path.name} cannot hold {loss}; use {listed.name} instead")
     try:
