@@ -57,6 +57,12 @@ CONFINED = {
         *("kernels", "field", "render", "training", "evaluate", "bench", "export", "splats", "viewer", "ct"),
         *("workflows", "cli", "machine", "distributed"),
     },
+    # What differs between systems.
+    "resource": {"machine"},
+    "psutil": {"machine"},
+    "filelock": {"atomic"},
+    "fcntl": set(),
+    "msvcrt": set(),
     "safetensors": {"field"},
     "numba": {"kernels"},
     "triton": {"kernels"},
@@ -80,6 +86,8 @@ NOT_AT_START = (
     "imageio_ffmpeg",
     "rich",
     "matplotlib",
+    "psutil",
+    "filelock",
 )
 MOST_LINES = 400
 MOST_FOLDERS = 19
