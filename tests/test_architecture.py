@@ -33,7 +33,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "export": {"render", "photos", "cameras"},
     "training": {"captures", "matching", "render", "field", "kernels", "photos", "cameras"},
     "evaluate": {"training", "captures", "matching", "render", "field", "photos", "cameras", "pages"},
-    "bench": {"evaluate", "training", "captures", "render", "photos"},
+    "bench": {"evaluate", "training", "captures", "render", "photos", "pages"},
     "splats": {"export", "render", "field", "kernels", "photos", "cameras", "pages"},
     "viewer": {"render", "field", "kernels", "photos", "cameras", "pages"},
     "poses.input": {"captures", "photos"},
@@ -69,7 +69,7 @@ CONFINED = {
     "pycolmap": {"poses", "poses.engine", "poses.judge", "poses.model", "cameras", "captures", "export"},
     "typer": {"cli"},
     "rich": {"cli"},
-    "matplotlib": {"photos", "bench"},
+    "matplotlib": {"photos", "pages"},
 }
 # The command line starts in a fraction of a second because these are imported inside the commands that need them.
 NOT_AT_START = (

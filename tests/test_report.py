@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from browser import Browser, find_browser
 from fog import fog, foggy_cells
+from markupsafe import escape
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -20,8 +21,7 @@ from nerfcli.evaluate.ledger import Entry
 from nerfcli.evaluate.metrics import Metrics
 from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.protocol import Novelty, PhotoMetrics, RunMetrics
-from nerfcli.evaluate.report.drawings import Curve, curves, from_above
-from nerfcli.evaluate.report.page import page_html
+from nerfcli.evaluate.report.page import from_above, page_html
 from nerfcli.evaluate.report.run_facts import RunFacts, captures_of, labels_of, mismatches_of, warnings_of
 from nerfcli.evaluate.report.views import (
     ERROR_RANGE,
@@ -32,6 +32,7 @@ from nerfcli.evaluate.report.views import (
     spread_evenly,
 )
 from nerfcli.evaluate.report.views import look_at as look_through
+from nerfcli.pages import figures
 from nerfcli.photos.colours import levels_of
 from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest
@@ -221,7 +222,7 @@ def test_what_comes_from_outside_stays_text(seen):
     text = page_html([run], [look], depths=[_meta()])
     assert "<script>alert" not in text
     assert "<b>\"'" not in text
-    assert html.escape(EVIL) in text
+    assert escape(EVIL) in text
 
 
 def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
@@ -229,6 +230,7 @@ def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     other = facts("another", config=replace(facts().config, settings=TrainSettings(log2_rows=14)))
     text = page_html([facts(), other], [look, look], depths=[_meta(), _meta()])
     assert "differs: settings.log2_rows" in text
+    assert "<th class=number>another</th>" in text
     assert text.index("differs: settings.log2_rows") < text.index(">settings.seed<")
     assert "another: rendered" in text
     farther = [replace(view, depth=view.depth + 1) for view in look]
@@ -310,34 +312,39 @@ def test_labels_are_the_shortest_ends_that_differ():
 
 
 def test_curves_go_where_their_values_say():
-    """Linear values on a linear axis, and decades on a logarithmic one, are evenly spaced and rise to the right."""
+    """On a linear axis, and decades on a logarithmic one; what cannot be drawn is left out."""
+    for y, logarithmic in (([0, 5, 10], False), ([1, 10, 100], True)):
+        figure = figures.curves([figures.Curve(0, "a", [0, 1, 2], y)], y_title="y", logarithmic=logarithmic)
+        assert figure is not None
+        (axes,) = figure.axes
+        assert axes.get_yscale() == ("log" if logarithmic else "linear")
+        np.testing.assert_array_equal(axes.lines[0].get_xydata(), np.column_stack([[0, 1, 2], y]))
+    assert figures.curves([figures.Curve(0, "a", [0.0], [float("nan")])], y_title="y") is None
+    assert figures.curves([figures.Curve(0, "a", [0.0], [0.0])], y_title="y", logarithmic=True) is None
 
-    def rows(y: list[float], *, logarithmic: bool) -> np.ndarray:
-        drawn = curves([Curve(0, "a", [0, 1, 2], y)], y_title="y", logarithmic=logarithmic)
-        found = re.search(r'points="([^"]+)"', drawn)
-        assert found is not None
-        return np.array([point.split(",") for point in found[1].split()], float)
 
-    linear, decades = rows([0, 5, 10], logarithmic=False), rows([1, 10, 100], logarithmic=True)
-    for points in (linear, decades):
-        assert np.diff(points[:, 0]) == pytest.approx(np.diff(points[:, 0])[0], abs=0.11)
-        assert np.diff(points[:, 1]) == pytest.approx(np.diff(points[:, 1])[0], abs=0.11)
-        assert points[0, 1] > points[-1, 1]
-    assert curves([Curve(0, "a", [0.0], [float("nan")])], y_title="y") == ""
-    assert curves([Curve(0, "a", [0.0], [0.0])], y_title="y", logarithmic=True) == ""
-    assert "<circle" in curves([Curve(0, "a", [0.0], [1.0], dots=True)], y_title="y")
+def test_drawings_say_what_they_show_load_nothing_and_are_always_the_same():
+    figure = figures.curves([figures.Curve(0, EVIL, [0.0, 1.0], [1.0, 2.0], dots=True)], y_title="dB")
+    assert figure is not None
+    drawn = figures.svg(figure)
+    assert drawn.startswith("<svg")
+    assert "<script>" not in drawn
+    titles = [html.unescape(title) for title in re.findall("<title>(.*?)</title>", drawn)]
+    assert titles == [EVIL, f"{EVIL}: 1 at 0 s", f"{EVIL}: 2 at 1 s"]
+    assert "http" not in drawn
+    assert "var(--soft)" in drawn
+    assert figures.svg(figure) == drawn
 
 
 def test_a_ring_of_cameras_is_drawn_as_a_ring_whichever_way_it_is_turned():
     angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     frames = [camera_at(f"{i}", tuple(turn @ (5 * np.cos(a), 0.0, 5 * np.sin(a)))) for i, a in enumerate(angles)]
-    drawn = from_above(frames[:9], frames[9:])
-    centres = np.array(re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', drawn), float)
-    radii = np.linalg.norm(centres - 150.0, axis=1)
-    assert radii == pytest.approx(np.full(12, radii.mean()), rel=2e-3)
-    assert drawn.count('circle class="test"') == 3
-    assert from_above([], []) == ""
+    (axes,) = from_above(frames[:9], frames[9:]).axes
+    dots = [line for line in axes.lines if line.get_marker() == "o"]
+    radii = np.linalg.norm(np.concatenate([dot.get_xydata() for dot in dots]), axis=1)
+    assert radii == pytest.approx(np.full(12, 5.0), rel=1e-9)
+    assert [dot.get_color() == figures.LOOK for dot in dots] == [False] * 9 + [True] * 3
 
 
 def _meta() -> Any:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.atomic import atomic_path, write_json
+from nerfcli.pages import figures
 from nerfcli.version import __version__
 
 BENCH = "bench.json"
@@ -106,12 +107,7 @@ def write_results(folder: Path, about: Mapping[str, Any], points: Sequence[Point
 
 def _draw(path: Path, about: Mapping[str, Any], points: Sequence[Point]) -> None:
     """Draw error against time: filled points are in the Pareto set, bars are quartiles."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 5), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes, chosen = figure.add_subplot(), pareto(points)
+    (figure, axes), chosen = figures.new_figure(8, 5), pareto(points)
     of_rendering = points[0].levels_off is not None
     for point in points:
         height = point.levels_off if point.levels_off is not None else point.psnr
@@ -132,5 +128,4 @@ def _draw(path: Path, about: Mapping[str, Any], points: Sequence[Point]) -> None
         f"{Path(about['source']).name} on {about['machine']['processor']}, {about['machine']['threads']} threads"
     )
     axes.grid(alpha=0.3)
-    with atomic_path(path) as partial:
-        figure.savefig(partial, format="png")
+    figures.write_png(figure, path)

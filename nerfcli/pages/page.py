@@ -1,4 +1,4 @@
-"""HTML page around the content of a command: head, common style, origin, tables, pictures inside; and writing it."""
+"""HTML pages: templates, head, common style, origin, tables, pictures inside; and writing them."""
 
 import base64
 import hashlib
@@ -8,15 +8,18 @@ from dataclasses import dataclass
 from functools import cache
 from html import escape
 from pathlib import Path
-from string import Template
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from markupsafe import Markup
 
 from nerfcli.atomic import atomic_path, refuse_read_only
 from nerfcli.errors import UserError
 from nerfcli.output import Output
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 # An earlier page of the same kind is recognised by a mark within this many bytes from its beginning.
 _HEAD_BYTES = 4096
@@ -61,20 +64,46 @@ def page_html(
         connect: True to let the page fetch from its own server, and no other.
     """
     server = " 'self'" if connect else ""
-    return _PAGE.substitute(
-        mark=mark.html() + ("" if origin is None else f"\n{_origin_html(origin)}"),
-        title=escape(title),
-        kind=mark.kind,
-        policy=f"default-src 'none'; img-src data:{server}; style-src 'unsafe-inline'"
+    policy = (
+        f"default-src 'none'; img-src data:{server}; style-src 'unsafe-inline'"
         + ("; script-src 'unsafe-inline'" if script else "")
-        + ("; connect-src 'self'" if connect else ""),
-        style=asset("page.css") + style,
-        body=body,
-        script=f"<script>{script}</script>\n" if script else "",
+        + ("; connect-src 'self'" if connect else "")
+    )
+    return rendered(
+        "page.html",
+        mark=Markup(mark.html()),
+        origin=None if origin is None else Markup(_origin_html(origin)),
+        title=title,
+        kind=mark.kind,
+        policy=Markup(policy),
+        style=Markup(asset("page.css") + style),
+        body=Markup(body),
+        script=Markup(script),
     )
 
 
-def data_element(name: str, content: Any) -> str:
+def rendered(template: str, **values: Any) -> Markup:
+    """Fill in a template of the folder `templates`; what is not HTML from here is shown as text."""
+    return Markup(_templates().get_template(template).render(**values))
+
+
+@cache
+def _templates() -> "Environment":
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).with_name("templates")),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["sentence"] = lambda text: text[:1].upper() + text[1:] + "."
+    environment.filters["file_name"] = lambda name: name.replace("\\", "/").rpartition("/")[2]
+    return environment
+
+
+def data_element(name: str, content: Any) -> Markup:
     """Return data for the page's script, which reads it by JSON.parse(document.getElementById(name).textContent).
 
     Raises:
@@ -83,7 +112,7 @@ def data_element(name: str, content: Any) -> str:
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     # Only these characters can end a script element or begin another one inside it.
     safe = text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
-    return f'<script type="application/json" id="{escape(name)}">{safe}</script>'
+    return Markup(f'<script type="application/json" id="{escape(name)}">{safe}</script>')
 
 
 @cache
@@ -148,38 +177,18 @@ def refuse_foreign(path: Path, mark: Mark, *, about: str) -> None:
     )
 
 
-_PAGE = Template("""<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8">
-$mark
-<meta http-equiv="Content-Security-Policy" content="$policy">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>$title: nerfcli $kind</title>
-<style>
-$style</style></head><body><main>
-$body
-</main>
-$script</body></html>
-""")
-
-
-def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Collection[int] = ()) -> str:
-    """Return a table that scrolls sideways where the window is too narrow; all cells are plain text.
+@dataclass(frozen=True)
+class Table:
+    """A table of plain text, for the macro of `parts.html`; it scrolls sideways where the window is too narrow.
 
     Args:
-        rows: each with as many cells.
+        rows: each with as many cells as there are columns.
         numbers: indices of the columns that are aligned to the right.
     """
 
-    def line(tag: str, cells: Sequence[str]) -> str:
-        return "".join(
-            f"<{tag}{' class=number' if index in numbers else ''}>{escape(cell)}</{tag}>"
-            for index, cell in enumerate(cells)
-        )
-
-    head = f"<thead><tr>{line('th', columns)}</tr></thead>"
-    body = "\n".join(f"<tr>{line('td', row)}</tr>" for row in rows)
-    return f'<div class="wide"><table>{head}<tbody>{body}</tbody></table></div>'
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    numbers: Collection[int] = ()
 
 
 JPEG_QUALITY = 85

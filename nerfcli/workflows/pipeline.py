@@ -60,7 +60,7 @@ def run_pipeline(
     Example:
         >>> import nerfcli
         >>> done = nerfcli.run_pipeline("photos", nerfcli.Output("kitchen"))
-        >>> done.evaluation.metrics["mean"]["psnr"], done.report
+        >>> done.evaluation.metrics.mean.psnr, done.report
 
     Args:
         photos: a folder of photos, or a video.

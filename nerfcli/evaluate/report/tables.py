@@ -1,37 +1,35 @@
 """The tables of a report: a column for each run, or a row for each photo, stage, component or setting."""
 
 from collections.abc import Callable, Sequence
-from html import escape
 from typing import Any, Literal
 
 from nerfcli.evaluate.protocol import Novelty, RunMetrics
 from nerfcli.evaluate.report.run_facts import RunFacts, captures_of
-from nerfcli.pages.page import table
+from nerfcli.pages.page import Table
 
 _MEGA = 1e6
 
 
-def numbers_html(runs: Sequence[RunFacts]) -> str:
-    """Format the metrics of the runs and their protocols."""
-    return _columns(runs, _NUMBERS) + _protocols_html(runs)
+def numbers_table(runs: Sequence[RunFacts]) -> Table:
+    """Format the metrics of the runs."""
+    return _columns(runs, _NUMBERS)
 
 
-def capture_html(runs: Sequence[RunFacts]) -> str:
+def capture_table(runs: Sequence[RunFacts]) -> Table:
     """Format the captures of the runs and their poses."""
     return _columns(runs, _CAPTURE)
 
 
-def _columns(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Callable[[RunFacts], str]]]) -> str:
+def _columns(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Callable[[RunFacts], str]]]) -> Table:
     """Return a table with a column for each run; rows that are empty for all runs are left out."""
     cells = [(name, *(read(run) for run in runs)) for name, read in rows]
     kept = [row for row in cells if any(row[1:])]
-    return table(("", *(run.label for run in runs)), kept, numbers=range(1, len(runs) + 1))
+    return Table(("", *(run.label for run in runs)), kept, range(1, len(runs) + 1))
 
 
-def _protocols_html(runs: Sequence[RunFacts]) -> str:
+def protocols_of(runs: Sequence[RunFacts]) -> list[str]:
     """Return the evaluation protocols, each once."""
-    protocols = dict.fromkeys(run.metrics.protocol for run in runs if run.metrics)
-    return "".join(f'<p class="legend"><b>protocol</b> {escape(protocol)}</p>' for protocol in protocols)
+    return list(dict.fromkeys(run.metrics.protocol for run in runs if run.metrics))
 
 
 def measured(read: Callable[[RunMetrics], float | None], form: str) -> Callable[[RunFacts], str]:
@@ -99,17 +97,15 @@ def _verdict(run: RunFacts) -> str:
     return ("passed all checks" if verdict.get("accepted") else "not accepted") if verdict else ""
 
 
-def photos_html(runs: Sequence[RunFacts]) -> str:
+def photo_tables(runs: Sequence[RunFacts]) -> list[Table]:
     """Format PSNR and SSIM of every held-out photo by every run, in a table for each capture."""
-    tables = (_photos_html([runs[index] for index in capture], of_many=len(runs) > 1) for capture in captures_of(runs))
-    return "".join(filter(None, tables)) or "<p>Not measured.</p>"
+    tables = (_photos([runs[index] for index in capture], of_many=len(runs) > 1) for capture in captures_of(runs))
+    return [made for made in tables if made.rows]
 
 
-def _photos_html(runs: Sequence[RunFacts], *, of_many: bool) -> str:
+def _photos(runs: Sequence[RunFacts], *, of_many: bool) -> Table:
     by_run = [{image.name: image for image in (run.metrics.images if run.metrics else ())} for run in runs]
     names = sorted({name for images in by_run for name in images})
-    if not names:
-        return ""
     columns = ["photo"]
     for run in runs:
         of = f"{run.label}: " if of_many else ""
@@ -123,7 +119,7 @@ def _photos_html(runs: Sequence[RunFacts], *, of_many: bool) -> str:
         view = next((images[name].view for images in by_run if name in images and images[name].view), None)
         rows.append([*row, *_novelty(view)])
     columns += ["nearest training view", "distance / scene radius", "degrees between", "type of view"]
-    return table(columns, rows, numbers=range(1, len(columns)))
+    return Table(columns, rows, range(1, len(columns)))
 
 
 def _novelty(view: Novelty | None) -> list[str]:
@@ -133,7 +129,7 @@ def _novelty(view: Novelty | None) -> list[str]:
     return [view.nearest, _number(view.distance_relative, 3), _number(view.angle_deg, 1), view.kind]
 
 
-def ledger_html(runs: Sequence[RunFacts]) -> str:
+def ledger_table(runs: Sequence[RunFacts]) -> Table:
     """Format a table of the stages that used the held-out photos."""
     words = {True: "yes", False: "no", None: "not known"}
     rows = [
@@ -141,13 +137,11 @@ def ledger_html(runs: Sequence[RunFacts]) -> str:
         for run in runs
         for entry in (run.metrics.ledger if run.metrics else ())
     ]
-    if not rows:
-        return "<p>Unknown: the run was not evaluated.</p>"
-    return table(("run", "stage", "used held-out photos", "how"), rows)
+    return Table(("run", "stage", "used held-out photos", "how"), rows)
 
 
-def selection_html(runs: Sequence[RunFacts]) -> str:
-    """Format the automatic selection of components; "" without one."""
+def selection_table(runs: Sequence[RunFacts]) -> Table:
+    """Format the automatic selection of components; without rows if there was none."""
     rows = [
         (
             run.label,
@@ -161,13 +155,10 @@ def selection_html(runs: Sequence[RunFacts]) -> str:
         if run.config.selection is not None
         for decision in run.config.selection.decisions
     ]
-    if not rows:
-        return ""
-    columns = ("run", "component", "gain, dB", "time", "kept", "why")
-    return f"<h2>Selected components</h2>{table(columns, rows, numbers=(2, 3))}"
+    return Table(("run", "component", "gain, dB", "time", "kept", "why"), rows, (2, 3))
 
 
-def settings_html(runs: Sequence[RunFacts]) -> str:
+def settings_table(runs: Sequence[RunFacts]) -> Table:
     """Format all settings and versions; rows in which runs differ are marked and come first."""
     per_run = [
         _flat({"settings": run.config.settings.to_json(), "versions": dict(run.config.versions)}) for run in runs
@@ -177,7 +168,7 @@ def settings_html(runs: Sequence[RunFacts]) -> str:
     differing = [row for row in rows if len(set(row[1:])) > 1]
     same = [row for row in rows if len(set(row[1:])) == 1]
     marked = [(f"differs: {row[0]}", *row[1:]) for row in differing]
-    return table(("", *(run.label for run in runs)), [*marked, *same], numbers=range(1, len(runs) + 1))
+    return Table(("", *(run.label for run in runs)), [*marked, *same], range(1, len(runs) + 1))
 
 
 def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, str]:
