@@ -307,7 +307,7 @@ def main(
     import torch
 
     from nerfcli import kernels
-    from nerfcli.kernels.devices import describe_machine
+    from nerfcli.kernels import describe_machine
 
     sizes, where = (TINY, torch.device("cpu")) if dry else (FULL, torch.device(device))
     if not dry:

@@ -13,7 +13,7 @@ from commands import nerfcli
 from nerfcli import kernels
 from nerfcli.bench import measurement
 from nerfcli.errors import UserError
-from nerfcli.kernels.devices import describe_machine
+from nerfcli.kernels import describe_machine
 from nerfcli.machine import device_name, keep_freed_memory, return_freed_memory
 from nerfcli.training.runs.settings import TrainSettings, sizes_for
 

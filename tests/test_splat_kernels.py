@@ -13,7 +13,7 @@ from torch import Tensor
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.rigid import from_parts, rotation_from_vector
 from nerfcli.kernels.interface import BEYOND, LARGEST_ALPHA, LOW_PASS, Splats, SplatView
-from nerfcli.kernels.numba_cpu.splat_lens import project_point
+from nerfcli.kernels.numba_cpu.splat_projection import project_point
 from nerfcli.kernels.numba_cpu.splats import (
     SplatAdam,
     SplatPicture,

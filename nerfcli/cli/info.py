@@ -52,7 +52,7 @@ def info(
     if machine == (path is not None):
         raise typer.BadParameter("give a path, or --machine", param_hint="PATH")
     if path is None:
-        from nerfcli.kernels.devices import describe_machine
+        from nerfcli.kernels import describe_machine
 
         described = describe_machine(thread_count(0))
         typer.echo(json_text.dumps(described) if json else "\n".join(lines_of(described)))

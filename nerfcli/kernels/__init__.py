@@ -5,9 +5,12 @@ A backend is chosen once per training or model, from the device and the precisio
 
 import functools
 import importlib
+import platform
 import warnings
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
 from types import ModuleType
+from typing import Any
 
 import torch
 
@@ -32,6 +35,7 @@ from nerfcli.kernels.interface import (
 )
 from nerfcli.kernels.reference import ray_indices, sum_along_rays
 from nerfcli.kernels.reference.backend import ReferenceBackend
+from nerfcli.version import __version__
 
 __all__ = [
     "CONTRACTIONS",
@@ -50,6 +54,7 @@ __all__ = [
     "Targets",
     "backend_for",
     "contract",
+    "describe_machine",
     "driver_version",
     "gpu_launcher",
     "grid_coordinates",
@@ -216,3 +221,41 @@ def _numba_cpu() -> ModuleType | None:
             stacklevel=3,
         )
     return kernels
+
+
+def describe_machine(processors: int) -> dict[str, Any]:
+    """Return the GPUs, the versions and the backend that runs on each device, as plain values.
+
+    Args:
+        processors: number of processors that this process may use.
+    """
+    described: dict[str, Any] = {
+        "nerfcli": __version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "triton": _version("triton"),
+        "system": f"{platform.system()} {platform.machine()}",
+        "processors": processors,
+        "backend on cpu": backend_for(torch.device("cpu"), torch.float32).name,
+    }
+    if not torch.cuda.is_available():
+        return {**described, "cuda": "torch finds no CUDA device"}
+    for index in range(torch.cuda.device_count()):
+        device = torch.device("cuda", index)
+        properties = torch.cuda.get_device_properties(device)
+        gigabytes = properties.total_memory / 1e9
+        described[str(device)] = (
+            f"{properties.name}, {gigabytes:.0f} GB, compute capability {properties.major}.{properties.minor}"
+        )
+        why_not = triton_unavailable_reason(device)
+        described[f"backend on {device}"] = (
+            f"triton_cuda, launched by {gpu_launcher(device)}" if why_not is None else f"reference, because {why_not}"
+        )
+    return {**described, "cuda of torch": torch.version.cuda, "cuda of the driver": driver_version()}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

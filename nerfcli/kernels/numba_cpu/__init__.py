@@ -9,13 +9,12 @@ from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
 from nerfcli.kernels.numba_cpu.marching import keep_largest, occupied_samples
 from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
 from nerfcli.kernels.numba_cpu.pixels import pixel_rays
-from nerfcli.kernels.numba_cpu.projection import back_project, project
 from nerfcli.kernels.numba_cpu.rays import ray_indices
 from nerfcli.kernels.numba_cpu.row_adam import adam_rows
 from nerfcli.kernels.numba_cpu.threads import thread_safe
-from nerfcli.kernels.numba_cpu.total_variation import denoise_total_variation
 from nerfcli.kernels.numba_cpu.tracing import trace_rays
 from nerfcli.kernels.numba_cpu.visible import visible_samples
+from nerfcli.kernels.numba_cpu.volumes import back_project, denoise_total_variation, project
 
 __all__ = [
     "adam_rows",

@@ -2,7 +2,7 @@
 
 LLVM vectorises the loops over the 16 lanes because all numbers are in one buffer at constant offsets, and because the
 loops have no branch. One Gaussian after the other takes three times as long: every number waits for the one before.
-Arithmetic is in float32, but for the lens, see `splat_lens`.
+Arithmetic is in float32, but for the lens, see `splat_projection`.
 """
 
 from typing import Any
@@ -11,8 +11,6 @@ import numba
 import numpy as np
 
 from nerfcli.kernels.numba_cpu.exponential import exponential, sigmoid
-from nerfcli.kernels.numba_cpu.splat_harmonics import harmonics, slopes_1, slopes_2, slopes_3
-from nerfcli.kernels.numba_cpu.splat_lens import project_point
 from nerfcli.kernels.numba_cpu.splat_projection import (
     COLOUR,
     FUSED,
@@ -22,6 +20,11 @@ from nerfcli.kernels.numba_cpu.splat_projection import (
     QUATERNION,
     SCALE,
     SUMS,
+    harmonics,
+    project_point,
+    slopes_1,
+    slopes_2,
+    slopes_3,
     to_camera,
 )
 from nerfcli.kernels.numba_cpu.vector import LANES

@@ -9,6 +9,7 @@ import torch
 
 from nerfcli.kernels.interface import RayTermination, SplatView
 from nerfcli.kernels.numba_cpu import machine_code, splat_compositing
+from nerfcli.kernels.numba_cpu.splat_compositing import into_tiles
 from nerfcli.kernels.numba_cpu.splat_gradient import BUFFER, gather_lane, gradient_of_lane, gradients_of_lanes
 from nerfcli.kernels.numba_cpu.splat_projection import (
     COLOUR,
@@ -22,7 +23,6 @@ from nerfcli.kernels.numba_cpu.splat_projection import (
     degree_of,
     project,
 )
-from nerfcli.kernels.numba_cpu.splat_tiles import into_tiles
 from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.vector import LANES
 

@@ -26,9 +26,8 @@ from nerfcli.kernels.reference.marching import (
 )
 from nerfcli.kernels.reference.networks import density, geometry, radiance
 from nerfcli.kernels.reference.pixels import pixel_rays
-from nerfcli.kernels.reference.projection import back_project, project
 from nerfcli.kernels.reference.row_adam import adam_rows
-from nerfcli.kernels.reference.total_variation import denoise_total_variation, total_variation
+from nerfcli.kernels.reference.volumes import back_project, denoise_total_variation, project, total_variation
 
 __all__ = [
     "adam_rows",
