@@ -234,7 +234,8 @@ class Fitting:
         total = torch.cat([loss.view(1), *(gradient.flatten() for gradient in gradients.values())]).sum()
         if self.optimiser.table_grad is not None:
             watch.values("gradient of rows", self.optimiser.table_grad)
-        weighted = [losses.weighted.get(name, torch.zeros_like(loss)) for name in LOSSES]
+        absent = torch.zeros_like(loss)
+        weighted = [losses.weighted.get(name, absent) for name in LOSSES]
         self._take_losses(self._sent.exchange(torch.stack([total, *weighted])))
         if not self.losses or watch is not UNWATCHED:
             self.settle()
