@@ -399,7 +399,8 @@ def test_the_log_records_speed_memory_and_held_out_psnr(spheres, tmp_path):
     log = read_log(tmp_path / "run")
     assert [entry["step"] for entry in log if "heldout_psnr" in entry] == [1, 2]
     last = log[-1]
-    assert last["loss"] == progress[-1].loss
+    assert last["loss"] == progress[-1].loss == sum(last.get("losses", {}).values())
+    assert [name for name, loss in last.get("losses", {}).items() if loss] == ["colour", "distortion"]
     assert last["seconds"] == pytest.approx(progress[-1].seconds, abs=1e-3)
     assert last["samples_per_second"] > 0
     assert last["rays_per_second"] > 0

@@ -148,11 +148,12 @@ def _shown(state: State, batch: Batch, seen: RaySums, plan: StepPlan) -> Shown:
     """Return what rendered rays show, for the losses."""
     appearance, pixels = state.appearance, batch.pixels
     rendered, measured = appearance.compared(seen.rgb, seen.transmittance, pixels, behind=batch.behind)
+    distances = emerging_losses(seen.depth_loss) if plan.are_emerging and batch.points else seen.depth_loss
     return Shown(
         colours=colour_losses(rendered, measured),
         transmittance=seen.transmittance,
         distortion=seen.distortion,
-        distances=pixels.trust * (emerging_losses(seen.depth_loss) if plan.are_emerging else seen.depth_loss),
+        distances=pixels.trust * distances if batch.points else distances,
         sky=None if appearance.sky is None else appearance.sky[pixels.numbers],
         roughness=None if appearance.background is None else appearance.background.roughness(),
         rays=batch.rays,
