@@ -167,7 +167,7 @@ def collect_evidence(
     stereo_is_open = points_are_open and has_points and (wanted.stereo if "stereo" in fixed else bool(side_px))
     with_exposures = wanted.exposure == "matched" or (wanted.exposure == "learned" and wanted.stereo) or stereo_is_open
     with_occluders = wanted.occluders or (stereo_is_open and "occluders" not in fixed)
-    with_depths = wanted.stereo or stereo_is_open
+    with_depths = stereo_is_open or (wanted.stereo and found.track_depths is not None)
     if not (with_exposures or with_occluders or with_depths):
         return found
     with found.timed("stereo"):
@@ -177,15 +177,16 @@ def collect_evidence(
         count = len(found.stereo_depths.numbers)
         notify(f"stereo matching: the depth of {count} pixels of the training photos, {found.seconds['stereo']:.1f} s")
 
+    if not (with_exposures or with_occluders):
+        return found
     with found.timed("exposures"):
         log_gains = matched_log_gains(album, dense)
-        if with_exposures:
-            # Those that a user asks for need no confirmation.
-            found.log_gains = log_gains if wanted.exposure == "matched" else confirmed_by_exif(log_gains, album)
+    if with_exposures:  # those that a user asks for need no confirmation
+        found.log_gains = log_gains if wanted.exposure == "matched" else confirmed_by_exif(log_gains, album)
 
     if with_occluders:
-        skies = skies or sky_masks(album, threads=threads)
         with found.timed("occluders"):
+            skies = skies or sky_masks(album, threads=threads)
             found.occluders = occluder_masks(album, dense, skies, log_gains, threads=threads)
     return found
 
