@@ -15,7 +15,7 @@ from torch import Tensor
 from nerfcli import distributed
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.loading import refuse_without_training_photos
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, several
 from nerfcli.machine import default_memory_limit
 from nerfcli.matching.correspondences import SharedFeatures
 from nerfcli.matching.tracks import triangulate
@@ -28,7 +28,7 @@ from nerfcli.training.runs.components import Components, Selection
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.schedule import SEARCH_FRACTION, Budget
 from nerfcli.training.selection import Facts, select, with_evidence, with_known_cameras
-from nerfcli.training.storage import PhotoStorage, check_device_memory, needs_of, storage_for
+from nerfcli.training.storage import check_device_memory, needs_of, storage_for
 from nerfcli.training.trials import Trials
 
 
@@ -64,10 +64,14 @@ def prepare(
         UserError: too little memory, no training photo, unreadable photos.
     """
     refuse_without_training_photos(scene)
-    camera = scene.train_frames[0].camera
-    factor = settings.downscale or automatic_downscale(camera)
-    storage = _storage(scene, settings, factor=factor, run=run, memory_bytes=memory_bytes, notify=notify)
-    masks, threads = settings.components.masks, settings.threads
+    device, masks, threads = torch.device(settings.device), settings.components.masks, settings.threads
+    factor = settings.downscale or automatic_downscale(scene.train_frames[0].camera)
+    needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
+    if device.type == "cuda":
+        notify(check_device_memory(needs, device, memory_bytes))
+        memory_bytes = default_memory_limit()
+    storage, text = storage_for(needs, memory_bytes, folder=run)
+    notify(text)
     album = load_album(scene.train_frames, factor=factor, threads=threads, storage=storage, masks=masks)
     shared = SharedFeatures(album.photos, lambda: tracks_of_model(scene, album.photos), threads=threads)
     photos = TrainingPhotos(scene, album, shared)
@@ -75,9 +79,14 @@ def prepare(
     if begun is not None:
         settings = replace(settings, components=begun.components)
     extent = distributed.from_first(lambda: _extent(photos, settings, notify=notify) if begun is None else begun.extent)
-    device = torch.device(settings.device)
     pool = PixelPool(album.photos, extent.training_from_scene, device, colours=album.colours, storage=storage)
-    _report(scene, pool, settings, factor=factor, extent=extent, notify=notify)
+    camera = pool.cameras[0]
+    notify(
+        f"{len(pool.frames)} training photos, {len(scene.test_frames)} held out, {camera.width}x{camera.height} "
+        f"(1/{factor}), {extent}, {settings.device}, {several(threads, 'thread')}"
+    )
+    if pool.without_ray:
+        notify(f"{pool.without_ray} pixels are skipped: they lie outside the lens model's field of view")
     inputs = TrainingInputs(settings, extent, pool, factor=factor, storage=storage)
 
     is_new = begun is None
@@ -112,26 +121,6 @@ def prepare(
     )
 
 
-def _storage(
-    scene: Capture,
-    settings: TrainSettings,
-    *,
-    factor: int,
-    run: Path,
-    memory_bytes: int | None,
-    notify: Callable[[str], None],
-) -> PhotoStorage:
-    """Return where arrays of the size of the photos are kept."""
-    needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
-    device = torch.device(settings.device)
-    if device.type == "cuda":
-        notify(check_device_memory(needs, device, memory_bytes))
-        memory_bytes = default_memory_limit()
-    storage, text = storage_for(needs, memory_bytes, folder=run)
-    notify(text)
-    return storage
-
-
 def _extent(photos: TrainingPhotos, settings: TrainSettings, *, notify: Callable[[str], None]) -> Extent:
     """Return the extent of the field; without 3D points, from triangulated ones if it needs any."""
     scene, fills_frame = photos.scene, photos.album.fills_frame
@@ -140,25 +129,6 @@ def _extent(photos: TrainingPhotos, settings: TrainSettings, *, notify: Callable
         scene = replace(scene, points=triangulate(frames, photos.shared.of_matches).found)
         notify(f"the scene has no 3D points; estimating its extent from {len(scene.points)} triangulated ones")
     return choose_extent(scene, settings, fills_frame=fills_frame)
-
-
-def _report(
-    scene: Capture,
-    pool: PixelPool,
-    settings: TrainSettings,
-    *,
-    factor: int,
-    extent: Extent,
-    notify: Callable[[str], None],
-) -> None:
-    """Say what is trained on, and on what."""
-    camera, threads = pool.cameras[0], settings.threads
-    notify(
-        f"{len(pool.frames)} training photos, {len(scene.test_frames)} held out, {camera.width}x{camera.height} "
-        f"(1/{factor}), {extent}, {settings.device}, {threads} {'thread' if threads == 1 else 'threads'}"
-    )
-    if pool.without_ray:
-        notify(f"{pool.without_ray} pixels are skipped: they lie outside the lens model's field of view")
 
 
 def _decide(
