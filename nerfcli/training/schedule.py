@@ -4,6 +4,7 @@ Progress is the used fraction of the budget, in [0, 1]. Where a number of steps 
 Everything that depends on either reads it here. `nerfcli train SCENE --dry-run` shows it as a table.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import cos, pi
@@ -217,8 +218,9 @@ class Schedule:
 NOTES = (
     f"before the first step: stereo matching for up to {100 * STEREO_FRACTION:.0f} % of the budget, trials for up to "
     f"{100 * SEARCH_FRACTION:.0f} %",
-    "points, sky and roughness count where the components include points and a background; cameras move where they are "
-    "refined, and then finer levels learn later",
+    "points, sky and roughness count where the components include points and a background; with log, points have a log "
+    "likelihood",
+    "cameras move where they are refined; then finer levels learn later",
 )
 
 
@@ -236,13 +238,17 @@ def table_of(plans: Sequence[tuple[float, StepPlan]]) -> tuple[list[str], list[l
         row("finer levels that learn", lambda plan: f"{100.0 * min(1.0, max(0.0, plan.detail)):.0f} %"),
         row("steps along rays", lambda plan: "shortest" if plan.stride == SHORTEST else f"{plan.stride} x"),
         row("closed cells", lambda plan: f"< {plan.threshold:.2g}"),
-        *(row(f"weight of {name}", lambda plan, name=name: f"{plan.weights.get(name, 0.0):.2g}") for name in names),
-        row("loss of points", lambda plan: "logarithm" if plan.are_emerging else "linear"),
+        *(row(f"weight of {name}", functools.partial(_weight, name)) for name in names),
         row("cameras move", lambda plan: f"{100.0 * plan.cameras.rate:.0f} %"),
         row("cameras are damped", lambda plan: f"{plan.cameras.damping:.2g}"),
         row("cameras are held", lambda plan: f"{plan.cameras.holding:.2g}"),
     ]
     return ["progress", *(f"{100.0 * progress:.0f} %" for progress, _ in plans)], rows
+
+
+def _weight(name: str, plan: StepPlan) -> str:
+    weight = f"{plan.weights.get(name, 0.0):.2g}"
+    return f"{weight} log" if name == "points" and plan.are_emerging else weight
 
 
 def stride(progress: float, step: int) -> int:
