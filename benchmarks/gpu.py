@@ -250,7 +250,8 @@ def quality(capture: Path, device: str, seconds: int, folder: Path, *, dry: bool
     settings = replace(settings, **sizes_for(device))
     if dry:
         settings = replace(settings, budget_seconds=None, steps=2, downscale=8)
-    run = nerfcli.train_scene(capture, folder / f"{device.replace(':', '-')}-{seconds}", settings, overwrite=True)
+    output = nerfcli.Output(folder / f"{device.replace(':', '-')}-{seconds}", overwrite=True)
+    run = nerfcli.train_scene(capture, output, settings)
     metrics = nerfcli.evaluate_run(
         run.path, nerfcli.Output(overwrite=True), resources=nerfcli.Resources(device=device)
     ).metrics

@@ -23,6 +23,8 @@ from scipy import stats
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.loading import load_scene
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.render.coverage import coverage_and_parallax, depth_maps, small_frame
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
@@ -173,7 +175,9 @@ def main(
         )
         path = output / f"seed-{seed}"
         resume = was_interrupted(place, path, settings, holdout=str(names))
-        model = train_scene(place, path, settings, holdout=str(names), resume=resume, notify=print).model()
+        model = train_scene(
+            place, Output(path), settings, holdout=str(names), resume=resume, reporter=Reporter(note=print)
+        ).model()
         rendered.append(distances(model, views))
         if seed == 0:
             photos = coverage(model, scene.train_frames, views, rendered[0])

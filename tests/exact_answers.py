@@ -129,7 +129,7 @@ def corners(point: Numbers, resolution: int, rows: int) -> Iterator[tuple[int, F
         x, y, z = (c + d for c, d in zip(cell, corner, strict=True))
         hashed = (x ^ y * 2654435761 ^ z * 805459861) % 2**32 % rows
         fractions = [s - c if d else 1 - (s - c) for s, c, d in zip(scaled, cell, corner, strict=True)]
-        yield (z * side + y) * side + x if side**3 <= rows else hashed, math.prod(fractions)
+        yield (z * side + y) * side + x if side**3 <= rows else hashed, math.prod(fractions, start=Fraction(1))
 
 
 def hash_encode(given: Inputs) -> Outcome:

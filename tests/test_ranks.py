@@ -22,6 +22,8 @@ from commands import error_of, nerfcli
 from nerfcli import distributed, machine
 from nerfcli.errors import INTERRUPTED, LOST_RANK, TERMINATED
 from nerfcli.field.checkpoint import load_tensors
+from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.training import evidence, loop
 from nerfcli.training.pool import PixelBatch
@@ -86,7 +88,7 @@ def train_until(step: int, run: Path, settings: TrainSettings) -> None:
             raise KeyboardInterrupt
 
     with suppress(KeyboardInterrupt), patch.object(evidence, "occluder_masks", left_halves):
-        train_scene(SPHERES, run, settings, overwrite=True, progress=progress)
+        train_scene(SPHERES, Output(run, overwrite=True), settings, reporter=Reporter(progress=progress))
 
 
 def left_halves(photos: Sequence[LoadedPhoto], *_: object, threads: int) -> list[np.ndarray]:

@@ -1,37 +1,39 @@
 """nerfcli train: from a scene to a field."""
 
-import functools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from nerfcli.cli import options
 from nerfcli.cli.batch import STDIN, Given, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.machine import device_name, is_first, is_one_of_several, local_rank_and_size, thread_count
+from nerfcli.machine import is_first, is_one_of_several, local_rank_and_size
+
+if TYPE_CHECKING:
+    from nerfcli.training.runs.settings import TrainSettings
+    from nerfcli.workflows.train import TrainingPlan
 
 DEFAULT_BUDGET = "2m"
 
 
-@command
-def train(
-    scene: Annotated[str, typer.Argument(help="Scene folder, or - to read paths from standard input.")],
-    output: options.Output = None,
+@dataclass(frozen=True)
+class Fit:
+    """How long is trained, and what."""
+
     budget: Annotated[
         str | None, typer.Option(help="Training time: 90s, 5m, 1h; 90 is 90 s.  [default: 2m, or none with --steps]")
-    ] = None,
+    ] = None
     steps: Annotated[
         int | None, typer.Option(help="Total optimizer steps; results repeat bit for bit on a CPU.", min=1)
-    ] = None,
-    include: options.Include = None,
-    exclude: options.Exclude = None,
-    field: options.FieldKind = None,
-    field_memory: options.FieldMemory = None,
-    model: options.ModelChoice = "auto",
-    downscale: options.Downscale = "auto",
-    contraction: options.Contraction = "auto",
+    ] = None
+    include: options.Include = None
+    exclude: options.Exclude = None
+    field: options.FieldKind = None
+    field_memory: options.FieldMemory = None
+    model: options.ModelChoice = "auto"
+    contraction: options.Contraction = "auto"
     log2_rows: Annotated[
         int | None,
         typer.Option(
@@ -40,7 +42,7 @@ def train(
             max=24,
             show_default=False,
         ),
-    ] = None,
+    ] = None
     batch: Annotated[
         int | None,
         typer.Option(
@@ -48,22 +50,61 @@ def train(
             min=2**8,
             show_default=False,
         ),
-    ] = None,
+    ] = None
+    memory: options.DeviceMemory = None
+
+    def settings(self, training: options.Training) -> "TrainSettings":
+        """Return the settings that the options select.
+
+        Raises:
+            typer.BadParameter: a value cannot be parsed, or does not fit another one.
+        """
+        from nerfcli.field.kinds import KINDS
+        from nerfcli.training.runs.components import Components, choose
+
+        if self.field not in (None, "hash") and self.log2_rows is not None:
+            message = "it works with --field hash; for other fields, give --field-memory"
+            raise typer.BadParameter(message, param_hint="--log2-rows")
+        budget = DEFAULT_BUDGET if self.budget is None and self.steps is None else self.budget
+        sized = training.settings(budget, self.steps)
+        largest = self.batch or sized.samples_per_step
+        size = None if self.field_memory is None else options.bytes_from_text(self.field_memory, "--field-memory")
+        return replace(
+            sized,
+            contraction=options.contraction_name(self.contraction),
+            components=choose(Components(), included=self.include or (), excluded=self.exclude or ()),
+            model=options.one_of(self.model, ("auto", "default"), "--model"),
+            fixed=options.named_components(self.include, self.exclude),
+            first_samples_per_step=min(sized.first_samples_per_step, largest),
+            samples_per_step=largest,
+            log2_rows=self.log2_rows or sized.log2_rows,
+            field=options.one_of(self.field or "hash", KINDS, "--field"),
+            field_memory_bytes=size,
+        )
+
+    def memory_limit(self, device: str) -> int | None:
+        """Return the limit in bytes for all processes of this machine, of the GPU or of resident memory."""
+        from nerfcli.machine import default_memory_limit
+
+        return default_memory_limit(device) if self.memory is None else options.bytes_from_text(self.memory)
+
+
+@command
+def train(
+    scene: Annotated[str, typer.Argument(help="Scene folder, or - to read paths from standard input.")],
+    writing: options.Writing,
+    fit: Fit,
+    training: options.Training,
     holdout: options.Holdout = None,
     resume: Annotated[
         bool,
         typer.Option("--resume", help="Continue from the last checkpoint to the new total; without one, start."),
     ] = False,
-    memory: options.DeviceMemory = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show how much memory, disk and time it would take, and its schedule.")
     ] = False,
-    device: options.Device = "auto",
-    seed: options.Seed = 0,
-    threads: options.Threads = 0,
-    overwrite: options.Overwrite = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    *,
+    printing: options.Printing,
 ) -> None:
     """Fit a radiance field to a scene.
 
@@ -109,87 +150,43 @@ def train(
       nerfcli train photos-scene --field voxels --field-memory 16MB
     """
     from nerfcli.errors import UserError
-    from nerfcli.field.kinds import KINDS
-    from nerfcli.machine import default_memory_limit
-    from nerfcli.training.runs.components import Components, choose
-    from nerfcli.training.runs.settings import TrainSettings, sizes_for
-    from nerfcli.training.schedule import NOTES, table_of
     from nerfcli.workflows.train import plan_training, train_scene
 
-    if budget is None and steps is None:
-        budget = DEFAULT_BUDGET
-    if field not in (None, "hash") and log2_rows is not None:
-        message = "it works with --field hash; for other fields, give --field-memory"
-        raise typer.BadParameter(message, param_hint="--log2-rows")
     if is_one_of_several() and (dry_run or scene == STDIN):
         raise UserError("processes of torchrun train one field of photos", "use this command without torchrun", 2)
-    console = Console(quiet=quiet or not is_first(), json_lines=json)
-    budget_seconds = None if budget is None else options.seconds_from_text(budget)
-    rule = options.holdout_rule(holdout)
-    limit = None if memory is None else options.bytes_from_text(memory)
-
-    @functools.cache
-    def photo_settings() -> TrainSettings:
-        torch_device = device_name(device)
-        sized = replace(TrainSettings(), **sizes_for(torch_device))
-        largest = batch or sized.samples_per_step
-        field_bytes = None if field_memory is None else options.bytes_from_text(field_memory, "--field-memory")
-        return TrainSettings(
-            budget_seconds=budget_seconds,
-            steps=steps,
-            downscale=options.downscale_factor(downscale),
-            contraction=options.contraction_name(contraction),
-            seed=seed,
-            device=torch_device,
-            threads=thread_count(threads),
-            components=choose(Components(), included=include or (), excluded=exclude or ()),
-            model=options.one_of(model, ("auto", "default"), "--model"),
-            fixed=options.named_components(include, exclude),
-            first_samples_per_step=min(sized.first_samples_per_step, largest),
-            samples_per_step=largest,
-            log2_rows=log2_rows or sized.log2_rows,
-            field=options.one_of(field or "hash", KINDS, "--field"),
-            field_memory_bytes=field_bytes,
-        )
-
-    def memory_of_process() -> int | None:
-        shared = limit or default_memory_limit(photo_settings().device)
-        on_gpu = photo_settings().device != "cpu"
-        return shared if shared is None or on_gpu else shared // local_rank_and_size()[1]
-
-    def train_one_scene(folder: Path, run: Path) -> None:
-        with console.stage(f"train {folder.name}") as reporter:
-            train_scene(
-                folder,
-                run,
-                photo_settings(),
-                memory_bytes=memory_of_process(),
-                resume=resume,
-                overwrite=overwrite,
-                holdout=rule,
-                notify=reporter.note,
-                warn=reporter.warn,
-                progress=reporter.progress,
-            )
-
-    def plan_one_scene(folder: Path) -> None:
-        on_host = photo_settings().device == "cpu"  # else --memory refers to the GPU
-        resident = (limit or default_memory_limit()) if on_host else None
-        plan = plan_training(folder, photo_settings(), memory_bytes=resident, holdout=rule)
-        console.facts(folder, plan.to_json(), f"{folder}: {plan.describe()}")
-        if not json:
-            console.fact_table(*table_of(plan.schedule), styles={})
-            for note in NOTES:
-                console.note(note)
+    console = Console(quiet=printing.quiet or not is_first(), json_lines=printing.json)
+    rule, settings = options.holdout_rule(holdout), fit.settings(training)
+    limit, on_gpu = fit.memory_limit(settings.device), settings.device != "cpu"
 
     def work(given: Given) -> None:
-        run = options.Writing(output, overwrite).beside(given, "-run").at(given.path)
+        output = writing.beside(given, "-run")
         if dry_run:
-            plan_one_scene(given.path)
+            resident = fit.memory_limit("cpu") if not on_gpu else None
+            plan = plan_training(given.path, settings, memory_bytes=resident, holdout=rule)
+            show_plan(plan, given.path, console, with_schedule=not printing.json)
             return
-        train_one_scene(given.path, run)
+        with console.stage(f"train {given.path.name}") as reporter:
+            run = train_scene(
+                given.path,
+                output,
+                settings,
+                memory_bytes=limit if limit is None or on_gpu else limit // local_rank_and_size()[1],
+                resume=resume,
+                holdout=rule,
+                reporter=reporter,
+            )
         if is_first():
-            console.result(run)
+            console.result(run.path)
 
-    photo_settings()  # refuses invalid options before anything is read
     for_each_input(scene, work, command="train")
+
+
+def show_plan(plan: "TrainingPlan", scene: Path, console: Console, *, with_schedule: bool) -> None:
+    """Print what a training costs, and its schedule as a table."""
+    from nerfcli.training.schedule import NOTES, table_of
+
+    console.facts(scene, plan.to_json(), f"{scene}: {plan.describe()}")
+    if with_schedule:
+        console.fact_table(*table_of(plan.schedule), styles={})
+        for note in NOTES:
+            console.note(note)

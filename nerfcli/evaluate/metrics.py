@@ -47,7 +47,10 @@ class Metrics:
     def mean(measured: Sequence["Metrics"]) -> "Metrics":
         """Return the mean of each metric; None if one of them does not have it."""
         values = {name: [getattr(metrics, name) for metrics in measured] for name in NAMES}
-        return Metrics(**{name: None if None in found else statistics.fmean(found) for name, found in values.items()})
+        means: dict[str, Any] = {
+            name: None if None in found else statistics.fmean(found) for name, found in values.items()
+        }
+        return Metrics(**means)
 
     @staticmethod
     def from_json(content: Mapping[str, Any]) -> "Metrics":

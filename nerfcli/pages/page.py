@@ -98,9 +98,17 @@ def _templates() -> "Environment":
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["sentence"] = lambda text: text[:1].upper() + text[1:] + "."
-    environment.filters["file_name"] = lambda name: name.replace("\\", "/").rpartition("/")[2]
+    environment.filters["sentence"] = _sentence
+    environment.filters["file_name"] = _file_name
     return environment
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + "."
+
+
+def _file_name(name: str) -> str:
+    return name.replace("\\", "/").rpartition("/")[2]
 
 
 def data_element(name: str, content: Any) -> Markup:

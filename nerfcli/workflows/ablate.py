@@ -72,12 +72,11 @@ def ablate_scene(
         resume = not output.overwrite and was_interrupted(path, target, settings)
         run = train_scene(
             path,
-            target,
+            Output(target, output.overwrite),
             settings,
             memory_bytes=default_memory_limit(settings.device),
             resume=resume,
-            overwrite=output.overwrite,
-            warn=reporter.warn,
+            reporter=Reporter(warn=reporter.warn),
         )
         # The training state is three times as large as the field, and complete trainings are not resumed.
         (target / STATE).unlink(missing_ok=True)

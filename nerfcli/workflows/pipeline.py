@@ -130,12 +130,9 @@ def _trained(scene: Path, output: Output, settings: TrainSettings, resources: Re
     path = output.at(scene)
     return train.train_scene(
         scene,
-        path,
+        output,
         settings,
         memory_bytes=resources.memory_limit(settings.device),
         resume=not output.overwrite and train.was_interrupted(scene, path, settings),
-        overwrite=output.overwrite,
-        notify=told.note,
-        warn=told.warn,
-        progress=told.progress,
+        reporter=told,
     )

@@ -21,7 +21,8 @@ from nerfcli.errors import UserError, listed, several
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import chosen_size, closing_steps
 from nerfcli.machine import is_one_of_several
-from nerfcli.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.notices import Reporter, silent
+from nerfcli.output import Output
 from nerfcli.training import loop
 from nerfcli.training.loop import OCCLUDERS
 from nerfcli.training.runs.components import choose
@@ -37,16 +38,13 @@ LIKELY_FOOTPRINT = 1e-3
 
 def train_scene(
     scene: str | Path,
-    run: str | Path,
+    output: Output = Output(),
     settings: TrainSettings = TrainSettings(),
     *,
     memory_bytes: int | None = None,
     resume: bool = False,
-    overwrite: bool = False,
     holdout: str | None = None,
-    notify: Notify = silent,
-    warn: Notify = warn_python,
-    progress: Progress = no_progress,
+    reporter: Reporter = Reporter(),
 ) -> Run:
     """Train one scene, keep a complete run with the same settings, or refuse to touch another one.
 
@@ -55,76 +53,37 @@ def train_scene(
     Example:
         >>> import nerfcli
         >>> from nerfcli.training.runs.settings import TrainSettings
-        >>> run = nerfcli.train_scene("photos-scene", "photos-scene-run", TrainSettings(budget_seconds=60, threads=4))
+        >>> run = nerfcli.train_scene("photos-scene", settings=TrainSettings(budget_seconds=60, threads=4))
         >>> run.summary.steps
 
     Args:
         scene: a folder that `estimate_poses` wrote, or of another format that `load_scene` reads.
-        run: the folder to write.
+        output: the folder to write, SCENE-run by default.
         settings: budget, components, resolution, seed, device, threads.
         memory_bytes: limit of resident memory, or of memory on the GPU that trains; None for no limit.
-        resume: continue from the last checkpoint of `run`; start from the beginning if there is none.
-        overwrite: replace another run at `run`.
+        resume: continue from the last checkpoint of the run; start from the beginning if there is none.
         holdout: photos to hold out, "every:8", "block:0.15" or a file of names; None for the scene's own split.
-        notify, warn: called with lines for the user.
-        progress: called with the fraction of the budget and a short text, after every step.
+        reporter: its progress is the fraction of the budget, after every step.
 
     Returns:
         The run, complete.
 
     Raises:
-        UserError: see `nerfcli.training.loop.train`; or a different run exists at `run`.
+        UserError: see `nerfcli.training.loop.train`; or a different run exists there.
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
-    folder, run = Path(scene), Path(run)
-    try:
-        return _trained(
-            folder,
-            run,
-            settings,
-            memory_bytes=memory_bytes,
-            resume=resume,
-            overwrite=overwrite,
-            holdout=holdout,
-            notify=notify,
-            warn=warn,
-            progress=progress,
-        )
-    except KeyboardInterrupt:
-        if (run / STATE).exists():
-            notify(f"checkpoint saved in {run}; to continue, add --resume to the same command")
-        raise
-
-
-def _trained(
-    folder: Path,
-    run: Path,
-    settings: TrainSettings,
-    *,
-    memory_bytes: int | None,
-    resume: bool,
-    overwrite: bool,
-    holdout: str | None,
-    notify: Notify,
-    warn: Notify,
-    progress: Progress,
-) -> Run:
-    """See `train_scene`."""
+    folder = Path(scene)
+    run = output.beside(folder, "-run")
     loaded = load_scene(folder, holdout=holdout)
-    notify(describe_source(folder, loaded))
-    if loaded.missing:
-        names = listed(loaded.missing)
-        warn(f"{several(len(loaded.missing), 'missing photo')} of {folder} skipped: {names}")
-    for text in describe_rescaling(loaded.rescaled):
-        notify(text)
-    if text := describe_unused_masks(loaded):
-        notify(f"unused masks: {text}")
-
+    _describe(folder, loaded, reporter)
     if resume and not Run(run).is_trained and not (run / STATE).exists():
         # A script that a scheduler starts again always gives --resume, and may have been ended before a checkpoint.
         resume = False
         _refuse_others(run)
-        notify(f"{run} has no checkpoint to resume; the training starts from the beginning")
+        reporter.note(f"{run} has no checkpoint to resume; the training starts from the beginning")
+
+    def fit(place: Path, **told: Any) -> None:
+        loop.train(loaded, place, settings, resume=resume, memory_bytes=memory_bytes, **told)
 
     if is_one_of_several():
         distributed.join(settings.device)
@@ -132,25 +91,21 @@ def _trained(
         # The first process decides whether to train, keeps what comes of it, and reports.
         if distributed.from_first(lambda: True):  # or what the first one says instead
             with TemporaryDirectory() as nobody_reads, suppress(KeyboardInterrupt):
-                loop.train(
-                    loaded,
-                    Path(nobody_reads),
-                    settings,
-                    resume=resume,
-                    memory_bytes=memory_bytes,
-                    notify=silent,
-                    on_progress=lambda state: None,
-                )
+                fit(Path(nobody_reads), notify=silent, on_progress=lambda state: None)
         return Run(run)
 
     def is_kept() -> bool:
-        if not _keeps(run, loaded, settings, resume=resume, overwrite=overwrite):
+        if not _keeps(run, loaded, settings, resume=resume, overwrite=output.overwrite):
             return False
         distributed.from_first(lambda: False)
         complete = "it is complete and has these settings; add --overwrite to train again"
         used = "its training has used this budget; give a larger --budget or --steps"
-        notify(f"{run} is kept: {used if resume else complete}")
+        reporter.note(f"{run} is kept: {used if resume else complete}")
         return True
+
+    def on_progress(state: loop.Progress) -> None:
+        speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
+        reporter.progress(state.fraction, f"step {state.step}  loss {state.loss:.4f}  {speed}")
 
     if is_kept():
         return Run(run)
@@ -158,25 +113,28 @@ def _trained(
         if is_kept():  # another process has just completed it
             return Run(run)
         clear_leftovers(run)
-        if overwrite:
+        if output.overwrite:
             (run / METRICS).unlink(missing_ok=True)  # they belong to the field that is replaced
         distributed.from_first(lambda: True)
-
-        def on_progress(state: loop.Progress) -> None:
-            speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
-            progress(state.fraction, f"step {state.step}  loss {state.loss:.4f}  {speed}")
-
-        progress(0.0, "")
-        loop.train(
-            loaded,
-            run,
-            settings,
-            resume=resume,
-            memory_bytes=memory_bytes,
-            notify=notify,
-            on_progress=on_progress,
-        )
+        reporter.progress(0.0, "")
+        try:
+            fit(run, notify=reporter.note, on_progress=on_progress)
+        except KeyboardInterrupt:
+            if (run / STATE).exists():
+                reporter.note(f"checkpoint saved in {run}; to continue, add --resume to the same command")
+            raise
     return Run(run)
+
+
+def _describe(folder: Path, scene: Capture, reporter: Reporter) -> None:
+    """Tell what was loaded, and what was left out."""
+    reporter.note(describe_source(folder, scene))
+    if scene.missing:
+        reporter.warn(f"{several(len(scene.missing), 'missing photo')} of {folder} skipped: {listed(scene.missing)}")
+    for text in describe_rescaling(scene.rescaled):
+        reporter.note(text)
+    if text := describe_unused_masks(scene):
+        reporter.note(f"unused masks: {text}")
 
 
 def was_interrupted(scene: Path, run: Path, settings: TrainSettings, *, holdout: str | None = None) -> bool:
