@@ -33,9 +33,9 @@ from nerfcli.kernels.reference.compositing import contracted_distance, depth_los
 class Backend(abc.ABC):
     """The hot operations on one kind of device.
 
-    `name` is its name in `backend_for`; `deterministic` says whether the same inputs always give the same bits; `parts`
-    are the single operations on packed samples, as `reference` defines them. Subclasses differ in these, and in how
-    they sample and evaluate a hash grid.
+    `name` is its name in `backend_for`; `deterministic` says whether the same inputs always give the same bits;
+    `operations` are the single operations on packed samples, as `reference` defines them. Subclasses differ in these,
+    and in how they sample and evaluate a hash grid.
     """
 
     name: str

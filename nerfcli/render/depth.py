@@ -40,7 +40,7 @@ class DepthRequest:
         background_distance: distance along the ray at which the background convention counts the light that passes, in
             the scene's unit; only needed by that convention.
         min_views, min_parallax_deg: coverage and parallax of the median point below which an export removes the depth;
-            see `visibility`.
+            see `render.coverage`.
 
     Raises:
         ValueError: unknown convention or axis.

@@ -34,7 +34,7 @@ class RenderedPicture:
         median: (H, W) distance along that axis at which half of all light is absorbed; None without depth.
         truncation_error: (H, W) bound on the truncation error of each channel of rgb; the tolerance at most.
         valid: (H, W) bool; False where the lens has no ray (rgb is then the background, opacity 0).
-        coverage, parallax: (H, W) for the points at `median`, see `visibility`; None unless an export adds them.
+        coverage, parallax: (H, W) for the points at `median`, see `render.coverage`; None unless an export adds them.
         lower, upper: (H, W) bounds of an interval of depth, see `depth_errors`; None unless an export adds them.
         confidence: (H, W) fraction of depths within a tolerance, see `depth_errors`; None unless an export adds it.
     """

@@ -171,7 +171,7 @@ class PixelBatch(NamedTuple):
         origins, directions: (N, 3) in the training frame; directions are unit vectors.
         colours: (N, 3 or 4) float32 in [0, 1].
         numbers: (N,) int64 indices of the pixels, counted through all photos.
-        distances, trust: (K,) of the last K pixels, whose surface depth is known; see `point_depth.PointDepths`.
+        distances, trust: (K,) of the last K pixels, whose surface depth is known; see `PointDepths`.
     """
 
     origins: Tensor

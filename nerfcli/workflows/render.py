@@ -73,8 +73,8 @@ def render_run(
     Raises:
         UserError: the run or the cameras do not exist, or the output holds other files.
     """
-    trained, torch_device = Run(Path(run)), resources.torch_device
-    settings = usual_settings(load_run(run), views) if settings is None else settings
+    trained, torch_device = load_run(run), resources.torch_device
+    settings = usual_settings(trained, views) if settings is None else settings
     name = folder_name(views, settings) + ("-splats" if splats is not None else "")
     folder = output.at(trained.path / RENDERS / name)
     resources.begin()

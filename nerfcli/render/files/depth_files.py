@@ -29,7 +29,6 @@ from nerfcli.render.files.float_maps import (
 from nerfcli.render.job import EXR_FOLDER, FLOAT_FORMATS, LEVELS_FOLDER, ExportSettings, meaning_of, with_suffix
 from nerfcli.render.pictures import RenderedPicture
 
-# Levels are chosen by this quantile of the depths of a clip, and reach up to this many times as far.
 _AXES_OF_VIEW = "OpenCV: +x right, +y down, +z forward; the top-left pixel's centre is (0.5, 0.5)"
 
 
