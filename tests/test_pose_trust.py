@@ -291,9 +291,10 @@ def test_each_way_stands_in_for_the_one_before(
 
 
 def test_mapping_again_is_bounded_in_time_and_says_what_contradicts_where_no_pair_does(
-    solved: Solved, refused: ExaminedModel, tmp_path: Path
+    solved: Solved, refused: ExaminedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Nothing is mapped again where the first mapping took no time; the sound part alone costs only its checks."""
+    """Nothing is mapped again where there is no time for it; the sound part alone costs only its checks."""
+    monkeypatch.setattr(remap, "_LEAST_SECONDS", 0.0)
     wrong = replace(wrongly_mapped(solved, tmp_path / "again"), seconds=0.0)
     evidence = "40 % of the matches are in pairs whose relative rotation differs"
     verdict = Verdict({"pairs": {"judged": 15, "contradicting": 0}}, (Failure("contradict", evidence, "more photos"),))

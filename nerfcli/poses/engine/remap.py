@@ -34,6 +34,9 @@ from nerfcli.poses.model.two_views import agreements, count_matches, read_verifi
 _LEAST_PART = 0.3
 # Photos in smaller models, as a fraction of those in the accepted one, from which it is extended to them.
 _LEAST_APART = 0.05
+# Mapping again may take this long at least: with few photos no way takes longer, so that the result depends neither on
+# how busy the machine is nor on how much of the first mapping an earlier call has done.
+_LEAST_SECONDS = 60.0
 _GLOBALLY = "all photos at once (global mapper)"
 _Pairs = Set[frozenset[int]]  # of photo numbers
 
@@ -78,7 +81,7 @@ def is_contradicted(verdict: Verdict) -> bool:
 
 
 def remap_refused(given: ChosenModel, report: Report, tell: Tell, *, checks: Callable[[], Checks]) -> ChosenModel:
-    """Map again in one way after the other, for at most twice the time of the first mapping.
+    """Map again in one way after the other, for at most twice the time of the first mapping, or for a minute.
 
     `checks` makes a check runner for one more model. Returns the first accepted model, which may be the largest
     consistent part of the given one; else the given one.
@@ -87,7 +90,8 @@ def remap_refused(given: ChosenModel, report: Report, tell: Tell, *, checks: Cal
     job, scratch, pairs = mapped.job, mapped.seconds, verdict.measures["pairs"]
     against = f"{pairs['contradicting']} of {pairs['judged']} pairs of photos contradict the poses"
     against = against if pairs["contradicting"] else verdict.failures[0].evidence
-    tell(f"{against}: mapping again, for at most {duration(2 * scratch)}")
+    most = max(2 * scratch, _LEAST_SECONDS)
+    tell(f"{against}: mapping again, for at most {duration(most)}")
     largest, by_global_mapper = mapped.models[0], list[pycolmap.Reconstruction]()
     part, suspects = _consistent_part(largest, job)
     rest = scratch * (1 - part.num_reg_images() / largest.num_reg_images())
@@ -110,7 +114,7 @@ def remap_refused(given: ChosenModel, report: Report, tell: Tell, *, checks: Cal
         ("only the largest consistent part of the first model", 0.0, lambda: [part, *mapped.models[1:]]),
     )
     for what, takes, make in ways:
-        left = max(2 * scratch - (time.perf_counter() - start), 0.0)
+        left = max(most - (time.perf_counter() - start), 0.0)
         if takes >= left and what != ways[-1][0]:
             why = f"it takes about {duration(takes)}, and {duration(left)} are left" if left > 0 else "no time is left"
             tell(f"{what}: skipped, since {why}")
