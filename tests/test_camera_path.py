@@ -177,6 +177,7 @@ def test_what_the_format_cannot_hold_is_reported(tmp_path):
         ({"render_height": None}, "render_height is None"),
         ({"render_height": 47.5}, "render_height is 47.5"),
         ({"render_width": 0}, "render_width is 0"),
+        ({"render_height": float("nan")}, "render_height is nan"),
         ({"render_width": 10**12}, r"render_width is 1e\+12"),
         ({"render_width": True}, "render_width is True"),
         ({"fps": 0}, "fps is 0"),

@@ -5,17 +5,11 @@ from typing import Any
 
 import pytest
 from clips import encode, ffmpeg, pan
-from commands import estimated_poses
-from typer.testing import CliRunner, Result
+from commands import estimated_poses, nerfcli
 
-from nerfcli import cli
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
 from nerfcli.poses import structure_from_motion
 from nerfcli.workflows import train as train_workflow
-
-
-def nerfcli(*arguments: str | Path, stdin: str | None = None) -> Result:
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments], input=stdin)
 
 
 @pytest.fixture
@@ -90,13 +84,6 @@ def test_videos_and_folders_on_standard_input(clip, estimated):
 def test_a_number_of_frames_that_cannot_be(number, clip, estimated):
     assert nerfcli("poses", clip, f"--frames={number}").exit_code == 2
     assert estimated == []
-
-
-def test_more_frames_than_there_are(clip, estimated):
-    result = nerfcli("poses", clip, "--frames", "21")
-    assert result.exit_code == 0
-    assert "my clip.MOV has only 20 frames, but --frames is 21: using all of them" in result.stderr
-    assert estimated == [("my clip-frames", "my clip-scene", 20)]
 
 
 def test_a_camera_that_stands_still(tmp_path, estimated):

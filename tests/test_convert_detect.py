@@ -16,7 +16,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures import evidence
-from nerfcli.captures.axes import Convention, expressed, for_picture, opencv_from_axes, poses_of, reinterpreted
+from nerfcli.captures.axes import Convention, for_picture, opencv_from_axes, poses_of, reinterpreted
 from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.detect import Detection, detect
 from nerfcli.captures.evidence import LEAST_MOVE, MatchEvidence, match_neighbours
@@ -343,14 +343,3 @@ def test_a_photo_of_another_shape_is_reported(photographed):
 
 def test_a_principal_point_in_the_middle_was_not_given():
     assert for_picture(Camera.pinhole(640, 480, 500.0), 2.0) == Camera.pinhole(640, 480, 250.0)
-
-
-def test_what_is_written_in_a_convention_is_detected_as_that(tmp_path):
-    """The writer and the detector agree about what a convention means."""
-    capture = capture_of([PINHOLE])
-    wanted = Convention("llff", pixel_centre=0.0)
-    written = expressed(capture, wanted, written_axes="opencv")
-    assert written.observations is not None
-    assert capture.observations is not None
-    spoiled = replace(written, observations=capture.observations)
-    assert detect(spoiled, axes="opencv", progress=silent).convention == wanted

@@ -240,7 +240,9 @@ def test_markers_are_sought_in_photos_as_the_scene_shows_them(tmp_path):
     options = ("--to", "nerfcli", "--markers", "DICT_4X4_50:0.05", "--json")
     result = nerfcli("convert", tmp_path / "scene", tmp_path / "out", *options)
     assert result.exit_code == 0, result.stderr
+    assert "from ArUco markers (DICT_4X4_50, 0.05 m), 8 sides" in result.stderr
     assert json.loads(result.stdout)["new_from_old"]["scale"] == pytest.approx(0.05 / 0.7, rel=1e-4)
+    assert load_scene(tmp_path / "out").unit == "metre"
 
 
 # Data beside the cameras

@@ -4,11 +4,13 @@ import gzip
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
+import torch
 from ellipsoids import attenuation_of_voxels, bean
 from test_reconstruct import cone, scan_of
 from typer.testing import CliRunner
@@ -17,6 +19,7 @@ from nerfcli.atomic import read_sealed, write_sealed
 from nerfcli.cli import app
 from nerfcli.ct.export import VolumeFile, export_scan, read_volume, write_volume
 from nerfcli.ct.grid import VoxelGrid, centred_grid
+from nerfcli.ct.likelihood import Gaussian, Poisson
 from nerfcli.ct.marks import UNSEEN
 from nerfcli.ct.recognise import DESCRIPTION
 from nerfcli.ct.render import residual_of, slice_of
@@ -52,8 +55,6 @@ def bean_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "first": list(grid.first),
         "size": grid.size,
     }
-    from dataclasses import replace
-
     save_scan(folder / "bean", replace(scan, history={"truth": described}))
     code, out, err = call("train", folder / "bean", "--passes", "8", "--centre", "0", "--tilt", "0")
     assert code == 0, err
@@ -168,10 +169,6 @@ def test_lists_of_runs_on_standard_input(bean_run: Path, tmp_path: Path) -> None
 
 def test_sign_of_residuals(bean_run: Path) -> None:
     """More photons than predicted: the measured line integral is smaller, the residual negative; closed form."""
-    import torch
-
-    from nerfcli.ct.likelihood import Gaussian, Poisson
-
     zero = torch.zeros(1, 1)
     view = torch.tensor([0])
     counts = Poisson(torch.full((1, 1), 110.0), torch.full((1, 1), 100.0), zero)
@@ -346,14 +343,9 @@ def test_train_refuses_in_two_lines(bean_run: Path, tmp_path: Path, arguments: t
 
 
 def test_a_changed_scan_is_not_evaluated_as_the_old_one(bean_run: Path, tmp_path: Path) -> None:
-    import shutil
-
     shutil.copytree(bean_run.parent, tmp_path / "copy")
     run = tmp_path / "copy" / "bean-run"
-
     result = load_reconstruction(run)
-    from dataclasses import replace
-
     with pytest.raises(UserError, match="has changed"):
         scan_behind(replace(result, scan_digest="0"), run)
     with pytest.raises(UserError, match="does not exist"):

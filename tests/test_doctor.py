@@ -3,7 +3,6 @@
 The photos are drawn by `walks`: boards with known textures at known distances, seen by a camera on a known path.
 """
 
-import hashlib
 import json
 from dataclasses import dataclass, replace
 from functools import cache
@@ -36,9 +35,7 @@ from nerfcli.doctor.page import page_html
 from nerfcli.doctor.photo_facts import PhotoFacts, Source, measure_sharpness, read_photo
 from nerfcli.errors import UserError
 from nerfcli.matching.features import LOOSE_RATIO, mutual_matches
-from nerfcli.matching.graph import connected_groups
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding
-from nerfcli.pages.page import Mark, refuse_foreign
 from nerfcli.photos.exif import Exif
 
 ONE = 3  # the number of the photo that is spoilt
@@ -357,10 +354,6 @@ def test_heights_come_back_from_differences_of_which_some_are_wrong():
     assert backing[11] == 0
 
 
-def test_sets_of_connected_photos():
-    assert connected_groups(range(6), [(4, 1), (1, 5), (0, 3)]) == [[1, 4, 5], [0, 3], [2]]
-
-
 def test_large_captures_are_not_compared_exhaustively(clean):
     few = replace(clean.facts[0].features, descriptors=clean.facts[0].features.descriptors[:20], scales=np.ones(20))
     photos = [replace(clean.facts[0], features=few)] * 70
@@ -512,26 +505,10 @@ def test_the_page_needs_nothing_else_and_shows_each_photo_once(clean):
     assert str(clean.folder) not in html
 
 
-def test_only_a_page_of_the_same_capture_is_replaced(clean, tmp_path):
-    page = tmp_path / "page.html"
-    page.write_text(page_html(clean.diagnosis()), encoding="utf-8")
-    refuse_foreign(page, Mark("doctor", clean.folder), about="capture")
-    with pytest.raises(UserError, match="not a page of this capture"):
-        refuse_foreign(page, Mark("doctor", tmp_path), about="capture")
-    page.write_text("mine")
-    with pytest.raises(UserError, match="not a page of this capture"):
-        refuse_foreign(page, Mark("doctor", clean.folder), about="capture")
-
-
 def test_the_same_photos_give_the_same_findings(clean, tmp_path):
     folder = write(tmp_path / "again", list(clean.photos[:3]))
     runs = [content(examine(find_subject(folder), threads=t, progress=lambda fraction, detail: None)) for t in (1, 3)]
     assert runs[0] == runs[1]
-
-
-def test_photos_keep_their_digest(clean):
-    path = clean.folder / "00.jpg"
-    assert clean.facts[0].digest == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def test_quality_thresholds_are_those_of_the_docstring():

@@ -14,7 +14,6 @@ from nerfcli.captures.formats.trajectories import (
     losses_tum,
     parse_kitti,
     parse_tum,
-    write_kitti,
     write_tum,
 )
 from nerfcli.errors import BAD_INPUT, UserError
@@ -30,7 +29,6 @@ TUM = (
 KITTI = "0 0 1 1 0 1 0 2 -1 0 0 3\n1 0 0 0 0 1 0 0 0 0 1 0\n"
 
 PARSERS = {"tum": parse_tum, "kitti": parse_kitti}
-WRITERS = {"tum": write_tum, "kitti": write_kitti}
 LOSSES = {"tum": losses_tum, "kitti": losses_kitti}
 TEXTS = {"tum": TUM, "kitti": KITTI}
 

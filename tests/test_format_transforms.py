@@ -172,17 +172,6 @@ def test_images_of_blender_files_in_another_folder(tmp_path):
     assert parsed.frames[0].camera.width == 64
 
 
-def test_a_written_file_serves_for_training_and_as_a_camera_path(tmp_path):
-    capture = with_photos(ring(CAMERAS["OPENCV"]), tmp_path)
-    write_transforms(capture, tmp_path / "transforms.json")
-    photograph(capture.frames[1:])
-    scene = load_scene(tmp_path / "transforms.json")
-    assert scene.missing == (capture.frames[0].name,)
-    for frame, again in zip(capture.frames[1:], scene.frames, strict=True):
-        assert (again.name, again.camera) == (frame.name, frame.camera)
-        np.testing.assert_allclose(again.world_from_cam, frame.world_from_cam, rtol=0, atol=1e-15)
-
-
 def test_blender_files_are_read_back(tmp_path):
     capture = with_photos(pinhole_ring(), tmp_path)
     splits = ("train", "train", "train", "val", "test", "test")

@@ -3,7 +3,7 @@
 import json
 import subprocess
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 
 import imageio_ffmpeg
 import numpy as np
@@ -15,9 +15,7 @@ from depth_maps import ALL, FULL_META, META, plain_depth
 from every_format import WITH_PHOTOS
 from PIL import Image
 from test_every_format import VIEWS
-from typer.testing import CliRunner, Result
 
-from nerfcli import cli
 from nerfcli.cli.info import lines_of
 from nerfcli.photos.images import write_png
 from nerfcli.render.files.depth_pictures import KEY
@@ -26,12 +24,7 @@ from nerfcli.render.files.float_maps import write_exr, write_png16
 from nerfcli.splats.files import write_splats
 from nerfcli.splats.gaussians import Gaussians
 
-
-def info(*arguments: str | Path) -> Result:
-    result = CliRunner().invoke(cli.app, ["info", *map(str, arguments)])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
+info = partial(nerfcli, "info")
 
 
 def test_facts_fit_the_lines_of_a_terminal():

@@ -9,7 +9,6 @@ import pytest
 from commands import error_of, nerfcli
 from PIL import Image
 
-from nerfcli.errors import BAD_INPUT
 from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.workflows.views import file_fps
 
@@ -103,37 +102,6 @@ def transforms(**changes: Any) -> dict[str, Any]:
 def camera_path(**changes: Any) -> dict[str, Any]:
     view = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50}
     return {"render_width": 64, "render_height": 48, "camera_path": [view], **changes}
-
-
-@pytest.mark.parametrize(
-    ("content", "reported"),
-    [
-        (transforms(w=0), "w and h are 0"),
-        (transforms(h=float("nan")), "h is nan"),
-        (transforms(fl_x=float("nan")), "fl_x is nan"),
-        (camera_path(render_width=0), "render_width is 0"),
-        (camera_path(render_height=float("nan")), "render_height is nan"),
-        (camera_path(camera_path=[{"camera_to_world": [float("nan")] * 16, "fov": 50}]), "camera_to_world"),
-        (camera_path(camera_path=[{"camera_to_world": np.eye(4).ravel().tolist(), "fov": float("nan")}]), "fov is nan"),
-    ],
-)
-def test_a_file_of_cameras_with_a_size_of_nothing_or_nan(content, reported, finished, tmp_path):
-    path = tmp_path / "views.json"
-    path.write_text(json.dumps(content))
-    result = nerfcli("render", finished, "--cameras", path)
-    assert result.exit_code == BAD_INPUT
-    assert reported in error_of(result)[0]
-    assert not (finished / "renders").exists()
-
-
-@pytest.mark.parametrize("value", [float("nan"), None])
-def test_a_run_whose_cameras_are_damaged(value, finished):
-    content = json.loads((finished / "cameras.json").read_text())
-    content["test"][0]["world_from_cam"][0][3] = value
-    (finished / "cameras.json").write_text(json.dumps(content))
-    result = nerfcli("render", finished)
-    assert result.exit_code == BAD_INPUT
-    assert "cameras.json cannot be read" in error_of(result)[0]
 
 
 def test_the_frame_rate_of_a_camera_path_is_the_default(tmp_path):

@@ -118,25 +118,6 @@ def test_a_converted_model_whose_names_begin_with_the_folder_of_the_photos(tmp_p
     assert scene.frames[0].image == tmp_path / "images" / NAMES[0]
 
 
-def test_a_colmap_model_of_photos_stored_lying_is_turned_upright(tmp_path, model):
-    """COLMAP ignores the EXIF orientation: its cameras are of the stored pixels, ours of the picture as it is shown."""
-    shutil.copytree(model, tmp_path / "sparse/0")
-    for name in NAMES:
-        write_image(tmp_path / "images" / name, orientation=6 if name == NAMES[0] else 1)
-    loaded = load_scene(tmp_path)
-    assert loaded.pixels == "upright"
-    turned, plain = loaded.frames[:2]
-    assert (turned.camera.width, turned.camera.height) == (48, 64)
-    assert (plain.camera.width, plain.camera.height) == (64, 48)
-    write_image(tmp_path / "images" / NAMES[0])
-    stored = load_scene(tmp_path).frames[0]
-    # The stored picture's right edge is the upright one's bottom edge.
-    right, _ = stored.camera.bearings(np.array([[64.0, 10.0]]))
-    bottom, _ = turned.camera.bearings(np.array([[48.0 - 10.0, 64.0]]))
-    in_world = [rigid.apply(f.world_from_cam, d) for f, d in ((stored, right), (turned, bottom))]
-    np.testing.assert_allclose(in_world[1], in_world[0], rtol=0, atol=1e-9)
-
-
 def test_own_scene_is_read_back(own, tmp_path):
     content = json.loads((own / "scene.json").read_text(encoding="utf-8"))
     assert content["image_folder"] == "../photos"
@@ -156,31 +137,6 @@ def test_own_scene_is_read_back(own, tmp_path):
     moved = load_scene(tmp_path / "elsewhere/photos-scene")
     assert moved.missing == (NAMES[0],)
     assert moved.test_names == {NAMES[8]}
-
-
-def test_cameras_of_an_own_scene_refer_to_upright_photos(own, tmp_path):
-    """`nerfcli poses` shows pycolmap upright photos: nothing is turned a second time."""
-    before = load_scene(own).frames[0]
-    write_image(tmp_path / "photos" / NAMES[0], orientation=3)
-    after = load_scene(own).frames[0]
-    assert after.camera == before.camera
-    np.testing.assert_array_equal(after.world_from_cam, before.world_from_cam)
-
-
-def test_masks_are_found_by_the_photos_name(own, tmp_path):
-    masks = tmp_path / "masks"
-    write_image(masks / f"{NAMES[0]}.png")
-    write_image(masks / "photo 01.png")
-    write_image(masks / NAMES[2])
-    save(own, image_folder=tmp_path / "photos", provenance={}, masks=masks, unit="metre", unit_source="a ruler")
-    scene = load_scene(own)
-    assert [frame.mask for frame in scene.frames[:4]] == [
-        masks / f"{NAMES[0]}.png",
-        masks / "photo 01.png",
-        masks / NAMES[2],
-        None,
-    ]
-    assert scene.unit == "metre"
 
 
 @pytest.mark.parametrize(

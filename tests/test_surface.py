@@ -1,7 +1,6 @@
 """Geometry taken out of fields: where surfaces are, in which frame and unit, and what the files say."""
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -111,22 +110,6 @@ def test_the_mesh_of_a_ball_is_the_ball(fused):
     assert np.abs(mesh.vertices.mean(0) - CENTRE).max() < 0.05 * 0.025
     outwards = (mesh.normals * (mesh.vertices - CENTRE)).sum(1) / RADIUS
     assert outwards.min() > 0.9
-
-
-def test_pictures_half_a_pixel_aside_make_another_ball(ball_views):
-    """The test above would notice: the same depths, with cameras whose principal point is half a pixel off."""
-    fx, fy, cx, cy = CAMERA.params
-    shifted = Camera("PINHOLE", 120, 90, (fx, fy, cx + 0.5, cy + 0.5))
-    moved = [
-        DepthView(
-            Frame(view.frame.name, shifted, view.frame.world_from_cam),
-            *(view.rgb, view.opacity, view.depth, view.spread, view.disagreement, view.normals),
-        )
-        for view in ball_views
-    ]
-    mesh = surface_of(fuse(moved, Grid.over((*(CENTRE - 0.7), *(CENTRE + 0.7)), 0.025)))
-    off = np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS
-    assert np.sqrt((off**2).mean()) > 0.06 * 0.025
 
 
 def test_the_mesh_of_a_ball_has_no_gap_between_blocks_and_bricks(fused):
@@ -392,25 +375,6 @@ def test_points_are_written(blocked, tmp_path):
     assert np.abs(sides_of(blocked, places) - 0.5).max() < 0.02
     facts = describe(tmp_path / "p.ply")
     assert facts["properties"] == "x y z nx ny nz red green blue photos parallax_deg spread"
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--to", "mesh", "--box", "1,2,3"), "'1,2,3'; write X0,Y0,Z0,X1,Y1,Z1"),
-        (("--to", "mesh", "--box=1,0,0,0,1,1"), "the low corner comes first"),
-        (("--to", "mesh", "--format", "stl"), "'stl'; choose ply, glb or obj"),
-        (("--to", "mesh", "--voxel-size", "nan"), "--voxel-size"),
-        (("--to", "voxels"), "'voxels'; choose page"),
-        (("--to", "mesh", "--sh", "1"), "it is for splats"),
-        (("--to", "volume"), "'volume'; choose page"),
-        (("--to", "mesh", "-o", "a.stl"), "not have the suffix of a mesh"),
-    ],
-)
-def test_wrong_usage_of_export(options, message, finished):
-    result = nerfcli("export", finished, *options)
-    assert result.exit_code == 2
-    assert message in re.sub(r"\s+", " ", result.stderr)
 
 
 def test_what_cannot_be_exported_is_refused_in_two_lines(blocked, tmp_path):
