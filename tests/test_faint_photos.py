@@ -11,8 +11,8 @@ from corner import CENTRES, HEIGHT, WIDTH, render
 from in_this_process import worker_in_this_process
 from PIL import Image
 from test_masks import job_for
-from test_poses import similarity
 
+from nerfcli.cameras.alignment import align
 from nerfcli.photos.exif import read_exif
 from nerfcli.poses.engine import features as searching
 from nerfcli.poses.engine.features import extract, feature_counts
@@ -60,8 +60,8 @@ def test_poses_of_dark_photos_agree_with_the_truth(tmp_path: Path):
     assert reported["faint"] == (5, 5)
     model = pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse/0"))
     centres = np.array([model.find_image_with_name(f"{i}.png").projection_center() for i in range(5)])
-    scale, rotation, translation = similarity(centres, CENTRES[:5])
-    assert np.linalg.norm(scale * centres @ rotation.T + translation - CENTRES[:5], axis=1).max() < 0.03
+    aligned = align(centres, CENTRES[:5]).apply(centres)
+    assert np.linalg.norm(aligned - CENTRES[:5], axis=1).max() < 0.03
 
 
 def job_of(folder: Path, work: Path) -> Job:

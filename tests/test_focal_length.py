@@ -164,22 +164,6 @@ def test_a_changed_prior_focal_length_is_verified_anew(job: Job):
     assert not verified(job)
 
 
-def test_verification_without_a_prior_asks_for_no_focal_length(job: Job):
-    """Independent: pycolmap's own verification, with two focal lengths."""
-    with closing(pycolmap.Database.open(str(job.database))) as database:
-        one, other = (np.asarray(database.read_keypoints(i), dtype=np.float64)[:, :2] for i in (1, 2))
-        matches = database.read_matches(1, 2)
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = 0
-    kept = []
-    for px in (300.0, 3000.0):
-        camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", px, WIDE.width, WIDE.height)
-        found = pycolmap.estimate_two_view_geometry(camera, one, camera, other, matches=matches, options=options)
-        kept.append(found.inlier_matches)
-    np.testing.assert_array_equal(kept[0], kept[1])
-    assert len(kept[0]) > 100
-
-
 def test_a_first_mapping_starts_from_it(job: Job):
     """All photos placed, focal length within half a per cent of the truth."""
     notes: list[str] = []

@@ -89,19 +89,6 @@ def test_views_in_opposite_directions_are_left_alone():
     assert forward_depths(view_of(one, 200), view_of(other, 200), walls()) is None
 
 
-@given(st.floats(-np.pi, np.pi), st.floats(0.1, 6.0))
-def test_a_sector_contains_its_angles_also_across_the_end_of_the_circle(first, size):
-    angles = first + np.linspace(0.0, size, 2000)
-    begin, extent = forward_stereo._sector(np.arctan2(np.sin(angles), np.cos(angles)))
-    step = 2.0 * np.pi / 360
-    assert size <= extent <= size + 2.0 * step + 1e-9
-    assert np.all(np.mod(angles - begin, 2.0 * np.pi) <= extent + 1e-9)
-
-
-def test_a_full_circle_is_one_sector():
-    assert forward_stereo._sector(np.linspace(-np.pi, np.pi, 5000))[1] == pytest.approx(2.0 * np.pi)
-
-
 @example([0.0, 0.0, 0.0], 0)
 @example([0.0, 0.0, 0.0], 1)
 @given(st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3), st.integers(0, 2**31))

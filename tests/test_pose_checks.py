@@ -326,18 +326,6 @@ def test_a_refused_model_stays_and_can_be_accepted(
     assert len(load_scene(scene).frames) == len(NAMES)
 
 
-@pytest.mark.usefixtures("same_process")
-def test_after_an_end_in_a_check_only_the_checks_are_left(photos: Path, mapped: Path, tmp_path: Path):
-    """An earlier call was ended in its first check, after mapping; this one maps nothing."""
-    scene = shutil.copytree(mapped, tmp_path / "scene")
-    assert pycolmap.Reconstruction(str(scene / "work/mapped/0")).num_reg_images() == len(NAMES)
-    stages: set[str] = set()
-    report, notes = estimate(photos, scene, progress=lambda stage, done, total: stages.add(stage))
-    assert report.registered == len(NAMES)
-    assert stages == {"read", "check", "stabilise"}
-    assert "the photos are already mapped: running the checks" in notes
-
-
 def test_closing_notes_name_components_and_checks(estimated: tuple[Path, PosesReport]):
     _, report = estimated
     first = report.components[0]

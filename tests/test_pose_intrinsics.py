@@ -19,8 +19,8 @@ from in_this_process import worker_in_this_process
 from PIL import Image
 from test_cli import write_photos
 from test_pose_stages import model, rows
-from test_poses import similarity
 
+from nerfcli.cameras.alignment import align
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.calibration import Calibration, Picture, calibrated, read_calibration
 from nerfcli.captures.capture import Capture
@@ -49,8 +49,7 @@ def worst_centre(scene: Path) -> float:
     """How far a camera is from the truth, after the best similarity; the corner is 4 units away."""
     found = pycolmap.Reconstruction(str(scene / "sparse/0"))
     centres = np.array([found.find_image_with_name(name).projection_center() for name in NAMES])
-    scale, rotation, translation = similarity(centres, CENTRES)
-    return float(np.linalg.norm(scale * centres @ rotation.T + translation - CENTRES, axis=1).max())
+    return float(np.linalg.norm(align(centres, CENTRES).apply(centres) - CENTRES, axis=1).max())
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import WIDE, Lens
 
+from nerfcli.cameras.alignment import align
 from nerfcli.poses.judge.examine import pose_blur_px
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.intrinsics import choose_lenses, convert_camera
@@ -179,12 +180,9 @@ def _picture_motion(truth: pycolmap.Reconstruction, found: pycolmap.Reconstructi
     """Mean squared motion of the true points in each photo, after the similarity that fits all points best."""
     source = np.array([found.point3D(i).xyz for i in sorted(found.point3D_ids())])
     target = np.array([truth.point3D(i).xyz for i in sorted(truth.point3D_ids())])
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    u, sizes, vt = np.linalg.svd((target - target_mean).T @ (source - source_mean))
-    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    scale = sizes.sum() / ((source - source_mean) ** 2).sum()
+    fit = align(source, target)
     moved = pycolmap.Reconstruction(found)
-    moved.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), target_mean - scale * rotation @ source_mean))
+    moved.transform(pycolmap.Sim3d(fit.scale, pycolmap.Rotation3d(fit.rotation), fit.translation))
     motions = []
     for image_id in sorted(truth.reg_image_ids()):
         pixels = [

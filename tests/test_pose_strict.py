@@ -8,8 +8,9 @@ import pycolmap
 import pytest
 from corner import CENTRES, NAMES, cam_from_world, write_capture
 from in_this_process import poses_in_this_process
-from test_poses import FAST, similarity
+from test_poses import FAST
 
+from nerfcli.cameras.alignment import align
 from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.ledger import leak_ledger
 from nerfcli.poses.engine.strict import fingerprint, move_held_out_last, training_part
@@ -43,10 +44,10 @@ def test_a_held_out_photo_is_placed_and_moves_nothing_by_a_bit(solved):
     assert held_out.image_id not in tracks
     others = [index for index in range(len(NAMES)) if index != HELD_OUT]
     centres = np.array([model.find_image_with_name(NAMES[index]).projection_center() for index in others])
-    scale, rotation, translation = similarity(centres, CENTRES[others])
-    found = scale * rotation @ held_out.projection_center() + translation
-    assert np.linalg.norm(found - CENTRES[HELD_OUT]) < 0.01
-    turn = held_out.cam_from_world().rotation.matrix() @ rotation.T @ cam_from_world(CENTRES[HELD_OUT])[:, :3].T
+    truth_from_found = align(centres, CENTRES[others])
+    assert np.linalg.norm(truth_from_found.apply(held_out.projection_center()) - CENTRES[HELD_OUT]) < 0.01
+    turned = held_out.cam_from_world().rotation.matrix() @ truth_from_found.rotation.T
+    turn = turned @ cam_from_world(CENTRES[HELD_OUT])[:, :3].T
     assert np.degrees(np.arccos(min((np.trace(turn) - 1) / 2, 1.0))) < 0.3
     assert report.strict["placed"][name]["inliers"] > 50
     assert report.strict["placed"][name]["error_px"] < 1.5

@@ -7,7 +7,7 @@ everything is real.
 import shutil
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -86,17 +86,26 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> Solved:
     return solve(tmp_path_factory.mktemp("right"), views, synthetic.boulder(650, seed=0), Noise(outliers=0.2))
 
 
+def rotations_off_deg(
+    model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction, photos: Sequence[int] = range(2, 11)
+) -> list[float]:
+    """Return by how many degrees the rotations of photos relative to the first one differ from the truth."""
+    return [
+        float(np.degrees((found.rotation * true.rotation.inverse()).angle()))
+        for found, true in (
+            [one.image(photo).cam_from_world() * one.image(1).cam_from_world().inverse() for one in (model, truth)]
+            for photo in photos
+        )
+    ]
+
+
 def test_a_right_result_is_accepted_and_right(solved: Solved):
     """Synthetic truth: relative rotations within 0.4 degrees, focal lengths within 1 %."""
     assert solved.examined.verdict.accepted
     assert solved.examined.left_out == {}
     assert solved.model.num_reg_images() == 10
     truth = synthetic.true_model(solved.views)
-    first, true_first = solved.model.image(1).cam_from_world(), truth.image(1).cam_from_world()
-    for image_id in range(2, 11):
-        found = solved.model.image(image_id).cam_from_world() * first.inverse()
-        true = truth.image(image_id).cam_from_world() * true_first.inverse()
-        assert np.degrees((found.rotation * true.rotation.inverse()).angle()) < 0.4
+    assert max(rotations_off_deg(solved.model, truth)) < 0.4
     for camera_id, camera in solved.model.cameras.items():
         assert camera.mean_focal_length() == pytest.approx(truth.camera(camera_id).mean_focal_length(), rel=0.01)
 
@@ -147,10 +156,16 @@ def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
     assert "verified matches between" in verdict.failures[0].evidence
 
 
+def job_again(solved: Solved, folder: Path) -> Job:
+    """Return the job in a copy of its folder, without the models of its mapper."""
+    shutil.copytree(solved.job.database.parent, folder)
+    (folder / "work" / "models_0.json").unlink(missing_ok=True)
+    return replace(solved.job, folder=str(folder / "work"))
+
+
 def wrongly_mapped(solved: Solved, folder: Path) -> MappedModels:
     """The whole capture with photos 8, 9 and 10 in a wrong place, as a misled mapper leaves it."""
-    shutil.copytree(solved.job.database.parent, folder)
-    job = replace(solved.job, folder=str(folder / "work"))
+    job = job_again(solved, folder)
     return MappedModels(
         [synthetic.bent(solved.model, 8)], job, [{"what": "default thresholds", "models": [10]}], seconds=1000.0
     )
@@ -176,30 +191,26 @@ def test_a_contradicted_model_is_mapped_again_from_its_sound_part(
     assert [attempt["models"] for attempt in chosen.mapped.attempts] == [[10], [10]]
     assert notes[0].endswith("mapping again, for at most 33 min")
     assert notes[-1] == "from the largest consistent part: 10 of 10 photos registered, accepted"
-    truth = synthetic.true_model(solved.views)
-    for image_id in range(2, 11):
-        relative = [
-            model.image(image_id).cam_from_world() * model.image(1).cam_from_world().inverse()
-            for model in (chosen.examined.model, truth)
-        ]
-        assert np.degrees((relative[0].rotation * relative[1].rotation.inverse()).angle()) < 0.4
+    assert max(rotations_off_deg(chosen.examined.model, synthetic.true_model(solved.views))) < 0.4
 
 
-def without(model: pycolmap.Reconstruction, photos: range) -> pycolmap.Reconstruction:
+def without(
+    model: pycolmap.Reconstruction, photos: Iterable[int], *, tear_down: bool = True
+) -> pycolmap.Reconstruction:
     """Return a copy of a model without some photos."""
     rest = pycolmap.Reconstruction(model)
     for image_id in photos:
         rest.deregister_frame(rest.image(image_id).frame_id)
-    rest.tear_down()
+    if tear_down:
+        rest.tear_down()
     return rest
 
 
 def in_two_parts(solved: Solved, tmp_path: Path) -> MappedModels:
     """Return a right model in two parts, of seven and four photos, in a folder of its own."""
-    shutil.copytree(solved.job.database.parent, tmp_path / "again")
     parts = [without(solved.model, range(8, 11)), without(solved.model, range(1, 7))]
-    job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
-    return MappedModels(parts, job, [{"what": "default thresholds", "models": [7, 4]}], seconds=1000.0)
+    attempts = [{"what": "default thresholds", "models": [7, 4]}]
+    return MappedModels(parts, job_again(solved, tmp_path / "again"), attempts, seconds=1000.0)
 
 
 def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(solved: Solved, tmp_path: Path):
@@ -211,13 +222,7 @@ def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(solved: Solved, 
         assert found.examined.verdict.accepted
         assert [model.num_reg_images() for model in found.mapped.models] == [10]
         assert found.examined.model is not None
-        truth = synthetic.true_model(solved.views)
-        for image_id in range(2, 11):
-            relative = [
-                model.image(image_id).cam_from_world() * model.image(1).cam_from_world().inverse()
-                for model in (found.examined.model, truth)
-            ]
-            assert np.degrees((relative[0].rotation * relative[1].rotation.inverse()).angle()) < 0.4
+        assert max(rotations_off_deg(found.examined.model, synthetic.true_model(solved.views))) < 0.4
         assert notes == [
             "3 photos in smaller models, next: from the accepted model (about 5 min)",
             "from the accepted model: 10 of 10 photos registered, accepted",
@@ -238,30 +243,25 @@ def test_an_accepted_model_grows_with_the_lens_that_was_chosen_for_it(solved: So
     assert found.mapped.models[0].num_reg_images() == 10
 
 
-def test_a_model_that_grows_into_one_that_is_refused_stays_as_it_was(
-    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("grown", ["wrong", "same"])
+def test_a_model_that_grows_into_a_wrong_one_or_not_at_all_stays_as_it_was(
+    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grown: str
 ):
+    """One that takes in no further photo is not checked again."""
     mapped = in_two_parts(solved, tmp_path)
-    monkeypatch.setattr(remap, "map_photos", lambda *_, **__: [synthetic.bent(solved.model, 8)])
+    result = synthetic.bent(solved.model, 8) if grown == "wrong" else pycolmap.Reconstruction(mapped.models[0])
+    monkeypatch.setattr(remap, "map_photos", lambda *_, **__: [result])
+    examined = iter([examine] * (2 if grown == "wrong" else 1))
+    monkeypatch.setattr(remap, "examine", lambda *arguments, **options: next(examined)(*arguments, **options))
     notes: list[str] = []
     found = choose_model(mapped, lambda *progress: None, notes.append, checks=Checks)
     assert found.examined.verdict.accepted
     assert [model.num_reg_images() for model in found.mapped.models] == [7, 4]
-    assert notes[-1].startswith("from the accepted model: 10 of 10 photos registered, the poses contradict")
-    assert [attempt["models"] for attempt in found.mapped.attempts] == [[7, 4], [10]]
-
-
-def test_a_model_that_takes_in_no_further_photo_is_not_checked_again(
-    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    mapped = in_two_parts(solved, tmp_path)
-    monkeypatch.setattr(remap, "map_photos", lambda *_, **__: [pycolmap.Reconstruction(mapped.models[0])])
-    examined = iter([examine])  # the second time there is none
-    monkeypatch.setattr(remap, "examine", lambda *arguments, **options: next(examined)(*arguments, **options))
-    notes: list[str] = []
-    found = choose_model(mapped, lambda *progress: None, notes.append, checks=Checks)
-    assert [model.num_reg_images() for model in found.mapped.models] == [7, 4]
-    assert notes[-1] == "from the accepted model: no further photo registered"
+    if grown == "wrong":
+        assert notes[-1].startswith("from the accepted model: 10 of 10 photos registered, the poses contradict")
+        assert [attempt["models"] for attempt in found.mapped.attempts] == [[7, 4], [10]]
+    else:
+        assert notes[-1] == "from the accepted model: no further photo registered"
 
 
 def test_nothing_is_mapped_again_where_the_camera_only_turned():
@@ -333,8 +333,7 @@ def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(
     solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Eight of ten are placed: attempts that continue from them are made, attempts from scratch are not."""
-    shutil.copytree(solved.job.database.parent, tmp_path / "again")
-    job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
+    job = job_again(solved, tmp_path / "again")
     real = attempts.map_photos
 
     def without_two(*arguments, **options) -> list[pycolmap.Reconstruction]:
@@ -356,12 +355,8 @@ def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(
 
 
 def test_the_mapper_counts_the_photos_that_it_goes_on_from(solved: Solved, tmp_path: Path):
-    shutil.copytree(solved.job.database.parent, tmp_path / "again")
-    job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
-    base = pycolmap.Reconstruction(solved.model)
-    for photo in (9, 10):
-        base.deregister_frame(base.image(photo).frame_id)
-    base.tear_down()
+    job = job_again(solved, tmp_path / "again")
+    base = without(solved.model, (9, 10))
     reports: list[tuple[str, int, int]] = []
     map_photos(
         job,
@@ -371,13 +366,6 @@ def test_the_mapper_counts_the_photos_that_it_goes_on_from(solved: Solved, tmp_p
         base=base,
     )
     assert reports == [("map", 8, 10), ("map", 9, 10), ("map", 10, 10)]
-
-
-def _again(solved: Solved, folder: Path) -> Job:
-    """Return the job in a copy of its folder, without the models of its mapper."""
-    shutil.copytree(solved.job.database.parent, folder)
-    (folder / "work" / "models_0.json").unlink(missing_ok=True)
-    return replace(solved.job, folder=str(folder / "work"))
 
 
 def test_a_run_of_the_mapper_ends_if_no_photo_follows(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -393,7 +381,7 @@ def test_a_run_of_the_mapper_ends_if_no_photo_follows(solved: Solved, tmp_path: 
             time.sleep(1.5)
 
     notes: list[str] = []
-    mapped = map_with_fallbacks(_again(solved, tmp_path / "again"), report, notes.append)
+    mapped = map_with_fallbacks(job_again(solved, tmp_path / "again"), report, notes.append)
     stopped = "default thresholds: stopped after 0 s without another photo"
     assert (mapped.attempts[0]["models"], mapped.cut_short[0], notes[0]) == ([8], stopped, f"cut short: {stopped}")
 
@@ -410,13 +398,13 @@ def test_a_slow_run_of_the_mapper_is_not_ended_while_photos_follow(
 
     monkeypatch.setattr(mapping.pycolmap, "incremental_mapping", slow)
     monkeypatch.setattr(mapping, "stall_seconds", lambda photos: 1.4)
-    map_photos(_again(solved, tmp_path / "again"), lambda *progress: None, attempt=0, start=MapperOptions())
+    map_photos(job_again(solved, tmp_path / "again"), lambda *progress: None, attempt=0, start=MapperOptions())
 
 
 def test_the_mapper_goes_on_from_its_last_snapshot(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Interrupted at the eighth of ten photos; the last snapshot was not written to its end."""
     monkeypatch.setattr(mapping, "_MANY_PHOTOS", 10)
-    job, counts = _again(solved, tmp_path / "again"), list[int]()
+    job, counts = job_again(solved, tmp_path / "again"), list[int]()
 
     def report(stage: str, done: int, total: int) -> None:
         counts.append(done)
@@ -622,10 +610,7 @@ def test_a_photo_without_verified_pairs_is_placed_by_the_points_of_the_model(tmp
     ]
     assert [(one["name"], one["refused"]) for one in weak.mapped.attempts[1]["photos"]] == [("00003.jpg", "")]
     assert (weak.examined.verdict.accepted, weak.examined.left_out) == (True, {})
-    turned = weak.model.image(4).cam_from_world().rotation * weak.model.image(1).cam_from_world().rotation.inverse()
-    truth = synthetic.true_model(views)
-    true = truth.image(4).cam_from_world().rotation * truth.image(1).cam_from_world().rotation.inverse()
-    assert np.degrees((turned * true.inverse()).angle()) < 0.8
+    assert max(rotations_off_deg(weak.model, synthetic.true_model(views), photos=[4])) < 0.8
 
 
 def test_a_fisheye_without_metadata_is_recognized(tmp_path: Path):
@@ -682,8 +667,7 @@ def test_a_camera_whose_photos_are_not_registered_is_no_error(tmp_path: Path):
 
 def test_a_given_initial_pair_is_tried_once(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """pycolmap tries an unsuitable one again 200 times at each of five thresholds, with the same result."""
-    shutil.copytree(solved.job.database.parent, tmp_path / "again")
-    job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
+    job = job_again(solved, tmp_path / "again")
     trials: list[int] = []
 
     def mapping(*arguments, options: pycolmap.IncrementalPipelineOptions, **others) -> dict[int, object]:
@@ -714,7 +698,7 @@ def test_first_attempts_and_those_of_many_photos_are_rough(
     monkeypatch.setattr(pycolmap, "incremental_mapping", mapping_of)
     monkeypatch.setattr(mapping, "_MANY_PHOTOS", many)
     monkeypatch.setattr(mapping, "_DENSE", dense)
-    map_photos(_again(solved, tmp_path / "again"), lambda *progress: None, attempt=attempt, start=MapperOptions())
+    map_photos(job_again(solved, tmp_path / "again"), lambda *progress: None, attempt=attempt, start=MapperOptions())
     assert used[0].mapper.ba_global_ignore_redundant_points3D == rough
     assert used[0].ba_local_max_num_iterations == (10 if rough else -1)
     assert used[0].ba_global_frames_ratio == used[0].ba_global_points_ratio == growth
@@ -738,9 +722,7 @@ def test_the_search_of_larger_pictures_is_worth_what_is_missing(
     job = synthetic.synthetic_job(tmp_path, views, seed=0)
     groups = tuple(replace(group, width=5184, height=3888) for group in job.groups)
     job = replace(job, groups=groups, max_image_size=1600, max_features=4096)
-    model = synthetic.true_model(views)
-    for image_id in range(placed + 1, 11):
-        model.deregister_frame(model.image(image_id).frame_id)
+    model = without(synthetic.true_model(views), range(placed + 1, 11), tear_down=False)
     searched: list[Job] = []
     notes: list[str] = []
     monkeypatch.setattr(attempts, "extract", lambda job, report: searched.append(job))
@@ -755,9 +737,7 @@ def test_the_search_of_larger_pictures_is_worth_what_is_missing(
 
 def test_single_photos_are_located_before_costlier_attempts(solved: Solved, monkeypatch: pytest.MonkeyPatch):
     """Eight of ten photos are mapped. With the other two located, nothing else is tried; without, much is."""
-    model = pycolmap.Reconstruction(solved.model)
-    for image_id in (9, 10):
-        model.deregister_frame(model.image(image_id).frame_id)
+    model = without(solved.model, (9, 10), tear_down=False)
     monkeypatch.setattr(attempts, "map_photos", lambda *arguments, **options: [model])
     tried = {}
     for grown in (solved.model, model):
@@ -780,12 +760,7 @@ def test_pairs_of_perspective_photos_ask_for_no_fisheye(solved: Solved):
 
 def test_sub_models_are_merged_where_they_overlap(solved: Solved, tmp_path: Path):
     """Two models of photos 1...6 and 6...10, the second turned, moved and three times as large, become the whole."""
-    first, second = (pycolmap.Reconstruction(solved.model) for _ in range(2))
-    for image_id in range(1, 11):
-        if image_id > 6:
-            first.deregister_frame(first.image(image_id).frame_id)
-        if image_id < 6:
-            second.deregister_frame(second.image(image_id).frame_id)
+    first, second = (without(solved.model, left, tear_down=False) for left in (range(7, 11), range(1, 6)))
     turn = pycolmap.Rotation3d(np.array([0.3, -0.4, 1.2]))
     second.transform(pycolmap.Sim3d(3.0, turn, np.array([5.0, -2.0, 1.0])))
     reports: list[tuple[str, int, int]] = []
@@ -797,21 +772,14 @@ def test_sub_models_are_merged_where_they_overlap(solved: Solved, tmp_path: Path
     )
     assert reports == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
     assert [model.num_reg_images() for model in merged] == [10]
-    for image_id in range(2, 11):
-        poses = [model.image(image_id).cam_from_world() for model in (merged[0], solved.model)]
-        relative = [
-            pose * model.image(1).cam_from_world().inverse()
-            for pose, model in zip(poses, (merged[0], solved.model), strict=True)
-        ]
-        assert np.degrees((relative[0].rotation * relative[1].rotation.inverse()).angle()) < 0.3
+    assert max(rotations_off_deg(merged[0], solved.model)) < 0.3
 
 
 def test_a_model_that_the_matches_contradict_is_left_out_when_several_are_joined(solved: Solved):
     """Photos 7 and 8 in the right place, 9 and 10 moved by the radius of the ring: only the former are added."""
-    base, right, wrong = (pycolmap.Reconstruction(solved.model) for _ in range(3))
-    for model, kept in ((base, range(1, 7)), (right, (7, 8)), (wrong, (9, 10))):
-        for image_id in set(range(1, 11)) - set(kept):
-            model.deregister_frame(model.image(image_id).frame_id)
+    base, right, wrong = (
+        without(solved.model, set(range(1, 11)) - set(kept), tear_down=False) for kept in (range(1, 7), (7, 8), (9, 10))
+    )
     radius = np.linalg.norm(base.image(1).projection_center())
     shift = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([0.0, 0.0, radius]))
     given = [merging._Aligned(wrong, shift), merging._Aligned(right, pycolmap.Sim3d())]
@@ -824,11 +792,7 @@ def test_a_model_that_the_matches_contradict_is_left_out_when_several_are_joined
 
 
 def test_models_with_nothing_in_common_stay_apart(solved: Solved, tmp_path: Path):
-    first = pycolmap.Reconstruction(solved.model)
-    second = pycolmap.Reconstruction(solved.model)
-    for image_id in range(1, 11):
-        model = first if image_id > 3 else second
-        model.deregister_frame(model.image(image_id).frame_id)
+    first, second = (without(solved.model, left, tear_down=False) for left in (range(4, 11), range(1, 4)))
     for point_id in sorted(second.point3D_ids()):
         second.delete_point3D(point_id)
     merged = merging.merge_models([second, first], solved.job, output=tmp_path / "m")

@@ -125,12 +125,6 @@ def test_what_is_left_out_must_surely_not_be_missed(changed, kept, why):
     assert why in decision.why
 
 
-def test_time_counts_only_where_time_is_what_is_spent():
-    base, slow = [trial(20.0), trial(21.0)], [trial(20.4, seconds=2.0), trial(21.4, seconds=2.0)]
-    assert not judge(base, ("view", 3), slow, by_time=True).kept
-    assert judge(base, ("view", 3), slow, by_time=False).kept
-
-
 def test_one_seed_is_enough_only_where_the_gain_is_clear():
     """All photos gain alike, so the error is `SEED_DB`: the gain must exceed the least gain by `CLEAR_ERRORS` of it."""
     least = LEAST_GAIN_DB + CLEAR_ERRORS * SEED_DB
@@ -152,6 +146,7 @@ def test_the_margins_in_numbers():
     assert [judged(base, both(dB)).kept for dB in (0.04, 0.06)] == [False, True]
     assert [judge_removal(base, ("view", 0), both(dB), by_time=False).kept for dB in (-0.13, -0.08)] == [False, True]
     assert [judged(base, both(0.4, seconds)).kept for seconds in (1.31, 1.2)] == [False, True]
+    assert judge(base, ("view", 3), both(0.4, 2.0), by_time=False).kept  # where steps are what is spent
 
 
 def test_a_photo_without_pixels_to_judge_by_counts_nothing():
@@ -304,29 +299,35 @@ def test_a_sky_that_signs_speak_for_is_kept_at_a_smaller_gain(far, kept):
     assert sphere.kept is kept
 
 
-def test_what_is_needed_stays():
-    chosen = chosen_by(Scripted(lambda c: -0.5 * (c.view == 0)))
-    assert chosen.components == Components()
-    assert [d.why for d in chosen.decisions if d.component == "view"] == ["it is needed"]
+Gain = Callable[[Components], float]
+# The gains of components, the components that are then chosen, and why a component, or a value of one, is kept or not.
+SEARCHES: dict[str, tuple[Gain, Components, tuple[str, str] | None]] = {
+    "what is needed stays": (lambda c: -0.5 * (c.view == 0), Components(), ("view", "it is needed")),
+    # View dependence alone explains drifting exposures and would be kept; with learned exposures it is not needed.
+    "what another does better is left out": (
+        lambda c: 0.6 if c.exposure == "learned" else 0.5 * (c.view > 0),
+        Components(view=0, exposure="learned"),
+        None,
+    ),
+    "of two that mend the same fault the better one is kept": (
+        lambda c: 0.6 if c.exposure == "learned" else 0.5 * (c.background == "sphere"),
+        Components(view=0, exposure="learned"),
+        ("background", "no gain above the noise, in addition to exposure"),
+    ),
+    "two that gain beside each other are both kept": (
+        lambda c: 0.6 * (c.exposure == "learned") + 0.5 * (c.background == "sphere"),
+        Components(view=0, exposure="learned", background="sphere"),
+        None,
+    ),
+}
 
 
-def test_what_another_component_does_better_is_left_out_beside_it():
-    """View dependence alone explains drifting exposures and would be kept; with learned exposures it is not needed."""
-    scripted = Scripted(lambda c: 0.6 if c.exposure == "learned" else 0.5 * (c.view > 0))
-    assert chosen_by(scripted).components == Components(view=0, exposure="learned")
-
-
-def test_of_two_that_mend_the_same_fault_only_the_better_is_kept():
-    scripted = Scripted(lambda c: 0.6 if c.exposure == "learned" else 0.5 * (c.background == "sphere"))
-    chosen = chosen_by(scripted)
-    assert chosen.components == Components(view=0, exposure="learned")
-    (sphere,) = (decision for decision in chosen.decisions if decision.component == "background")
-    assert sphere.why == "no gain above the noise, in addition to exposure"
-
-
-def test_two_that_gain_beside_each_other_are_both_kept():
-    chosen = chosen_by(Scripted(lambda c: 0.6 * (c.exposure == "learned") + 0.5 * (c.background == "sphere")))
-    assert (chosen.components.exposure, chosen.components.background) == ("learned", "sphere")
+@pytest.mark.parametrize("case", SEARCHES)
+def test_what_is_in_the_model_is_what_gains_beside_the_rest(case):
+    gain, expected, why = SEARCHES[case]
+    chosen = chosen_by(Scripted(gain))
+    assert chosen.components == expected
+    assert why is None or [d.why for d in chosen.decisions if d.component == why[0]] == [why[1]]
 
 
 def test_of_two_values_of_a_component_the_better_is_kept():

@@ -75,12 +75,6 @@ def test_a_wire_does_not_end_a_sky():
         assert mask[26:30].mean() > 0.7
 
 
-def test_a_sky_is_extended_by_half_a_window_at_most():
-    plain = sky._Small(LoadedPhoto(photo(0.0).frame, np.full((120, 160, 3), 200, np.uint8), None))
-    mask = np.arange(120)[:, None] < np.full(160, 10)
-    assert np.array_equal(sky._up_to_its_border(plain, mask), np.arange(120)[:, None] < np.full(160, 13))
-
-
 def test_the_sky_of_a_camera_on_its_side_is_found():
     upright, one_aside = photos(), photos()
     clockwise = np.eye(4)
