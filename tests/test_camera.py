@@ -57,15 +57,6 @@ def directions_within(angle_rad: float, *, count: int = 400, seed: int = 0) -> n
     return np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], axis=-1)
 
 
-def test_pinhole_bearing_by_hand():
-    camera = Camera("PINHOLE", 4, 2, (2.0, 4.0, 2.0, 1.0))
-    directions, valid = camera.bearings(np.array([[2.0, 1.0], [4.0, 1.0], [2.0, 5.0], [0.0, -3.0]]))
-    assert valid.all()
-    np.testing.assert_allclose(directions / directions[:, 2:], [[0, 0, 1], [1, 0, 1], [0, 1, 1], [-1, -1, 1]])
-    middle, _ = Camera("SIMPLE_PINHOLE", 3, 3, (5.0, 1.5, 1.5)).bearings(np.array([[1.5, 1.5]]))
-    np.testing.assert_array_equal(middle, [[0, 0, 1]])
-
-
 def test_pixel_bearings_go_row_by_row_through_pixel_centres():
     camera = camera_of("OPENCV")
     directions, valid = camera.pixel_bearings()

@@ -79,15 +79,6 @@ def test_moved_gaussians_look_the_same_from_the_moved_camera(degree, seed):
     np.testing.assert_array_equal(moved.logits, gaussians.logits)
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_two_moves_are_one(degree):
-    gaussians, c_from_b, b_from_a = some_gaussians(1, degree), some_similarity(2), some_similarity(3)
-    twice, once = gaussians.moved(b_from_a).moved(c_from_b), gaussians.moved(c_from_b.compose(b_from_a))
-    for first, second in zip(twice, once, strict=True):
-        sign = np.sign((first * second).sum(axis=1, keepdims=True)) if first.shape[1:] == (4,) else 1  # q is -q
-        np.testing.assert_allclose(sign * first, second, rtol=1e-5, atol=1e-5)  # twice the roundings of one move
-
-
 def test_shapes_are_checked_and_values_are_float32():
     whole = some_gaussians(0, 2)
     assert {values.dtype for values in whole} == {np.dtype(np.float32)}

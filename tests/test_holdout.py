@@ -11,10 +11,6 @@ from nerfcli.errors import UserError
 NAMES = [f"frame_{index}.png" for index in range(1, 21)]
 
 
-def test_the_default_is_the_split_of_scenes():
-    assert names_held_out(DEFAULT_HOLDOUT, NAMES) == default_split(NAMES)
-
-
 def test_every_n_counts_names_in_order():
     assert names_held_out("every:5", ["d", "b", "a", "c", "f", "e"]) == {"a", "f"}
 

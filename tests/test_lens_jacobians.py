@@ -123,15 +123,6 @@ def test_bearings_turn_as_pixels_move(model, seed):
         )
 
 
-def test_footprint_of_a_pinhole_is_cos_cubed_over_f_squared():
-    camera = Camera.pinhole(200, 100, 80.0)
-    pixels = random_pixels(np.random.default_rng(0), 50, margin=0.0) / (WIDTH, HEIGHT) * (200, 100)
-    cosine = camera.bearings(pixels)[0][:, 2]
-    footprint, valid = camera.pixel_footprint(pixels)
-    assert valid.all()
-    np.testing.assert_allclose(footprint, cosine**3 / 80**2, rtol=1e-13)
-
-
 def test_footprint_of_a_fisheye_is_sinc_over_f_squared_behind_the_camera_too():
     camera = Camera("SIMPLE_FISHEYE", 1000, 1000, (200.0, 500.0, 500.0))
     angle = np.radians([0.0, 1e-6, 1.0, 45.0, 90.0, 120.0, 170.0])

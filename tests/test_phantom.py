@@ -9,21 +9,13 @@ import pytest
 import tifffile
 import torch
 from commands import error_of, nerfcli
-from ellipsoids import Ellipsoid, attenuation_at, attenuation_of_voxels, bean, line_integrals, sphere
+from ellipsoids import Ellipsoid, attenuation_at, attenuation_of_voxels, bean, line_integrals
 
 from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.likelihood import likelihood_of
 from nerfcli.ct.truth import load_truth
 
 PHANTOM = Path(__file__).parent.parent / "sample_scenes" / "phantom"
-
-
-@pytest.mark.parametrize("distance", [0.0, 1.0, 1.999999, 2.0, 2.5])
-def test_chord_of_a_sphere(distance: float) -> None:
-    """Closed form: 2 sqrt(r^2 - d^2), for a direction of any length."""
-    origin, direction = np.array([[1 + distance, -50.0, 3.0]]), np.array([[0, 7.0, 0]])
-    expected = 2 * np.sqrt(max(4 - distance**2, 0))
-    assert sphere((1, 2, 3), 2, 1.0).chords(origin, direction) == pytest.approx(expected, abs=1e-7)
 
 
 def test_line_integrals_are_those_of_quadrature() -> None:

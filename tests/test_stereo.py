@@ -75,23 +75,23 @@ def test_most_pixels_of_two_walls_have_their_distance_within_the_error_that_is_c
         assert np.percentile(np.abs(off) / depth.errors, 95) > 0.1
 
 
-def test_photos_of_different_sizes_and_turns_are_matched():
-    small = Camera.pinhole(120, 160, 150.0)
-    photos = [photo(0.0), photo(0.3, turned=-0.1), photo(-0.3, camera=small), photo(0.15, turned=0.05)]
+SMALL = Camera.pinhole(120, 160, 150.0)
+
+
+@pytest.mark.parametrize(
+    ("photos", "share", "within"),
+    [
+        ([photo(0.0), photo(0.3, turned=-0.1), photo(-0.3, camera=SMALL), photo(0.15, turned=0.05)], 0.3, 0.02),
+        ([photo(0.0), photo(0.3)], 0.5, 0.03),
+    ],
+    ids=["different sizes and turns", "two photos"],
+)
+def test_other_sets_of_photos_are_matched_too(photos, share, within):
     for one, depth in zip(photos, found(photos), strict=True):
         columns, rows = depth.pixels.T
         off = depth.distances / truth(one.frame.camera, one.frame.world_from_cam)[0][rows, columns] - 1.0
-        assert len(off) > 0.3 * one.pixels[..., 0].size
-        assert np.mean(np.abs(off) < 0.02) > 0.97
-
-
-def test_two_photos_are_enough():
-    photos = [photo(0.0), photo(0.3)]
-    for one, depth in zip(photos, found(photos), strict=True):
-        columns, rows = depth.pixels.T
-        off = depth.distances / truth(PINHOLE, one.frame.world_from_cam)[0][rows, columns] - 1.0
-        assert len(off) > 0.5 * one.pixels[..., 0].size
-        assert np.mean(np.abs(off) < 0.03) > 0.97
+        assert len(off) > share * one.pixels[..., 0].size
+        assert np.mean(np.abs(off) < within) > 0.97
 
 
 NOTHING = {

@@ -66,18 +66,6 @@ def test_a_similarity_changes_no_pixel_and_scales_depths(seed, scale):
     assert [frame.camera for frame in after.frames] == [frame.camera for frame in before.frames]
 
 
-@given(seed=seeds, scale=st.sampled_from([1e-3, 1.0, 1e3]))
-@few
-def test_there_and_back_through_json_is_where_it_was(seed, scale):
-    rng = np.random.default_rng(seed)
-    before, similarity = capture_of(rng), random_similarity(rng, scale)
-    back = Similarity.from_json(similarity.to_json()).inverse()
-    after = transformed(transformed(before, similarity), back)
-    np.testing.assert_allclose(after.points, before.points, rtol=0, atol=1e-12)
-    for one, other in zip(after.frames, before.frames, strict=True):
-        np.testing.assert_allclose(one.world_from_cam, other.world_from_cam, rtol=0, atol=1e-12)
-
-
 def test_a_capture_without_frames_or_bounds_keeps_none():
     points = np.array([[1.0, 0, 0]])
     after = transformed(Capture((), points, (), None, "ply"), Similarity(2.0, np.eye(3), np.zeros(3)))
