@@ -9,7 +9,7 @@ from nerfcli.errors import UserError
 from nerfcli.field.fourier_field import FourierFieldSettings
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
-from nerfcli.field.kinds import KINDS, chosen_size, field_bytes, fresh_field, parameter_bytes, parameter_count
+from nerfcli.field.kinds import KINDS, chosen_size, field_bytes, fresh_field, parameter_bytes
 from nerfcli.field.voxel_field import VoxelFieldSettings
 
 HASH = HashFieldSettings(contraction="none")
@@ -20,24 +20,11 @@ SEVERAL: list[FieldSettings] = [
     VoxelFieldSettings(contraction="l2", view_degree=0, log2_vertices=9),
     FourierFieldSettings(contraction="none", octaves=4, width=24, layers=3),
 ]
-MIB = 2**20
 
 
 @pytest.mark.parametrize("settings", SEVERAL, ids=str)
 def test_bytes_are_those_of_the_module(settings):
     assert parameter_bytes(settings) == field_bytes(fresh_field(settings))
-
-
-def test_the_default_hash_grid_by_hand():
-    assert parameter_count(HASH) == 8 * 65536 * 4 + 32 * 32 + 16 * 32 + 32 * 32 + 32 * 32 + 3 * 32 == 2_100_832
-
-
-def test_dense_grids_by_the_worked_example():
-    """A 128^3 grid: 8 MiB for one number, 32 MiB for density and colour; twice the side is eight times as much."""
-    grey = VoxelFieldSettings(contraction="none", view_degree=0, log2_vertices=21)
-    assert grey.resolution == 127  # between 128^3 vertices
-    assert parameter_bytes(grey) == 4 * 128**3 * 4 == 32 * MIB
-    assert parameter_count(replace(grey, log2_vertices=24)) == 8 * parameter_count(grey)
 
 
 @pytest.mark.parametrize(

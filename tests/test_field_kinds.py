@@ -116,17 +116,6 @@ def test_the_dense_grid_has_as_many_cells_as_fit():
         assert side**3 <= 2**log2_vertices < (side + 1) ** 3
 
 
-def test_fourier_features_of_a_line_have_one_frequency_each():
-    """By the FFT: over two units, octave k is a pure tone of 2^k periods, sine and cosine a quarter apart."""
-    x = torch.arange(256, dtype=torch.float64)[:, None] / 128
-    spectrum = np.fft.rfft(fourier_features(x, 5).numpy(), axis=0) / 128
-    for octave in range(5):
-        for column, expected in ((2 * octave, -1j), (2 * octave + 1, 1.0)):
-            tone = np.zeros(129, complex)
-            tone[2**octave] = expected
-            np.testing.assert_allclose(spectrum[:, column], tone, atol=1e-12)
-
-
 def test_the_network_field_is_its_formula():
     torch.manual_seed(0)
     field = FourierField(FourierFieldSettings(contraction="none", octaves=3, width=8, layers=2)).double()

@@ -18,7 +18,7 @@ from nerfcli.render.held_out_exposure import (
     gains_beyond_exif,
     log_gains_of,
 )
-from nerfcli.render.model import load_model
+from nerfcli.render.model import Model, load_model
 from nerfcli.training.loop import train
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
@@ -132,6 +132,21 @@ def test_two_photos_give_no_estimate_and_are_refused():
     assert gains_between(np.arange(4), drifting(np.arange(4.0)), np.zeros(0)).shape == (0, 3)
 
 
+def trained(scene: Capture, run: Path, *, exposure: str) -> Model:
+    """Return the field of a short training."""
+    settings = TrainSettings(
+        budget_seconds=None,
+        steps=150,
+        log2_rows=8,
+        first_samples_per_step=2**10,
+        samples_per_step=2**10,
+        components=Components(exposure=exposure),
+        threads=1,
+    )
+    train(scene, run, settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
+    return load_model(run / "field.safetensors", "cpu")
+
+
 def test_training_estimates_exposures_of_held_out_photos_without_opening_them(tmp_path: Path):
     """Grey photos become brighter one by one; the last but one is held out and nearly black. Its gains are nevertheless
     between those of its neighbours, which are brighter than the mean."""
@@ -144,17 +159,7 @@ def test_training_estimates_exposures_of_held_out_photos_without_opening_them(tm
         pose[:3, 3] = [0.1 * index, 0.0, -2.0]
         frames.append(Frame(f"{index}.png", camera, pose, tmp_path / f"{index}.png"))
     scene = Capture(tuple(frames), np.zeros((9, 3)), kind="colmap", root=tmp_path, test_names=frozenset({"7.png"}))
-    settings = TrainSettings(
-        budget_seconds=None,
-        steps=150,
-        log2_rows=8,
-        first_samples_per_step=2**10,
-        samples_per_step=2**10,
-        components=Components(exposure="learned"),
-        threads=1,
-    )
-    train(scene, tmp_path / "run", settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
-    model = load_model(tmp_path / "run" / "field.safetensors", "cpu")
+    model = trained(scene, tmp_path / "run", exposure="learned")
     assert set(model.exposures) == {"7.png"}
     reported = log_gains_of(scene.test_frames, model)
     assert reported.tolist() == [list(model.exposures["7.png"])]
@@ -188,17 +193,7 @@ def test_a_run_keeps_the_offset_to_exif_of_held_out_photos(tmp_path: Path, expos
         pose[:3, 3] = [0.1 * index, 0.0, -2.0]
         frames.append(Frame(path.name, camera, pose, path))
     scene = Capture(tuple(frames), np.zeros((13, 3)), kind="colmap", root=tmp_path, test_names=frozenset({"9.png"}))
-    settings = TrainSettings(
-        budget_seconds=None,
-        steps=150,
-        log2_rows=8,
-        first_samples_per_step=2**10,
-        samples_per_step=2**10,
-        components=Components(exposure=exposure),
-        threads=1,
-    )
-    train(scene, tmp_path / "run", settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
-    model = load_model(tmp_path / "run" / "field.safetensors", "cpu")
+    model = trained(scene, tmp_path / "run", exposure=exposure)
     assert gain_sources(scene.test_frames, model) == ["EXIF and training photos around"]
     assert set(model.beyond_exif) == {"9.png"}
     assert np.mean(model.beyond_exif["9.png"]) == pytest.approx(drift[9], abs=0.12)

@@ -8,9 +8,8 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib import colormaps
-from skimage.color import rgb2lab
 
-from nerfcli.photos.colours import COLOUR_MAPS, levels_of
+from nerfcli.photos.colours import COLOUR_MAPS
 from nerfcli.render.files.depth_files import quantiles
 from nerfcli.render.files.depth_pictures import DepthMeta
 from nerfcli.render.presentation import coloured, preview
@@ -84,39 +83,18 @@ def test_false_colours_are_those_of_matplotlib(colour_map):
     assert np.abs(coloured(depth, lo=0.0, hi=1.0, colour_map=colour_map)[0, ::2] - expected).max() <= 0.5
 
 
-@pytest.mark.parametrize("colour_map", ["viridis", "grey"])
-def test_even_maps_grow_lighter_in_even_steps(colour_map):
-    """Lightness of CIELAB, as scikit-image computes it; both maps are made to be linear in it or close."""
-    lightness = rgb2lab(levels_of(colour_map)[None])[0, :, 0]
-    assert (np.diff(lightness) > -0.05).all()  # a level of blue is 0.1 or less
-    assert np.corrcoef(lightness, np.arange(256))[0, 1] > 0.99
-
-
-FRACTIONS = (0.0, 0.01, 0.5, 0.99, 1.0)
-
-
 @examples(100)
 @given(
-    lists=st.lists(st.lists(st.floats(width=32), max_size=30), max_size=5),
-    fraction=st.floats(0, 1),
+    lists=st.lists(st.lists(st.floats(width=32) | st.floats(1, 1 + 2**-10, width=32), max_size=30), max_size=5),
+    fractions=st.lists(st.floats(0, 1), min_size=1, max_size=5),
 )
-def test_quantiles_are_those_of_sorted_values(lists, fraction):
-    """Any floats, NaN and infinities among them, of any sign and size; NumPy's inverted_cdf is the same definition."""
+def test_quantiles_are_those_of_sorted_values(lists, fractions):
+    """Any floats, NaN and infinities among them, of any sign and size, and some with the same upper 16 bits."""
     maps = [np.array(values, np.float32) for values in lists]
     values = np.concatenate([np.empty(0, np.float32), *maps])
     finite = np.sort(values[np.isfinite(values)])
-    found = quantiles(lambda: maps, [fraction, fraction])
+    found = quantiles(lambda: maps, fractions)
     if finite.size == 0:
         assert found == []
         return
-    expected = finite[max(int(np.ceil(fraction * finite.size)) - 1, 0)]
-    assert found == [expected, expected]
-
-
-@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
-def test_quantiles_of_many_maps_are_numpys(scale):
-    rng = np.random.default_rng(0)
-    maps = [(scale * rng.normal(1, 2, (50, 40))).astype(np.float32) for _ in range(20)]
-    maps[3][:20] = np.nan
-    values = np.concatenate([m[np.isfinite(m)] for m in maps])
-    assert quantiles(lambda: iter(maps), FRACTIONS) == np.quantile(values, FRACTIONS, method="inverted_cdf").tolist()
+    assert found == [finite[max(int(np.ceil(fraction * finite.size)) - 1, 0)] for fraction in fractions]

@@ -194,25 +194,6 @@ def test_rays_have_unit_length_and_start_at_the_camera():
     np.testing.assert_allclose(rays.cosines.numpy(), rays.directions[:, 2].numpy(), atol=1e-6)
 
 
-@pytest.mark.parametrize("tile", [5, 64])
-def test_tiles_leave_no_trace(tile):
-    frame = towards_slab()
-    request = DepthRequest("conditional", "z", 0.1)
-    model = fog(SLAB, SIMILARITY, step=1 / 64)
-    whole = picture_of(model, frame, request)
-    counts: list[int] = []
-    tiled = render_picture(
-        model, frame, background=BACKGROUND, depth=request, on_tile=counts.append, rays_per_tile=tile
-    )
-    np.testing.assert_array_equal(tiled.rgb, whole.rgb)
-    np.testing.assert_array_equal(tiled.opacity, whole.opacity)
-    assert whole.depth is not None
-    assert tiled.depth is not None
-    np.testing.assert_array_equal(tiled.depth, whole.depth)
-    assert sum(counts) == 16 * 12
-    assert max(counts) <= tile
-
-
 @pytest.mark.parametrize(("gigabytes", "rays"), [(80, 2**16), (8, 2**8 * 142), (1, 2**14)])
 def test_tiles_of_a_gpu_fit_into_its_memory(gigabytes, rays, monkeypatch):
     """A tile takes an eighth of it if all 250 steps are in occupied cells, but is never too small to fill a GPU."""

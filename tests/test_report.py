@@ -151,6 +151,12 @@ def test_runs_are_shown_by_photos_that_all_of_them_hold_out():
     assert common_names([holding("a.png"), holding("b.png")], 8) == []
 
 
+def layers_in(page: str) -> list[list[dict[str, Any]]]:
+    data = re.search(r'<script type="application/json" id="views">(.*?)</script>', page, re.DOTALL)
+    assert data is not None
+    return json.loads(data[1])
+
+
 def test_the_page_shows_the_numbers_and_embeds_the_pictures(seen):
     look, _ = seen
     text = page_html([facts()], [look], depths=[_meta()])
@@ -166,9 +172,7 @@ def test_the_page_shows_the_numbers_and_embeds_the_pictures(seen):
     ):
         assert reported in text
     assert not re.search(r"(src|href)=\"?http", text)
-    data = re.search(r'<script type="application/json" id="views">(.*?)</script>', text, re.DOTALL)
-    assert data is not None
-    layers = json.loads(data[1])
+    layers = layers_in(text)
     assert [layer["label"] for layer in layers[0]] == ["photo", "rendered", "error", "depth", "coverage"]
     assert all(layer["uri"].startswith("data:image/jpeg;base64,") for view in layers for layer in view)
 
@@ -190,9 +194,7 @@ def two_captures(seen: tuple[list[HeldOutRenderings], np.ndarray]) -> str:
 
 def test_photos_of_the_same_name_in_two_captures_stay_apart(seen):
     text = two_captures(seen)
-    data = re.search(r'<script type="application/json" id="views">(.*?)</script>', text, re.DOTALL)
-    assert data is not None
-    rendered = [[layer["label"] for layer in view if "rendered" in layer["label"]] for view in json.loads(data[1])]
+    rendered = [[layer["label"] for layer in view if "rendered" in layer["label"]] for view in layers_in(text)]
     assert rendered == [["one: rendered", "three: rendered"]] * len(seen[0]) + [["two: rendered"]] * len(seen[0])
     assert "different held-out photos" not in text
     assert text.count('<img class="thumbnail"') == 3

@@ -107,11 +107,8 @@ def read_a_step_later(self: Delayed, *tensors: torch.Tensor) -> tuple[torch.Tens
     return before
 
 
-@pytest.mark.parametrize(("bad_call", "on_gpu"), [(8, False), (8, True), (12, True)], ids=str)
-def test_a_fault_that_does_not_come_back_changes_nothing(bad_call, on_gpu, views, tmp_path, monkeypatch):
-    fit(views, tmp_path / "straight")
-    if on_gpu:
-        monkeypatch.setattr(Delayed, "exchange", read_a_step_later)
+def make_flaky(monkeypatch: pytest.MonkeyPatch, bad_call: int) -> None:
+    """Have compositing return NaN in one of its calls."""
     composite, calls = numba_cpu.composite, 0
 
     def flaky(*args: torch.Tensor, **named: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -121,6 +118,14 @@ def test_a_fault_that_does_not_come_back_changes_nothing(bad_call, on_gpu, views
         return (rgb * math.nan if calls == bad_call else rgb), transmittance, fractions
 
     monkeypatch.setattr(numba_cpu, "composite", flaky)
+
+
+@pytest.mark.parametrize(("bad_call", "on_gpu"), [(8, False), (8, True), (12, True)], ids=str)
+def test_a_fault_that_does_not_come_back_changes_nothing(bad_call, on_gpu, views, tmp_path, monkeypatch):
+    fit(views, tmp_path / "straight")
+    if on_gpu:
+        monkeypatch.setattr(Delayed, "exchange", read_a_step_later)
+    make_flaky(monkeypatch, bad_call)
     reported = fit(views, tmp_path / "flaky")
     assert any("but are finite when the step is repeated" in line for line in reported)
     assert weights(tmp_path / "flaky") == weights(tmp_path / "straight")
@@ -139,15 +144,7 @@ def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, t
     assert line.startswith("table is not finite at step 8")
     _, description = load_tensors(tmp_path / "poisoned" / "failure-8.safetensors", "cpu")
     assert description["state"]["step"] == 7
-    composite, calls = numba_cpu.composite, 0
-
-    def flaky(*args: torch.Tensor, **named: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        nonlocal calls
-        calls += 1
-        rgb, transmittance, fractions = composite(*args, **named)
-        return (rgb * math.nan if calls == 9 else rgb), transmittance, fractions
-
-    monkeypatch.setattr(numba_cpu, "composite", flaky)
+    make_flaky(monkeypatch, 9)
     reported = fit(views, tmp_path / "flaky")
     assert any("this device does not repeat results exactly" in line for line in reported)
 
