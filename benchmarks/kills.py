@@ -10,6 +10,7 @@ every 0.3 s instead of every 30 s, so that kills hit that as well.
 """
 
 import csv
+import json
 import os
 import random
 import shutil
@@ -39,6 +40,7 @@ TOLD = {
     "poses": ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"),
     "train": ("field.safetensors", "cameras.json", "config.json"),
 }
+PASSING = ("seconds", "written_at", "blake2b")  # fields of JSON files
 TIMED = ("metrics.json",)  # of the other commands
 WRITING = (".partial-", "-journal", "-wal")  # parts of file names; the last two are of SQLite
 LOOK_EVERY_SECONDS = 0.002
@@ -142,9 +144,21 @@ def killed(process: subprocess.Popen[str], output: Path, *, after: float, writin
     return "done" if code == 0 else "writing" if writing else "working"
 
 
+def lasting_facts(folder: Path) -> dict[str, str]:
+    """Return the content of the JSON files of a run, without times, places, and digests of these."""
+
+    def lasting(content: object) -> object:
+        if isinstance(content, dict):
+            return {key: lasting(value) for key, value in content.items() if key not in PASSING}
+        return [lasting(value) for value in content] if isinstance(content, list) else content
+
+    paths = [folder / name for name in TOLD["train"] if name.endswith(".json")]
+    return {path.name: json.dumps(lasting(json.loads(path.read_text()))) for path in paths if path.exists()}
+
+
 def differing(name: str, whole: Path, part: Path) -> list[str]:
     """Return the files that differ between two results or are missing, and leftovers of unfinished writing."""
-    one, other = digests(whole), digests(part)
+    one, other = (digests(folder) | lasting_facts(folder) for folder in (whole, part))
     names = TOLD.get(name) or sorted(file for file in one.keys() | other.keys() if Path(file).name not in TIMED)
     leftovers = [file for file in other if "partial" in file or "unfinished" in file]
     return [file for file in names if one.get(file) != other.get(file) or file not in one] + leftovers
