@@ -36,12 +36,12 @@ from nerfcli.cli import main
 main()
 """
 # Files to compare; the other files of these results contain times of day and durations.
-TOLD = {
+COMPARED = {
     "poses": ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"),
     "train": ("field.safetensors", "cameras.json", "config.json"),
 }
-PASSING = ("seconds", "written_at", "blake2b")  # fields of JSON files
-TIMED = ("metrics.json",)  # of the other commands
+VOLATILE_FIELDS = ("seconds", "written_at", "blake2b")  # fields of JSON files
+VOLATILE_FILES = ("metrics.json",)  # of the other commands
 WRITING = (".partial-", "-journal", "-wal")  # parts of file names; the last two are of SQLite
 LOOK_EVERY_SECONDS = 0.002
 
@@ -144,22 +144,24 @@ def killed(process: subprocess.Popen[str], output: Path, *, after: float, writin
     return "done" if code == 0 else "writing" if writing else "working"
 
 
-def lasting_facts(folder: Path) -> dict[str, str]:
+def stable_json(folder: Path) -> dict[str, str]:
     """Return the content of the JSON files of a run, without times, places, and digests of these."""
 
-    def lasting(content: object) -> object:
+    def stable(content: object) -> object:
         if isinstance(content, dict):
-            return {key: lasting(value) for key, value in content.items() if key not in PASSING}
-        return [lasting(value) for value in content] if isinstance(content, list) else content
+            return {key: stable(value) for key, value in content.items() if key not in VOLATILE_FIELDS}
+        return [stable(value) for value in content] if isinstance(content, list) else content
 
-    paths = [folder / name for name in TOLD["train"] if name.endswith(".json")]
-    return {path.name: json.dumps(lasting(json.loads(path.read_text()))) for path in paths if path.exists()}
+    paths = [folder / name for name in COMPARED["train"] if name.endswith(".json")]
+    return {path.name: json.dumps(stable(json.loads(path.read_text()))) for path in paths if path.exists()}
 
 
 def differing(name: str, whole: Path, part: Path) -> list[str]:
     """Return the files that differ between two results or are missing, and leftovers of unfinished writing."""
-    one, other = (digests(folder) | lasting_facts(folder) for folder in (whole, part))
-    names = TOLD.get(name) or sorted(file for file in one.keys() | other.keys() if Path(file).name not in TIMED)
+    one, other = (digests(folder) | stable_json(folder) for folder in (whole, part))
+    names = COMPARED.get(name) or sorted(
+        file for file in one.keys() | other.keys() if Path(file).name not in VOLATILE_FILES
+    )
     leftovers = [file for file in other if "partial" in file or "unfinished" in file]
     return [file for file in names if one.get(file) != other.get(file) or file not in one] + leftovers
 

@@ -2,8 +2,8 @@
 
 Python programs can call the commands as functions: `run_pipeline` is all of them; `estimate_poses`, `train_scene`,
 `evaluate_run`, `render_run` and `export_run` are its stages; `load_scene`, `load_run` and `load_splats` read their
-results. `Output`, `Resources` and `Reporter` say where results go, what may be used and who is told. All are imported
-on first use: `import nerfcli` is fast.
+results. `Output`, `Resources` and `Reporter` say where results go, what may be used and where messages go. All are
+imported on first use: `import nerfcli` is fast.
 """
 
 # Must come before any import of pycolmap: its wheel exports zlib's functions, and if Python's zlib is loaded after it,

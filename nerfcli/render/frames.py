@@ -7,8 +7,8 @@ Until a folder is complete, everything is in a hidden folder beside it, named af
         frames/FRAME.json                facts about a complete frame, written after its files
         lock                             held by the one command that completes the folder
 
-All files are atomic, so those of a frame are complete if its facts are there: a command that was killed at any moment,
-or several commands with parts of the frames, leave what the next one goes on with.
+All files are atomic, so those of a frame are complete if its facts are there. After a command that was killed at any
+moment, or several that rendered parts of the frames, the next one renders only what is missing.
 """
 
 import json
@@ -68,7 +68,7 @@ def render_job(
         output: the folder to write, whose path is given; it appears, or is replaced, when it is complete. The pictures
             of a folder that differs only in videos and levels stay.
         part: which frames; several machines that share a disk may render different ones at the same time.
-        reporter: told what happens, and the fraction of the rays that is done.
+        reporter: receives messages, and the fraction of the rays that is done.
 
     Returns:
         The paths to show, see `RenderJob.results`; with `part`, the unfinished folder.

@@ -139,7 +139,7 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
 
 
 def _stops(spread: float) -> str:
-    """Return a spread of the logarithm of light in words."""
+    """Describe a spread of log exposures in words."""
     return f"{spread / math.log(2.0):.2g} stops"
 
 

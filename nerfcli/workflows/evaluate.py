@@ -66,7 +66,7 @@ def evaluate_run(
         output: the file to write, RUN/metrics.json by default.
         predictions: "png" saves the compared pictures in RUN/predictions, "float" also unrounded ones; None saves none.
         resources: threads and device.
-        reporter: told what happens, and the fraction of the rays that is done.
+        reporter: receives messages, and the fraction of the rays that is done.
 
     Raises:
         UserError: the folder is not a run, its split is not the one it was trained with, a photo cannot be read, or

@@ -62,7 +62,7 @@ def export_run(
         settings: region and resolution of a geometry.
         splats: number, refinement and frame of splats.
         resources: threads and device.
-        reporter: told what happens, and the fraction of the work that is done.
+        reporter: receives messages, and the fraction of the work that is done.
 
     Returns:
         The path that was written.

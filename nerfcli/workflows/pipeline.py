@@ -70,7 +70,7 @@ def run_pipeline(
         frames: number of frames to use from a video; None for 120.
         intrinsics: file with intrinsics of the cameras, which are kept; None to estimate them.
         resources: threads, device and memory of all stages.
-        reporter: told what happens, stage by stage.
+        reporter: receives messages, stage by stage.
         show: called with each result as soon as it is complete.
 
     Raises:

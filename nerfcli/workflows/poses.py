@@ -58,7 +58,7 @@ def estimate_poses(
         frames: number of frames to use from a video; None for 120.
         intrinsics: file with intrinsics of the cameras, which are kept; None to estimate them.
         resources: limit of the memory of structure from motion; the threads are those of the settings.
-        reporter: told what happens.
+        reporter: receives messages.
 
     Returns:
         The folder of the scene.

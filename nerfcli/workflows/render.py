@@ -65,7 +65,7 @@ def render_run(
         settings: outputs, depth, file formats, videos, and steps along rays; `usual_settings` by default.
         splats: a .ply or .spz to render instead of the field.
         resources: threads and device.
-        reporter: told what happens, and the fraction of the rays that is done.
+        reporter: receives messages, and the fraction of the rays that is done.
 
     Returns:
         The paths to show: videos, or the folders of the outputs; the unfinished folder if only a part is rendered.

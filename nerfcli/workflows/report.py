@@ -38,7 +38,7 @@ def report_runs(
             on these runs is replaced in any case; another file only if it may be overwritten.
         keep: keep a page that was made from the same files with the same options.
         resources: threads and device to render with.
-        reporter: told what happens.
+        reporter: receives messages.
 
     Raises:
         UserError: a folder is not a run, its photos cannot be read, or the page's path holds something else.

@@ -17,7 +17,7 @@ from nerfcli.errors import UserError
 
 CAMERAS = "cameras.json"
 # Hint for a damaged file of a run.
-MEND = f"train again with --overwrite, or restore the file; if you edited it yourself, remove its entry {SEAL}"
+REPAIR_HINT = f"train again with --overwrite, or restore the file; if you edited it yourself, remove its entry {SEAL}"
 # Keys: in an entry, camera and pose as the scene had them; beside the entries, the run's absolute path.
 _GIVEN, _WRITTEN_AT = "given", "written_at"
 
@@ -99,7 +99,7 @@ def _read_frames(path: Path, *, given: bool) -> RunCameras:
             f"{run} is not a run folder: it has no {CAMERAS}", "give a run folder written by nerfcli train"
         ) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{path} cannot be read: {error}", MEND) from error
+        raise UserError(f"{path} cannot be read: {error}", REPAIR_HINT) from error
     return RunCameras(train, test)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from nerfcli.atomic import read_json, read_sealed, write_sealed
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import photo_folder, recognised
-from nerfcli.captures.formats.run_cameras import CAMERAS, MEND, RunCameras, read_cameras, read_given_cameras
+from nerfcli.captures.formats.run_cameras import CAMERAS, REPAIR_HINT, RunCameras, read_cameras, read_given_cameras
 from nerfcli.captures.loading import fingerprint
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, in_shell
@@ -152,9 +152,9 @@ def read_config(run: Path) -> RunConfig:
     except (FileNotFoundError, NotADirectoryError) as error:
         raise no_run(run) from error
     except UserError as error:
-        raise UserError(f"{run / CONFIG} cannot be read: {error.message}", MEND) from error
+        raise UserError(f"{run / CONFIG} cannot be read: {error.message}", REPAIR_HINT) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{run / CONFIG} cannot be read: {error}", MEND) from error
+        raise UserError(f"{run / CONFIG} cannot be read: {error}", REPAIR_HINT) from error
 
 
 def no_run(path: Path) -> UserError:
