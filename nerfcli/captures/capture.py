@@ -47,6 +47,7 @@ class Capture:
         root: the folder that was loaded, or that the loaded file is in.
         test_names: names of the held-out frames of a loaded capture.
         holdout: the rule that chose them; None for the split of the capture, or the default split.
+        notes: what was left out or assumed while the files were read, each a line for people.
     """
 
     frames: tuple[Frame, ...]
@@ -64,6 +65,7 @@ class Capture:
     root: Path = Path()
     test_names: frozenset[str] = frozenset()
     holdout: str | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def train_frames(self) -> tuple[Frame, ...]:
